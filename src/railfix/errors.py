@@ -1,0 +1,89 @@
+"""The errors that railfix raises, and the exit code of the command line for each.
+
+Every error is one sentence that names the file (and line or field), what was expected and what
+to do. Array functions raise `ValueError` when their contract is violated.
+
+==== =====================================================================
+code meaning
+==== =====================================================================
+0    done
+1    a defect of railfix itself (a traceback is shown)
+2    the command line was misused (unknown option, missing argument)
+3    an input file is missing, unreadable, or not what it should be
+4    a setting is misspelt, out of range, or contradicts another
+5    the inputs are readable but do not belong together (other day, other place)
+6    the track map was checked and has errors
+7    the run ended without a single position
+8    the output cannot be written
+==== =====================================================================
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import ClassVar
+
+
+class RailfixError(Exception):
+    """Base of every error that a user of railfix can cause and mend.
+
+    Attributes
+    ----------
+    exit_code : int
+        Exit code of the command line for this class of error.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+
+class InputFileError(RailfixError):
+    """An input file is missing, unreadable or malformed.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    message : str
+        What is wrong, what was expected, what to do; no trailing full stop.
+    line : int, optional
+        1-based line number where it was found.
+    """
+
+    exit_code = 3
+
+    def __init__(self, path: str | PathLike[str], message: str, *, line: int | None = None) -> None:
+        self.path = str(path)
+        self.line = line
+        self.message = message
+        where = self.path if line is None else f"{self.path}, line {line}"
+        super().__init__(f"{where}: {message}")
+
+
+class SettingsError(RailfixError):
+    """A setting is misspelt, out of range, or contradicts another."""
+
+    exit_code = 4
+
+
+class MismatchError(RailfixError):
+    """Inputs that are each readable but do not belong together."""
+
+    exit_code = 5
+
+
+class MapQualityError(RailfixError):
+    """The quality report of a track map holds errors."""
+
+    exit_code = 6
+
+
+class NoPositionError(RailfixError):
+    """A run ended without a single position."""
+
+    exit_code = 7
+
+
+class OutputError(RailfixError):
+    """The output cannot be written."""
+
+    exit_code = 8
