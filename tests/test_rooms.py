@@ -1,0 +1,82 @@
+"""The flow of the package is one-way: a room imports only from its own floor or floors below, without cycles."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Final
+
+from conftest import ROOT
+
+SOURCE: Final = ROOT / "src" / "railfix"
+
+#: The rooms (a module or a folder of the package), floor by floor. docs/concepts.md draws the same.
+FLOORS: Final[dict[int, tuple[str, ...]]] = {
+    0: ("constants", "errors", "timescale", "geodesy"),
+    1: ("epochs", "navigation", "reasons"),
+    2: ("rinex", "sp3", "position_log", "orbits", "atmosphere"),
+    3: ("track_map", "antenna"),
+    4: ("clock_elimination", "measurement", "section", "constrained", "spp", "screens"),
+    5: ("config", "pipeline"),
+    6: ("simulate", "evaluate", "tables", "report", "run", "cli"),
+}
+FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
+
+
+def _room(path: Path) -> str:
+    """Room of a source file: the first name below the package."""
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def _imported_rooms(path: Path) -> set[str]:
+    """Rooms that one file imports, wherever in the file the import stands."""
+    rooms: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: write imports with the package's name"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        rooms |= {name.split(".")[1] for name in names if name.startswith("railfix.")}
+    return rooms - {"__version__"}
+
+
+def _sources() -> list[Path]:
+    return [p for p in sorted(SOURCE.rglob("*.py")) if p.parent != SOURCE or not p.name.startswith("__")]
+
+
+def _graph() -> dict[str, set[str]]:
+    graph: dict[str, set[str]] = {}
+    for path in _sources():
+        graph.setdefault(_room(path), set()).update(_imported_rooms(path) - {_room(path)})
+    return graph
+
+
+def test_every_room_has_a_floor() -> None:
+    assert sorted(set(_graph()) - set(FLOOR_OF)) == [], "name the floor of a new room in FLOORS"
+
+
+def test_a_room_imports_only_from_its_floor_or_below() -> None:
+    wrong = [
+        f"{room} (floor {FLOOR_OF[room]}) imports {other} (floor {FLOOR_OF[other]})"
+        for room, others in _graph().items()
+        for other in others
+        if room in FLOOR_OF and other in FLOOR_OF and FLOOR_OF[other] > FLOOR_OF[room]
+    ]
+    assert wrong == []
+
+
+def test_rooms_do_not_import_each_other_in_a_circle() -> None:
+    graph = _graph()
+    rest = dict(graph)
+    while free := [room for room, others in rest.items() if not others & set(rest)]:
+        for room in free:
+            del rest[room]
+    assert rest == {}, "these rooms import each other"
+
+
+def test_files_stay_small() -> None:
+    large = {str(p.relative_to(ROOT)): n for p in _sources() if (n := len(p.read_text().splitlines())) > 450}
+    assert large == {}, "is there a second room in these files?"
