@@ -1,0 +1,1 @@
+"""The batch: logs, navigation and a track map in, tables of positions out."""

@@ -1,0 +1,102 @@
+"""Logs of several antennas as chunks that cover the same span of time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from railfix.epochs import Observations, concatenate
+from railfix.errors import InputFileError
+
+
+def within(
+    parts: Iterator[Observations], *, start: np.datetime64 | None = None, end: np.datetime64 | None = None
+) -> Iterator[Observations]:
+    """Parts of a log cut to ``start <= time <= end``; nothing is read after the end."""
+    for part in parts:
+        low = 0 if start is None else int(np.searchsorted(part.time, start, side="left"))
+        high = len(part) if end is None else int(np.searchsorted(part.time, end, side="right"))
+        if high > low:
+            yield part[low:high]
+        if high < len(part):
+            return
+
+
+def rising(parts: Iterator[Observations], path: str) -> Iterator[Observations]:
+    """The parts themselves, as long as time rises from each to the next.
+
+    Raises
+    ------
+    InputFileError
+        A part starts before the one before it ends: files given in the wrong order, or twice.
+    """
+    last: np.datetime64 | None = None
+    for part in parts:
+        if len(part):
+            if last is not None and part.time[0] <= last:
+                raise InputFileError(
+                    path,
+                    f"the epoch {part.time[0]} does not come after {last}, expected time to rise through the log; "
+                    "give the files of one log in order of time, each once",
+                )
+            last = part.time[-1]
+            yield part
+
+
+def _spacing_ns(part: Observations) -> int:
+    """Usual spacing of the epochs of a part [ns]; 0 when it has one epoch."""
+    if len(part) < 2:
+        return 0
+    return int(np.median(np.diff(part.time).astype(np.int64)))
+
+
+def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
+    """Chunks that cover the same span of time for every antenna.
+
+    Each antenna keeps its own epochs. A chunk ends where the first of the parts at hand ends;
+    what the others have beyond waits for the next chunk. Epochs that belong together but are
+    tagged a little apart (less than half the spacing of the epochs) stay in one chunk.
+
+    Parameters
+    ----------
+    logs : mapping of str to iterator of Observations
+        Parts of the log of each antenna, in order of time.
+
+    Yields
+    ------
+    dict of str to Observations
+        All antennas that have been seen so far; one without epochs in the span has zero length.
+    """
+    live = dict(logs)
+    waiting: dict[str, Observations] = {}
+    spacing: dict[str, int] = {}
+    while True:
+        for name in list(live):
+            if len(waiting.get(name, ())):
+                continue
+            part = next(live[name], None)
+            if part is None:
+                del live[name]
+                continue
+            waiting[name] = part
+            spacing[name] = _spacing_ns(part) or spacing.get(name, 0)
+        ends = [waiting[name].time[-1] for name in live]
+        if not any(len(part) for part in waiting.values()):
+            return
+        if ends:
+            horizon = min(ends) + np.timedelta64(min(spacing[name] for name in live) // 2, "ns")
+            cut = {n: int(np.searchsorted(p.time, horizon, side="right")) for n, p in waiting.items()}
+        else:
+            cut = {name: len(part) for name, part in waiting.items()}
+        yield {name: part[: cut[name]] for name, part in waiting.items()}
+        rest = {name: part[cut[name] :] for name, part in waiting.items()}
+        # A short rest would cut every chunk that follows in two: it is joined with the next part.
+        short = [n for n in live if 0 < len(rest[n]) < len(waiting[n]) // 2]
+        waiting = rest
+        for name in short:
+            part = next(live[name], None)
+            if part is None:
+                del live[name]
+            else:
+                waiting[name] = concatenate([rest[name], part])

@@ -1,0 +1,157 @@
+"""Aligned chunks of several antennas, and the folder that gets all files at once or none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from railfix.epochs import Observations
+from railfix.errors import InputFileError, OutputError
+from railfix.run.chunks import aligned, rising, within
+from railfix.run.output import OutputFolder
+
+START = np.datetime64("2026-05-12T03:00:00", "ns")
+
+
+def log(milliseconds: list[int]) -> Observations:
+    time = START + np.array(milliseconds, dtype="timedelta64[ms]")
+    shape = (len(time), 1)
+    values = np.arange(len(time), dtype=float)[:, None] + 2e7
+    return Observations(
+        time=time.astype("datetime64[ns]"),
+        satellite=np.array(["G01"]),
+        signal=np.array(["1C"]),
+        code_m=values,
+        phase_cycles=values,
+        doppler_hz=values,
+        cn0_dbhz=values,
+        loss_of_lock=np.zeros(shape, dtype=np.uint8),
+        break_before=np.zeros(len(time), dtype=bool),
+    )
+
+
+def parts(whole: Observations, size: int) -> Iterator[Observations]:
+    return (whole[i : i + size] for i in range(0, len(whole), size))
+
+
+def times(chunks: list[dict[str, Observations]], name: str) -> list[int]:
+    return [int((t - START) / np.timedelta64(1, "ms")) for c in chunks if name in c for t in c[name].time]
+
+
+@given(
+    front=st.sets(st.integers(0, 60), max_size=40),
+    rear=st.sets(st.integers(0, 60), max_size=40),
+    sizes=st.tuples(st.integers(1, 9), st.integers(1, 9)),
+)
+def test_every_epoch_comes_once_and_in_order(front: set[int], rear: set[int], sizes: tuple[int, int]) -> None:
+    grids = {"front": sorted(100 * k for k in front), "rear": sorted(100 * k for k in rear)}
+    logs = {n: parts(log(grids[n]), size) for n, size in zip(grids, sizes, strict=True)}
+    chunks = list(aligned(logs))
+    for name, grid in grids.items():
+        assert times(chunks, name) == grid
+    # Equal tags of the two antennas stand in the same chunk.
+    for chunk in chunks:
+        ends = [p.time[[0, -1]] for p in chunk.values() if len(p)]
+        assert ends, "a chunk without any epoch"
+    firsts = [min(p.time[0] for p in c.values() if len(p)) for c in chunks]
+    lasts = [max(p.time[-1] for p in c.values() if len(p)) for c in chunks]
+    assert all(last < first for last, first in zip(lasts, firsts[1:], strict=False))
+
+
+def test_tags_a_little_apart_stay_together() -> None:
+    front = log([100 * k for k in range(40)])
+    rear = log([100 * k + 3 for k in range(40)])
+    for chunk in aligned({"front": parts(front, 7), "rear": parts(rear, 5)}):
+        assert len(chunk["front"]) == len(chunk["rear"])
+
+
+def test_an_antenna_that_starts_late_does_not_pile_up() -> None:
+    front, rear = log(list(range(0, 1000))), log(list(range(900, 1900)))
+    read: list[int] = []
+
+    def watched(whole: Observations) -> Iterator[Observations]:
+        for part in parts(whole, 10):
+            read.append(len(part))
+            yield part
+
+    chunks = aligned({"front": parts(front, 10), "rear": watched(rear)})
+    for _ in range(50):
+        next(chunks)
+    assert sum(read) <= 20
+
+
+def test_time_limits_are_inclusive_and_reading_stops() -> None:
+    def endless() -> Iterator[Observations]:
+        yield from parts(log(list(range(0, 1000, 100))), 3)
+        raise AssertionError("read beyond the end")
+
+    kept = list(within(endless(), start=START + np.timedelta64(200, "ms"), end=START + np.timedelta64(500, "ms")))
+    assert [len(p) for p in kept] == [1, 3]
+
+
+def test_files_out_of_order_are_named() -> None:
+    with pytest.raises(InputFileError, match=r"b\.obs: the epoch .* does not come after"):
+        list(rising(iter([log([0, 100]), log([100, 200])]), "b.obs"))
+
+
+TABLE = pl.DataFrame(
+    {"time_gpst": np.array(["2026-05-12T03:00:00.005"], dtype="datetime64[ns]"), "chainage_m": [None]},
+    schema={"time_gpst": pl.Datetime("ns"), "chainage_m": pl.Float64},
+)
+
+
+def test_files_appear_together(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    with OutputFolder(out) as folder:
+        for _ in range(2):
+            folder.append_csv("positions.csv", TABLE)
+            folder.append_parquet("positions.parquet", TABLE)
+        folder.write_json("run.json", {"a": 1})
+        assert [p.name for p in out.iterdir() if not p.name.startswith(".")] == []
+        files = folder.commit({"provenance": "x"})
+    assert sorted(p.name for p in out.iterdir()) == ["positions.csv", "positions.parquet", "run.json"] == sorted(files)
+    assert (out / "positions.csv").read_text() == (
+        "time_gpst,chainage_m\n2026-05-12T03:00:00.005000000,\n2026-05-12T03:00:00.005000000,\n"
+    )
+    assert pl.read_parquet(files["positions.parquet"]).equals(pl.concat([TABLE, TABLE]))
+    assert pl.read_parquet_metadata(files["positions.parquet"])["provenance"] == "x"
+    assert json.loads(files["run.json"].read_text()) == {"a": 1}
+
+
+def test_an_error_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    with pytest.raises(KeyboardInterrupt), OutputFolder(out) as folder:  # noqa: PT012
+        folder.append_csv("positions.csv", TABLE)
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_refused_or_its_files_replaced(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="not empty"):
+        OutputFolder(tmp_path)
+    with pytest.raises(ValueError, match="stop"), OutputFolder(tmp_path, overwrite="replace") as folder:  # noqa: PT012
+        folder.write_json("run.json", {})
+        raise ValueError("stop")
+    assert (tmp_path / "run.json").read_text() == "old"
+    with OutputFolder(tmp_path, overwrite="replace") as folder:
+        folder.write_json("run.json", {})
+        folder.commit({})
+    assert (tmp_path / "run.json").read_text() == "{}\n"
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(OutputError, match="file"):
+            OutputFolder(path)
