@@ -1,0 +1,1 @@
+"""Readers of RINEX files, and what they are stored in."""
