@@ -1,0 +1,177 @@
+"""Normal equations of ranges with the receiver clocks eliminated.
+
+The single-point position, the constrained position and the section search all ask the same
+question: how well do pseudoranges fit a place, whatever the receiver clock of each constellation
+is? Subtracting the weighted mean of a constellation's satellites from its residuals and design
+rows is the same as solving for that clock (algebraically: the Schur complement of the clock
+block). What is left is a 3 x 3 system in the place alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.constants import CLOCK_GROUP
+from railfix.geodesy import range_with_rotation
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranges:
+    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels.
+
+    Attributes
+    ----------
+    sat_ecef_m : ndarray, shape (T, M, 3) [m]
+        Satellites in ECEF at transmit time; any finite value where the weight is 0.
+    code_m : ndarray, shape (T, M) [m]
+        Corrected pseudorange (satellite clock, group delay, ionosphere, troposphere applied);
+        any finite value where the weight is 0.
+    weight : ndarray, shape (T, M) [1/m^2]
+        1/sigma^2, 0 for what is not used.
+    groups : tuple of slice
+        Channels that share one receiver clock stand side by side; one slice a clock.
+    """
+
+    sat_ecef_m: Floats
+    code_m: Floats
+    weight: Floats
+    groups: tuple[slice, ...]
+
+    def __len__(self) -> int:
+        return len(self.code_m)
+
+    def take(self, epochs: NDArray[np.bool_] | NDArray[np.intp]) -> Ranges:
+        """The ranges of some epochs, by mask or index."""
+        return Ranges(
+            sat_ecef_m=self.sat_ecef_m[epochs],
+            code_m=self.code_m[epochs],
+            weight=self.weight[epochs],
+            groups=self.groups,
+        )
+
+    @property
+    def n_used(self) -> NDArray[np.int64]:
+        """Channels with weight, shape (T,)."""
+        return np.count_nonzero(self.weight, axis=1)
+
+    @property
+    def n_clocks(self) -> NDArray[np.int64]:
+        """Receiver clocks that have at least one channel, shape (T,)."""
+        seen = [np.any(self.weight[:, group] > 0, axis=1) for group in self.groups]
+        return np.sum(seen, axis=0, dtype=np.int64) if seen else np.zeros(len(self), dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalEquations:
+    """Fit of ranges around a place, the clocks eliminated.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (T, 3, 3) [1/m^2]
+        Normal matrix of the place in ECEF.
+    vector : ndarray, shape (T, 3) [1/m]
+        Right-hand side: the step that lowers `wsse` most is ``matrix^-1 vector``.
+    wsse : ndarray, shape (T,)
+        Weighted sum of squared residuals at the place itself.
+    clock_m : ndarray, shape (T, G) [m]
+        Receiver clock of each group at the place; NaN where the group has no satellite.
+    residual_m : ndarray, shape (T, M) [m]
+        Code - range - clock; 0 where the weight is 0.
+    """
+
+    matrix: Floats
+    vector: Floats
+    wsse: Floats
+    clock_m: Floats
+    residual_m: Floats
+
+
+def clock_groups(system: Sequence[str] | NDArray[np.str_]) -> tuple[slice, ...]:
+    """Slices of channels that share a receiver clock.
+
+    Parameters
+    ----------
+    system : sequence of str, length M
+        Constellation letters, those of one clock side by side (QZSS beside GPS).
+
+    Raises
+    ------
+    ValueError
+        When the channels of one clock are not side by side.
+    """
+    clocks = [CLOCK_GROUP[str(letter)] for letter in system]
+    starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
+    if len({clocks[i] for i in starts}) != len(starts):
+        raise ValueError(f"channels of one clock must stand side by side, got {clocks}")
+    return tuple(slice(a, b) for a, b in zip(starts, [*starts[1:], len(clocks)], strict=True))
+
+
+def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
+    """Normal equations of `ranges` linearised at one place an epoch.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        T epochs.
+    place_ecef_m : ndarray, shape (T, 3) [m]
+
+    Returns
+    -------
+    NormalEquations
+    """
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
+    weight = ranges.weight
+    # Columns: the design row -u (three) and the residual.
+    rows = np.concatenate([-los, (ranges.code_m - distance)[..., None]], axis=-1)
+    clocks = np.full((len(weight), len(ranges.groups)), np.nan)
+    for g, group in enumerate(ranges.groups):
+        total = weight[:, group].sum(axis=1)
+        seen = total > 0
+        mean = np.matmul(weight[:, None, group], rows[:, group])[:, 0] / np.where(seen, total, 1.0)[:, None]
+        rows[:, group] -= mean[:, None, :]
+        clocks[:, g] = np.where(seen, mean[:, 3], np.nan)
+    rows *= (weight > 0)[..., None]
+    system = np.matmul((rows * weight[..., None]).swapaxes(1, 2), rows)
+    return NormalEquations(
+        matrix=system[:, :3, :3],
+        vector=system[:, :3, 3],
+        wsse=system[:, 3, 3],
+        clock_m=clocks,
+        residual_m=rows[..., 3],
+    )
+
+
+def fit(ranges: Ranges, place_ecef_m: Floats) -> Floats:
+    """Weighted sum of squared residuals at a place, the clocks eliminated, shape (T,).
+
+    The ``q`` of the section search: `normal_equations(...).wsse` without the derivatives.
+    """
+    distance, _ = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
+    total = np.zeros(len(ranges))
+    for group in ranges.groups:
+        weight = ranges.weight[:, group]
+        residual = ranges.code_m[:, group] - distance[:, group]
+        mass = weight.sum(axis=1)
+        mean = (weight * residual).sum(axis=1) / np.where(mass > 0, mass, 1.0)
+        total += (weight * (residual - mean[:, None]) ** 2).sum(axis=1)
+    return total
+
+
+def inverse_3x3(matrix: Floats) -> Floats:
+    """Inverse of symmetric 3 x 3 matrices by their cofactors, shape (..., 3, 3).
+
+    NaN where a matrix is singular: its determinant, against the cube of its mean diagonal, is
+    below 1e-12 (axes whose information differs by more than six orders of magnitude in sigma).
+    """
+    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    determinant = np.einsum("...i,...i->...", a, cofactors[..., :, 0])
+    size = np.trace(matrix, axis1=-2, axis2=-1) / 3.0
+    regular = determinant > 1e-12 * size**3
+    return np.where(regular[..., None, None], cofactors / np.where(regular, determinant, 1.0)[..., None, None], np.nan)

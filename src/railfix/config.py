@@ -1,0 +1,156 @@
+"""Settings of a run: one frozen model, from Python or from TOML, misspelt keys refused.
+
+Each room owns its limits; this module only puts them side by side under the names that the
+configuration file uses::
+
+    systems = ["G", "J", "E", "C"]
+    min_satellites = 3
+
+    [elevation]
+    mask_deg = 15.0
+
+    [noise]
+    model = "elevation"
+"""
+
+from __future__ import annotations
+
+import tomllib
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+
+from railfix.constrained import ConstrainedLimits
+from railfix.errors import InputFileError, SettingsError
+from railfix.measurement import CodeNoise
+from railfix.screens import ElevationLimits
+from railfix.section import SectionLimits
+from railfix.spp import SinglePointLimits
+
+#: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
+DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
+    "G": ("1C", "1W", "1P", "1X", "1L", "1S"),
+    "J": ("1C", "1X", "1L", "1S", "1Z"),
+    "E": ("1C", "1X", "1B", "1Z", "1A"),
+    "C": ("2I", "2X", "2Q"),
+    "R": ("1C", "1P"),
+}
+
+
+class Config(BaseModel):
+    """Settings of the positioning, each with its default and where that comes from.
+
+    Attributes
+    ----------
+    systems : tuple of str
+        Constellations used. GLONASS is left out by default: its channels have code biases of
+        metres between them.
+    signals : mapping of str to tuple of str
+        Signals of each constellation in order of preference; the first one observed is used.
+    min_satellites : int
+        Satellites asked for (P1 3.2: 3; 2 is possible and doubtful on curves).
+    dilution_limit : float
+        Largest along-track dilution [m/m] that still counts as a position.
+    off_map_m, off_map_risk : float
+        A position is called off the map when the 3-D one lies further than this from the line and
+        noise explains it with less than this probability.
+    ionosphere : {"klobuchar", "off"}
+    troposphere : {"saastamoinen", "off"}
+    max_ephemeris_age_s : float or None
+        Tighter limit on the age of a record than its own validity.
+    map_plan_sigma_m, map_height_sigma_m : float or None
+        In place of the track's own map error (P1 4.1(3): 0.30 m and 0.60 m).
+    noise_prior : float
+        Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
+        being estimated; infinite holds the scale at 1.
+    noise, elevation, single_point, section, constrained
+        Limits of the rooms of these names.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
+
+    systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
+    signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
+    min_satellites: int = Field(default=3, ge=2)
+    dilution_limit: float = Field(default=20.0, gt=0)
+    off_map_m: float = Field(default=200.0, gt=0)
+    off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
+    ionosphere: Literal["klobuchar", "off"] = "klobuchar"
+    troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
+    max_ephemeris_age_s: float | None = Field(default=None, gt=0)
+    map_plan_sigma_m: float | None = Field(default=None, gt=0)
+    map_height_sigma_m: float | None = Field(default=None, gt=0)
+    noise_prior: float = Field(default=100.0, gt=0)
+    noise: CodeNoise = Field(default_factory=CodeNoise)
+    elevation: ElevationLimits = Field(default_factory=ElevationLimits)
+    single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)
+    section: SectionLimits = Field(default_factory=SectionLimits)
+    constrained: ConstrainedLimits = Field(default_factory=ConstrainedLimits)
+
+    @field_validator("systems")
+    @classmethod
+    def _some_system_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not value or len(set(value)) != len(value):
+            raise ValueError("name at least one constellation, each once")
+        return value
+
+    @field_validator("noise", "elevation", "single_point", "section", "constrained", mode="before")
+    @classmethod
+    def _known_keys(cls, value: Any, info: Any) -> Any:
+        if isinstance(value, dict):
+            annotation = cls.model_fields[info.field_name].annotation
+            known = set(getattr(annotation, "__dataclass_fields__", {}))
+            unknown = sorted(set(value) - known)
+            if unknown:
+                raise ValueError(f"unknown setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
+        return value
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        plain: dict[str, Any] = TypeAdapter(Config).dump_python(self, mode="json")
+        return plain
+
+
+def parse_config(values: dict[str, Any], *, source: str = "settings") -> Config:
+    """A configuration from plain values.
+
+    Raises
+    ------
+    SettingsError
+        Names the source, the setting, and what was expected.
+    """
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        known = sorted(Config.model_fields)
+        if first["type"] == "extra_forbidden":
+            raise SettingsError(f"{source}: unknown setting {where}; known are {', '.join(known)}") from None
+        message = first["msg"].removeprefix("Value error, ")
+        raise SettingsError(f"{source}: setting {where}: {message}, got {first['input']!r}") from None
+
+
+def load_config(path: str | PathLike[str]) -> Config:
+    """A configuration from a TOML file.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, or no TOML.
+    SettingsError
+        A setting is misspelt or out of range.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read as a configuration file ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputFileError(path, "is no text file; a configuration is TOML") from None
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputFileError(path, f"is no valid TOML: {error}") from None
+    return parse_config(values, source=str(path))

@@ -1,0 +1,481 @@
+"""The positioning of chunks of epochs: the calls in reading order.
+
+`EpochProcessor` holds what does not change during a run (settings, ephemerides, trajectories).
+`process` takes a chunk and the state left by the chunk before it, and returns every intermediate
+result and the new state. A live epoch is a chunk of length one; any cutting gives the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import digamma
+from scipy.stats import chi2
+
+from railfix.antenna import Trajectory
+from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
+from railfix.clock_elimination import Ranges, clock_groups
+from railfix.config import Config
+from railfix.constrained import Constrained, constrained_position
+from railfix.epochs import Observations
+from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.measurement import PLAUSIBLE_CODE_M, channel_order, code_sigma_m, first_available
+from railfix.navigation import Navigation
+from railfix.orbits import SatelliteStates, satellite_states
+from railfix.reasons import POSITIONED, Reason, Status
+from railfix.screens import Screened, elevation_screen
+from railfix.section import SearchIndex, Section, search
+from railfix.signals import carrier_frequency_hz
+from railfix.spp import SinglePoint, single_point
+
+Floats = NDArray[np.float64]
+Bits = NDArray[np.int64]
+
+#: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
+ANCHOR_SIGMA_M: Final = 10.0
+#: A receiver on the ground is this far from the Earth's centre [m], within `EARTH_SHELL_M`.
+EARTH_RADIUS_M: Final = 6.371e6
+EARTH_SHELL_M: Final = 1e5
+#: Stands for the satellite of a range without weight [m].
+SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaState:
+    """What one antenna's epochs leave to the next.
+
+    Attributes
+    ----------
+    log_variance_sum, log_variance_weight : float
+        Sums behind the noise scale: the receiver's post-fit variance against the weights, averaged
+        as a logarithm so that multipath does not carry it.
+    """
+
+    log_variance_sum: float = 0.0
+    log_variance_weight: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What a chunk leaves to the next, by antenna."""
+
+    antennas: Mapping[str, AntennaState] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaResult:
+    """All that was found for one antenna, T epochs by M channels (those of the observations given).
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite, signal : ndarray of str, shape (M,)
+    status : ndarray of int8, shape (T,)
+        `reasons.Status`.
+    chainage_m, kilometrage_m, arc_m : ndarray, shape (T,) [m]
+        Along the line (reference point named by the trajectory), its own marking, and along the
+        antenna's trajectory. NaN where the status has no position.
+    along_sigma_m : ndarray, shape (T,) [m]
+        Standard deviation along the line, the receiver's noise scale and the map error included.
+    noise_scale : ndarray, shape (T,)
+        Standard deviation of this receiver's ranges against the one the weights assume, as
+        estimated from all epochs so far.
+    ecef_m : ndarray, shape (T, 3) [m]
+        Antenna.
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+    n_used, n_rejected : ndarray of int, shape (T,)
+        Satellites used; satellites with a code that were not used.
+    conventional_ecef_m : ndarray, shape (T, 3) [m]
+        3-D single point from the same ranges.
+    conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]
+        Nearest point of the trajectory to it, and how far that is.
+    reason : ndarray of int64, shape (T, M)
+        `reasons.Reason` bits, 0 = used.
+    elevation_deg, azimuth_deg, cn0_dbhz, sigma_m, corrected_code_m, residual_m : ndarray, shape (T, M)
+        NaN where unknown; residuals of the position on the line.
+    satellites : SatelliteStates
+        Of the channels in `columns`.
+    columns : ndarray of int, shape (K,)
+        Channels that settings allow, in the order of the intermediate results below.
+    elevation_screen : Screened
+    single_point : SinglePoint
+    section : Section
+    constrained : Constrained
+    """
+
+    time: NDArray[np.datetime64]
+    satellite: NDArray[np.str_]
+    signal: NDArray[np.str_]
+    status: NDArray[np.int8]
+    chainage_m: Floats
+    kilometrage_m: Floats
+    arc_m: Floats
+    along_sigma_m: Floats
+    noise_scale: Floats
+    ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    n_used: NDArray[np.int64]
+    n_rejected: NDArray[np.int64]
+    conventional_ecef_m: Floats
+    conventional_arc_m: Floats
+    conventional_chainage_m: Floats
+    conventional_offset_m: Floats
+    reason: Bits
+    elevation_deg: Floats
+    azimuth_deg: Floats
+    cn0_dbhz: Floats
+    sigma_m: Floats
+    corrected_code_m: Floats
+    residual_m: Floats
+    satellites: SatelliteStates
+    columns: NDArray[np.intp]
+    elevation_screen: Screened
+    single_point: SinglePoint
+    section: Section
+    constrained: Constrained
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Results of one chunk.
+
+    Attributes
+    ----------
+    antennas : mapping of str to AntennaResult
+    notes : tuple of str
+        What was asked for and what was used in its place, one sentence each.
+    """
+
+    antennas: Mapping[str, AntennaResult]
+    notes: tuple[str, ...]
+
+
+class EpochProcessor:
+    """Positions along the line from chunks of observations.
+
+    Parameters
+    ----------
+    config : Config
+    navigation : Navigation
+    trajectories : mapping of str to Trajectory
+        The trajectory of each antenna, one or two ("front", "rear").
+    glonass_channel : mapping of str to int, optional
+        Frequency channels where the observation header does not tell.
+    """
+
+    def __init__(self, config: Config, navigation: Navigation, trajectories: Mapping[str, Trajectory]) -> None:
+        if not trajectories:
+            raise ValueError("at least one antenna's trajectory is needed")
+        self.config = config
+        self.navigation = navigation
+        plan, height = config.map_plan_sigma_m, config.map_height_sigma_m
+        self.trajectories = {
+            name: replace(
+                trajectory,
+                sigma_plan_m=trajectory.sigma_plan_m if plan is None else plan,
+                sigma_height_m=trajectory.sigma_height_m if height is None else height,
+            )
+            for name, trajectory in trajectories.items()
+        }
+        self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
+        self._klobuchar, self.notes = self._ionosphere()
+
+    def _ionosphere(self) -> tuple[Floats | None, tuple[str, ...]]:
+        """Klobuchar coefficients to use, and what there is to say about them."""
+        if self.config.ionosphere == "off":
+            return None, ()
+        for letter, name in (("G", "GPS"), ("J", "QZSS"), ("C", "BeiDou")):
+            if letter in self.navigation.klobuchar:
+                note = f"ionosphere: klobuchar asked for, coefficients broadcast by {name} used"
+                return self.navigation.klobuchar[letter], (() if letter == "G" else (note,))
+        return None, ("ionosphere: klobuchar asked for, no coefficients received, delay left uncorrected",)
+
+    def process(self, observations: Mapping[str, Observations], state: State | None = None) -> tuple[Result, State]:
+        """Positions of one chunk.
+
+        Parameters
+        ----------
+        observations : mapping of str to Observations
+            By antenna; each antenna keeps its own epochs.
+        state : State, optional
+            Left by the chunk before this one; None at the start of a log.
+
+        Returns
+        -------
+        Result
+        State
+            To be passed on with the next chunk.
+
+        Raises
+        ------
+        ValueError
+            An antenna has no trajectory.
+        """
+        unknown = sorted(set(observations) - set(self.trajectories))
+        if unknown:
+            raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
+        before = state.antennas if state else {}
+        results, after = {}, dict(before)
+        for name, part in observations.items():
+            results[name], after[name] = self._antenna(name, part, before.get(name, AntennaState()))
+        return Result(antennas=results, notes=self.notes), State(antennas=after)
+
+    def _antenna(self, name: str, obs: Observations, state: AntennaState) -> tuple[AntennaResult, AntennaState]:
+        trajectory, index = self.trajectories[name], self._index[name]
+        columns = channel_order(obs.satellite, obs.signal, systems=self.config.systems, signals=self.config.signals)
+        satellite, signal = obs.satellite[columns], obs.signal[columns]
+        groups = clock_groups(satellite.astype("<U1"))
+        code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
+
+        reason = _refuse_codes(satellite, code)
+        states = satellite_states(
+            obs.time, satellite, signal, code, self.navigation, max_age_s=self.config.max_ephemeris_age_s
+        )
+        _refuse_satellites(reason, states)
+        anchor = self._anchor(index, groups, states, code, reason)
+        elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
+        elevation_verdict = elevation_screen(elevation, limits=self.config.elevation)
+        reason[elevation_verdict.reject] |= Reason.ELEVATION_MASK
+        _refuse_lone(reason, groups)
+
+        frequency = carrier_frequency_hz(satellite, signal, obs.header.glonass_channel)
+        corrected = self._corrected(obs.time, anchor, elevation, azimuth, frequency, states, code)
+        sigma = code_sigma_m(cn0, elevation, noise=self.config.noise)
+        ranges = _ranges(states, corrected, 1.0 / sigma**2, reason, groups)
+        point = single_point(ranges, anchor, limits=self.config.single_point)
+        section = search(ranges, index, point, limits=self.config.section)
+        enough = ranges.n_used >= self.config.min_satellites
+        constrained = constrained_position(
+            ranges, trajectory, np.where(enough, section.vertex, -1), limits=self.config.constrained
+        )
+        status = self._status(code, ranges, trajectory, point, section, constrained)
+        scale, state = self._noise_scale(ranges, constrained, state)
+        found = _Found(
+            columns=columns, states=states, elevation=elevation_verdict, azimuth_deg=azimuth, sigma_m=sigma,
+            corrected_code_m=corrected, reason=reason, point=point, section=section, constrained=constrained,
+        )  # fmt: skip
+        return self._result(obs, trajectory, status, scale, found), state
+
+    def _anchor(
+        self, index: SearchIndex, groups: tuple[slice, ...], states: SatelliteStates, code: Floats, reason: Bits
+    ) -> Floats:
+        """A place near the antenna to see the satellites from, shape (T, 3): good to some hundred metres.
+
+        A 3-D position from raw ranges of equal weight, started from the middle of the line at every
+        epoch so that no epoch depends on another; where that fails, the point of the line that fits best.
+        """
+        middle = np.broadcast_to(index.trajectory.ecef_m.mean(axis=0), (len(code), 3))
+        clean = code + states.clock_m - states.group_delay_m
+        ranges = _ranges(states, clean, np.full(code.shape, 1.0 / ANCHOR_SIGMA_M**2), reason, groups)
+        point = single_point(ranges, middle, limits=self.config.single_point)
+        on_earth = np.abs(np.linalg.norm(point.ecef_m, axis=1) - EARTH_RADIUS_M) < EARTH_SHELL_M
+        anchor = np.where(on_earth[:, None], point.ecef_m, middle)
+        rest = np.flatnonzero(~on_earth)
+        if len(rest):
+            nowhere = replace(point.take(rest), ecef_m=np.full((len(rest), 3), np.nan))
+            vertex = search(ranges.take(rest), index, nowhere, limits=self.config.section).vertex
+            anchor[rest] = np.where((vertex >= 0)[:, None], index.trajectory.ecef_m[vertex], middle[rest])
+        return anchor
+
+    def _corrected(
+        self,
+        time: NDArray[np.datetime64],
+        anchor: Floats,
+        elevation: Floats,
+        azimuth: Floats,
+        frequency: Floats,
+        states: SatelliteStates,
+        code: Floats,
+    ) -> Floats:
+        """P = code + c dt_sv - c TGD - I - T, shape (T, K)."""
+        latitude, longitude, height = geodetic_from_ecef(anchor)
+        corrected = code + states.clock_m - states.group_delay_m
+        if self._klobuchar is not None:
+            corrected -= klobuchar_delay_m(time, latitude, longitude, elevation, azimuth, self._klobuchar, frequency)
+        if self.config.troposphere == "saastamoinen":
+            corrected -= saastamoinen_delay_m(latitude, height, elevation)
+        return corrected
+
+    def _status(
+        self,
+        code: Floats,
+        ranges: Ranges,
+        trajectory: Trajectory,
+        point: SinglePoint,
+        section: Section,
+        constrained: Constrained,
+    ) -> NDArray[np.int8]:
+        """The status of each epoch, shape (T,), decided once, from numbers, the gravest first."""
+        config = self.config
+        redundancy = ranges.n_used - ranges.n_clocks - 1
+        position = trajectory.at_arc(constrained.arc_m)
+        away = np.linalg.norm(position - point.ecef_m, axis=1)
+        misfit = (constrained.wsse - point.wsse) / np.maximum(1.0, constrained.wsse / np.maximum(redundancy, 1))
+        lost = (away > config.off_map_m) & (misfit > chi2.isf(config.off_map_risk, 2))
+        beyond = constrained.overshoot_m > np.maximum(4.0 * constrained.sigma_m, trajectory.sigma_plan_m)
+        conditions = [
+            (~np.isfinite(code).any(axis=1), Status.NO_OBSERVATION),
+            ((ranges.n_used < config.min_satellites) | (redundancy < 0), Status.TOO_FEW_SATELLITES),
+            (constrained.dilution > config.dilution_limit, Status.UNOBSERVABLE),
+            (~np.isfinite(constrained.arc_m), Status.NO_CONVERGENCE),
+            (lost | beyond, Status.OFF_MAP),
+            ((section.excess <= config.section.threshold) | (redundancy < config.section.redundancy), Status.AMBIGUOUS),
+        ]
+        return np.select([c for c, _ in conditions], [s.value for _, s in conditions], Status.OK).astype(np.int8)
+
+    def _noise_scale(
+        self, ranges: Ranges, constrained: Constrained, state: AntennaState
+    ) -> tuple[Floats, AntennaState]:
+        """Standard deviation of this receiver's ranges against the weights', from all epochs so far.
+
+        The mean of the logarithm of wsse / degrees of freedom, each weighted by its degrees of
+        freedom, less what the logarithm of a chi-square variable is lower by.
+        """
+        freedom = (ranges.n_used - ranges.n_clocks - 1).astype(np.float64)
+        usable = (freedom > 0) & (constrained.wsse > 0)
+        safe = np.where(usable, freedom, 1.0)
+        level = np.log(np.where(usable, constrained.wsse, 1.0) / safe) - (digamma(safe / 2) - np.log(safe / 2))
+        weight = np.where(usable, freedom, 0.0)
+        # cumsum from the carried sums: the same additions in the same order however epochs are cut.
+        sums = np.cumsum(np.r_[state.log_variance_sum, weight * level])
+        weights = np.cumsum(np.r_[state.log_variance_weight, weight])
+        scale = np.exp(0.5 * sums[1:] / (weights[1:] + self.config.noise_prior))
+        return scale, AntennaState(log_variance_sum=float(sums[-1]), log_variance_weight=float(weights[-1]))
+
+    def _result(
+        self, obs: Observations, trajectory: Trajectory, status: NDArray[np.int8], scale: Floats, found: _Found
+    ) -> AntennaResult:
+        """Everything side by side, coordinates only where the status has them."""
+        point, constrained = found.point, found.constrained
+        has = np.isin(status, [s.value for s in POSITIONED])
+        arc = np.where(has, constrained.arc_m, np.nan)
+        ecef = trajectory.at_arc(arc)
+        latitude, longitude, height = geodetic_from_ecef(ecef)
+        nearest, offset = trajectory.nearest(point.ecef_m)
+        exact, total = constrained.exact_map_sigma_m**2, constrained.sigma_m**2
+        reason = self._whole_reason(obs, found)
+
+        def whole(values: Floats) -> Floats:
+            full = np.full(obs.code_m.shape, np.nan)
+            full[:, found.columns] = values
+            return full
+
+        return AntennaResult(
+            time=obs.time,
+            satellite=obs.satellite,
+            signal=obs.signal,
+            status=status,
+            chainage_m=trajectory.chainage_at(arc),
+            kilometrage_m=trajectory.kilometrage_at(arc),
+            arc_m=arc,
+            along_sigma_m=np.where(has, np.sqrt(scale**2 * exact + (total - exact)), np.nan),
+            noise_scale=scale,
+            ecef_m=ecef,
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
+            n_used=np.count_nonzero(found.reason == 0, axis=1),
+            n_rejected=_satellites_refused(obs.satellite, reason),
+            conventional_ecef_m=point.ecef_m,
+            conventional_arc_m=nearest,
+            conventional_chainage_m=trajectory.chainage_at(nearest),
+            conventional_offset_m=offset,
+            reason=reason,
+            elevation_deg=whole(found.elevation.metric),
+            azimuth_deg=whole(found.azimuth_deg),
+            cn0_dbhz=obs.cn0_dbhz,
+            sigma_m=whole(found.sigma_m),
+            corrected_code_m=whole(found.corrected_code_m),
+            residual_m=whole(np.where(found.reason == 0, constrained.residual_m, np.nan)),
+            satellites=found.states,
+            columns=found.columns,
+            elevation_screen=found.elevation,
+            single_point=point,
+            section=found.section,
+            constrained=constrained,
+        )
+
+    def _whole_reason(self, obs: Observations, found: _Found) -> Bits:
+        """Reasons of all channels, those that settings leave out included, shape (T, M)."""
+        reason = np.where(np.isfinite(obs.code_m), 0, int(Reason.NOT_OBSERVED))
+        selected = np.isin(obs.system, self.config.systems)
+        reason[:, ~selected] |= Reason.SYSTEM_NOT_SELECTED
+        reason[:, np.setdiff1d(np.flatnonzero(selected), found.columns)] |= Reason.OTHER_SIGNAL_TAKEN
+        reason[:, found.columns] = found.reason
+        return reason
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """What the rooms said of the channels that settings allow."""
+
+    columns: NDArray[np.intp]
+    states: SatelliteStates
+    elevation: Screened
+    azimuth_deg: Floats
+    sigma_m: Floats
+    corrected_code_m: Floats
+    reason: Bits
+    point: SinglePoint
+    section: Section
+    constrained: Constrained
+
+
+def _refuse_codes(satellite: NDArray[np.str_], code: Floats) -> Bits:
+    """Reasons that the codes alone give, shape (T, K)."""
+    observed = np.isfinite(code)
+    plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
+    taken = first_available(satellite, plausible)
+    reason = np.zeros(code.shape, dtype=np.int64)
+    reason[~observed] |= Reason.NOT_OBSERVED
+    reason[observed & ~plausible] |= Reason.IMPLAUSIBLE_CODE
+    reason[plausible & ~taken] |= Reason.OTHER_SIGNAL_TAKEN
+    return reason
+
+
+def _refuse_satellites(reason: Bits, states: SatelliteStates) -> None:
+    """Add the reasons of the ephemerides to observed channels."""
+    observed = (reason & Reason.NOT_OBSERVED) == 0
+    for mask, bit in (
+        (states.no_record, Reason.NO_EPHEMERIS),
+        (states.too_old, Reason.EPHEMERIS_TOO_OLD),
+        (states.unhealthy, Reason.UNHEALTHY),
+    ):
+        reason[observed & mask] |= bit
+
+
+def _refuse_lone(reason: Bits, groups: tuple[slice, ...]) -> None:
+    """Add the reason of a satellite that determines its own clock and nothing else."""
+    for group in groups:
+        used = reason[:, group] == 0
+        lone = used & (np.count_nonzero(used, axis=1) == 1)[:, None]
+        reason[:, group][lone] |= Reason.ALONE_ON_ITS_CLOCK
+
+
+def _ranges(states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]) -> Ranges:
+    """Ranges to be fitted: what has a reason gets no weight and harmless numbers."""
+    used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
+    return Ranges(
+        sat_ecef_m=np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M),
+        code_m=np.where(used, code, 0.0),
+        weight=np.where(used, weight, 0.0),
+        groups=groups,
+    )
+
+
+def _satellites_refused(satellite: NDArray[np.str_], reason: Bits) -> NDArray[np.int64]:
+    """Satellites with a code of which no signal was used, shape (T,)."""
+    names, which = np.unique(satellite, return_inverse=True)
+    member = (which[:, None] == np.arange(len(names))).astype(np.int64)
+    seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.int64) @ member > 0
+    used = (reason == 0).astype(np.int64) @ member > 0
+    return np.count_nonzero(seen & ~used, axis=1)
