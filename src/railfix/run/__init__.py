@@ -1,1 +1,6 @@
 """The batch: logs, navigation and a track map in, tables of positions out."""
+
+from railfix.run.driver import RunOptions, RunSummary, run_files
+from railfix.run.inputs import RunInputs
+
+__all__ = ["RunInputs", "RunOptions", "RunSummary", "run_files"]

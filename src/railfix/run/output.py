@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -113,7 +114,7 @@ class OutputFolder:
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write one JSON file."""
         with _writing(self.path / name):
-            text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+            text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
             (self._staging / name).write_text(text + "\n", encoding="utf-8")
         self._staged.append(self._staging / name)
 
@@ -159,3 +160,14 @@ def _writing(path: Path) -> Iterator[None]:
         raise OutputError(f"{path}: cannot be written ({reason}); name a folder that can be written to") from error
     except PolarsError as error:
         raise OutputError(f"{path}: cannot be written ({error})") from error
+
+
+def _finite(value: Any) -> Any:
+    """The same plain values with NaN and infinities, which JSON has not, as words."""
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value

@@ -1,0 +1,99 @@
+"""What the command line shows: a progress bar while it works, a summary when it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from railfix.reasons import Status
+
+if TYPE_CHECKING:
+    from railfix.run import RunSummary
+    from railfix.run.driver import Progress as ProgressCall
+
+#: Parts of the whole that the bar counts in.
+_STEPS = 1000
+
+
+@contextmanager
+def progress_bar() -> Iterator[ProgressCall]:
+    """A bar on the standard error output, with the rate and the time left; silent where that is no terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[epochs]:,} epochs"),
+        TextColumn("{task.fields[rate]:,.0f} epochs/s"),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("positions", total=None, epochs=0, rate=0.0)
+
+        def show(*, epochs: int, fraction: float | None) -> None:
+            elapsed = bar.tasks[task].elapsed or 0.0
+            bar.update(
+                task,
+                total=None if fraction is None else _STEPS,
+                completed=0 if fraction is None else _STEPS * fraction,
+                epochs=epochs,
+                rate=epochs / elapsed if elapsed > 0 else 0.0,
+            )
+
+        yield show
+
+
+def show_summary(summary: RunSummary) -> None:
+    """Epochs, positions, statuses, the budget of reasons, and where the results are."""
+    console = Console(highlight=False)
+    names = list(summary.tally.antennas)
+    console.print(_positions(summary, names))
+    console.print(_reasons(summary, names))
+    for note in summary.notes:
+        console.print(f"note: {note}", markup=False)
+    for path in summary.files.values():
+        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    rate = summary.tally.epochs / summary.wall_s
+    console.print(f"{summary.tally.epochs:,} epochs in {summary.wall_s:.2f} s ({rate:,.0f} epochs/s, reading included)")
+
+
+def _positions(summary: RunSummary, names: list[str]) -> Table:
+    tally, sigma = summary.tally.antennas, summary.sigma
+    table = Table(title="Positions", title_justify="left")
+    table.add_column("")
+    for name in names:
+        table.add_column(name, justify="right")
+    table.add_row("epochs", *(f"{tally[n].epochs:,}" for n in names))
+    table.add_row("with observations", *(f"{tally[n].observed:,}" for n in names))
+    table.add_row("with a position", *(f"{tally[n].positioned:,}" for n in names))
+    table.add_row("positioning rate", *(_percent(tally[n].positioned, tally[n].observed) for n in names))
+    for status in Status:
+        if any(tally[n].status[status.text] for n in names):
+            table.add_row(f"  {status.text}", *(f"{tally[n].status[status.text]:,}" for n in names))
+    for label, field in (("p50", "p50_m"), ("p95", "p95_m"), ("largest", "max_m")):
+        cells = [f"{getattr(sigma[n], field):.2f} m" if n in sigma else "-" for n in names]
+        table.add_row(f"sigma along the line, {label}", *cells)
+    return table
+
+
+def _reasons(summary: RunSummary, names: list[str]) -> Table:
+    tally = summary.tally.antennas
+    table = Table(title="Pseudoranges, by the first reason that refused them", title_justify="left")
+    table.add_column("")
+    for name in names:
+        table.add_column(name, justify="right")
+    table.add_row("observed", *(f"{tally[n].observations:,}" for n in names))
+    table.add_row("used", *(f"{tally[n].used:,}" for n in names))
+    reasons = dict.fromkeys(reason for n in names for reason, _ in tally[n].first_reason.most_common())
+    for reason in reasons:
+        table.add_row(f"  {reason}", *(f"{tally[n].first_reason[reason]:,}" for n in names))
+    return table
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.2f} %" if whole else "-"

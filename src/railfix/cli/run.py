@@ -1,0 +1,237 @@
+"""``railfix run``: logs, navigation and a track map in, a folder of positions out."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from railfix.config import Config
+
+Paths = list[Path]
+INPUTS = "Inputs"
+CHOICES = "Choices"
+
+
+def run(
+    *,
+    front: Annotated[
+        Paths,
+        typer.Option(
+            "--front",
+            metavar="OBS",
+            rich_help_panel=INPUTS,
+            help="RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
+        ),
+    ],
+    nav: Annotated[
+        Paths,
+        typer.Option(
+            "--nav", metavar="FILE", rich_help_panel=INPUTS, help="RINEX navigation file; repeat it for several."
+        ),
+    ],
+    track: Annotated[
+        Paths,
+        typer.Option(
+            "--track",
+            metavar="TRACK",
+            rich_help_panel=INPUTS,
+            help="Track map, CSV or GeoJSON; several are joined to a route in the order given.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; it is made.")],
+    rear: Annotated[
+        Paths | None,
+        typer.Option(
+            "--rear", metavar="OBS", rich_help_panel=INPUTS, help="The same of the rear antenna, where there is one."
+        ),
+    ] = None,
+    sp3: Annotated[
+        Paths | None,
+        typer.Option(
+            "--sp3",
+            metavar="FILE",
+            rich_help_panel=INPUTS,
+            help="Precise orbits and clocks, used in place of the broadcast ones.",
+        ),
+    ] = None,
+    vehicle: Annotated[
+        Path | None,
+        typer.Option(
+            "--vehicle",
+            metavar="TOML",
+            rich_help_panel=INPUTS,
+            help="Vehicle: bogie distance, gauge, places of the antennas. Without it the track is taken as the "
+            "antenna's own path.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="TOML", rich_help_panel=CHOICES, help="Settings; defaults where not given."),
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            rich_help_panel=CHOICES,
+            help="One setting, over the file's: --set elevation.mask_deg=15; may be repeated.",
+        ),
+    ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(metavar="EPSG", rich_help_panel=CHOICES, help="CRS of the track where its file does not say."),
+    ] = None,
+    height_datum: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DATUM", rich_help_panel=CHOICES, help="Heights of the track: ellipsoidal or orthometric."
+        ),
+    ] = None,
+    geoid: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            rich_help_panel=CHOICES,
+            help="Geoid of orthometric heights: japan, gsigeo2011, or a grid or CRS known to PROJ.",
+        ),
+    ] = None,
+    start: Annotated[
+        datetime | None, typer.Option(metavar="TIME", rich_help_panel=CHOICES, help="First epoch, GPS time.")
+    ] = None,
+    end: Annotated[
+        datetime | None, typer.Option(metavar="TIME", rich_help_panel=CHOICES, help="Last epoch, GPS time.")
+    ] = None,
+    observations: Annotated[
+        bool,
+        typer.Option(
+            "--observations",
+            rich_help_panel=CHOICES,
+            help="Also write observations.parquet: one row an epoch, satellite and signal, with its reason.",
+        ),
+    ] = False,
+    lenient: Annotated[
+        bool,
+        typer.Option(
+            "--lenient", rich_help_panel=CHOICES, help="Count broken lines of the logs and go on, instead of stopping."
+        ),
+    ] = False,
+    overwrite: Annotated[
+        bool,
+        typer.Option("--overwrite", rich_help_panel=CHOICES, help="Replace results that are already in DIR."),
+    ] = False,
+    chunk: Annotated[
+        int,
+        typer.Option(
+            metavar="EPOCHS",
+            min=1,
+            rich_help_panel=CHOICES,
+            help="Epochs in memory at a time; the results do not depend on it.",
+        ),
+    ] = 6000,
+) -> None:
+    r"""Positions along the line from receiver logs, navigation files and a track map.
+
+    Reads RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), reads the log in pieces, and writes into DIR:
+
+    - `positions.csv` and `positions.parquet`: one row an epoch and antenna, also where there is no
+      position; place along the line, its standard deviation, coordinates, the conventional
+      position for comparison
+    - `observations.parquet` (with `--observations`): one row an epoch, satellite and signal
+    - `run.json`: versions, hashes of the inputs, settings asked for and used, counts by status and
+      reason, positioning rate
+
+    Times are GPS time, as the receiver tagged them. The results appear in DIR when all is done; an
+    error leaves nothing there.
+
+    Example:
+
+        railfix run --front front.obs --rear rear.obs --nav brdc.nav \
+            --track line.csv --vehicle car.toml --out results
+
+    Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
+    4 a setting is wrong; 5 the inputs do not belong together; 7 not one position; 8 DIR cannot be
+    written; 1 a defect of railfix.
+    """
+    from railfix.cli.console import progress_bar, show_summary
+    from railfix.run import RunInputs, RunOptions, run_files
+
+    settings, asked = settings_of(config, setting or [])
+    inputs = RunInputs(
+        front=tuple(front),
+        rear=tuple(rear or ()),
+        nav=tuple(nav),
+        sp3=tuple(sp3 or ()),
+        track=tuple(track),
+        vehicle=vehicle,
+        config=config,
+    )
+    options = RunOptions(
+        observations="write" if observations else "skip",
+        broken_lines="count" if lenient else "stop",
+        overwrite="replace" if overwrite else "refuse",
+        chunk_epochs=chunk,
+        start=start,
+        end=end,
+        track_crs=crs,
+        track_height_datum=height_datum,
+        track_geoid=geoid,
+    )
+    with progress_bar() as progress:
+        summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
+    show_summary(summary)
+
+
+def settings_of(path: Path | None, overrides: list[str]) -> tuple[Config, dict[str, Any]]:
+    """Settings of a file with single ones on top.
+
+    Returns
+    -------
+    Config
+    dict
+        The settings that were asked for, as opposed to defaults.
+
+    Raises
+    ------
+    SettingsError
+        A setting is misspelt, out of range, or not written as KEY=VALUE.
+    InputFileError
+        The file cannot be read.
+    """
+    import tomllib
+
+    from railfix.config import load_config, parse_config
+
+    values: dict[str, Any] = {}
+    config = parse_config(values)
+    if path is not None:
+        config = load_config(path)
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    for text in overrides:
+        _set(values, text)
+    return (parse_config(values, source="--set") if overrides else config), values
+
+
+def _set(values: dict[str, Any], text: str) -> None:
+    """Put one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
+    import tomllib
+
+    from railfix.errors import SettingsError
+
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise SettingsError(f"--set {text}: expected KEY=VALUE, for example elevation.mask_deg=15")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    *groups, last = (part.strip() for part in key.split("."))
+    place = values
+    for group in groups:
+        place = place.setdefault(group, {})
+        if not isinstance(place, dict):
+            raise SettingsError(f"--set {text}: {group} is a single setting, not a group")
+    place[last] = parsed

@@ -1,0 +1,118 @@
+"""Whether inputs that can each be read belong together, and whether a run led to anything."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from railfix.errors import MismatchError, NoPositionError
+from railfix.navigation import Navigation
+from railfix.run.tally import AntennaTally, Tally
+
+#: A conventional position further from the trajectory than this belongs to another place [m].
+ANOTHER_PLACE_M: Final = 100_000.0
+#: Conventional positions that must agree on that before a run is stopped half-way.
+ENOUGH_TO_STOP: Final = 10
+#: Navigation records further from the log than this are of another day.
+ANOTHER_DAY: Final = np.timedelta64(24, "h")
+#: Records reach about this far beyond their reference time (Galileo, IODnav of 4 h and its margin).
+RECORD_REACH: Final = np.timedelta64(4, "h")
+
+
+def navigation_span(navigation: Navigation) -> tuple[np.datetime64, np.datetime64] | None:
+    """Reference times of the first and the last record; None where there is none."""
+    times = [navigation.kepler.toe, navigation.glonass.toe]
+    if navigation.precise is not None:
+        times.append(navigation.precise.time)
+    known = np.concatenate(times)
+    known = known[~np.isnat(known)]
+    return (known.min(), known.max()) if len(known) else None
+
+
+def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
+    """Raise where the navigation records and the log are of different times.
+
+    Raises
+    ------
+    MismatchError
+        Not one pseudorange was used, and the log lies further than `reach` from every record.
+    """
+    if any(antenna.used for antenna in tally.antennas.values()):
+        return
+    span = navigation_span(navigation)
+    for name, antenna in tally.antennas.items():
+        if antenna.first is None or antenna.last is None or not antenna.unrecorded:
+            continue
+        if span is None:
+            files = ", ".join(navigation.sources) or "the navigation files"
+            raise MismatchError(f"{files}: no record of any satellite of the {name} log; give its navigation file")
+        if antenna.first - reach > span[1] or antenna.last + reach < span[0]:
+            raise MismatchError(
+                f"{', '.join(navigation.sources)}: navigation records of {_period(*span)} do not reach the {name} "
+                f"log of {_period(antenna.first, antenna.last)} (GPS time); give the navigation file of that day"
+            )
+
+
+def check_same_place(tally: Tally, *, enough: int = ENOUGH_TO_STOP) -> None:
+    """Raise where all conventional positions lie far from the line.
+
+    Raises
+    ------
+    MismatchError
+        At least `enough` conventional positions, none within `ANOTHER_PLACE_M`.
+    """
+    for name, antenna in tally.antennas.items():
+        if antenna.conventional >= enough and antenna.conventional_nearest_m > ANOTHER_PLACE_M:
+            raise MismatchError(
+                f"the track lies {antenna.conventional_nearest_m / 1000:.0f} km from where the {name} log was "
+                "recorded; give the track of that line, and check the order of latitude and longitude"
+            )
+
+
+def check_same_time(tally: Tally) -> None:
+    """Raise where the logs of two antennas have no time in common.
+
+    Raises
+    ------
+    MismatchError
+    """
+    spans = {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
+    if len(spans) < 2:
+        return
+    latest_start = max(first for first, _ in spans.values())
+    earliest_end = min(last for _, last in spans.values())
+    if latest_start > earliest_end:
+        told = " and ".join(f"the {n} log covers {_period(*span)}" for n, span in spans.items())
+        raise MismatchError(f"{told} (GPS time), expected logs of one run; give logs that overlap")
+
+
+def check_positions(tally: Tally) -> None:
+    """Raise where a run has not one position.
+
+    Raises
+    ------
+    NoPositionError
+        Names the commonest status and the commonest reason.
+    """
+    if tally.positioned:
+        return
+    if not tally.epochs:
+        raise NoPositionError("no epoch between --start and --end; the logs have none there")
+    told = "; ".join(_why_nothing(name, antenna) for name, antenna in tally.antennas.items() if antenna.epochs)
+    raise NoPositionError(f"not one position: {told}")
+
+
+def _why_nothing(name: str, antenna: AntennaTally) -> str:
+    status, epochs = antenna.status.most_common(1)[0]
+    text = f"{name}: {status} in {epochs} of {antenna.epochs} epochs"
+    if antenna.first_reason:
+        reason, count = antenna.first_reason.most_common(1)[0]
+        text += f", {count} of {antenna.observations} pseudoranges refused as {reason}"
+    return text
+
+
+def _period(first: np.datetime64, last: np.datetime64) -> str:
+    """``2021-05-17 02:33 to 03:00``."""
+    one, two = (str(t.astype("datetime64[m]")).replace("T", " ") for t in (first, last))
+    return f"{one} to {two[11:] if one[:10] == two[:10] else two}"

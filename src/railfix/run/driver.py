@@ -1,0 +1,230 @@
+"""The run itself: readers, aligned chunks, the epoch processor, tables, files."""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from railfix.config import Config
+from railfix.epochs import Observations
+from railfix.navigation import Navigation
+from railfix.pipeline import EpochProcessor, State
+from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
+from railfix.run.chunks import aligned, rising, within
+from railfix.run.inputs import RunInputs, collected
+from railfix.run.output import OutputFolder
+from railfix.run.record import AlongSigma, along_sigma, run_record
+from railfix.run.sources import Line, open_line, open_log, open_navigation
+from railfix.run.tally import Tally
+from railfix.tables import observations_table, positions_table, rounded
+
+
+class Progress(Protocol):
+    """Whoever wants to know how far a run is."""
+
+    def __call__(self, *, epochs: int, fraction: float | None) -> None:
+        """Epochs done so far, and the part of the logs that has been read where it is known."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Choices of a run that do not touch the positions.
+
+    Attributes
+    ----------
+    observations : {"skip", "write"}
+        Whether ``observations.parquet`` is written.
+    broken_lines : {"stop", "count"}
+        What to do with lines of the logs that cannot be read.
+    overwrite : {"refuse", "replace"}
+    chunk_epochs : int
+        Epochs in memory at a time.
+    start, end : datetime or None
+        First and last epoch, GPS time, inclusive.
+    track_crs, track_height_datum, track_geoid : str or None
+        Where the track's own file does not say; see `railfix.track_map.read_track`.
+    """
+
+    observations: Literal["skip", "write"] = "skip"
+    broken_lines: Literal["stop", "count"] = "stop"
+    overwrite: Literal["refuse", "replace"] = "refuse"
+    chunk_epochs: int = 6000
+    start: datetime | None = None
+    end: datetime | None = None
+    track_crs: str | None = None
+    track_height_datum: str | None = None
+    track_geoid: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunSummary:
+    """What a run came to.
+
+    Attributes
+    ----------
+    tally : Tally
+    sigma : mapping of str to AlongSigma
+        Percentiles of the along-track standard deviation by antenna.
+    notes : tuple of str
+    files : mapping of str to Path
+        The results.
+    wall_s : float
+    """
+
+    tally: Tally
+    sigma: Mapping[str, AlongSigma]
+    notes: tuple[str, ...]
+    files: Mapping[str, Path]
+    wall_s: float
+
+
+def run_files(
+    inputs: RunInputs,
+    config: Config,
+    *,
+    out: Path,
+    options: RunOptions | None = None,
+    asked: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> RunSummary:
+    """Position the logs of one run along its line and write the results.
+
+    Parameters
+    ----------
+    inputs : RunInputs
+    config : Config
+        Settings used.
+    out : Path
+        Folder for the results.
+    options : RunOptions, optional
+    asked : mapping, optional
+        Settings that were asked for, as opposed to defaults; goes into ``run.json``.
+    progress : Progress, optional
+
+    Returns
+    -------
+    RunSummary
+
+    Raises
+    ------
+    RailfixError
+        See `railfix.errors`; nothing is left in `out` then.
+    """
+    began = clock.perf_counter()
+    options = options or RunOptions()
+    inputs.check()
+    with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
+        fingerprints = inputs.fingerprints(pool)
+        navigation = open_navigation(inputs.nav, inputs.sp3)
+        line = open_line(
+            inputs.track,
+            inputs.vehicle,
+            antennas=tuple(inputs.logs),
+            crs=options.track_crs,
+            height_datum=options.track_height_datum,
+            geoid=options.track_geoid,
+        )
+        processor = EpochProcessor(config, navigation, line.trajectories)
+        logs = _Logs(inputs, options)
+        tally = _position(logs, processor, folder, options, progress)
+        check_same_time(tally)
+        check_same_day(navigation, tally, reach=RECORD_REACH)
+        check_same_place(tally, enough=1)
+        check_positions(tally)
+        sigma = along_sigma(folder)
+        notes = _notes(line, navigation, tally, logs)
+        wall = clock.perf_counter() - began
+        record = run_record(
+            files=collected(fingerprints),
+            command=sys.argv,
+            asked=asked or {},
+            used=config.as_dict(),
+            line=line.facts,
+            navigation=navigation,
+            tally=tally,
+            sigma=sigma,
+            notes=notes,
+            wall_s=wall,
+        )
+        folder.write_json("run.json", record)
+        files = folder.commit(_footer(record))
+    return RunSummary(tally=tally, sigma=sigma, notes=notes, files=files, wall_s=wall)
+
+
+class _Logs:
+    """The logs of all antennas as aligned chunks, and how much of them was read."""
+
+    def __init__(self, inputs: RunInputs, options: RunOptions) -> None:
+        self._options = options
+        self._sources = {
+            name: open_log(paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines)
+            for name, paths in inputs.logs.items()
+        }
+
+    def chunks(self) -> Iterator[dict[str, Observations]]:
+        limits = {
+            "start": None if self._options.start is None else np.datetime64(self._options.start, "ns"),
+            "end": None if self._options.end is None else np.datetime64(self._options.end, "ns"),
+        }
+        return aligned({name: within(rising(log.parts(), log.path), **limits) for name, log in self._sources.items()})
+
+    @property
+    def fraction(self) -> float | None:
+        """The part of the bytes of all logs that has been read."""
+        total = sum(log.size for log in self._sources.values())
+        return sum(log.done for log in self._sources.values()) / total if total else None
+
+    @property
+    def notes(self) -> Iterator[str]:
+        for log in self._sources.values():
+            yield from log.notes
+
+
+def _position(
+    logs: _Logs, processor: EpochProcessor, folder: OutputFolder, options: RunOptions, progress: Progress | None
+) -> Tally:
+    """Chunk by chunk: positions, counts, rows."""
+    tally, state = Tally(), State()
+    for chunk in logs.chunks():
+        result, state = processor.process(chunk, state)
+        tally.add(result)
+        check_same_day(processor.navigation, tally)
+        check_same_place(tally)
+        table = positions_table(result)
+        folder.append_parquet("positions.parquet", table)
+        folder.append_csv("positions.csv", rounded(table))
+        if options.observations == "write":
+            folder.append_parquet("observations.parquet", observations_table(result))
+        if progress is not None:
+            progress(epochs=tally.epochs, fraction=logs.fraction)
+    return tally
+
+
+def _notes(line: Line, navigation: Navigation, tally: Tally, logs: _Logs) -> tuple[str, ...]:
+    """Everything a reader of the results should know, each once."""
+    said = [*line.notes, *navigation.notes, *logs.notes, *tally.notes]
+    for name, antenna in tally.antennas.items():
+        if antenna.never_recorded:
+            seen = ", ".join(antenna.never_recorded)
+            said.append(f"{name}: satellites seen without any usable navigation record: {seen}")
+        if antenna.positioned and antenna.positioned == antenna.status["off_map"]:
+            said.append(f"{name}: every position is off the map; is this the right track?")
+    return tuple(dict.fromkeys(said))
+
+
+def _footer(record: Mapping[str, Any]) -> dict[str, str]:
+    """Provenance in short, for the footer of the Parquet files."""
+    return {
+        "railfix": str(record["versions"]["railfix"]),
+        "command": " ".join(record["command"]),
+        "inputs": "; ".join(f"{f['input']} {f['path']} sha256:{f['sha256']}" for f in record["inputs"]),
+        "notes": "; ".join(record["notes"]),
+    }

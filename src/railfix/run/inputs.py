@@ -1,0 +1,103 @@
+"""What a run reads: named, checked and hashed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from railfix.errors import InputFileError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInputs:
+    """The files of a run.
+
+    Attributes
+    ----------
+    front, rear : tuple of Path
+        RINEX observation files of each antenna, in order of time; `rear` may be empty.
+    nav, sp3 : tuple of Path
+        Navigation files; precise orbits, which may be empty.
+    track : tuple of Path
+        Track map, joined to a route in this order.
+    vehicle, config : Path or None
+    """
+
+    front: tuple[Path, ...]
+    nav: tuple[Path, ...]
+    track: tuple[Path, ...]
+    rear: tuple[Path, ...] = ()
+    sp3: tuple[Path, ...] = ()
+    vehicle: Path | None = None
+    config: Path | None = None
+
+    def named(self) -> Iterator[tuple[str, Path]]:
+        """Each file with the name of what it is."""
+        for item in fields(self):
+            value = getattr(self, item.name)
+            for path in value if isinstance(value, tuple) else (value,):
+                if path is not None:
+                    yield item.name, path
+
+    @property
+    def logs(self) -> dict[str, tuple[Path, ...]]:
+        """Observation files by antenna."""
+        both = {"front": self.front, "rear": self.rear}
+        return {name: paths for name, paths in both.items() if paths}
+
+    def check(self) -> None:
+        """Look at every file before the work begins.
+
+        Raises
+        ------
+        InputFileError
+            A file is missing, a folder, or cannot be opened; or the same log is given twice.
+        """
+        for name, path in self.named():
+            _check_file(name, path)
+        seen: dict[Path, str] = {}
+        for name, paths in self.logs.items():
+            for path in paths:
+                whole = path.resolve()
+                if whole in seen:
+                    raise InputFileError(
+                        path, f"is given twice (--{seen[whole]} and --{name}), expected each log once; name another"
+                    )
+                seen[whole] = name
+
+    def fingerprints(self, pool: Executor) -> list[tuple[str, Path, Future[str]]]:
+        """SHA-256 of every file, worked out beside the run."""
+        return [(name, path, pool.submit(_sha256, path)) for name, path in self.named()]
+
+
+def collected(fingerprints: list[tuple[str, Path, Future[str]]]) -> list[dict[str, Any]]:
+    """Name, path, size and hash of every file, as plain values."""
+    return [
+        {"input": name, "path": str(path), "bytes": path.stat().st_size, "sha256": digest.result()}
+        for name, path, digest in fingerprints
+    ]
+
+
+def _check_file(name: str, path: Path) -> None:
+    try:
+        if path.is_dir():
+            raise InputFileError(path, f"is a folder, --{name} expects a file; name the file in it")
+        if not path.is_file():
+            what = "is no regular file" if path.exists() else "there is no such file"
+            raise InputFileError(path, f"{what}; check what --{name} names")
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read ({error.strerror}); check what --{name} names") from error
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read ({error.strerror})") from error

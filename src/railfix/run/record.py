@@ -1,0 +1,118 @@
+"""``run.json``: what was read, what was asked for, what was used, what came of it."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final
+
+import polars as pl
+
+from railfix import __version__
+from railfix.navigation import Navigation
+from railfix.run.output import OutputFolder
+from railfix.run.tally import Tally
+
+#: Packages whose version may matter to a result.
+PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlongSigma:
+    """Percentiles of the along-track standard deviation of the positions [m]."""
+
+    p50_m: float
+    p95_m: float
+    max_m: float
+
+
+def along_sigma(folder: OutputFolder) -> dict[str, AlongSigma]:
+    """Percentiles by antenna, from the rows written so far."""
+    sigma = pl.col("along_sigma_m")
+    table = (
+        folder.scan("positions.parquet")
+        .filter(sigma.is_not_null())
+        .group_by("antenna")
+        .agg(p50=sigma.quantile(0.5), p95=sigma.quantile(0.95), max=sigma.max())
+        .sort("antenna")
+        .collect()
+    )
+    return {
+        row["antenna"]: AlongSigma(p50_m=row["p50"], p95_m=row["p95"], max_m=row["max"])
+        for row in table.iter_rows(named=True)
+    }
+
+
+def run_record(
+    *,
+    files: Sequence[Mapping[str, Any]],
+    command: Sequence[str],
+    asked: Mapping[str, Any],
+    used: Mapping[str, Any],
+    line: Mapping[str, Any],
+    navigation: Navigation,
+    tally: Tally,
+    sigma: Mapping[str, AlongSigma],
+    notes: Sequence[str],
+    wall_s: float,
+) -> dict[str, Any]:
+    """Everything that ``run.json`` says, as plain values.
+
+    Parameters
+    ----------
+    files : sequence of mapping
+        Inputs with size and hash.
+    command : sequence of str
+    asked, used : mapping
+        Settings as given, and all settings that were in force.
+    line : mapping
+        Facts of the track map, the vehicle and the trajectories.
+    navigation : Navigation
+    tally : Tally
+    sigma : mapping of str to AlongSigma
+    notes : sequence of str
+    wall_s : float
+
+    Returns
+    -------
+    dict
+    """
+    return {
+        "versions": {"railfix": __version__, "python": platform.python_version(), **_versions()},
+        "platform": platform.platform(),
+        "command": list(command),
+        "inputs": list(files),
+        "settings_asked": dict(asked),
+        "settings_used": dict(used),
+        "line": dict(line),
+        "navigation": {
+            "records": len(navigation.kepler) + len(navigation.glonass),
+            "passed_over": dict(navigation.passed_over),
+            "klobuchar_from": sorted(navigation.klobuchar),
+            "precise": "" if navigation.precise is None else navigation.precise.source,
+        },
+        "notes": list(notes),
+        "positioning_rate": _overall_rate(tally),
+        "antennas": {
+            name: {**antenna.as_dict(), "along_sigma_m": asdict(sigma[name]) if name in sigma else None}
+            for name, antenna in tally.antennas.items()
+        },
+        "wall_s": round(wall_s, 3),
+    }
+
+
+def _overall_rate(tally: Tally) -> float | None:
+    observed = sum(a.observed for a in tally.antennas.values())
+    return tally.positioned / observed if observed else None
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found

@@ -1,0 +1,137 @@
+"""Counts over a run, added up chunk by chunk."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from railfix.pipeline import AntennaResult, Result
+from railfix.reasons import POSITIONED, Reason, Status, first_reason
+
+_NOT_A_REFUSAL = Reason.NOT_OBSERVED
+_NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
+
+
+@dataclass(kw_only=True)
+class AntennaTally:
+    """Counts of one antenna.
+
+    Attributes
+    ----------
+    epochs, observed, positioned : int
+        Epochs; those with at least one pseudorange; those with a position.
+    status : Counter of str
+    first_reason, only_reason : Counter of str
+        Refused observations by the first reason that applied, and those that one reason alone refused.
+    observations, used : int
+        Pseudoranges, and those that were used.
+    satellites : Counter of str
+        Observations by satellite.
+    unrecorded : Counter of str
+        Observations by satellite for which no navigation record was there or valid.
+    first, last : datetime64[ns] or None
+    conventional : int
+        Epochs with a conventional position.
+    conventional_nearest_m : float
+        Least distance of a conventional position from the trajectory; NaN when there was none.
+    """
+
+    epochs: int = 0
+    observed: int = 0
+    positioned: int = 0
+    observations: int = 0
+    used: int = 0
+    status: Counter[str] = field(default_factory=Counter)
+    first_reason: Counter[str] = field(default_factory=Counter)
+    only_reason: Counter[str] = field(default_factory=Counter)
+    satellites: Counter[str] = field(default_factory=Counter)
+    unrecorded: Counter[str] = field(default_factory=Counter)
+    first: np.datetime64 | None = None
+    last: np.datetime64 | None = None
+    conventional: int = 0
+    conventional_nearest_m: float = float("nan")
+
+    def add(self, result: AntennaResult) -> None:
+        """Count one more chunk."""
+        if not len(result.time):
+            return
+        self.first = result.time[0] if self.first is None else self.first
+        self.last = result.time[-1]
+        counts = np.bincount(result.status, minlength=len(Status))
+        self.epochs += len(result.time)
+        self.observed += len(result.time) - int(counts[Status.NO_OBSERVATION])
+        self.positioned += sum(int(counts[s]) for s in POSITIONED)
+        self.status.update({s.text: int(counts[s]) for s in Status if counts[s]})
+        self._add_reasons(result)
+        offset = result.conventional_offset_m
+        self.conventional += int(np.count_nonzero(np.isfinite(offset)))
+        if np.isfinite(offset).any():
+            self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, np.nanmin(offset)))
+
+    def _add_reasons(self, result: AntennaResult) -> None:
+        seen = (result.reason & _NOT_A_REFUSAL) == 0
+        reason = result.reason[seen]
+        first = first_reason(reason)
+        self.observations += reason.size
+        self.used += int(np.count_nonzero(reason == 0))
+        for bit in Reason:
+            name = str(bit.name).lower()
+            if count := int(np.count_nonzero(first == bit)):
+                self.first_reason[name] += count
+            if count := int(np.count_nonzero(reason == bit)):
+                self.only_reason[name] += count
+        without = seen & ((result.reason & _NO_RECORD) != 0)
+        for counter, mask in ((self.satellites, seen), (self.unrecorded, without)):
+            of_channel = np.count_nonzero(mask, axis=0)
+            for channel in np.flatnonzero(of_channel):
+                counter[str(result.satellite[channel])] += int(of_channel[channel])
+
+    @property
+    def never_recorded(self) -> dict[str, int]:
+        """Satellites seen for which no record was ever usable, with their observations."""
+        return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "epochs": self.epochs,
+            "epochs_with_observations": self.observed,
+            "epochs_with_position": self.positioned,
+            "positioning_rate": self.positioned / self.observed if self.observed else None,
+            "first_epoch_gpst": None if self.first is None else str(self.first),
+            "last_epoch_gpst": None if self.last is None else str(self.last),
+            "status": {s.text: self.status[s.text] for s in Status},
+            "observations": self.observations,
+            "observations_used": self.used,
+            "observations_refused_by_first_reason": dict(self.first_reason),
+            "observations_refused_by_one_reason_alone": dict(self.only_reason),
+            "satellites_seen": dict(sorted(self.satellites.items())),
+            "satellites_without_any_record": self.never_recorded,
+        }
+
+
+@dataclass(kw_only=True)
+class Tally:
+    """Counts of all antennas of a run."""
+
+    antennas: dict[str, AntennaTally] = field(default_factory=dict)
+    notes: dict[str, None] = field(default_factory=dict)
+
+    def add(self, result: Result) -> None:
+        """Count one more chunk."""
+        for name, antenna in result.antennas.items():
+            self.antennas.setdefault(name, AntennaTally()).add(antenna)
+        self.notes.update(dict.fromkeys(result.notes))
+
+    @property
+    def epochs(self) -> int:
+        """Epochs of all antennas."""
+        return sum(a.epochs for a in self.antennas.values())
+
+    @property
+    def positioned(self) -> int:
+        """Epochs with a position, of all antennas."""
+        return sum(a.positioned for a in self.antennas.values())

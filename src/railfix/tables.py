@@ -1,0 +1,227 @@
+"""Results as tables: polars for files and analysis, xarray for arrays with names.
+
+Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and
+NaN in xarray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from railfix.pipeline import AntennaResult, Result
+from railfix.reasons import Reason, Status, reason_text
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+#: Words of the column ``status``.
+STATUS_TYPE: Final = pl.Enum([s.text for s in Status])
+#: Decimals written to CSV: 0.1 mm, and the same in degrees.
+CSV_DECIMALS_M: Final = 4
+CSV_DECIMALS_DEG: Final = 9
+
+#: Columns of the table of positions, with their unit and meaning.
+POSITION_COLUMNS: Final[dict[str, str]] = {
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "status": "what became of the epoch",
+    "chainage_m": "distance along the line from the first point of the track",
+    "kilometrage_m": "the line's own marking, where the track has one",
+    "along_sigma_m": "standard deviation along the line",
+    "latitude_deg": "antenna, WGS 84",
+    "longitude_deg": "antenna, WGS 84",
+    "height_m": "antenna, above the ellipsoid",
+    "x_m": "antenna, ECEF",
+    "y_m": "antenna, ECEF",
+    "z_m": "antenna, ECEF",
+    "n_used": "satellites used",
+    "n_rejected": "satellites with a pseudorange that were not used",
+    "noise_scale": "noise of this receiver against what the weights assume, estimated so far",
+    "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
+    "conventional_offset_m": "distance of the 3-D single point from that point",
+    "conventional_x_m": "3-D single point, ECEF",
+    "conventional_y_m": "3-D single point, ECEF",
+    "conventional_z_m": "3-D single point, ECEF",
+}
+
+#: Columns of the table of observations, with their unit and meaning.
+OBSERVATION_COLUMNS: Final[dict[str, str]] = {
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "satellite": "`G01`, `J02`",
+    "signal": "RINEX 3 code without its type letter, `1C`",
+    "reason": "bits of `railfix.reasons.Reason`, 0 = used",
+    "reason_text": "their names joined by `+`, `used` for 0",
+    "residual_m": "corrected pseudorange minus what the position on the line and the clock explain",
+    "elevation_deg": "elevation of the satellite",
+    "azimuth_deg": "azimuth of the satellite, from north over east",
+    "cn0_dbhz": "carrier-to-noise density",
+    "sigma_m": "standard deviation that the weights assume",
+    "corrected_code_m": "pseudorange, satellite clock, group delay and atmosphere applied",
+}
+
+#: Results with one value an epoch, and with one an epoch and channel.
+_OF_EPOCH: Final = (
+    *("chainage_m", "kilometrage_m", "arc_m", "along_sigma_m", "latitude_deg", "longitude_deg", "height_m"),
+    *("n_used", "n_rejected", "noise_scale", "conventional_chainage_m", "conventional_offset_m"),
+)
+_OF_CHANNEL: Final = (
+    *("reason", "residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"),
+)
+
+
+def _floats(values: NDArray[np.float64]) -> pl.Series:
+    """A column of floats, NaN as null."""
+    return pl.Series(values=np.ascontiguousarray(values, dtype=np.float64), nan_to_null=True)
+
+
+def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
+    """One row an epoch of one antenna, also where there is no position.
+
+    Parameters
+    ----------
+    name : str
+        Goes into the column ``antenna``.
+    result : AntennaResult
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `POSITION_COLUMNS`.
+    """
+    epochs = len(result.time)
+    words = pl.Series(values=[s.text for s in Status], dtype=STATUS_TYPE)
+    columns: dict[str, pl.Series] = {
+        "time_gpst": pl.Series(values=np.array(result.time)),
+        "antenna": pl.Series(values=[name], dtype=pl.String).new_from_index(0, epochs),
+        "status": words.gather(pl.Series(values=result.status.astype(np.uint32))),
+    }
+    for column in ("chainage_m", "kilometrage_m", "along_sigma_m", "latitude_deg", "longitude_deg", "height_m"):
+        columns[column] = _floats(getattr(result, column))
+    for axis, column in enumerate(("x_m", "y_m", "z_m")):
+        columns[column] = _floats(result.ecef_m[:, axis])
+    columns["n_used"] = pl.Series(values=result.n_used.astype(np.int16))
+    columns["n_rejected"] = pl.Series(values=result.n_rejected.astype(np.int16))
+    columns["noise_scale"] = _floats(result.noise_scale)
+    columns["conventional_chainage_m"] = _floats(result.conventional_chainage_m)
+    columns["conventional_offset_m"] = _floats(result.conventional_offset_m)
+    for axis, column in enumerate(("conventional_x_m", "conventional_y_m", "conventional_z_m")):
+        columns[column] = _floats(result.conventional_ecef_m[:, axis])
+    return pl.DataFrame(columns)
+
+
+def positions_table(result: Result) -> pl.DataFrame:
+    """One row an epoch and antenna, in order of time, then of the antennas as given.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `POSITION_COLUMNS`.
+    """
+    parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
+    whole = pl.concat(parts)
+    return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
+
+
+def antenna_observations(name: str, result: AntennaResult) -> pl.DataFrame:
+    """One row an epoch and channel that was observed, of one antenna.
+
+    Parameters
+    ----------
+    name : str
+        Goes into the column ``antenna``.
+    result : AntennaResult
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `OBSERVATION_COLUMNS`.
+    """
+    epoch, channel = np.nonzero((result.reason & Reason.NOT_OBSERVED) == 0)
+    reason = result.reason[epoch, channel]
+    values, inverse = np.unique(reason, return_inverse=True)
+    texts = pl.Series(values=[reason_text(int(v)) for v in values], dtype=pl.String)
+    of_channel = pl.Series(values=channel.astype(np.uint32))
+    columns: dict[str, pl.Series] = {
+        "time_gpst": pl.Series(values=result.time[epoch]),
+        "antenna": pl.Series(values=[name], dtype=pl.String).new_from_index(0, len(epoch)),
+        "satellite": pl.Series(values=result.satellite.tolist(), dtype=pl.String).gather(of_channel),
+        "signal": pl.Series(values=result.signal.tolist(), dtype=pl.String).gather(of_channel),
+        "reason": pl.Series(values=reason.astype(np.int32)),
+        "reason_text": texts.gather(pl.Series(values=inverse.astype(np.uint32))),
+    }
+    for column in ("residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"):
+        columns[column] = _floats(getattr(result, column)[epoch, channel])
+    return pl.DataFrame(columns)
+
+
+def observations_table(result: Result) -> pl.DataFrame:
+    """One row an epoch, antenna and channel that was observed, in order of time, antenna, satellite.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `OBSERVATION_COLUMNS`.
+    """
+    parts = [antenna_observations(name, antenna) for name, antenna in result.antennas.items()]
+    whole = pl.concat(parts)
+    return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
+
+
+def rounded(table: pl.DataFrame) -> pl.DataFrame:
+    """A table with its floats rounded to what CSV files get: 0.1 mm, 1e-9 deg."""
+    floats = [name for name, kind in table.schema.items() if kind == pl.Float64]
+    return table.with_columns(
+        pl.col(name).round(CSV_DECIMALS_DEG if name.endswith("_deg") else CSV_DECIMALS_M) for name in floats
+    )
+
+
+def to_xarray(result: AntennaResult, *, attributes: Mapping[str, Any] | None = None) -> xr.Dataset:
+    """Results of one antenna as arrays with named axes.
+
+    Parameters
+    ----------
+    result : AntennaResult
+    attributes : mapping, optional
+        Put on the dataset (name of the antenna, provenance).
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions ``time``, ``channel`` and ``xyz``; ``satellite`` and ``signal`` are coordinates
+        of ``channel``.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        xarray is not installed (``pip install railfix[notebook]``).
+    """
+    try:
+        import xarray as xr
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("xarray is not installed; pip install 'railfix[notebook]'") from error
+    words = np.array([s.text for s in Status])
+    data: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {"status": (("time",), words[result.status])}
+    data |= {name: (("time",), getattr(result, name)) for name in _OF_EPOCH}
+    data |= {name: (("time", "xyz"), getattr(result, name)) for name in ("ecef_m", "conventional_ecef_m")}
+    data |= {name: (("time", "channel"), getattr(result, name)) for name in _OF_CHANNEL}
+    coordinates = {
+        "time": result.time,
+        "satellite": ("channel", result.satellite),
+        "signal": ("channel", result.signal),
+        "xyz": ["x", "y", "z"],
+    }
+    return xr.Dataset(data, coords=coordinates, attrs=dict(attributes or {}))

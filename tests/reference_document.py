@@ -1,0 +1,148 @@
+"""The reference document, from the docstrings: ``python tests/reference_document.py`` writes ``docs/reference.md``."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import re
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+from railfix import errors
+from railfix.config import Config
+from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
+
+DOCUMENT: Final = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
+
+#: Modules whose public names are listed, in reading order.
+MODULES: Final = (
+    "railfix.rinex",
+    "railfix.track_map",
+    "railfix.antenna",
+    "railfix.vehicle",
+    "railfix.config",
+    "railfix.pipeline",
+    "railfix.tables",
+    "railfix.run",
+    "railfix.evaluate",
+    "railfix.report",
+    "railfix.simulate",
+    "railfix.reasons",
+    "railfix.timescale",
+    "railfix.geodesy",
+)
+
+
+def _first_paragraph(item: object) -> str:
+    text = inspect.getdoc(item) or ""
+    return " ".join(text.split("\n\n")[0].split())
+
+
+def _attribute_docs(item: object) -> dict[str, str]:
+    """Descriptions in the Attributes section of a numpydoc docstring, by name."""
+    text = inspect.getdoc(item) or ""
+    _, _, section = text.partition("Attributes\n----------\n")
+    section = re.split(r"\n\n[A-Z][a-z]+\n-+\n", section)[0]
+    docs: dict[str, str] = {}
+    names: list[str] = []
+    for line in section.splitlines():
+        if line.startswith(" "):
+            for name in names:
+                docs[name] = f"{docs[name]} {line.strip()}".strip()
+        elif line.strip():
+            head, _, kind = line.partition(" : ")
+            names = [n.strip() for n in head.split(",")]
+            unit = re.search(r"\[[^\]]+\]$", kind)
+            docs |= dict.fromkeys(names, "")
+            if unit:
+                docs |= dict.fromkeys(names, unit.group())
+    return docs
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("``", "`")
+
+
+def _exit_codes() -> list[str]:
+    rows = re.findall(r"^(\d)\s+(.*)$", errors.__doc__ or "", flags=re.MULTILINE)
+    kinds = [kind for kind in vars(errors).values() if inspect.isclass(kind) and kind is not errors.RailfixError]
+    raised = {str(kind.exit_code): kind.__name__ for kind in kinds}
+    lines = ["## Exit codes", "", "| code | meaning | error in Python |", "|---:|---|---|"]
+    return lines + [f"| {c} | {text} | {f'`{raised[c]}`' if c in raised else ''} |" for c, text in rows]
+
+
+def _columns(heading: str, columns: dict[str, str]) -> list[str]:
+    lines = ["", f"## {heading}", "", "| column | meaning |", "|---|---|"]
+    return lines + [f"| `{name}` | {_cell(text)} |" for name, text in columns.items()]
+
+
+def _setting_rows(prefix: str, item: Any, docs: dict[str, str]) -> list[str]:
+    rows = []
+    for name in docs:
+        if not hasattr(item, name):
+            continue
+        value = getattr(item, name)
+        if dataclasses.is_dataclass(value):
+            continue
+        rows.append(f"| `{prefix}{name}` | `{_cell(str(value))}` | {_cell(docs[name])} |")
+    return rows
+
+
+def _settings() -> list[str]:
+    config = Config()
+    lines = ["", "## Settings", "", "Keys of the configuration file (TOML) and of `--set`, with their defaults.", ""]
+    lines += ["| key | default | meaning |", "|---|---|---|"]
+    lines += _setting_rows("", config, {k: v for k, v in _attribute_docs(Config).items() if k != "noise"})
+    for name in Config.model_fields:
+        group = getattr(config, name)
+        if dataclasses.is_dataclass(group):
+            docs = _attribute_docs(group) or dict.fromkeys((f.name for f in dataclasses.fields(group)), "")
+            lines += _setting_rows(f"{name}.", group, docs)
+    return lines
+
+
+def _signature(item: Any) -> str:
+    try:
+        text = str(inspect.signature(item))
+    except (TypeError, ValueError):
+        return ""
+    return text if len(text) < 400 else "(...)"
+
+
+def _module(name: str) -> list[str]:
+    module = importlib.import_module(name)
+    names = getattr(module, "__all__", None) or [
+        n for n, v in vars(module).items() if not n.startswith("_") and getattr(v, "__module__", "") == name
+    ]
+    lines = ["", f"## `{name}`", "", _first_paragraph(module), ""]
+    for public in names:
+        item = getattr(module, public)
+        if inspect.isclass(item):
+            lines.append(f"- **`{public}`** {_cell(_first_paragraph(item))}")
+        elif inspect.isroutine(item):
+            lines.append(f"- **`{public}{_signature(item)}`** {_cell(_first_paragraph(item))}")
+    return lines
+
+
+def document() -> str:
+    """The document as Markdown."""
+    lines = ["# Reference", "", "Written by `python tests/reference_document.py` from the docstrings.", ""]
+    lines += _exit_codes()
+    lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS)
+    lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS)
+    lines += _settings()
+    for name in MODULES:
+        lines += _module(name)
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Write the document."""
+    DOCUMENT.write_text(document(), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,56 @@
+"""The documents say what the program does: generated ones are up to date, links lead somewhere, examples run."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from conftest import ROOT
+from reference_document import DOCUMENT, document
+from traceability import TABLE, marked_tests, table
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def test_traceability_is_up_to_date() -> None:
+    assert TABLE.read_text(encoding="utf-8") == table(), "run python tests/traceability.py"
+
+
+def test_reference_is_up_to_date() -> None:
+    assert DOCUMENT.read_text(encoding="utf-8") == document(), "run python tests/reference_document.py"
+
+
+def test_markers_are_found_on_functions_classes_and_files(tmp_path: Path) -> None:
+    path = tmp_path / "test_x.py"
+    path.write_text(
+        "import pytest\n"
+        'pytestmark = [pytest.mark.slow, pytest.mark.requirement("A1")]\n'
+        "def test_one(): ...\n"
+        '@pytest.mark.requirement("A2")\n'
+        "class TestTwo:\n"
+        '    @pytest.mark.requirement("A3")\n'
+        "    def test_three(self): ...\n"
+        "def helper(): ...\n"
+    )
+    three = "test_x.py::TestTwo::test_three"
+    assert list(marked_tests(path)) == [("A1", "test_x.py::test_one"), ("A1", three), ("A2", three), ("A3", three)]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_links_between_documents_lead_somewhere(path: Path) -> None:
+    targets = re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text(encoding="utf-8"))
+    assert [t for t in targets if not (path.parent / t).exists()] == []
+
+
+def test_ci_runs_the_command_of_the_readme() -> None:
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (expression,) = re.findall(r"command=\$\((sed .*)\)\n", script)
+    found = subprocess.run(["bash", "-c", expression], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert found.strip() in readme
+    assert found.count("\n") == 1
+    assert "pytest" in found
+    assert ".venv" in found
