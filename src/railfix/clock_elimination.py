@@ -169,9 +169,16 @@ def inverse_3x3(matrix: Floats) -> Floats:
     NaN where a matrix is singular: its determinant, against the cube of its mean diagonal, is
     below 1e-12 (axes whose information differs by more than six orders of magnitude in sigma).
     """
-    a, b, c = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
-    cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
-    determinant = np.einsum("...i,...i->...", a, cofactors[..., :, 0])
-    size = np.trace(matrix, axis1=-2, axis2=-1) / 3.0
-    regular = determinant > 1e-12 * size**3
-    return np.where(regular[..., None, None], cofactors / np.where(regular, determinant, 1.0)[..., None, None], np.nan)
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    cofactors = np.empty(matrix.shape)
+    cofactors[..., 0, 0] = d * f - e * e
+    cofactors[..., 1, 1] = a * f - c * c
+    cofactors[..., 2, 2] = a * d - b * b
+    cofactors[..., 0, 1] = cofactors[..., 1, 0] = c * e - b * f
+    cofactors[..., 0, 2] = cofactors[..., 2, 0] = b * e - c * d
+    cofactors[..., 1, 2] = cofactors[..., 2, 1] = b * c - a * e
+    determinant = a * cofactors[..., 0, 0] + b * cofactors[..., 0, 1] + c * cofactors[..., 0, 2]
+    regular = determinant > 1e-12 * ((a + d + f) / 3.0) ** 3
+    determinant = np.where(regular, determinant, np.nan)
+    return cofactors / determinant[..., None, None]

@@ -1,8 +1,7 @@
 """How good were the positions: the error along the line against a reference.
 
-The error is the distance along the map between the answer and the reference's own point on it,
-positive toward the end of the line (P1 3.3). Where the map passes the reference several times
-(laps, loops), the pass nearest to the answer counts: which lap it is, ranges cannot tell.
+The error is the distance on the map between the answer and the reference's own point on it,
+positive toward the end of the line (P1 3.3).
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from railfix.antenna import Trajectory
 from railfix.timescale import seconds
@@ -88,10 +86,13 @@ def interpolate_reference(
     return between
 
 
-def along_track_error(
-    arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory, *, same_place_m: float = 10.0
-) -> Floats:
-    """Signed distance along the trajectory from the reference's point to the answer, shape (T,) [m].
+def along_track_error(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
+    """Signed distance on the map from the reference's point to the answer, shape (T,) [m].
+
+    The reference's point is the nearest one of the trajectory. The size is the straight distance
+    between the two points - along the line on any stretch of railway, and the metres between the
+    branches where a line passes the same place twice and the answer is on the other branch. The
+    sign is that of the distance along the line, + toward its end (P1 3.3).
 
     Parameters
     ----------
@@ -99,35 +100,15 @@ def along_track_error(
         Answers along the trajectory; NaN where there is none.
     reference_ecef_m : ndarray, shape (T, 3) [m]
     trajectory : Trajectory
-    same_place_m : float
-        Passes of the map no further from the reference than its nearest point plus this are the
-        reference's place too.
 
     Returns
     -------
     ndarray, shape (T,) [m]
         NaN where either is missing.
     """
-    error = np.full(len(arc_m), np.nan)
-    at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
-    if not len(at):
-        return error
-    points, length = trajectory.ecef_m, trajectory.length_m
-    _, offset = trajectory.nearest(reference_ecef_m[at])
-    reach = offset + same_place_m
-    middle = 0.5 * (points[1:] + points[:-1])
-    lists = cKDTree(middle).query_ball_point(reference_ecef_m[at], reach + 0.5 * length.max())
-    which = np.repeat(np.arange(len(at)), [len(x) for x in lists])
-    section = np.concatenate([np.asarray(x, dtype=np.intp) for x in lists])
-    delta = reference_ecef_m[at][which] - points[section]
-    foot = np.clip(np.einsum("pi,pi->p", delta, trajectory.tangent[section]), 0.0, length[section])
-    away = np.linalg.norm(delta - foot[:, None] * trajectory.tangent[section], axis=1)
-    signed = arc_m[at][which] - (trajectory.arc_m[section] + foot)
-    size = np.where(away <= reach[which] + 1e-6, np.abs(signed), np.inf)
-    order = np.lexsort((size, which))
-    first = order[np.flatnonzero(np.r_[True, which[order][1:] != which[order][:-1]])]
-    error[at[which[first]]] = signed[first]
-    return error
+    reference_arc, _ = trajectory.nearest(reference_ecef_m)
+    apart = np.linalg.norm(trajectory.at_arc(arc_m) - trajectory.at_arc(reference_arc), axis=1)
+    return np.copysign(apart, arc_m - reference_arc)
 
 
 def score(error_m: Floats, observed: NDArray[np.bool_]) -> Score:

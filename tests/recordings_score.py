@@ -1,0 +1,221 @@
+"""Scores on the real recordings: one setting for all, printed as a table.
+
+Run ``python tests/recordings_score.py`` with the recordings beside the checkout.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import recordings_truth
+
+from railfix.antenna import Trajectory
+from railfix.clock_elimination import Ranges, clock_groups
+from railfix.config import Config, parse_config
+from railfix.constrained import constrained_position
+from railfix.evaluate import Score, along_track_error, interpolate_reference, score
+from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.measurement import code_sigma_m
+from railfix.pipeline import AntennaResult, EpochProcessor
+from railfix.rinex import read_navigation, read_observations
+from railfix.section import SearchIndex, search
+from railfix.spp import single_point
+from railfix.timescale import timedelta
+from railfix.track_map import Track, from_positions
+
+#: Screens of health and elevation only, mask as the recordings' table was made with.
+SETTINGS = parse_config({"elevation": {"mask_deg": 15.0}})
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One recording's run."""
+
+    name: str
+    constrained: Score
+    conventional: Score
+    result: AntennaResult | None
+    trajectory: Trajectory | None
+    ranges: Ranges | None = None
+
+
+def trajectory_of(time: np.ndarray, ecef_m: np.ndarray) -> Trajectory:
+    """The map made from the reference, 5 m, standing still removed."""
+    return Trajectory.from_track(from_positions(time, ecef_m, spacing_m=5.0))
+
+
+def run_rinex(
+    name: str, observations: Path, navigation: list[Path], truth: tuple[np.ndarray, np.ndarray], config: Config
+) -> Outcome:
+    time, ecef = truth
+    trajectory = trajectory_of(time, ecef)
+    processor = EpochProcessor(config, read_navigation(navigation), {"front": trajectory})
+    result, _ = processor.process({"front": read_observations(observations)})
+    antenna = result.antennas["front"]
+    reference = interpolate_reference(antenna.time, time, ecef)
+    return outcome(name, antenna, reference, trajectory)
+
+
+def outcome(name: str, antenna: AntennaResult, reference: np.ndarray, trajectory: Trajectory) -> Outcome:
+    observed = np.isfinite(reference[:, 0]) & np.any((antenna.reason & 1) == 0, axis=1)
+    error = along_track_error(antenna.arc_m, reference, trajectory)
+    other = along_track_error(antenna.conventional_arc_m, reference, trajectory)
+    return Outcome(name, score(error, observed), score(other, observed), antenna, trajectory)
+
+
+def urbannav_f9p(data: Path, config: Config = SETTINGS) -> Outcome:
+    folder = data / "kinematic" / "urbannav_tst"
+    obs = folder / "20210517.light-urban.tste.ublox.f9p.obs"
+    return run_rinex(
+        "urbannav_tst F9P", obs, [folder / "hksc137c.nav"], recordings_truth.urbannav_truth(folder), config
+    )
+
+
+def urbannav_m8t(data: Path, config: Config = SETTINGS) -> Outcome:
+    folder = data / "kinematic" / "urbannav_tst"
+    obs = folder / "20210517.light-urban.tste.ublox.m8t.GC.obs"
+    return run_rinex(
+        "urbannav_tst M8T", obs, [folder / "hksc137c.nav"], recordings_truth.urbannav_truth(folder), config
+    )
+
+
+def gsdc(data: Path, config: Config = SETTINGS) -> Outcome:
+    folder = data / "kinematic" / "gsdc_pixel5_a"
+    truth = recordings_truth.gsdc_truth(folder)
+    return run_rinex("gsdc_pixel5_a", folder / "Pixel5_a.21o", [folder / "hour1180.21n"], truth, config)
+
+
+def japan(data: Path, config: Config = SETTINGS) -> Outcome:
+    folder = data / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
+    truth = recordings_truth.japan_truth(folder)
+    return run_rinex("japan_mosaic", folder / "SEPT265G.21O", [folder / "SEPT2650.21P"], truth, config)
+
+
+def straight_line(station_ecef_m: np.ndarray, azimuth_deg: float, *, half_m: float = 1000.0) -> Trajectory:
+    """A level line of 2 km through a station, points every 5 m, off the station's own vertex."""
+    along = np.arange(-half_m, half_m + 1.0, 5.0) + 2.3
+    latitude, longitude, height = geodetic_from_ecef(station_ecef_m)
+    axes = enu_axes(latitude, longitude)
+    bearing = np.radians(azimuth_deg)
+    points = station_ecef_m + along[:, None] * (np.sin(bearing) * axes[0] + np.cos(bearing) * axes[1])
+    lat, lon, _ = geodetic_from_ecef(points)
+    # Level: the tangent plane leaves the ellipsoid by 8 cm at 1 km.
+    return Trajectory.from_track(Track.from_ecef(ecef_from_geodetic(lat, lon, np.full(len(along), float(height)))))
+
+
+def geonet(data: Path, station: str, azimuth_deg: float, config: Config = SETTINGS) -> Outcome:
+    folder = data / "static" / "rtklib_geonet2005"
+    observations = read_observations(folder / f"{station}0920.05o")
+    place = observations.header.approximate_ecef_m
+    trajectory = straight_line(place, azimuth_deg)
+    navigation = read_navigation([folder / f"{station}0920.05n"])
+    processor = EpochProcessor(config, navigation, {"front": trajectory})
+    result, _ = processor.process({"front": observations})
+    antenna = result.antennas["front"]
+    reference = np.broadcast_to(place, (len(antenna), 3))
+    return outcome(f"geonet2005 {station} az {azimuth_deg:.0f}", antenna, reference, trajectory)
+
+
+@dataclass(frozen=True)
+class SmartlocLog:
+    """Ranges as recorded: satellite clock and atmosphere applied, Earth rotation not."""
+
+    time: np.ndarray
+    satellite: np.ndarray
+    code_m: np.ndarray
+    sat_ecef_m: np.ndarray
+    elevation_deg: np.ndarray
+    cn0_dbhz: np.ndarray
+
+
+def smartloc_ranges(folder: Path) -> SmartlocLog:
+    """The text log as (epoch, satellite) arrays, satellites of one clock side by side."""
+    letters = {1: "G", 16: "J", 8: "E", 32: "C", 4: "R"}
+    rows = []
+    with (folder / "Berlin_Potsdamer_Platz_Input.txt").open(encoding="ascii") as lines:
+        for line in lines:
+            kind, *numbers = line.split()
+            if kind == "pseudorange3" and int(float(numbers[7])) in letters:
+                rows.append([float(x) for x in numbers[:10]])
+    table = np.array(rows)
+    names = np.array([f"{letters[int(s)]}{int(n):02d}" for n, s in table[:, 6:8]])
+    satellite, column = np.unique(names, return_inverse=True)
+    stamp, row = np.unique(table[:, 0], return_inverse=True)
+    grid = np.full((len(stamp), len(satellite), 6), np.nan)
+    grid[row, column] = table[:, [1, 3, 4, 5, 8, 9]]
+    return SmartlocLog(
+        time=recordings_truth.SMARTLOC_START + timedelta(stamp),
+        satellite=satellite,
+        code_m=grid[..., 0],
+        sat_ecef_m=grid[..., 1:4],
+        elevation_deg=grid[..., 4],
+        cn0_dbhz=grid[..., 5],
+    )
+
+
+def smartloc(data: Path, config: Config = SETTINGS) -> Outcome:
+    """No RINEX: ranges, satellites, elevations and C/N0 go straight into the array functions."""
+    log = smartloc_ranges(data / "kinematic" / "smartloc_berlin")
+    time, ecef = recordings_truth.smartloc_truth(data / "kinematic" / "smartloc_berlin")
+    trajectory = trajectory_of(time, ecef)
+    used = log.elevation_deg >= config.elevation.mask_deg
+    sigma = code_sigma_m(log.cn0_dbhz, log.elevation_deg, noise=config.noise)
+    used &= np.isfinite(log.code_m) & np.isfinite(sigma)
+    ranges = Ranges(
+        sat_ecef_m=np.where(used[..., None], log.sat_ecef_m, 2.6e7),
+        code_m=np.where(used, log.code_m, 0.0),
+        weight=np.where(used, 1.0 / sigma**2, 0.0),
+        groups=clock_groups([str(s)[0] for s in log.satellite]),
+    )
+    point = single_point(ranges, np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3)))
+    section = search(ranges, SearchIndex(trajectory), point)
+    enough = ranges.n_used >= config.min_satellites
+    got = constrained_position(ranges, trajectory, np.where(enough, section.vertex, -1))
+    arc = np.where(got.dilution <= config.dilution_limit, got.arc_m, np.nan)
+    reference = interpolate_reference(log.time, time, ecef)
+    observed = np.isfinite(reference[:, 0]) & np.isfinite(log.code_m).any(axis=1)
+    nearest, _ = trajectory.nearest(point.ecef_m)
+    return Outcome(
+        "smartloc_berlin",
+        score(along_track_error(arc, reference, trajectory), observed),
+        score(along_track_error(nearest, reference, trajectory), observed),
+        None,
+        trajectory,
+        ranges,
+    )
+
+
+RECORDINGS: dict[str, Callable[[Path], Outcome]] = {
+    "urbannav_f9p": urbannav_f9p,
+    "urbannav_m8t": urbannav_m8t,
+    "gsdc": gsdc,
+    "smartloc": smartloc,
+    "japan": japan,
+}
+
+
+def main() -> int:
+    data = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not data.is_dir():
+        print(f"the real recordings are not at {data}", file=sys.stderr)
+        return 1
+    print(
+        "recording                  epochs  rate %   p50 m   p95 m   max m  wrong %  | conventional: rate %  p50 m  p95 m"
+    )
+    outcomes = [run(data) for run in RECORDINGS.values()]
+    outcomes += [geonet(data, station, azimuth) for station in ("0759", "3040") for azimuth in (0, 45, 90, 135)]
+    for o in outcomes:
+        a, b = o.constrained, o.conventional
+        print(
+            f"{o.name:26s} {a.epochs:6d} {100 * a.rate:7.2f} {a.p50_m:7.2f} {a.p95_m:7.2f} {a.max_m:7.1f} "
+            f"{100 * a.wrong_place:8.2f}  | {100 * b.rate:20.2f} {b.p50_m:6.2f} {b.p95_m:6.2f}"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
