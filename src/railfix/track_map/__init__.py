@@ -1,7 +1,19 @@
 """The 3-D track map: files in, a `Track` out; its quality; a map made from good positions (P1 2.2(1), 4.2(1))."""
 
 from railfix.track_map.csv_file import write_track_csv
+from railfix.track_map.from_positions import Thinned, ThinningLimits, from_position_log, from_positions, thin
 from railfix.track_map.read import read_track
 from railfix.track_map.track import Provenance, Track, interpolate_kilometrage
 
-__all__ = ["Provenance", "Track", "interpolate_kilometrage", "read_track", "write_track_csv"]
+__all__ = [
+    "Provenance",
+    "Thinned",
+    "ThinningLimits",
+    "Track",
+    "from_position_log",
+    "from_positions",
+    "interpolate_kilometrage",
+    "read_track",
+    "thin",
+    "write_track_csv",
+]
