@@ -67,7 +67,7 @@ def _cell(text: str) -> str:
 
 def _exit_codes() -> list[str]:
     rows = re.findall(r"^(\d)\s+(.*)$", errors.__doc__ or "", flags=re.MULTILINE)
-    kinds = [kind for kind in vars(errors).values() if inspect.isclass(kind) and kind is not errors.RailfixError]
+    kinds = errors.RailfixError.__subclasses__()
     raised = {str(kind.exit_code): kind.__name__ for kind in kinds}
     lines = ["## Exit codes", "", "| code | meaning | error in Python |", "|---:|---|---|"]
     return lines + [f"| {c} | {text} | {f'`{raised[c]}`' if c in raised else ''} |" for c, text in rows]

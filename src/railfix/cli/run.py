@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Paths = list[Path]
 INPUTS = "Inputs"
 CHOICES = "Choices"
+TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d"]
 
 
 def run(
@@ -99,11 +100,20 @@ def run(
             help="Geoid of orthometric heights: japan, gsigeo2011, or a grid or CRS known to PROJ.",
         ),
     ] = None,
+    reference: Annotated[
+        Literal["antenna", "centre", "front_bogie", "rear_bogie"],
+        typer.Option(
+            rich_help_panel=CHOICES,
+            help="The point of the vehicle whose chainage is given; for each antenna its own place by default.",
+        ),
+    ] = "antenna",
     start: Annotated[
-        datetime | None, typer.Option(metavar="TIME", rich_help_panel=CHOICES, help="First epoch, GPS time.")
+        datetime | None,
+        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="First epoch, GPS time."),
     ] = None,
     end: Annotated[
-        datetime | None, typer.Option(metavar="TIME", rich_help_panel=CHOICES, help="Last epoch, GPS time.")
+        datetime | None,
+        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="Last epoch, GPS time."),
     ] = None,
     observations: Annotated[
         bool,
@@ -157,7 +167,7 @@ def run(
     written; 1 a defect of railfix.
     """
     from railfix.cli.console import progress_bar, show_summary
-    from railfix.run import RunInputs, RunOptions, run_files
+    from railfix.run import RunInputs, RunOptions, TrackReading, run_files
 
     settings, asked = settings_of(config, setting or [])
     inputs = RunInputs(
@@ -176,9 +186,7 @@ def run(
         chunk_epochs=chunk,
         start=start,
         end=end,
-        track_crs=crs,
-        track_height_datum=height_datum,
-        track_geoid=geoid,
+        track=TrackReading(crs=crs, height_datum=height_datum, geoid=geoid, reference=reference),
     )
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)

@@ -2,5 +2,6 @@
 
 from railfix.run.driver import RunOptions, RunSummary, run_files
 from railfix.run.inputs import RunInputs
+from railfix.run.sources import TrackReading
 
-__all__ = ["RunInputs", "RunOptions", "RunSummary", "run_files"]
+__all__ = ["RunInputs", "RunOptions", "RunSummary", "TrackReading", "run_files"]

@@ -6,7 +6,7 @@ import sys
 import time as clock
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -22,7 +22,7 @@ from railfix.run.chunks import aligned, rising, within
 from railfix.run.inputs import RunInputs, collected
 from railfix.run.output import OutputFolder
 from railfix.run.record import AlongSigma, along_sigma, run_record
-from railfix.run.sources import Line, open_line, open_log, open_navigation
+from railfix.run.sources import Line, Log, TrackReading, open_line, open_navigation
 from railfix.run.tally import Tally
 from railfix.tables import observations_table, positions_table, rounded
 
@@ -49,8 +49,7 @@ class RunOptions:
         Epochs in memory at a time.
     start, end : datetime or None
         First and last epoch, GPS time, inclusive.
-    track_crs, track_height_datum, track_geoid : str or None
-        Where the track's own file does not say; see `railfix.track_map.read_track`.
+    track : TrackReading
     """
 
     observations: Literal["skip", "write"] = "skip"
@@ -59,9 +58,7 @@ class RunOptions:
     chunk_epochs: int = 6000
     start: datetime | None = None
     end: datetime | None = None
-    track_crs: str | None = None
-    track_height_datum: str | None = None
-    track_geoid: str | None = None
+    track: TrackReading = field(default_factory=TrackReading)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,14 +121,7 @@ def run_files(
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
         navigation = open_navigation(inputs.nav, inputs.sp3)
-        line = open_line(
-            inputs.track,
-            inputs.vehicle,
-            antennas=tuple(inputs.logs),
-            crs=options.track_crs,
-            height_datum=options.track_height_datum,
-            geoid=options.track_geoid,
-        )
+        line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
         processor = EpochProcessor(config, navigation, line.trajectories)
         logs = _Logs(inputs, options)
         tally = _position(logs, processor, folder, options, progress)
@@ -165,7 +155,7 @@ class _Logs:
     def __init__(self, inputs: RunInputs, options: RunOptions) -> None:
         self._options = options
         self._sources = {
-            name: open_log(paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines)
+            name: Log(paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines)
             for name, paths in inputs.logs.items()
         }
 

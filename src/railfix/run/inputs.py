@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from railfix.errors import InputFileError
+
+Antenna = Literal["front", "rear"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +46,9 @@ class RunInputs:
                     yield item.name, path
 
     @property
-    def logs(self) -> dict[str, tuple[Path, ...]]:
+    def logs(self) -> dict[Antenna, tuple[Path, ...]]:
         """Observation files by antenna."""
-        both = {"front": self.front, "rear": self.rear}
+        both: dict[Antenna, tuple[Path, ...]] = {"front": self.front, "rear": self.rear}
         return {name: paths for name, paths in both.items() if paths}
 
     def check(self) -> None:

@@ -1,0 +1,150 @@
+"""The readers as a run needs them: the line with its trajectories, navigation, logs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from railfix.antenna import Trajectory
+from railfix.epochs import Observations
+from railfix.errors import SettingsError
+from railfix.navigation import Navigation
+from railfix.rinex import read_navigation
+from railfix.run.inputs import Antenna
+from railfix.sp3 import read_sp3
+from railfix.track_map import Track, read_track
+from railfix.vehicle import Reference, Vehicle, antenna_trajectory, read_vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackReading:
+    """How to read the track, and which point's chainage to give.
+
+    Attributes
+    ----------
+    crs, height_datum, geoid : str or None
+        Where the track's own file does not say; see `railfix.track_map.read_track`.
+    reference : str
+        The point of the vehicle whose chainage is given; see `railfix.vehicle.antenna_trajectory`.
+    """
+
+    crs: str | None = None
+    height_datum: str | None = None
+    geoid: str | None = None
+    reference: Reference = "antenna"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """The line and the path of each antenna on it.
+
+    Attributes
+    ----------
+    track : Track
+    vehicle : Vehicle or None
+    trajectories : dict of str to Trajectory
+    """
+
+    track: Track
+    vehicle: Vehicle | None
+    trajectories: dict[str, Trajectory]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the map, the vehicle and the trajectories have to say, each once."""
+        said = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
+        return tuple(dict.fromkeys([*said, *self.track.provenance.notes]))
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        track, provenance = self.track, self.track.provenance
+        return {
+            "track": {
+                "name": track.name,
+                "points": len(track),
+                "length_m": round(float(track.chainage_m[-1]), 3),
+                "sections": list(track.sections),
+                "sigma_plan_m": track.sigma_plan_m,
+                "sigma_height_m": track.sigma_height_m,
+                "crs": provenance.crs,
+                "height_datum_asked": provenance.height_datum_asked,
+                "height_datum_used": provenance.height_datum_used,
+                "geoid": provenance.geoid,
+            },
+            "vehicle": None if self.vehicle is None else self.vehicle.model_dump(mode="json"),
+            "chainage_of": {name: trajectory.reference for name, trajectory in self.trajectories.items()},
+        }
+
+
+def open_line(
+    track: tuple[Path, ...], vehicle: Path | None, *, antennas: tuple[Antenna, ...], reading: TrackReading
+) -> Line:
+    """Read the track and the vehicle, and work out the path of each antenna.
+
+    Raises
+    ------
+    InputFileError, SettingsError, MismatchError
+        A file is not what it should be, or track and vehicle do not fit.
+    """
+    centreline = read_track(track, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
+    if vehicle is None:
+        if reading.reference != "antenna":
+            raise SettingsError(
+                f"the chainage of {reading.reference} was asked for, which only a vehicle file can give; name one"
+            )
+        path = Trajectory.from_track(centreline)
+        return Line(track=centreline, vehicle=None, trajectories=dict.fromkeys(antennas, path))
+    body = read_vehicle(vehicle)
+    return Line(
+        track=centreline,
+        vehicle=body,
+        trajectories={n: antenna_trajectory(centreline, body, n, reference=reading.reference) for n in antennas},
+    )
+
+
+def open_navigation(nav: tuple[Path, ...], sp3: tuple[Path, ...]) -> Navigation:
+    """Read all navigation files as one, with precise orbits where given.
+
+    Raises
+    ------
+    InputFileError
+    """
+    navigation = read_navigation(nav)
+    return replace(navigation, precise=read_sp3(sp3)) if sp3 else navigation
+
+
+@dataclass(kw_only=True)
+class Log:
+    """The files of one antenna's log, read piece by piece.
+
+    Attributes
+    ----------
+    paths : tuple of Path
+    size, done : int [byte]
+        Of all files; read so far.
+    notes : list of str
+        What the reader had to say, once it is done.
+    """
+
+    paths: tuple[Path, ...]
+    chunk_epochs: int
+    broken_lines: Literal["stop", "count"]
+    done: int = 0
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def path(self) -> str:
+        """The files in one word."""
+        return ", ".join(str(path) for path in self.paths)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(path.stat().st_size for path in self.paths)
+
+    def parts(self) -> Iterator[Observations]:
+        """Pieces of the log in order of time."""
+        raise NotImplementedError
