@@ -36,18 +36,23 @@ class ThinningLimits:
         is noise or drift. Needs times; 0 keeps all.
     standing_window_s : float [s]
         Half of the window in which the displacement is looked at.
+    chord_m : float [m]
+        Where the positions between two points leave their chord by more, the furthest becomes a point
+        too (P1 4.1(3) keeps a map's chords within 0.30 m of the curve). Needs times, which tell noise
+        while standing from a bend.
     jump_m : float [m]
         Neighbouring points further apart are reported, for a straight line bridges them.
     """
 
     spacing_m: float = 5.0
+    chord_m: float = 0.30
     standing_mps: float = 0.2
     standing_window_s: float = 3.0
     jump_m: float = 50.0
 
     def __post_init__(self) -> None:
-        if not (self.spacing_m > 0 and self.jump_m > 0 and self.standing_window_s > 0 and self.standing_mps >= 0):
-            raise ValueError("spacing_m, jump_m and standing_window_s must be positive, standing_mps not negative")
+        if not min(self.spacing_m, self.chord_m, self.jump_m, self.standing_window_s) > 0 or self.standing_mps < 0:
+            raise ValueError("limits of thinning must be positive (standing_mps may be 0)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +139,10 @@ def thin(
     stands = standing(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=limits.standing_window_s)
     stands = _with_shuffles(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
-    kept = moving[_at_spacing(ecef_m[moving], limits.spacing_m)]
+    chosen = _at_spacing(ecef_m[moving], limits.spacing_m)
+    if not np.isnat(time[moving]).any():
+        chosen = _with_bends(ecef_m[moving], chosen, limits.chord_m)
+    kept = moving[chosen]
     steps = np.diff(ecef_m[kept], axis=0)
     length = np.linalg.norm(steps, axis=1)
     jumps = np.flatnonzero(length > limits.jump_m)
@@ -189,6 +197,25 @@ def _at_spacing(points: Floats, spacing_m: float) -> Indices:
         if np.linalg.norm(onward) >= 0.2 * spacing_m and float(onward @ before) > 0:
             kept.append(len(points) - 1)
     return np.array(kept, dtype=np.intp)
+
+
+def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
+    """The chosen points, and between two of them the one furthest from their chord, if over the limit."""
+    if len(chosen) < 2:
+        return chosen
+    piece = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
+    inside = np.flatnonzero((piece >= 0) & (piece < len(chosen) - 1) & ~np.isin(np.arange(len(points)), chosen))
+    piece = piece[inside]
+    start, step = points[chosen[piece]], points[chosen[piece + 1]] - points[chosen[piece]]
+    share = np.einsum("ni,ni->n", points[inside] - start, step) / np.einsum("ni,ni->n", step, step)
+    off = np.linalg.norm(points[inside] - start - share[:, None] * step, axis=1)
+    # near an end of the chord it would make a kink, not a curve
+    off = np.where((share > 0.2) & (share < 0.8), off, 0.0)
+    worst = np.zeros(len(chosen) - 1)
+    np.maximum.at(worst, piece, off)
+    bends = np.flatnonzero((off > chord_m) & (off == worst[piece]))
+    _, once = np.unique(piece[bends], return_index=True)
+    return np.sort(np.concatenate([chosen, inside[bends[once]]]))
 
 
 def from_positions(
