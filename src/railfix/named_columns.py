@@ -58,7 +58,7 @@ class NamedColumns:
     ----------
     path : str
     metadata : dict of str
-        ``# key: value`` comments above the header.
+        ``# key: value`` comments above the header; of a repeated key the values, joined by "; ".
     header_line : int
     line : ndarray of int, shape (n,)
         1-based line number of each row.
@@ -145,7 +145,8 @@ def read_named_columns(path: str | PathLike[str]) -> NamedColumns:
             continue
         if line.startswith("#"):
             if not header and (pair := _split_comment(line)):
-                metadata[pair[0]] = pair[1]
+                key, value = pair
+                metadata[key] = f"{metadata[key]}; {value}" if key in metadata else value
             continue
         cells = [cell.strip() for cell in next(csv.reader([line]))]
         if not header:

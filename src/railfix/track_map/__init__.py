@@ -2,14 +2,19 @@
 
 from railfix.track_map.csv_file import write_track_csv
 from railfix.track_map.from_positions import Thinned, ThinningLimits, from_position_log, from_positions, thin
+from railfix.track_map.quality import Finding, MapLimits, TrackQuality, check_track
 from railfix.track_map.read import read_track
 from railfix.track_map.track import Provenance, Track, interpolate_kilometrage
 
 __all__ = [
+    "Finding",
+    "MapLimits",
     "Provenance",
     "Thinned",
     "ThinningLimits",
     "Track",
+    "TrackQuality",
+    "check_track",
     "from_position_log",
     "from_positions",
     "interpolate_kilometrage",

@@ -29,7 +29,7 @@ OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
 }
 KNOWN_COLUMNS: Final = ("latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS)
 #: ``# key: value`` lines above the header that mean something; others are kept without effect.
-KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m")
+KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
 
 
 def straight_radius(radius_m: Floats) -> Floats:
@@ -62,6 +62,8 @@ def read_csv_segment(
     check_height_datum(height_datum)
     table = read_named_columns(path)
     notes = _check_columns(table)
+    if "note" in table.metadata:
+        notes += tuple(table.metadata["note"].split("; "))
     latitude, longitude = table.numbers("latitude_deg"), table.numbers("longitude_deg")
     check_degrees(table, latitude, longitude)
     datum = _datum(table, height_datum)

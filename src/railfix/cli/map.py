@@ -1,0 +1,225 @@
+"""``railfix map``: check a track map, or make one from good positions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from railfix.errors import MapQualityError, OutputError, SettingsError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from railfix.track_map import Thinned, Track, TrackQuality
+
+map_app = typer.Typer(
+    name="map",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Track maps: check one before trusting positions on it, or make one from good positions.",
+)
+
+#: Findings printed before the rest is only counted.
+_SHOWN = 40
+
+
+@map_app.command("check")
+def check(
+    tracks: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
+    ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(metavar="CRS", help="CRS of the coordinates where the file does not say, e.g. `EPSG:6677`."),
+    ] = None,
+    height_datum: Annotated[
+        str | None,
+        typer.Option(metavar="DATUM", help="`ellipsoidal` or `orthometric`, where the file does not say."),
+    ] = None,
+    geoid: Annotated[
+        str | None,
+        typer.Option(
+            metavar="GEOID",
+            help="Geoid of orthometric heights: `japan` (JPGEO2024), `gsigeo2011`, a pyproj grid or vertical CRS.",
+        ),
+    ] = None,
+    max_gap: Annotated[
+        float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
+    ] = 1.0,
+    mid_chord: Annotated[
+        float, typer.Option(metavar="M", help="Largest deviation of a chord from the arc at its middle.")
+    ] = 0.30,
+) -> None:
+    """Check a track map and print what is wrong with it.
+
+    Looked at: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
+    where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
+    kilometrage, gradients and height spikes, cant, and curve attributes against the points.
+
+    Ends with exit code 6 where there is an error, 0 where there are warnings only or nothing.
+    """
+    from railfix.track_map import MapLimits, check_track, read_track
+
+    if not mid_chord > 0.0 or not max_gap > 0.0:
+        raise SettingsError("--mid-chord and --max-gap must be positive")
+    track = read_track(
+        list(tracks), crs=crs, height_datum=height_datum, geoid=geoid, max_gap_m=max_gap, duplicates="keep"
+    )
+    quality = check_track(track, limits=MapLimits(mid_chord_m=mid_chord))
+    picture = None
+    if out is not None:
+        from railfix.plots.track import plot_track_quality
+
+        picture = _folder(out) / "map_check.png"
+        plot_track_quality(quality, picture)
+    _print_quality(quality, picture)
+    if quality.errors:
+        raise MapQualityError(
+            f"{track.name}: the track map has {len(quality.errors)} error(s), the first {quality.errors[0].sentence}"
+        )
+
+
+@map_app.command("from-positions")
+def from_positions_command(
+    positions: Annotated[
+        Path,
+        typer.Argument(metavar="POSITIONS", help="RTKLIB `.pos`, or CSV with named columns."),
+    ],
+    *,
+    out: Annotated[Path, typer.Option(metavar="TRACK.csv", help="Track map to write.")],
+    spacing: Annotated[float, typer.Option(metavar="M", help="Distance between the points of the map.")] = 5.0,
+    quality: Annotated[
+        str | None,
+        typer.Option(
+            metavar="Q,Q...",
+            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); 1 where the log tells quality.",
+        ),
+    ] = None,
+    max_sigma: Annotated[
+        float | None, typer.Option(metavar="M", help="Largest standard deviation of a position, any axis.")
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=COLUMN",
+            help="Column of a CSV under another name, e.g. `latitude_deg=Lat`; may be repeated. Names: time_gpst, "
+            "latitude_deg, longitude_deg, height_m, x_m, y_m, z_m, quality.",
+        ),
+    ] = None,
+    name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
+) -> None:
+    """Make a track map from good positions of one run, where no map exists.
+
+    Positions of lesser quality and those at which the antenna stands are left out, the rest is thinned
+    to the spacing; bends between two points are kept within 0.30 m. The map is the path of that
+    antenna: use it without a vehicle file. A run over several laps gives several laps.
+    """
+    from railfix.position_log import read_positions
+    from railfix.track_map import from_position_log, write_track_csv
+
+    if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
+        raise SettingsError("--spacing and --max-sigma must be positive")
+    log = read_positions(positions, columns=_columns(column or []))
+    track, thinned = from_position_log(
+        log,
+        spacing_m=spacing,
+        quality=_qualities(quality),
+        max_sigma_m=max_sigma,
+        name=name or positions.stem,
+    )
+    if not out.parent.is_dir():
+        raise OutputError(f"{out}: the folder {out.parent} does not exist")
+    write_track_csv(track, out)
+    _print_thinned(track, thinned, len(log), out)
+
+
+def _folder(path: Path) -> Path:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: the folder cannot be made ({error.strerror})") from None
+    return path
+
+
+def _columns(pairs: list[str]) -> dict[str, str]:
+    columns: dict[str, str] = {}
+    for pair in pairs:
+        ours, equals, theirs = pair.partition("=")
+        if not equals or not ours.strip() or not theirs.strip():
+            raise SettingsError(f"--column {pair!r}: expected NAME=COLUMN, for example latitude_deg=Lat")
+        columns[ours.strip()] = theirs.strip()
+    return columns
+
+
+def _qualities(text: str | None) -> list[int] | None:
+    if text is None:
+        return None
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise SettingsError(f"--quality {text!r}: expected whole numbers with commas, for example 1,2") from None
+
+
+def _console() -> Console:
+    from rich.console import Console
+
+    return Console(highlight=False)
+
+
+def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
+    from rich.table import Table
+
+    console, track, geometry = _console(), quality.track, quality.geometry
+    spacing = geometry.spacing_m
+    console.print(
+        f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.1f} m, {len(track.sections)} section(s); "
+        f"heights {track.provenance.height_datum_used}"
+        + (f" + geoid {track.provenance.geoid}" if track.provenance.geoid else ""),
+        markup=False,
+    )
+    import numpy as np
+
+    console.print(
+        f"spacing {spacing.min():.2f} / {np.median(spacing):.2f} / {spacing.max():.2f} m (least, median, largest); "
+        f"mid-chord deviation up to {np.nanmax(np.abs(geometry.mid_chord_m)):.3f} m",
+        markup=False,
+    )
+    for note in track.provenance.notes:
+        console.print(f"note: {note}", markup=False)
+    if quality.findings:
+        table = Table("severity", "kind", "points", "kilometrage", "finding", show_edge=False)
+        for finding in quality.findings[:_SHOWN]:
+            marking = "" if finding.kilometrage_m != finding.kilometrage_m else f"{finding.kilometrage_m:.0f}"
+            points = f"{finding.first}-{finding.last}" if finding.last > finding.first else f"{finding.first}"
+            table.add_row(finding.severity, finding.kind, points, marking, finding.sentence)
+        console.print(table)
+    rest = len(quality.findings) - _SHOWN
+    if rest > 0:
+        console.print(f"... and {rest} more")
+    console.print(f"{len(quality.errors)} error(s), {len(quality.warnings)} warning(s)")
+    if picture is not None:
+        console.print(f"picture: {picture}", markup=False, soft_wrap=True)
+
+
+def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None:
+    console = _console()
+    console.print(f"{rows} positions, {len(track)} points kept, {track.chainage_m[-1]:,.1f} m")
+    for reason, count in thinned.dropped.items():
+        if count:
+            console.print(f"dropped {count} {reason}")
+    for point, distance in zip(thinned.jumps[:_SHOWN], thinned.jump_m[:_SHOWN], strict=True):
+        console.print(
+            f"gap of {distance:.1f} m at chainage {track.chainage_m[point]:.1f} m, bridged by a straight line"
+        )
+    for point in thinned.turns[:_SHOWN]:
+        console.print(f"the path turns back at chainage {track.chainage_m[point]:.1f} m")
+    console.print(f"track map: {out}", markup=False, soft_wrap=True)
