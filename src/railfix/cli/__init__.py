@@ -11,8 +11,8 @@ import typer
 from typer.core import TyperGroup
 
 from railfix import __version__
-from railfix.cli.demo import demo
-from railfix.cli.run import run
+from railfix.cli.demo import demo as demo_command
+from railfix.cli.run import run as run_command
 from railfix.errors import RailfixError
 
 
@@ -83,8 +83,8 @@ def railfix(
     """
 
 
-app.command("run")(run)
-app.command("demo")(demo)
+app.command("run")(run_command)
+app.command("demo")(demo_command)
 
 
 def main() -> None:

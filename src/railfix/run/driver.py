@@ -15,6 +15,7 @@ import numpy as np
 
 from railfix.config import Config
 from railfix.epochs import Observations
+from railfix.errors import SettingsError
 from railfix.navigation import Navigation
 from railfix.pipeline import EpochProcessor, State
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
@@ -59,6 +60,10 @@ class RunOptions:
     start: datetime | None = None
     end: datetime | None = None
     track: TrackReading = field(default_factory=TrackReading)
+
+    def __post_init__(self) -> None:
+        if self.start is not None and self.end is not None and self.start > self.end:
+            raise SettingsError(f"--start {self.start} is after --end {self.end}; expected a time before it")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,318 @@
+"""Broken observation and navigation files."""
+
+from __future__ import annotations
+
+import gzip
+import random
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from broken_bench import INPUT, MISMATCH, NOTHING, Bench, broken, epoch_starts
+
+Options = dict[str, Any]
+
+
+def without_line(path: Path, label: str) -> Path:
+    """Drop the header lines with a label."""
+    lines = path.read_text().splitlines(keepends=True)
+    kept = [line for line in lines if line[60:].strip() != label]
+    assert len(kept) < len(lines)
+    path.write_text("".join(kept))
+    return path
+
+
+def shifted_days(text: str, days: int) -> str:
+    """Navigation records of GPS, QZSS and Galileo moved by whole days in their clock time."""
+
+    def move(match: re.Match[str]) -> str:
+        return f"{match[1]} {match[2]} {int(match[3]) + days:02d} "
+
+    return re.sub(r"(?m)^([GJEC]\d\d \d{4}) (\d\d) (\d\d) ", move, text)
+
+
+# --- observation files -------------------------------------------------------------------------
+
+
+@broken(INPUT, "absent.obs", "no such file")
+def observations_missing(bench: Bench) -> Options:
+    return {"front": bench.folder / "absent.obs"}
+
+
+@broken(INPUT, "folder")
+def observations_are_a_folder(bench: Bench) -> Options:
+    (bench.folder / "logs").mkdir()
+    return {"front": bench.folder / "logs"}
+
+
+@broken(INPUT, "dangling.obs", "no such file")
+def observations_are_a_dangling_link(bench: Bench) -> Options:
+    (bench.folder / "dangling.obs").symlink_to("nowhere.obs")
+    return {"front": bench.folder / "dangling.obs"}
+
+
+@broken(INPUT, "/proc/self/mem")
+def observations_cannot_be_read(_: Bench) -> Options:
+    return {"front": "/proc/self/mem"}
+
+
+@broken(INPUT, "/dev/null")
+def observations_are_a_device(_: Bench) -> Options:
+    return {"front": "/dev/null"}
+
+
+@broken(INPUT, "empty.obs", "empty")
+def observations_empty(bench: Bench) -> Options:
+    return {"front": bench.write("empty.obs", "")}
+
+
+@broken(INPUT, "blank.obs")
+def observations_blank(bench: Bench) -> Options:
+    return {"front": bench.write("blank.obs", " \n" * 40)}
+
+
+@broken(INPUT, "random.obs")
+def observations_binary(bench: Bench) -> Options:
+    return {"front": bench.write("random.obs", random.Random(1).randbytes(5000))}
+
+
+@broken(INPUT, "utf16.obs")
+def observations_in_utf16(bench: Bench) -> Options:
+    return {"front": bench.write("utf16.obs", bench.front.read_text().encode("utf-16"))}
+
+
+@broken(INPUT, "front.zip", "zip")
+def observations_in_a_zip_archive(bench: Bench) -> Options:
+    with zipfile.ZipFile(bench.folder / "front.zip", "w") as archive:
+        archive.write(bench.front)
+    return {"front": bench.folder / "front.zip"}
+
+
+@broken(INPUT, "front.obs.gz", "early")
+def observations_gzip_truncated(bench: Bench) -> Options:
+    packed = gzip.compress(bench.front.read_bytes(), mtime=0)
+    return {"front": bench.write("front.obs.gz", packed[: len(packed) // 2])}
+
+
+@broken(INPUT, "front.obs.gz")
+def observations_gzip_damaged(bench: Bench) -> Options:
+    packed = bytearray(gzip.compress(bench.front.read_bytes(), mtime=0))
+    middle = len(packed) // 2
+    packed[middle : middle + 64] = bytes(64)
+    return {"front": bench.write("front.obs.gz", bytes(packed))}
+
+
+@broken(INPUT, "front.crx")
+def observations_hatanaka_truncated(bench: Bench) -> Options:
+    import hatanaka
+
+    packed = hatanaka.rnx2crx(bench.front.read_bytes())
+    return {"front": bench.write("front.crx", packed[: len(packed) // 2])}
+
+
+@broken(INPUT, "brdc.nav", "navigation")
+def observations_are_navigation(bench: Bench) -> Options:
+    return {"front": bench.nav}
+
+
+@broken(INPUT, "line.csv")
+def observations_are_the_track(bench: Bench) -> Options:
+    return {"front": bench.track}
+
+
+@broken(INPUT, "train.toml")
+def observations_are_the_vehicle(bench: Bench) -> Options:
+    return {"front": bench.vehicle}
+
+
+@broken(INPUT, "rtk.pos")
+def observations_are_positions(bench: Bench) -> Options:
+    text = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns\n2026/05/12 03:00:00.000 35.0 135.0 100.0 1 9\n"
+    return {"front": bench.write("rtk.pos", text)}
+
+
+@broken(INPUT, "front.obs", "line 1")
+def observations_of_an_unknown_version(bench: Bench) -> Options:
+    text = bench.front.read_text()
+    return {"front": bench.write("front.obs", "     7.00" + text[9:])}
+
+
+@broken(INPUT, "front.obs")
+def observations_without_version(bench: Bench) -> Options:
+    return {"front": without_line(bench.front, "RINEX VERSION / TYPE")}
+
+
+@broken(INPUT, "front.obs", "OBS TYPES")
+def observations_without_types(bench: Bench) -> Options:
+    return {"front": without_line(bench.front, "SYS / # / OBS TYPES")}
+
+
+@broken(INPUT, "front.obs", "END OF HEADER")
+def observations_without_end_of_header(bench: Bench) -> Options:
+    return {"front": without_line(bench.front, "END OF HEADER")}
+
+
+@broken(INPUT, "front.obs")
+def observations_cut_in_the_header(bench: Bench) -> Options:
+    return {"front": bench.write("front.obs", bench.front.read_text()[:400])}
+
+
+@broken(INPUT, "front.obs", "epoch")
+def observations_without_epochs(bench: Bench) -> Options:
+    text = bench.front.read_text()
+    return {"front": bench.write("front.obs", text[: text.index("\n>") + 1])}
+
+
+@broken(INPUT, "front.obs", "line")
+def observations_cut_in_an_epoch(bench: Bench) -> Options:
+    lines = bench.front.read_text().splitlines(keepends=True)
+    return {"front": bench.write("front.obs", "".join(lines[: epoch_starts("".join(lines))[-1] + 3]))}
+
+
+@broken(INPUT, "front.obs", "line")
+def observations_with_a_broken_epoch_line(bench: Bench) -> Options:
+    lines = bench.front.read_text().splitlines(keepends=True)
+    at = epoch_starts("".join(lines))[5]
+    lines[at] = lines[at].replace(" 0 ", " ? ", 1).replace("> 20", "> xx")
+    return {"front": bench.write("front.obs", "".join(lines))}
+
+
+@broken(INPUT, "front.obs", "line")
+def observations_with_letters_for_a_number(bench: Bench) -> Options:
+    lines = bench.front.read_text().splitlines(keepends=True)
+    at = epoch_starts("".join(lines))[5] + 1
+    lines[at] = lines[at][:5] + "2l345678.9O1" + lines[at][17:]
+    return {"front": bench.write("front.obs", "".join(lines))}
+
+
+@broken(INPUT, "front.obs", "line")
+def observations_with_a_wrong_count_of_satellites(bench: Bench) -> Options:
+    lines = bench.front.read_text().splitlines(keepends=True)
+    at = epoch_starts("".join(lines))[5]
+    lines[at] = f"{lines[at][:32]}{int(lines[at][32:35]) + 2:3d}{lines[at][35:]}"
+    return {"front": bench.write("front.obs", "".join(lines))}
+
+
+@broken(INPUT, "front.obs", "given twice")
+def observations_given_twice(bench: Bench) -> Options:
+    return {"front": [bench.front, bench.front]}
+
+
+@broken(INPUT, "front.obs", "given twice", "--rear")
+def observations_given_for_both_antennas(bench: Bench) -> Options:
+    return {"rear": bench.front}
+
+
+@broken(INPUT, "first.obs")
+def observations_in_the_wrong_order(bench: Bench) -> Options:
+    text = bench.front.read_text()
+    lines = text.splitlines(keepends=True)
+    starts = epoch_starts(text)
+    header, middle = "".join(lines[: starts[0]]), starts[len(starts) // 2]
+    first = bench.write("first.obs", header + "".join(lines[starts[0] : middle]))
+    return {"front": [bench.write("second.obs", header + "".join(lines[middle:])), first]}
+
+
+@broken(MISMATCH, "brdc.nav", "navigation file of that day")
+def observations_of_another_week(bench: Bench) -> Options:
+    text = re.sub(r"(?m)^> (\d{4})", lambda m: f"> {int(m[1]) - 20}", bench.front.read_text())
+    return {"front": bench.write("front.obs", text)}
+
+
+@broken(MISMATCH, "front", "rear", "overlap")
+def observations_of_antennas_at_different_hours(bench: Bench) -> Options:
+    text = re.sub(
+        r"(?m)^(> \d{4} \d\d \d\d )(\d\d)", lambda m: f"{m[1]}{(int(m[2]) + 1) % 24:02d}", bench.rear.read_text()
+    )
+    return {"rear": bench.write("rear.obs", text)}
+
+
+@broken(NOTHING, "--start")
+def no_epoch_in_the_time_asked_for(_: Bench) -> Options:
+    return {"start": "2031-01-01T00:00:00"}
+
+
+# --- navigation files --------------------------------------------------------------------------
+
+
+@broken(INPUT, "absent.nav", "no such file")
+def navigation_missing(bench: Bench) -> Options:
+    return {"nav": bench.folder / "absent.nav"}
+
+
+@broken(INPUT, "folder")
+def navigation_is_a_folder(bench: Bench) -> Options:
+    return {"nav": bench.folder}
+
+
+@broken(INPUT, "empty.nav", "empty")
+def navigation_empty(bench: Bench) -> Options:
+    return {"nav": bench.write("empty.nav", "")}
+
+
+@broken(INPUT, "random.nav")
+def navigation_binary(bench: Bench) -> Options:
+    return {"nav": bench.write("random.nav", random.Random(2).randbytes(5000))}
+
+
+@broken(INPUT, "front.obs", "observation")
+def navigation_is_observations(bench: Bench) -> Options:
+    return {"nav": bench.front}
+
+
+@broken(INPUT, "line.csv")
+def navigation_is_the_track(bench: Bench) -> Options:
+    return {"nav": bench.track}
+
+
+@broken(INPUT, "brdc.nav", "END OF HEADER")
+def navigation_without_end_of_header(bench: Bench) -> Options:
+    return {"nav": without_line(bench.nav, "END OF HEADER")}
+
+
+@broken(INPUT, "brdc.nav")
+def navigation_without_version(bench: Bench) -> Options:
+    return {"nav": without_line(bench.nav, "RINEX VERSION / TYPE")}
+
+
+@broken(INPUT, "brdc.nav", "record")
+def navigation_without_records(bench: Bench) -> Options:
+    text = bench.nav.read_text()
+    return {"nav": bench.write("brdc.nav", text[: text.index("END OF HEADER") + 14])}
+
+
+@broken(INPUT, "brdc.nav", "line")
+def navigation_cut_in_a_record(bench: Bench) -> Options:
+    lines = bench.nav.read_text().splitlines(keepends=True)
+    return {"nav": bench.write("brdc.nav", "".join(lines[:-3]))}
+
+
+@broken(INPUT, "brdc.nav", "line")
+def navigation_with_letters_for_a_number(bench: Bench) -> Options:
+    lines = bench.nav.read_text().splitlines(keepends=True)
+    at = next(i for i, line in enumerate(lines) if re.match(r"[GE]\d\d \d{4} ", line)) + 2
+    lines[at] = lines[at][:6] + "not a number" + lines[at][18:]
+    return {"nav": bench.write("brdc.nav", "".join(lines))}
+
+
+@broken(MISMATCH, "brdc.nav", "navigation file of that day")
+def navigation_of_another_day(bench: Bench) -> Options:
+    text = bench.nav.read_text()
+    return {"nav": bench.write("brdc.nav", shifted_days(text, 9))}
+
+
+@broken(INPUT, "front.obs", "given twice")
+def observations_given_twice_by_another_name(bench: Bench) -> Options:
+    (bench.folder / "same.obs").symlink_to(bench.front)
+    return {"front": [bench.front, bench.folder / "same.obs"]}
+
+
+@broken(INPUT, "brdc.nav")
+def precise_orbits_are_navigation(bench: Bench) -> Options:
+    return {"sp3": bench.nav}
+
+
+@broken(INPUT, "empty.sp3", "empty")
+def precise_orbits_empty(bench: Bench) -> Options:
+    return {"sp3": bench.write("empty.sp3", "")}

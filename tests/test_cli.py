@@ -1,0 +1,116 @@
+"""The command line itself: manuals, version, misuse, exit codes, one sentence an error."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from conftest import ROOT
+from railfix import __version__, errors
+from railfix.cli import app
+
+RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
+COMMANDS = [[], ["run"], ["demo"], ["map"], ["map", "check"], ["map", "from-positions"]]
+
+
+def text_of(result: Any) -> str:
+    """Output without the frames of the panels, spaces evened."""
+    return " ".join(re.sub(r"[│╭╮╰╯─]", " ", result.output).split())
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda c: " ".join(c) or "railfix")
+def test_every_command_has_a_manual(command: list[str]) -> None:
+    result = RUNNER.invoke(app, [*command, "--help"])
+    assert result.exit_code == 0
+    text = text_of(result)
+    assert len(text.split()) > 30
+    if command not in ([], ["map"]):
+        assert "Example" in text
+        assert "Exit codes" in text
+
+
+def test_the_manual_lists_the_exit_codes_of_the_errors() -> None:
+    text = text_of(RUNNER.invoke(app, ["--help"]))
+    rows = re.findall(r"^(\d)\s+(.*)$", errors.__doc__ or "", flags=re.MULTILINE)
+    assert [code for code, _ in rows] == [str(n) for n in range(9)]
+    for code, meaning in rows:
+        assert f"{code}: {meaning}" in text
+    documented = {int(code) for code, _ in rows}
+    assert {kind.exit_code for kind in errors.RailfixError.__subclasses__()} == documented - {0, 1, 2}
+
+
+def test_without_arguments_the_manual_is_shown() -> None:
+    result = RUNNER.invoke(app, [])
+    assert result.exit_code == 2
+    assert "Usage" in result.output
+
+
+def test_version() -> None:
+    result = RUNNER.invoke(app, ["--version"])
+    assert (result.exit_code, result.output) == (0, f"railfix {__version__}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["run"], "--front"),
+        (["run", "--front"], "--front"),
+        (["ran"], "ran"),
+        (["run", "--chunk", "0"], "--chunk"),
+        (["run", "--chunk", "many"], "--chunk"),
+        (["run", "--start", "yesterday"], "--start"),
+        (["run", "--reference", "roof"], "--reference"),
+        (["run", "--colour"], "--colour"),
+    ],
+    ids=lambda v: " ".join(v) if isinstance(v, list) else "",
+)
+def test_misuse_ends_with_code_2(arguments: list[str], word: str) -> None:
+    result = RUNNER.invoke(app, arguments)
+    assert result.exit_code == 2
+    assert word in result.output
+
+
+def test_the_module_runs_as_a_program() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "railfix", "--version"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == f"railfix {__version__}\n"
+
+
+def test_the_manual_does_not_load_what_only_runs_need() -> None:
+    code = "import sys, railfix.cli; print(sorted({'numpy', 'scipy', 'polars', 'matplotlib'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_defect_shows_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("a defect")
+
+    monkeypatch.setattr("railfix.cli.run.settings_of", broken)
+    arguments = ["run", "--front", "a", "--nav", "b", "--track", "c", "--out", "d"]
+    result = RUNNER.invoke(app, arguments)
+    assert result.exit_code == 1
+    assert isinstance(result.exception, RuntimeError)
+
+
+def test_an_error_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise errors.SettingsError("a sentence\nover lines")
+
+    monkeypatch.setattr("railfix.cli.run.settings_of", refused)
+    result = RUNNER.invoke(app, ["run", "--front", "a", "--nav", "b", "--track", "c", "--out", "d"])
+    assert result.exit_code == 4
+    assert result.stderr == "railfix: error: a sentence over lines\n"
+
+
+def test_the_manual_comes_at_once() -> None:
+    began = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "railfix", "--help"], capture_output=True, check=True)
+    assert time.perf_counter() - began < 3.0
