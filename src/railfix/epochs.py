@@ -7,14 +7,18 @@ not have. Absent is NaN; 0 is a value.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import chain, islice
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+#: Sentences about single faults that are kept; the rest is only counted.
+MAX_PROBLEMS: Final = 50
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
@@ -46,6 +50,8 @@ class ObservationHeader:
     leap_seconds : int or None
     signals : mapping of str to tuple of str
         Signals announced per constellation, RINEX 3 codes without the type letter ("1C", "2W").
+    receiver_clock_applied : bool
+        RCV CLOCK OFFS APPL: tags, codes and phases are already corrected for the receiver's clock.
     """
 
     version: float = float("nan")
@@ -58,6 +64,7 @@ class ObservationHeader:
     glonass_channel: Mapping[str, int] = field(default_factory=dict)
     leap_seconds: int | None = None
     signals: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    receiver_clock_applied: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +93,14 @@ class Observations:
         True where nothing may be differenced across the step into this epoch: power failure
         (epoch flag 1), a new site or moving antenna (2, 3), start of another file with a gap.
     header : ObservationHeader
+    problems : tuple of str
+        What was broken in the file and passed over, a sentence each (file, line, what); at most
+        `MAX_PROBLEMS`, then one more that says how many more there were. A slice of epochs has none.
+    problem_count : int
+        How many problems there were.
+    passed_over : mapping of str to int
+        What was read over, counted by what it is: broken epochs and satellite lines, duplicate
+        epochs, external events, satellites of constellations unknown or not asked for.
     """
 
     time: NDArray[np.datetime64]
@@ -98,6 +113,9 @@ class Observations:
     loss_of_lock: NDArray[np.uint8]
     break_before: NDArray[np.bool_]
     header: ObservationHeader = field(default_factory=ObservationHeader)
+    problems: tuple[str, ...] = ()
+    problem_count: int = 0
+    passed_over: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         epochs, channels = len(self.time), len(self.satellite)
@@ -149,10 +167,13 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Returns
     -------
     Observations
-        Channels sorted by satellite, then signal. The header is that of the first part.
+        Channels sorted by satellite, then signal. The header is that of the first part, with the
+        signals and GLONASS channels of the others added; problems are joined, counters added.
     """
     if not parts:
         raise ValueError("concatenate needs at least one part")
+    if len(parts) == 1:
+        return parts[0]
     keys = sorted({(str(s), str(g)) for p in parts for s, g in zip(p.satellite, p.signal, strict=True)})
     column = {key: i for i, key in enumerate(keys)}
     total = sum(len(p) for p in parts)
@@ -173,6 +194,41 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         signal=np.array([k[1] for k in keys], dtype="<U2"),
         loss_of_lock=lock,
         break_before=np.concatenate([p.break_before for p in parts]),
-        header=parts[0].header,
+        header=_joined_header(parts),
+        problems=_joined_problems(parts),
+        problem_count=sum(p.problem_count for p in parts),
+        passed_over=_joined_counts(parts),
         **floats,
     )
+
+
+def _joined_header(parts: Sequence[Observations]) -> ObservationHeader:
+    first = parts[0].header
+    signals = {system: set(names) for system, names in first.signals.items()}
+    channels = dict(first.glonass_channel)
+    for header in {id(p.header): p.header for p in parts}.values():
+        for system, names in header.signals.items():
+            signals.setdefault(system, set()).update(names)
+        channels = {**header.glonass_channel, **channels}
+    joined = {system: tuple(sorted(names)) for system, names in signals.items()}
+    return replace(first, signals=joined, glonass_channel=channels)
+
+
+def _joined_problems(parts: Sequence[Observations]) -> tuple[str, ...]:
+    return capped_problems(
+        chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=sum(p.problem_count for p in parts)
+    )
+
+
+def capped_problems(sentences: Iterable[str], *, count: int) -> tuple[str, ...]:
+    """The first `MAX_PROBLEMS` sentences, and one that says how many more of `count` there were."""
+    kept = tuple(islice(sentences, MAX_PROBLEMS))
+    return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept
+
+
+def _joined_counts(parts: Sequence[Observations]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for part in parts:
+        for what, number in part.passed_over.items():
+            counts[what] = counts.get(what, 0) + number
+    return counts
