@@ -9,7 +9,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from broken_bench import INPUT, MISMATCH, NOTHING, Bench, broken, epoch_starts
+from broken_bench import INPUT, MISMATCH, Bench, broken, epoch_starts
 
 Options = dict[str, Any]
 
@@ -204,14 +204,14 @@ def observations_given_for_both_antennas(bench: Bench) -> Options:
     return {"rear": bench.front}
 
 
-@broken(INPUT, "first.obs")
-def observations_in_the_wrong_order(bench: Bench) -> Options:
+@broken(INPUT, "second.obs", "line")
+def observations_that_overlap(bench: Bench) -> Options:
     text = bench.front.read_text()
     lines = text.splitlines(keepends=True)
     starts = epoch_starts(text)
-    header, middle = "".join(lines[: starts[0]]), starts[len(starts) // 2]
-    first = bench.write("first.obs", header + "".join(lines[starts[0] : middle]))
-    return {"front": [bench.write("second.obs", header + "".join(lines[middle:])), first]}
+    header, middle = "".join(lines[: starts[0]]), len(starts) // 2
+    first = bench.write("first.obs", header + "".join(lines[starts[0] : starts[middle + 3]]))
+    return {"front": [first, bench.write("second.obs", header + "".join(lines[starts[middle] :]))]}
 
 
 @broken(MISMATCH, "brdc.nav", "navigation file of that day")
@@ -228,7 +228,7 @@ def observations_of_antennas_at_different_hours(bench: Bench) -> Options:
     return {"rear": bench.write("rear.obs", text)}
 
 
-@broken(NOTHING, "--start")
+@broken(MISMATCH, "front.obs", "time span")
 def no_epoch_in_the_time_asked_for(_: Bench) -> Options:
     return {"start": "2031-01-01T00:00:00"}
 

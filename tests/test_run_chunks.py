@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from railfix.epochs import Observations
-from railfix.errors import InputFileError, OutputError
-from railfix.run.chunks import aligned, rising, within
+from railfix.errors import OutputError
+from railfix.run.chunks import aligned
 from railfix.run.output import OutputFolder
 
 START = np.datetime64("2026-05-12T03:00:00", "ns")
@@ -85,20 +85,6 @@ def test_an_antenna_that_starts_late_does_not_pile_up() -> None:
     for _ in range(50):
         next(chunks)
     assert sum(read) <= 20
-
-
-def test_time_limits_are_inclusive_and_reading_stops() -> None:
-    def endless() -> Iterator[Observations]:
-        yield from parts(log(list(range(0, 1000, 100))), 3)
-        raise AssertionError("read beyond the end")
-
-    kept = list(within(endless(), start=START + np.timedelta64(200, "ms"), end=START + np.timedelta64(500, "ms")))
-    assert [len(p) for p in kept] == [1, 3]
-
-
-def test_files_out_of_order_are_named() -> None:
-    with pytest.raises(InputFileError, match=r"b\.obs: the epoch .* does not come after"):
-        list(rising(iter([log([0, 100]), log([100, 200])]), "b.obs"))
 
 
 TABLE = pl.DataFrame(

@@ -109,11 +109,11 @@ def run(
     ] = "antenna",
     start: Annotated[
         datetime | None,
-        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="First epoch, GPS time."),
+        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="Epochs from this on, GPS time."),
     ] = None,
     end: Annotated[
         datetime | None,
-        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="Last epoch, GPS time."),
+        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="Epochs before this, GPS time."),
     ] = None,
     observations: Annotated[
         bool,

@@ -7,41 +7,6 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from railfix.epochs import Observations, concatenate
-from railfix.errors import InputFileError
-
-
-def within(
-    parts: Iterator[Observations], *, start: np.datetime64 | None = None, end: np.datetime64 | None = None
-) -> Iterator[Observations]:
-    """Parts of a log cut to ``start <= time <= end``; nothing is read after the end."""
-    for part in parts:
-        low = 0 if start is None else int(np.searchsorted(part.time, start, side="left"))
-        high = len(part) if end is None else int(np.searchsorted(part.time, end, side="right"))
-        if high > low:
-            yield part[low:high]
-        if high < len(part):
-            return
-
-
-def rising(parts: Iterator[Observations], path: str) -> Iterator[Observations]:
-    """The parts themselves, as long as time rises from each to the next.
-
-    Raises
-    ------
-    InputFileError
-        A part starts before the one before it ends: files given in the wrong order, or twice.
-    """
-    last: np.datetime64 | None = None
-    for part in parts:
-        if len(part):
-            if last is not None and part.time[0] <= last:
-                raise InputFileError(
-                    path,
-                    f"the epoch {part.time[0]} does not come after {last}, expected time to rise through the log; "
-                    "give the files of one log in order of time, each once",
-                )
-            last = part.time[-1]
-            yield part
 
 
 def _spacing_ns(part: Observations) -> int:

@@ -11,16 +11,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
 from railfix.config import Config
-from railfix.epochs import Observations
 from railfix.errors import SettingsError
 from railfix.navigation import Navigation
 from railfix.pipeline import EpochProcessor, State
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
-from railfix.run.chunks import aligned, rising, within
-from railfix.run.inputs import RunInputs, collected
+from railfix.run.chunks import aligned
+from railfix.run.inputs import Antenna, RunInputs, collected
 from railfix.run.output import OutputFolder
 from railfix.run.record import AlongSigma, along_sigma, run_record
 from railfix.run.sources import Line, Log, TrackReading, open_line, open_navigation
@@ -49,7 +46,7 @@ class RunOptions:
     chunk_epochs : int
         Epochs in memory at a time.
     start, end : datetime or None
-        First and last epoch, GPS time, inclusive.
+        First epoch, and the time before which the last one lies, GPS time.
     track : TrackReading
     """
 
@@ -62,8 +59,8 @@ class RunOptions:
     track: TrackReading = field(default_factory=TrackReading)
 
     def __post_init__(self) -> None:
-        if self.start is not None and self.end is not None and self.start > self.end:
-            raise SettingsError(f"--start {self.start} is after --end {self.end}; expected a time before it")
+        if self.start is not None and self.end is not None and self.start >= self.end:
+            raise SettingsError(f"--start {self.start} is not before --end {self.end}; give an earlier start")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +125,16 @@ def run_files(
         navigation = open_navigation(inputs.nav, inputs.sp3)
         line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
         processor = EpochProcessor(config, navigation, line.trajectories)
-        logs = _Logs(inputs, options)
+        logs = {
+            name: Log(
+                paths=paths,
+                chunk_epochs=options.chunk_epochs,
+                broken_lines=options.broken_lines,
+                start=options.start,
+                end=options.end,
+            )
+            for name, paths in inputs.logs.items()
+        }
         tally = _position(logs, processor, folder, options, progress)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
@@ -154,41 +160,16 @@ def run_files(
     return RunSummary(tally=tally, sigma=sigma, notes=notes, files=files, wall_s=wall)
 
 
-class _Logs:
-    """The logs of all antennas as aligned chunks, and how much of them was read."""
-
-    def __init__(self, inputs: RunInputs, options: RunOptions) -> None:
-        self._options = options
-        self._sources = {
-            name: Log(paths=paths, chunk_epochs=options.chunk_epochs, broken_lines=options.broken_lines)
-            for name, paths in inputs.logs.items()
-        }
-
-    def chunks(self) -> Iterator[dict[str, Observations]]:
-        limits = {
-            "start": None if self._options.start is None else np.datetime64(self._options.start, "ns"),
-            "end": None if self._options.end is None else np.datetime64(self._options.end, "ns"),
-        }
-        return aligned({name: within(rising(log.parts(), log.path), **limits) for name, log in self._sources.items()})
-
-    @property
-    def fraction(self) -> float | None:
-        """The part of the bytes of all logs that has been read."""
-        total = sum(log.size for log in self._sources.values())
-        return sum(log.done for log in self._sources.values()) / total if total else None
-
-    @property
-    def notes(self) -> Iterator[str]:
-        for log in self._sources.values():
-            yield from log.notes
-
-
 def _position(
-    logs: _Logs, processor: EpochProcessor, folder: OutputFolder, options: RunOptions, progress: Progress | None
+    logs: Mapping[Antenna, Log],
+    processor: EpochProcessor,
+    folder: OutputFolder,
+    options: RunOptions,
+    progress: Progress | None,
 ) -> Tally:
     """Chunk by chunk: positions, counts, rows."""
     tally, state = Tally(), State()
-    for chunk in logs.chunks():
+    for chunk in aligned({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
         tally.add(result)
         check_same_day(processor.navigation, tally)
@@ -199,13 +180,13 @@ def _position(
         if options.observations == "write":
             folder.append_parquet("observations.parquet", observations_table(result))
         if progress is not None:
-            progress(epochs=tally.epochs, fraction=logs.fraction)
+            progress(epochs=tally.epochs, fraction=None)
     return tally
 
 
-def _notes(line: Line, navigation: Navigation, tally: Tally, logs: _Logs) -> tuple[str, ...]:
+def _notes(line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log]) -> tuple[str, ...]:
     """Everything a reader of the results should know, each once."""
-    said = [*line.notes, *navigation.notes, *logs.notes, *tally.notes]
+    said = [*line.notes, *navigation.notes, *_reading_notes(logs), *tally.notes]
     for name, antenna in tally.antennas.items():
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
@@ -213,6 +194,14 @@ def _notes(line: Line, navigation: Navigation, tally: Tally, logs: _Logs) -> tup
         if antenna.positioned and antenna.positioned == antenna.status["off_map"]:
             said.append(f"{name}: every position is off the map; is this the right track?")
     return tuple(dict.fromkeys(said))
+
+
+def _reading_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
+    for name, log in logs.items():
+        yield from log.problems
+        if log.passed_over:
+            told = ", ".join(f"{count} {what}" for what, count in sorted(log.passed_over.items()))
+            yield f"{name}: read over: {told}"
 
 
 def _footer(record: Mapping[str, Any]) -> dict[str, str]:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from railfix.antenna import Trajectory
 from railfix.epochs import Observations
 from railfix.errors import SettingsError
 from railfix.navigation import Navigation
-from railfix.rinex import read_navigation
+from railfix.rinex import read_navigation, scan_observations
 from railfix.run.inputs import Antenna
 from railfix.sp3 import read_sp3
 from railfix.track_map import Track, read_track
@@ -123,28 +127,41 @@ class Log:
     Attributes
     ----------
     paths : tuple of Path
-    size, done : int [byte]
-        Of all files; read so far.
-    notes : list of str
-        What the reader had to say, once it is done.
+    chunk_epochs : int
+    broken_lines : {"stop", "count"}
+    start, end : datetime or None
+        First epoch, and the time before which the last one lies.
+    problems : list of str
+        Sentences on what was broken and passed over.
+    passed_over : Counter of str
+        What was read over, counted by what it is.
     """
 
     paths: tuple[Path, ...]
     chunk_epochs: int
-    broken_lines: Literal["stop", "count"]
-    done: int = 0
-    notes: list[str] = field(default_factory=list)
-
-    @property
-    def path(self) -> str:
-        """The files in one word."""
-        return ", ".join(str(path) for path in self.paths)
-
-    @property
-    def size(self) -> int:
-        """Bytes of all files."""
-        return sum(path.stat().st_size for path in self.paths)
+    broken_lines: Literal["stop", "count"] = "stop"
+    start: datetime | None = None
+    end: datetime | None = None
+    problems: list[str] = field(default_factory=list)
+    passed_over: Counter[str] = field(default_factory=Counter)
 
     def parts(self) -> Iterator[Observations]:
-        """Pieces of the log in order of time."""
-        raise NotImplementedError
+        """Pieces of the log in order of time.
+
+        Raises
+        ------
+        InputFileError, MismatchError
+            See `railfix.rinex.scan_observations`.
+        """
+        pieces = scan_observations(
+            self.paths,
+            epochs=self.chunk_epochs,
+            on_error="strict" if self.broken_lines == "stop" else "lenient",
+            start=None if self.start is None else np.datetime64(self.start, "ns"),
+            end=None if self.end is None else np.datetime64(self.end, "ns"),
+        )
+        for piece in pieces:
+            self.problems += piece.problems
+            self.passed_over.update(piece.passed_over)
+            if len(piece):
+                yield piece
