@@ -1,0 +1,54 @@
+"""Runs that never happened, with their truth: RINEX logs of two antennas on a made line under a made sky.
+
+`Scenario` holds every choice, `write_run` makes the files, `Simulation` gives the arrays piece by
+piece. The same scenario gives the same numbers. ``python -m railfix.simulate --help`` is the same
+from the command line.
+
+The orbits, the delays and the rigid body are computed here apart from the rooms that the estimators
+use, by the same published formulas, so that an error in either shows as a position that is off.
+"""
+
+from railfix.simulate.alignment import Alignment, made_alignment
+from railfix.simulate.body import AntennaTruth, antenna_truth
+from railfix.simulate.constellation import made_navigation
+from railfix.simulate.demo_data import DEMO_FILES, demo_files, demo_folder
+from railfix.simulate.disturbance import Disturbance, Disturbances, Geometry
+from railfix.simulate.motion import Motion, shuttle
+from railfix.simulate.run import truth_table, write_run
+from railfix.simulate.scenario import (
+    ANTENNAS,
+    LineSettings,
+    ReceiverSettings,
+    RunSettings,
+    Scenario,
+    SkySettings,
+    VehicleSettings,
+)
+from railfix.simulate.signals import Piece, Simulation
+
+__all__ = [
+    "ANTENNAS",
+    "DEMO_FILES",
+    "Alignment",
+    "AntennaTruth",
+    "Disturbance",
+    "Disturbances",
+    "Geometry",
+    "LineSettings",
+    "Motion",
+    "Piece",
+    "ReceiverSettings",
+    "RunSettings",
+    "Scenario",
+    "Simulation",
+    "SkySettings",
+    "VehicleSettings",
+    "antenna_truth",
+    "demo_files",
+    "demo_folder",
+    "made_alignment",
+    "made_navigation",
+    "shuttle",
+    "truth_table",
+    "write_run",
+]

@@ -1,0 +1,207 @@
+"""The continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
+
+The truth is this curve; the track map is its sampling. Chainage is the arc length in three
+dimensions. Curvature changes linearly in transitions (clothoids), and with it the cant (ramps); the
+gradient changes linearly in vertical curves. The curve is laid on the ellipsoid, so that a line of
+200 km stays at its height and its curves stay curves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from railfix.geodesy import ecef_from_geodetic, enu_axes
+from railfix.simulate.scenario import LineSettings
+from railfix.track_map import Track
+
+Floats = NDArray[np.float64]
+
+_SEMI_MAJOR_M: Final = 6_378_137.0
+_FLATTENING: Final = 1.0 / 298.257_223_563
+#: Spacing of the points that the curve is integrated to [m]; the spline between them is exact to 1e-6 m.
+_STEP_M: Final = 0.5
+#: Rounds of the integration on the ellipsoid: each gains the factor (length / Earth radius).
+_ROUNDS: Final = 8
+
+#: Pattern of the made test line: length [m], radius at its end [m] (right positive), cant at its end [m].
+#: Curvature and cant run linearly from the element before.
+PATTERN: Final = (
+    (90.0, np.inf, 0.0),
+    (40.0, -160.0, 0.090),
+    (120.0, -160.0, 0.090),
+    (40.0, np.inf, 0.0),
+    (60.0, np.inf, 0.0),
+    (35.0, 300.0, 0.060),
+    (110.0, 300.0, 0.060),
+    (35.0, np.inf, 0.0),
+    (226.0, np.inf, 0.0),
+)
+PATTERN_LENGTH_M: Final = sum(length for length, _, _ in PATTERN)
+#: Gradient at places of the pattern: place [m], gradient [permille]; linear between.
+GRADIENT: Final = (
+    (0.0, 0.0), (60.0, 0.0), (100.0, -4.0), (180.0, -4.0), (240.0, 10.0), (380.0, 10.0), (450.0, 2.5),
+    (560.0, 2.5), (620.0, -6.0), (700.0, -6.0), (756.0, 0.0),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alignment:
+    """A line of given elements.
+
+    Attributes
+    ----------
+    settings : LineSettings
+    knot_m : ndarray, shape (K,) [m]
+        Chainage of the elements' ends, beginning with 0.
+    curvature : ndarray, shape (K,) [1/m]
+        In plan, positive to the right, linear between knots.
+    lean_m : ndarray, shape (K,) [m]
+        Cant, positive where the vehicle leans to the right, linear between knots.
+    grade_knot_m, grade : ndarray, shape (G,)
+        Chainage [m] and gradient [m/m, climb over plan length], linear between.
+    """
+
+    settings: LineSettings
+    knot_m: Floats
+    curvature: Floats
+    lean_m: Floats
+    grade_knot_m: Floats
+    grade: Floats
+
+    @property
+    def length_m(self) -> float:
+        """Chainage of the end."""
+        return self.settings.length_m
+
+    def curvature_at(self, chainage_m: ArrayLike) -> Floats:
+        """Curvature in plan [1/m], positive to the right."""
+        return np.interp(np.asarray(chainage_m, dtype=np.float64), self.knot_m, self.curvature)
+
+    def lean_at(self, chainage_m: ArrayLike) -> Floats:
+        """Cant [m], positive where the vehicle leans to the right."""
+        return np.interp(np.asarray(chainage_m, dtype=np.float64), self.knot_m, self.lean_m)
+
+    def grade_at(self, chainage_m: ArrayLike) -> Floats:
+        """Gradient [m/m]."""
+        return np.interp(np.asarray(chainage_m, dtype=np.float64), self.grade_knot_m, self.grade)
+
+    def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
+        """The line's own marking [m]."""
+        return np.asarray(np.asarray(chainage_m, dtype=np.float64) + self.settings.kilometrage_start_m)
+
+    @cached_property
+    def _curve(self) -> CubicHermiteSpline[np.float64]:
+        place, tangent = _integrate(self)
+        chainage = np.linspace(0.0, self.length_m, len(place))
+        return CubicHermiteSpline(chainage, place, tangent, axis=0)
+
+    def at(self, chainage_m: ArrayLike) -> Floats:
+        """Points of the curve, shape (..., 3) ECEF [m]; beyond the ends its first and last pieces go on."""
+        return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
+
+    def tangent_at(self, chainage_m: ArrayLike) -> Floats:
+        """Unit vectors along the curve, shape (..., 3), of length 1 within 1e-6."""
+        return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
+
+    def sampled_chainage_m(self) -> Floats:
+        """Chainage of the map's points: the elements' ends, and evenly between at no more than the spacing."""
+        points = [np.zeros(1)]
+        for first, last, *bend in zip(
+            self.knot_m[:-1], self.knot_m[1:], self.curvature[:-1], self.curvature[1:], strict=True
+        ):
+            spacing = self.settings.curve_spacing_m if np.any(bend) else self.settings.straight_spacing_m
+            pieces = max(1, int(np.ceil((last - first) / spacing - 1e-9)))
+            points.append(np.linspace(first, last, pieces + 1)[1:])
+        return np.concatenate(points)
+
+    def track(self) -> Track:
+        """The track map: the curve at `sampled_chainage_m`, with its attributes."""
+        chainage = self.sampled_chainage_m()
+        curvature = self.curvature_at(chainage)
+        with np.errstate(divide="ignore"):
+            radius = np.where(curvature == 0.0, np.inf, 1.0 / curvature)
+        from_ecef = Track.from_ecef(self.at(chainage))
+        return Track.from_geodetic(
+            from_ecef.latitude_deg,
+            from_ecef.longitude_deg,
+            from_ecef.height_m,
+            name=self.settings.name,
+            kilometrage_m=self.kilometrage_at(chainage),
+            cant_m=np.abs(self.lean_at(chainage)),
+            radius_m=radius,
+            gradient_permille=1e3 * self.grade_at(chainage),
+        )
+
+
+def made_alignment(settings: LineSettings) -> Alignment:
+    """The pattern of the made test line, repeated and every second time mirrored, to the length asked for."""
+    repeats = int(np.ceil(settings.length_m / PATTERN_LENGTH_M - 1e-12))
+    lengths, radii, cants = (np.array(column) for column in zip(*PATTERN, strict=True))
+    side = np.repeat(np.where(np.arange(repeats) % 2 == 0, 1.0, -1.0), len(lengths))
+    knot = np.concatenate([[0.0], np.cumsum(np.tile(lengths, repeats))])
+    curvature = np.concatenate([[0.0], side / np.tile(radii, repeats)])
+    lean = np.concatenate([[0.0], side * np.tile(np.sign(radii) * cants, repeats)])
+    place, permille = (np.array(column) for column in zip(*GRADIENT, strict=True))
+    turn = np.where(np.arange(repeats) % 2 == 0, 1e-3, -1e-3)[:, None]
+    grade_knot = (place[:-1] + PATTERN_LENGTH_M * np.arange(repeats)[:, None]).ravel()
+    grade = (permille[:-1] * turn).ravel()
+    inside = knot < settings.length_m
+    end = np.array([settings.length_m])
+    return Alignment(
+        settings=settings,
+        knot_m=np.concatenate([knot[inside], end]),
+        curvature=np.concatenate([curvature[inside], np.interp(end, knot, curvature)]),
+        lean_m=np.concatenate([lean[inside], np.interp(end, knot, lean)]),
+        grade_knot_m=np.append(grade_knot, PATTERN_LENGTH_M * repeats),
+        grade=np.append(grade, 0.0),
+    )
+
+
+def _integrate(line: Alignment) -> tuple[Floats, Floats]:
+    """Points and unit tangents of the curve at even chainages, shapes (n, 3).
+
+    ``d azimuth = curvature * plan step + sin(latitude) d longitude`` (convergence of the meridians),
+    ``d latitude = cos(azimuth) / (M + h)``, ``d longitude = sin(azimuth) / ((N + h) cos(latitude))``,
+    ``d height = climb``; integrated in rounds, each by Gauss's rule of two points a step.
+    """
+    cells = int(np.ceil(line.length_m / _STEP_M))
+    step = line.length_m / cells
+    edges = np.linspace(0.0, line.length_m, cells + 1)
+    offset = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)]) * step
+    gauss = edges[:-1, None] + offset
+    settings = line.settings
+    lat0, lon0 = np.radians([settings.latitude_deg, settings.longitude_deg])
+
+    def total(rate: Floats) -> tuple[Floats, Floats]:
+        """Integral of a rate given at the Gauss points: at the edges, and back at the Gauss points."""
+        at_edges = np.concatenate([[0.0], np.cumsum(rate.mean(axis=1) * step)])
+        slope = (rate[:, 1] - rate[:, 0]) / (offset[1] - offset[0])
+        start = rate[:, 0] - slope * offset[0]
+        return at_edges, at_edges[:-1, None] + start[:, None] * offset + slope[:, None] * offset**2 / 2.0
+
+    climb = np.sin(np.arctan(line.grade_at(gauss)))
+    plan = np.cos(np.arctan(line.grade_at(gauss)))
+    height_e, height = (settings.height_m + part for part in total(climb))
+    turn_e, turn = total(line.curvature_at(gauss) * plan)
+    latitude, convergence = np.full(gauss.shape, lat0), np.zeros(gauss.shape)
+    e2 = _FLATTENING * (2.0 - _FLATTENING)
+    for _ in range(_ROUNDS):
+        azimuth = np.radians(settings.azimuth_deg) + turn + convergence
+        w = np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
+        north_rate = plan * np.cos(azimuth) / (_SEMI_MAJOR_M * (1.0 - e2) / w**3 + height)
+        east_rate = plan * np.sin(azimuth) / ((_SEMI_MAJOR_M / w + height) * np.cos(latitude))
+        convergence_e, convergence = total(east_rate * np.sin(latitude))
+        latitude_e, latitude = (lat0 + part for part in total(north_rate))
+        longitude_e = lon0 + total(east_rate)[0]
+    azimuth_e = np.radians(settings.azimuth_deg) + turn_e + convergence_e
+    lat_deg, lon_deg = np.degrees(latitude_e), np.degrees(longitude_e)
+    slope_e = np.arctan(line.grade_at(edges))
+    local = np.stack([np.cos(slope_e) * np.sin(azimuth_e), np.cos(slope_e) * np.cos(azimuth_e), np.sin(slope_e)], -1)
+    tangent = np.einsum("nij,ni->nj", enu_axes(lat_deg, lon_deg), local)
+    return ecef_from_geodetic(lat_deg, lon_deg, height_e), tangent

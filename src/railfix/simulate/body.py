@@ -1,0 +1,86 @@
+"""Where the antennas truly are: a rigid body with both bogie centres on the continuous line.
+
+Computed apart from `railfix.vehicle`, which works on the polyline of the map: here by Newton's method
+on the curve and by rotation about the body's axis (Rodrigues).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.simulate.alignment import Alignment
+from railfix.simulate.scenario import VehicleSettings
+
+Floats = NDArray[np.float64]
+
+#: Contact points of the wheels lie further apart than the gauge [m].
+_RAIL_HEAD_M = 0.070
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaTruth:
+    """One antenna at n places of the vehicle's middle.
+
+    Attributes
+    ----------
+    ecef_m : ndarray, shape (n, 3) [m]
+    chainage_m : ndarray, shape (n,) [m]
+        Centreline point in the plane through the antenna square to the body's long axis.
+    forward : ndarray, shape (n, 3)
+        Unit vector of the body's long axis.
+    """
+
+    ecef_m: Floats
+    chainage_m: Floats
+    forward: Floats
+
+
+def antenna_truth(
+    line: Alignment, vehicle: VehicleSettings, offset_m: tuple[float, float, float], middle_m: Floats
+) -> AntennaTruth:
+    """True place of an antenna.
+
+    Parameters
+    ----------
+    line : Alignment
+    vehicle : VehicleSettings
+    offset_m : tuple of float
+        Along, across to the right, above the rail tops [m].
+    middle_m : ndarray, shape (n,) [m]
+        Chainage midway between the bogies' chainages.
+
+    Returns
+    -------
+    AntennaTruth
+    """
+    middle = np.asarray(middle_m, dtype=np.float64)
+    half = np.full(middle.shape, vehicle.bogie_distance_m / 2.0)
+    for _ in range(5):
+        chord = line.at(middle + half) - line.at(middle - half)
+        length = np.linalg.norm(chord, axis=-1)
+        rate = np.einsum("ni,ni->n", chord, line.tangent_at(middle + half) + line.tangent_at(middle - half)) / length
+        half = half - (length - vehicle.bogie_distance_m) / rate
+    rear, front = line.at(middle - half), line.at(middle + half)
+    forward = front - rear
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    origin = 0.5 * (rear + front)
+    latitude, longitude, _ = geodetic_from_ecef(origin)
+    vertical = enu_axes(latitude, longitude)[:, 2]
+    upright = vertical - np.einsum("ni,ni->n", vertical, forward)[:, None] * forward
+    upright /= np.linalg.norm(upright, axis=-1, keepdims=True)
+    contact = vehicle.gauge_m + _RAIL_HEAD_M
+    lean = 0.5 * (np.arcsin(line.lean_at(middle - half) / contact) + np.arcsin(line.lean_at(middle + half) / contact))
+    along, across, up = offset_m
+    arm = across * np.cross(forward, upright) + up * upright
+    # A lean to the right turns the body about its forward axis.
+    turned = np.cos(lean)[:, None] * arm + np.sin(lean)[:, None] * np.cross(forward, arm)
+    place = origin + along * forward + turned
+    abeam = middle + along
+    for _ in range(5):
+        ahead = np.einsum("ni,ni->n", line.at(abeam) - place, forward)
+        abeam = abeam - ahead / np.einsum("ni,ni->n", line.tangent_at(abeam), forward)
+    return AntennaTruth(ecef_m=place, chainage_m=abeam, forward=forward)

@@ -1,0 +1,224 @@
+"""A made sky: broadcast records of satellites that do not exist.
+
+Orbits have the size, shape and tilt of the real constellations, the places in them are invented, and
+one QZSS satellite stands near the zenith of the line at the start of the run. Each satellite's
+records describe the same orbit and clock to within a millimetre, whichever a reader takes, but the
+newer ones of the satellites named in `SkySettings.unhealthy` say unhealthy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.constants import BDT_MINUS_GPST_S
+from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.simulate.satellites import EARTH, FRAME_ROTATION
+from railfix.simulate.scenario import Scenario
+from railfix.timescale import gpst_minus_utc, to_week
+
+Floats = NDArray[np.float64]
+
+#: Klobuchar coefficients, alpha then beta (invented, of ordinary size).
+KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
+_KLOBUCHAR_BEIDOU: Final = (1.024e-8, 3.725e-8, -4.768e-7, 8.344e-7, 1.065e5, 8.192e4, -1.311e5, 3.932e5)
+#: Seconds between the transmission of the record before and the next (IS-GPS-200: two hours).
+_ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
+#: Transmission begins a little after the hour.
+_SENT_AFTER_S: Final = 18
+_MESSAGE: Final = {"G": "LNAV", "J": "LNAV", "E": "INAV", "C": "D1"}
+#: Galileo data source: I/NAV of E1-B, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
+_INAV_SOURCE: Final = 517
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Orbit:
+    """One satellite at the start of the run: angles in radians, node in the Earth-fixed frame of that instant."""
+
+    name: str
+    semi_major_m: float
+    eccentricity: float
+    tilt: float
+    perigee: float
+    node: float
+    mean_anomaly: float
+
+
+def made_navigation(scenario: Scenario) -> Navigation:
+    """Broadcast records for the whole of a run, as `railfix.rinex.write.write_navigation` writes them.
+
+    All values are already rounded to the digits of the file, so that the file and the arrays are the
+    same satellites.
+    """
+    rng = np.random.default_rng([scenario.seed, 1])
+    rows: list[dict[str, Any]] = []
+    for system in scenario.sky.systems:
+        for orbit in _orbits(system, scenario, rng):
+            rows += _issues(system, orbit, scenario, rng)
+    names = list(KeplerRecords.__dataclass_fields__)
+    table = {name: np.array([row[name] for row in rows]) for name in names}
+    table["satellite"] = table["satellite"].astype("<U3")
+    klobuchar = {"G": np.array(KLOBUCHAR)}
+    if "C" in scenario.sky.systems:
+        klobuchar["C"] = np.array(_KLOBUCHAR_BEIDOU)
+    return Navigation(
+        kepler=KeplerRecords(**table),
+        glonass=_no_glonass(),
+        klobuchar=klobuchar,
+        leap_seconds=int(gpst_minus_utc(scenario.start)),
+        sources=("simulated",),
+    )
+
+
+def _no_glonass() -> GlonassRecords:
+    none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
+    vectors = np.empty((0, 3))
+    whole = np.empty(0, dtype=np.int64)
+    return GlonassRecords(
+        satellite=np.empty(0, dtype="<U3"), toe=times, transmitted=times, clock_bias_s=none, relative_frequency=none,
+        position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=whole,
+        frequency_channel=whole, age_days=none,
+    )  # fmt: skip
+
+
+def _orbits(system: str, scenario: Scenario, rng: np.random.Generator) -> list[_Orbit]:
+    walker = {"G": (6, 5, 26_559_800.0, 55.0, 0.012), "E": (3, 8, 29_600_300.0, 56.0, 0.0004),
+              "C": (3, 8, 27_906_100.0, 55.0, 0.001)}  # fmt: skip
+    orbits = []
+    if system in walker:
+        planes, slots, size, tilt, shape = walker[system]
+        first = rng.uniform(0.0, 2.0 * np.pi, 2)
+        for k in range(planes * slots):
+            plane, slot = divmod(k, slots)
+            phase = 2.0 * np.pi * (slot / slots + plane / (planes * slots)) + rng.normal(0.0, 0.06)
+            perigee = rng.uniform(-np.pi, np.pi)
+            orbits.append(
+                _Orbit(
+                    name=_slot_name(system, k),
+                    semi_major_m=size + rng.normal(0.0, 500.0),
+                    eccentricity=shape * rng.uniform(0.05, 1.0),
+                    tilt=np.radians(tilt + rng.normal(0.0, 0.4)),
+                    perigee=perigee,
+                    node=first[0] + 2.0 * np.pi * plane / planes + rng.normal(0.0, 0.02),
+                    mean_anomaly=first[1] + phase - perigee,
+                )
+            )
+    if system == "J":
+        orbits = [
+            _figure_of_eight(name, scenario.line.longitude_deg, phase)
+            for name, phase in (("J01", 0.15), ("J02", 2.3), ("J04", -1.9))
+        ]
+        orbits.append(_synchronous("J03", 0.0003, 0.05, np.radians(127.0), 0.0))
+    if system == "C":
+        orbits += [
+            _figure_of_eight(f"C{38 + k}", 110.0 + 4.0 * k, phase, eccentricity=0.004, tilt_deg=55.0)
+            for k, phase in enumerate((0.6, 2.7, -1.6))
+        ]
+    return orbits
+
+
+def _slot_name(system: str, k: int) -> str:
+    """BeiDou's satellites stand where the real ones of their kind do: C01 to C05 are read as GEO."""
+    if system == "C":
+        return f"C{k + 19 if k < 19 else k + 22:02d}"
+    return f"{system}{k + 1:02d}"
+
+
+def _figure_of_eight(
+    name: str, longitude_deg: float, phase: float, *, eccentricity: float = 0.075, tilt_deg: float = 41.0
+) -> _Orbit:
+    """Inclined synchronous orbit, northmost and farthest at a longitude, `phase` radians ago."""
+    node = np.radians(longitude_deg) - np.pi / 2.0 - phase
+    return _Orbit(
+        name=name,
+        semi_major_m=_synchronous_radius(),
+        eccentricity=eccentricity,
+        tilt=np.radians(tilt_deg),
+        perigee=-np.pi / 2.0,
+        node=node,
+        mean_anomaly=np.pi + phase,
+    )
+
+
+def _synchronous(name: str, eccentricity: float, tilt_deg: float, longitude: float, perigee: float) -> _Orbit:
+    return _Orbit(
+        name=name,
+        semi_major_m=_synchronous_radius(),
+        eccentricity=eccentricity,
+        tilt=np.radians(tilt_deg),
+        perigee=perigee,
+        node=0.0,
+        mean_anomaly=longitude - perigee,
+    )
+
+
+def _synchronous_radius() -> float:
+    return float((EARTH["J"][0] / FRAME_ROTATION**2) ** (1.0 / 3.0))
+
+
+def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Records of one satellite: the one before the run, the one in force, and those that follow."""
+    every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
+    mu, rotation = EARTH[system]
+    start_sow = float(to_week(scenario.start)[1])
+    first = float(np.floor((start_sow - _SENT_AFTER_S) / every) - 1.0) * every
+    count = int((start_sow + scenario.duration_s - _SENT_AFTER_S) // every - first // every) + 1
+    motion = float(_digits(rng.normal(4.5e-9, 3e-10)))
+    drift = float(_digits(-rng.uniform(7.5e-9, 8.3e-9)))
+    tilting = float(_digits(rng.normal(0.0, 3e-10)))
+    bias, rate = rng.uniform(-3e-4, 3e-4), rng.normal(0.0, 3e-12)
+    wobble = dict(zip(("cuc", "cus", "cic", "cis"), rng.normal(0.0, 3e-6, 4) * (1, 1, 0.03, 0.03), strict=True))
+    wobble |= {"crc": rng.normal(200.0, 60.0), "crs": rng.normal(0.0, 60.0)}
+    delay = rng.normal(-5e-9, 6e-9, 2)
+    issue = int(rng.integers(1, 25))
+    sqrt_a = float(_digits(np.sqrt(orbit.semi_major_m)))
+    speed = np.sqrt(mu) / sqrt_a**3 + motion
+    rows = []
+    for k in range(count):
+        sent_sow = first + k * every + _SENT_AFTER_S
+        dt = first + (k + 1) * every - start_sow - shift
+        toe = scenario.start + _whole_seconds(dt)
+        _, toe_sow = to_week(toe + _whole_seconds(shift))
+        # Longitude of the node at toe, and back to the start of the week as the records count it.
+        node = orbit.node + (drift - rotation) * dt + rotation * float(toe_sow)
+        ill = orbit.name in scenario.sky.unhealthy and sent_sow + every > start_sow
+        row: dict[str, Any] = {
+            "af0_s": bias + rate * dt, "af1": rate, "af2": 0.0, "sqrt_a": sqrt_a, "eccentricity": orbit.eccentricity,
+            "m0": _wrapped(orbit.mean_anomaly + speed * dt), "delta_n": motion, "omega0": _wrapped(node),
+            "i0": orbit.tilt + tilting * dt, "omega": _wrapped(orbit.perigee), "omega_dot": drift, "i_dot": tilting,
+            **wobble, "toe_sow_s": float(toe_sow), "accuracy_m": 3.12 if system == "E" else 2.0,
+            "group_delay_1_s": delay[0], "group_delay_2_s": delay[1] if system in "EC" else np.nan,
+            "fit_interval_h": {"G": 4.0, "J": 2.0}.get(system, np.nan),
+        }  # fmt: skip
+        row = {name: float(_digits(value)) for name, value in row.items()}
+        rows.append(
+            row
+            | {
+                "satellite": orbit.name, "message": _MESSAGE[system], "toc": toe, "toe": toe,
+                "transmitted": scenario.start + _whole_seconds(sent_sow - start_sow),
+                "health": _ill_health(system) if ill else 0,
+                "iode": issue + k, "iodc": issue + k, "data_source": _INAV_SOURCE if system == "E" else 0,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _ill_health(system: str) -> int:
+    """As broadcast: all navigation data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou)."""
+    return {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}[system]
+
+
+def _whole_seconds(value: float) -> np.timedelta64:
+    return np.timedelta64(round(value * 1e9), "ns")
+
+
+def _wrapped(angle: float) -> float:
+    return float((angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def _digits(value: float) -> str:
+    """A value in the digits of RINEX's D19.12."""
+    return f"{value:.12E}"
