@@ -22,9 +22,8 @@ from railfix.timescale import gpst_minus_utc, to_week
 
 Floats = NDArray[np.float64]
 
-#: Klobuchar coefficients, alpha then beta (invented, of ordinary size).
+#: Klobuchar coefficients of GPS, alpha then beta (invented, of ordinary size); they serve all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
-_KLOBUCHAR_BEIDOU: Final = (1.024e-8, 3.725e-8, -4.768e-7, 8.344e-7, 1.065e5, 8.192e4, -1.311e5, 3.932e5)
 #: Seconds between the transmission of the record before and the next (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
 #: Transmission begins a little after the hour.
@@ -61,13 +60,10 @@ def made_navigation(scenario: Scenario) -> Navigation:
     names = list(KeplerRecords.__dataclass_fields__)
     table = {name: np.array([row[name] for row in rows]) for name in names}
     table["satellite"] = table["satellite"].astype("<U3")
-    klobuchar = {"G": np.array(KLOBUCHAR)}
-    if "C" in scenario.sky.systems:
-        klobuchar["C"] = np.array(_KLOBUCHAR_BEIDOU)
     return Navigation(
         kepler=KeplerRecords(**table),
         glonass=_no_glonass(),
-        klobuchar=klobuchar,
+        klobuchar={"G": np.array(KLOBUCHAR)},
         leap_seconds=int(gpst_minus_utc(scenario.start)),
         sources=("simulated",),
     )

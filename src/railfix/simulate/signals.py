@@ -311,20 +311,16 @@ def _ionosphere(simulation: Simulation, geometry: Geometry, frequency_hz: Floats
     scale = simulation.scenario.sky.ionosphere_scale
     latitude, longitude, _ = geodetic_from_ecef(geometry.antenna_ecef_m)
     since_midnight = seconds(geometry.time - geometry.time.astype("datetime64[D]"))
-    beidou = geometry.satellite.astype("<U1") == "C"
-    delay = np.empty(geometry.elevation_deg.shape)
-    for letter, mask in (("G", ~beidou), ("C", beidou)):
-        if mask.any():
-            delay[:, mask] = ionosphere_m(
-                simulation.navigation.klobuchar[letter],
-                since_midnight[:, None],
-                latitude[:, None],
-                longitude[:, None],
-                np.maximum(geometry.elevation_deg[:, mask], 1.0),
-                geometry.azimuth_deg[:, mask],
-                frequency_hz=1.0,
-            )
-    return scale * delay / frequency_hz**2
+    delay = ionosphere_m(
+        simulation.navigation.klobuchar["G"],
+        since_midnight[:, None],
+        latitude[:, None],
+        longitude[:, None],
+        np.maximum(geometry.elevation_deg, 1.0),
+        geometry.azimuth_deg,
+        frequency_hz=frequency_hz,
+    )
+    return scale * delay
 
 
 def _tracked(elevation_deg: Floats, scenario: Scenario) -> NDArray[np.bool_]:
