@@ -181,9 +181,9 @@ class PreciseEphemeris:
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Navigation:
-    """All that navigation files say.
+    """All that navigation files say. Compared and hashed by identity, so that what is prepared from it can be kept.
 
     Attributes
     ----------

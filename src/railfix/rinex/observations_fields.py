@@ -28,7 +28,7 @@ FIELD_WIDTH: Final = 16
 #: Blank characters that must follow the last character of a block, so that loads may run over it.
 PADDING: Final = 2048
 #: Fields worked on at a time: the intermediate arrays stay in the processor's cache.
-_CHUNK: Final = 8192
+_CHUNK: Final = 16384
 
 _U = np.uint64
 _BLANKS: Final = _U(0x2020202020202020)
