@@ -105,7 +105,7 @@ class NamedColumns:
             row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
             what = f"'{cells[row]}' is not a number" if cells[row] else "the cell is empty"
             raise self.error(row, f"column {name}: {what}; a number was expected") from None
-        given = np.array([bool(cell) for cell in self.cells[name]])
+        given = np.array([bool(cell) for cell in self.cells[name]], dtype=np.bool_)
         bad = given & np.isinf(values) if blank is None or not np.isinf(blank) else np.zeros_like(given)
         bad |= np.isnan(values) & (blank is None)
         if bad.any():

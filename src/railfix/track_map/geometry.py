@@ -57,6 +57,7 @@ def geometry_of(track: Track) -> Geometry:
         kept = np.array([0, len(track) - 1])
     plan, climb = _plan_steps(track, kept)
     length = np.hypot(plan[:, 0], plan[:, 1])
+    length = np.where(length > 0.0, length, np.nan)  # a point straight above another
     turn, reach = _turns(plan)
     height = track.height_m[kept]
     share = length[:-1] / (length[:-1] + length[1:])
