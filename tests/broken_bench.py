@@ -121,14 +121,14 @@ def epoch_starts(text: str) -> list[int]:
 def bench_in(folder: Path) -> Bench:
     """The shipped run, cut short and unpacked."""
     from railfix.rinex.files import read_bytes
-    from railfix.simulate import demo_files
+    from railfix.simulate.demo_data import demo_files
 
     demo = demo_files()
-    for name, path in (("front.obs", demo.front), ("rear.obs", demo.rear), ("brdc.nav", demo.nav)):
-        text = read_bytes(path).decode("ascii")
+    for name, what in (("front.obs", "front"), ("rear.obs", "rear"), ("brdc.nav", "nav")):
+        text = read_bytes(demo[what]).decode("ascii")
         (folder / name).write_text(text if name.endswith(".nav") else shortened(text, EPOCHS))
-    shutil.copy(demo.track, folder / "line.csv")
-    shutil.copy(demo.vehicle, folder / "train.toml")
+    shutil.copy(demo["track"], folder / "line.csv")
+    shutil.copy(demo["vehicle"], folder / "train.toml")
     return Bench(folder=folder)
 
 

@@ -12,13 +12,13 @@ SOURCE: Final = ROOT / "src" / "railfix"
 
 #: The rooms (a module or a folder of the package), floor by floor. docs/concepts.md draws the same.
 FLOORS: Final[dict[int, tuple[str, ...]]] = {
-    0: ("constants", "errors", "timescale", "geodesy", "polyline"),
+    0: ("constants", "errors", "timescale", "geodesy", "polyline", "signals"),
     1: ("epochs", "navigation", "reasons", "named_columns"),
     2: ("rinex", "sp3", "position_log", "orbits", "atmosphere"),
     3: ("track_map", "antenna", "vehicle"),
     4: ("clock_elimination", "measurement", "section", "constrained", "spp", "screens"),
     5: ("config", "pipeline"),
-    6: ("simulate", "evaluate", "tables", "plots", "report", "run", "cli"),
+    6: ("simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),
 }
 FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 

@@ -53,6 +53,7 @@ def show_summary(summary: RunSummary) -> None:
     console = Console(highlight=False)
     names = list(summary.tally.antennas)
     console.print(_positions(summary, names))
+    console.print("Pseudoranges, by the first reason that refused them")
     console.print(_reasons(summary, names))
     for note in summary.notes:
         console.print(f"note: {note}", markup=False)
@@ -64,7 +65,7 @@ def show_summary(summary: RunSummary) -> None:
 
 def _positions(summary: RunSummary, names: list[str]) -> Table:
     tally, sigma = summary.tally.antennas, summary.sigma
-    table = Table(title="Positions", title_justify="left")
+    table = Table()
     table.add_column("")
     for name in names:
         table.add_column(name, justify="right")
@@ -83,7 +84,7 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
 
 def _reasons(summary: RunSummary, names: list[str]) -> Table:
     tally = summary.tally.antennas
-    table = Table(title="Pseudoranges, by the first reason that refused them", title_justify="left")
+    table = Table()
     table.add_column("")
     for name in names:
         table.add_column(name, justify="right")

@@ -87,7 +87,7 @@ class RunSummary:
 
 def run_files(
     inputs: RunInputs,
-    config: Config,
+    config: Config | None = None,
     *,
     out: Path,
     options: RunOptions | None = None,
@@ -99,8 +99,8 @@ def run_files(
     Parameters
     ----------
     inputs : RunInputs
-    config : Config
-        Settings used.
+    config : Config, optional
+        Settings used; the defaults unless given.
     out : Path
         Folder for the results.
     options : RunOptions, optional
@@ -118,7 +118,7 @@ def run_files(
         See `railfix.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
-    options = options or RunOptions()
+    config, options = config or Config(), options or RunOptions()
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
