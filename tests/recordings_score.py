@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import recordings_truth
 
+import recordings_truth
 from railfix.antenna import Trajectory
 from railfix.clock_elimination import Ranges, clock_groups
 from railfix.config import Config, parse_config
@@ -203,9 +203,8 @@ def main() -> int:
     if not data.is_dir():
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
-    print(
-        "recording                  epochs  rate %   p50 m   p95 m   max m  wrong %  | conventional: rate %  p50 m  p95 m"
-    )
+    head = "recording                  epochs  rate %   p50 m   p95 m   max m  wrong %"
+    print(f"{head}  | conventional: rate %  p50 m  p95 m")
     outcomes = [run(data) for run in RECORDINGS.values()]
     outcomes += [geonet(data, station, azimuth) for station in ("0759", "3040") for azimuth in (0, 45, 90, 135)]
     for o in outcomes:

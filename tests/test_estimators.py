@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import synthetic
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
+import synthetic
 from railfix.antenna import Trajectory
 from railfix.clock_elimination import Ranges, clock_groups, fit, inverse_3x3, normal_equations
 from railfix.constrained import constrained_position

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import synthetic
 
+import synthetic
 from railfix.antenna import Trajectory
 from railfix.evaluate import along_track_error, interpolate_reference, score
 from railfix.timescale import timedelta

@@ -172,8 +172,6 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     """
     if not parts:
         raise ValueError("concatenate needs at least one part")
-    if len(parts) == 1:
-        return parts[0]
     keys = sorted({(str(s), str(g)) for p in parts for s, g in zip(p.satellite, p.signal, strict=True)})
     column = {key: i for i, key in enumerate(keys)}
     total = sum(len(p) for p in parts)

@@ -41,22 +41,22 @@ class Lookup:
     ----------
     record : ndarray of int, shape (n,)
         Rows of the record table, satellite by satellite, each in order of availability.
-    first, count : mapping of str to int
-        Where a satellite's records begin, and how many there are.
+    first : mapping of str to int
+        Where a satellite's records begin.
     key : ndarray of int64, shape (n,)
-        Satellite and time of availability as one rising number.
+        Satellite and time of availability since `origin` [ms] as one rising number.
     origin : datetime64[ns]
     """
 
     record: Indices
     first: Mapping[str, int]
-    count: Mapping[str, int]
     key: Indices
     origin: np.datetime64
 
 
-#: Longest time that a lookup tells apart, 2^52 ns (52 days).
-_SPAN: Final = np.int64(2**52)
+#: Longest time that a lookup tells apart [ms]: 34 years, so that records of another year do no harm.
+_SPAN: Final = np.int64(2**40)
+_MILLISECOND: Final = np.timedelta64(1, "ms")
 
 
 def make_lookup(records: KeplerRecords | GlonassRecords, rows: Indices, validity_s: Floats) -> Lookup:
@@ -76,19 +76,20 @@ def make_lookup(records: KeplerRecords | GlonassRecords, rows: Indices, validity
     order = np.lexsort((toe, satellite))
     available = np.where(known, transmitted, np.datetime64("NaT", "ns"))[order]
     satellite, toe, rows = satellite[order], toe[order], rows[order]
+    if not len(rows):
+        return Lookup(record=rows, first={}, key=rows, origin=np.datetime64(0, "ns"))
     same = np.r_[False, satellite[1:] == satellite[:-1]]
     middle = toe.copy()
     middle[1:] = toe[:-1] + (toe[1:] - toe[:-1]) // 2
     # A record whose transmission is unknown serves from half-way since the one before it.
     middle[~same] = toe[~same] - timedelta(np.full(int((~same).sum()), 86_400.0))
     available = np.where(np.isnat(available), middle, available)
-    origin = available.min() - np.timedelta64(1, "D") if len(available) else np.datetime64(0, "ns")
+    origin = available.min() - np.timedelta64(1, "D")
     names, number = np.unique(satellite, return_inverse=True)
-    key = number.astype(np.int64) * _SPAN + (available - origin).astype(np.int64)
+    key = number.astype(np.int64) * _SPAN + (available - origin) // _MILLISECOND
     resort = np.argsort(key, kind="stable")
     first = {str(n): int(np.searchsorted(number, i)) for i, n in enumerate(names)}
-    count = {str(n): int((number == i).sum()) for i, n in enumerate(names)}
-    return Lookup(record=rows[resort], first=first, count=count, key=key[resort], origin=np.datetime64(origin, "ns"))
+    return Lookup(record=rows[resort], first=first, key=key[resort], origin=np.datetime64(origin, "ns"))
 
 
 def find_records(
@@ -115,7 +116,7 @@ def find_records(
         return none, np.zeros(none.shape, dtype=bool)
     start = np.maximum(first, 0)
     number = lookup.key[start] // _SPAN
-    since = np.clip((time - lookup.origin).astype(np.int64), 0, _SPAN - 1)
+    since = np.clip((time - lookup.origin) // _MILLISECOND, 0, _SPAN - 1)
     found = np.searchsorted(lookup.key, number * _SPAN + since[:, None], side="right") - 1
     future = (found < start) & (first >= 0)
     row = lookup.record[np.maximum(found, start)]

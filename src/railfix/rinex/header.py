@@ -264,13 +264,21 @@ class _Records:
             if factor not in ("1", "10", "100", "1000"):
                 raise self._fail(f"SYS / SCALE FACTOR: '{factor}' is none of 1, 10, 100, 1000")
             count = text[8:10].strip()
-            self._scaling = (text[0], float(factor), int(count) if count.isdigit() else 0)
-            if self._scaling[2] == 0:
+            if count.strip("0"):
+                self._scaling = (text[0], float(factor), self._count(count, "SYS / SCALE FACTOR"))
+            else:
                 names = list(self._types.get(text[0], ()))
+                self._scaling = (text[0], float(factor), len(names))
         if self._scaling is None:
             raise self._fail("SYS / SCALE FACTOR: the constellation letter is missing")
+        system, scale, left = self._scaling
+        if len(names) != min(left, 12) and text[8:10].strip("0 "):
+            raise self._fail(
+                f"SYS / SCALE FACTOR: {min(left, 12)} observation types were expected, {len(names)} are listed"
+            )
         for name in names:
-            self._scale[self._scaling[0], name] = self._scaling[1]
+            self._scale[system, name] = scale
+        self._scaling = (system, scale, left - len(names))
 
     def time_of_first(self, text: str) -> None:
         """TIME OF FIRST OBS: its time system; the time itself is that of the first epoch."""

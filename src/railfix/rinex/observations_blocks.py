@@ -98,7 +98,7 @@ class BlockReader:
                 lines = split_lines(text[:end], first_number=number, keep_blank=header.version < 3.0)
                 used = 0
                 while used < len(lines):
-                    part = lines.since(used)
+                    part = lines[used:]
                     piece, header, taken = self._part(part, header, at_end=at_end)
                     yield piece
                     used += taken
@@ -120,25 +120,26 @@ class BlockReader:
 
     def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[Observations, RinexHeader, int]:
         """Epochs up to the end of the lines, or to where the observation types change."""
-        table, taken = find_epochs(
-            lines,
-            version=header.version,
-            lines_per_satellite=lines_per_satellite(header),
-            at_end=at_end,
-            log=self._log,
-        )
+        trial = self._log.fresh()
+        table, taken = self._find(lines, header, at_end=at_end, log=trial)
+        cut = _layout_change(lines, table)
+        if cut is None:
+            self._log.absorb(trial)
+        else:  # what follows was taken for what it is not
+            taken = cut
+            table, _ = self._find(lines[:cut], header, at_end=True, log=self._log)
         after = header
         for k in np.flatnonzero((table.flag >= 2) & (table.flag <= 5)).tolist():
             if table.flag[k] == 5:
                 self._log.count(EXTERNAL_EVENTS, 1)
-                continue
-            first, count = int(table.line[k]) + 1, int(table.count[k])
-            after = self._event(lines, first, count, after)
-            if any(lines.text(i)[60:80].strip() in LAYOUT_LABELS for i in range(first, first + count)):
-                table, taken = table[: k + 1], first + count
-                break
+            else:
+                after = self._event(lines, int(table.line[k]) + 1, int(table.count[k]), after)
         piece = self._observations(lines, table, header)
         return piece, after, taken
+
+    def _find(self, lines: Lines, header: RinexHeader, *, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
+        each = lines_per_satellite(header)
+        return find_epochs(lines, version=header.version, lines_per_satellite=each, at_end=at_end, log=log)
 
     def _event(self, lines: Lines, first: int, count: int, header: RinexHeader) -> RinexHeader:
         records = [lines.text(i) for i in range(first, first + count)]
@@ -209,6 +210,15 @@ class BlockReader:
         self.last_ns = int(highest[-1])
         self.epochs += int((~wrong).sum())
         return ~wrong
+
+
+def _layout_change(lines: Lines, table: Epochs) -> int | None:
+    """Where the lines end whose layout the header at hand tells; None where that is all of them."""
+    for k in np.flatnonzero((table.flag >= 2) & (table.flag <= 4)).tolist():
+        first, end = int(table.line[k]) + 1, int(table.line[k]) + 1 + int(table.count[k])
+        if any(lines.text(i)[60:80].strip() in LAYOUT_LABELS for i in range(first, end)):
+            return end
+    return None
 
 
 def _gps_time_ns(time_ns: Integers, time_system: str) -> Integers:

@@ -57,9 +57,9 @@ class Lines:
             text[short] = np.where(beyond, _BLANK, text[short])
         return text
 
-    def since(self, line: int) -> Lines:
-        """The lines from one on."""
-        return Lines(self.data, self.start[line:], self.length[line:], self.stop[line:], self.number[line:])
+    def __getitem__(self, some: slice) -> Lines:
+        """Some of the lines, of the same text."""
+        return Lines(self.data, self.start[some], self.length[some], self.stop[some], self.number[some])
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:

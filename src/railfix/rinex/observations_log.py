@@ -72,6 +72,19 @@ class FaultLog:
         if len(self._sentences) < MAX_PROBLEMS:
             self._sentences.append(sentence)
 
+    def fresh(self) -> FaultLog:
+        """An empty log of the same file, for a trial that may be thrown away."""
+        return FaultLog(self.path, on_error="strict" if self.strict else "lenient")
+
+    def absorb(self, other: FaultLog) -> None:
+        """Add what another log of the same file has."""
+        for what, number in other.counts.items():
+            self.count(what, number)
+        self._problems += other._problems
+        self._sentences += other._sentences[: MAX_PROBLEMS - len(self._sentences)]
+        if other._first is not None and (self._first is None or other._first < self._first):
+            self._first = other._first
+
     def settle(self) -> None:
         """Raise the fault that stands first in the file, when reading is strict."""
         if self.strict and self._first is not None:

@@ -140,13 +140,12 @@ def thin(
     stands = _with_shuffles(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
     chosen = _at_spacing(ecef_m[moving], limits.spacing_m)
+    back = chosen[_turning_back(ecef_m[moving[chosen]])]
     if not np.isnat(time[moving]).any():
         chosen = _with_bends(ecef_m[moving], chosen, limits.chord_m)
     kept = moving[chosen]
-    steps = np.diff(ecef_m[kept], axis=0)
-    length = np.linalg.norm(steps, axis=1)
+    length = np.linalg.norm(np.diff(ecef_m[kept], axis=0), axis=1)
     jumps = np.flatnonzero(length > limits.jump_m)
-    cosine = np.einsum("vi,vi->v", steps[1:], steps[:-1]) / (length[1:] * length[:-1])
     return Thinned(
         kept=kept,
         dropped={
@@ -157,8 +156,16 @@ def thin(
         },
         jumps=jumps,
         jump_m=length[jumps],
-        turns=np.flatnonzero(cosine < -0.5) + 1,
+        turns=np.searchsorted(chosen, back),
     )
+
+
+def _turning_back(points: Floats) -> Indices:
+    """Points at which the path turns by more than 120 degrees."""
+    steps = np.diff(points, axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    cosine = np.einsum("vi,vi->v", steps[1:], steps[:-1]) / (length[1:] * length[:-1])
+    return np.flatnonzero(cosine < -0.5) + 1
 
 
 def _with_shuffles(points: Floats, stands: NDArray[np.bool_], spacing_m: float) -> NDArray[np.bool_]:
@@ -186,7 +193,7 @@ def _at_spacing(points: Floats, spacing_m: float) -> Indices:
     start = 1
     while start < len(points):
         offset = np.linalg.norm(points[start : start + block] - points[kept[-1]], axis=1)
-        far = offset >= spacing_m
+        far = offset >= spacing_m - 1e-6
         if far.any():
             kept.append(start + int(np.argmax(far)))
             start = kept[-1] + 1
