@@ -18,8 +18,6 @@ from railfix.rinex.observations_signals import SYSTEMS, Column, columns_of
 #: Time systems of TIME OF FIRST OBS, and what a file of one constellation means without one.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-#: Labels that change how the lines after them are read.
-LAYOUT_LABELS: Final = ("SYS / # / OBS TYPES", "# / TYPES OF OBSERV", "SYS / SCALE FACTOR")
 #: Key of the types of a RINEX 2 file, which are those of every constellation.
 ALL: Final = ""
 #: A header is never longer; a file that goes on has none.

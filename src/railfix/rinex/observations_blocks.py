@@ -11,7 +11,7 @@ import numpy as np
 from railfix.epochs import Observations
 from railfix.errors import InputFileError
 from railfix.rinex.files import ByteStream, FilePath, open_stream
-from railfix.rinex.header import LAYOUT_LABELS, RinexHeader, apply_records, parse_header, read_header_bytes
+from railfix.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.rinex.observations_decode import decode, lines_per_satellite
 from railfix.rinex.observations_epochs import Epochs, find_epochs
 from railfix.rinex.observations_fields import Bools
@@ -122,18 +122,19 @@ class BlockReader:
         """Epochs up to the end of the lines, or to where the observation types change."""
         trial = self._log.fresh()
         table, taken = self._find(lines, header, at_end=at_end, log=trial)
-        cut = _layout_change(lines, table)
-        if cut is None:
-            self._log.absorb(trial)
-        else:  # what follows was taken for what it is not
-            taken = cut
-            table, _ = self._find(lines[:cut], header, at_end=True, log=self._log)
         after = header
         for k in np.flatnonzero((table.flag >= 2) & (table.flag <= 5)).tolist():
             if table.flag[k] == 5:
                 self._log.count(EXTERNAL_EVENTS, 1)
-            else:
-                after = self._event(lines, int(table.line[k]) + 1, int(table.count[k]), after)
+                continue
+            first, count = int(table.line[k]) + 1, int(table.count[k])
+            after = self._event(lines[first : first + count], after)
+            if after.types != header.types or after.scale != header.scale:
+                taken = first + count  # the lines after it were taken for what they are not: once more
+                trial = self._log.fresh()
+                table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
+                break
+        self._log.absorb(trial)
         piece = self._observations(lines, table, header)
         return piece, after, taken
 
@@ -141,10 +142,10 @@ class BlockReader:
         each = lines_per_satellite(header)
         return find_epochs(lines, version=header.version, lines_per_satellite=each, at_end=at_end, log=log)
 
-    def _event(self, lines: Lines, first: int, count: int, header: RinexHeader) -> RinexHeader:
-        records = [lines.text(i) for i in range(first, first + count)]
+    def _event(self, lines: Lines, header: RinexHeader) -> RinexHeader:
+        records = [lines.text(i) for i in range(len(lines))]
         notes: list[str] | None = None if self._log.strict else []
-        number = int(lines.number[first]) if count else 0
+        number = int(lines.number[0]) if records else 0
         changed = apply_records(self.path, header, records, first_line=number, notes=notes)
         for note in notes or ():
             self._log.note(note)
@@ -210,15 +211,6 @@ class BlockReader:
         self.last_ns = int(highest[-1])
         self.epochs += int((~wrong).sum())
         return ~wrong
-
-
-def _layout_change(lines: Lines, table: Epochs) -> int | None:
-    """Where the lines end whose layout the header at hand tells; None where that is all of them."""
-    for k in np.flatnonzero((table.flag >= 2) & (table.flag <= 4)).tolist():
-        first, end = int(table.line[k]) + 1, int(table.line[k]) + 1 + int(table.count[k])
-        if any(lines.text(i)[60:80].strip() in LAYOUT_LABELS for i in range(first, end)):
-            return end
-    return None
 
 
 def _gps_time_ns(time_ns: Integers, time_system: str) -> Integers:
