@@ -1,0 +1,133 @@
+"""``railfix map check`` and ``railfix map from-positions`` as a person calls them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from railfix.cli import Commands
+from railfix.cli.map import map_app
+from railfix.geodesy import ecef_from_geodetic, enu_axes
+from railfix.track_map import Track, read_track, write_track_csv
+
+runner = CliRunner()
+app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
+app.add_typer(map_app, name="map")
+
+
+def call(*arguments: object) -> tuple[int, str]:
+    """Exit code and everything printed."""
+    result = runner.invoke(app, ["map", *(str(a) for a in arguments)], env={"COLUMNS": "200"})
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.output
+
+
+def line(folder: Path, name: str = "line.csv", *, kink: float = 0.0, end: float = 200.0) -> Path:
+    north = np.arange(0.0, end + 1.0, 5.0)
+    enu = np.stack([0 * north, north, 0 * north], axis=1)
+    enu[20, 0] = kink
+    ecef = ecef_from_geodetic(35.0, 139.0, 50.0) + enu @ enu_axes(35.0, 139.0)
+    write_track_csv(Track.from_ecef(ecef, name=name.removesuffix(".csv")), folder / name)
+    return folder / name
+
+
+@pytest.mark.requirement("A1")
+def test_a_good_map_ends_with_0_and_a_picture(tmp_path: Path) -> None:
+    code, printed = call("check", line(tmp_path), "--out", tmp_path / "report")
+    assert code == 0
+    assert "0 error(s), 0 warning(s)" in printed
+    assert "41 points, 200.0 m" in printed
+    picture = tmp_path / "report" / "map_check.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in picture.parent.iterdir()] == ["map_check.png"]
+
+
+@pytest.mark.requirement("A1")
+def test_a_map_with_an_error_ends_with_6_and_says_which(tmp_path: Path) -> None:
+    code, printed = call("check", line(tmp_path, kink=2.0), "--out", tmp_path)
+    assert code == 6
+    assert "kink" in printed
+    assert "Traceback" not in printed
+    assert "railfix: error: line: the track map has" in printed
+    assert (tmp_path / "map_check.png").is_file(), "the picture shows what is wrong"
+
+
+def test_duplicates_are_shown_by_the_check_that_the_reader_names(tmp_path: Path) -> None:
+    path = line(tmp_path)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, lines[-1]]) + "\n")
+    code, printed = call("check", path)
+    assert code == 6
+    assert "duplicate" in printed
+
+
+def test_the_limit_of_the_mid_chord_deviation_is_an_option(tmp_path: Path) -> None:
+    path = line(tmp_path, kink=0.1)
+    assert call("check", path)[0] == 0
+    assert call("check", path, "--mid-chord", "0.005")[0] == 6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["check", "none.csv"], 3, "no such file"),
+        (["check", "."], 3, "ends in .csv"),
+        (["check", "line.csv", "--geoid", "japan"], 4, "ellipsoidal already"),
+        (["check", "line.csv", "--mid-chord", "0"], 4, "must be positive"),
+        (["check", "line.csv", "--crs", "EPSG:0"], 4, "unknown"),
+        (["check", "line.csv", "--out", "line.csv"], 8, "cannot be made"),
+        (["check", "line.csv", "far.csv"], 3, "the gap is"),
+        (["check"], 2, "Missing argument"),
+        (["check", "line.csv", "--wrong"], 2, "No such option"),
+        (["from-positions", "none.pos", "--out", "m.csv"], 3, "no such file"),
+        (["from-positions", "line.csv", "--out", "none/m.csv"], 8, "does not exist"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--quality", "good"], 4, "whole numbers"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--quality", "1"], 3, "no column 'quality'"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--spacing", "0"], 4, "must be positive"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--spacing", "900"], 3, "a track needs two"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--column", "lat"], 4, "expected NAME=COLUMN"),
+        (["from-positions", "line.csv", "--out", "m.csv", "--column", "lat=x"], 4, "'lat' is unknown"),
+    ],
+)
+def test_misuse_ends_with_one_sentence_and_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, said: str
+) -> None:
+    line(tmp_path)
+    far = Track.from_geodetic([36.0, 36.001], [139.0, 139.0], [50.0, 50.0])
+    write_track_csv(far, tmp_path / "far.csv")
+    monkeypatch.chdir(tmp_path)
+    found, printed = call(*arguments)
+    assert found == code, printed
+    assert said in " ".join(printed.split())
+    assert "Traceback" not in printed
+    assert {path.name for path in tmp_path.iterdir()} == {"line.csv", "far.csv"}, "nothing half-written"
+
+
+def test_map_from_positions_says_what_became_of_them(tmp_path: Path, recordings: Path) -> None:
+    log = next((recordings / "kinematic").glob("japan_mosaic*")) / "rtklib_rtk_ref_l1_GE.pos"
+    code, printed = call("from-positions", log, "--out", tmp_path / "course.csv", "--name", "course")
+    assert code == 0
+    for said in ("360 positions", "dropped 17 of insufficient quality", "standing still", "bridged by a straight line"):
+        assert said in printed
+    track = read_track(tmp_path / "course.csv")
+    assert track.name == "course"
+    assert len(track) > 200
+
+
+def test_help_reads_like_a_manual() -> None:
+    for command in ("check", "from-positions"):
+        code, printed = call(command, "--help")
+        assert code == 0
+        assert len(printed.splitlines()) > 20
+
+
+def test_the_commands_do_not_load_matplotlib() -> None:
+    import subprocess
+
+    code = "import sys, railfix.cli.map, railfix.track_map, railfix.vehicle; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
