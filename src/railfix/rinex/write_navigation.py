@@ -92,11 +92,16 @@ def _field(values: Floats) -> Strings:
 
 
 def _records(satellite: Strings, time: Datetimes, fields: Sequence[Floats]) -> Strings:
-    """Text of whole records: satellite, time, three clock fields, then four fields a line."""
-    text = np.char.add(satellite, np.char.replace(_calendar_text(time), "-", " "))
+    """Text of whole records: satellite, time, three clock fields, then four fields a line.
+
+    Blank fields at the end of a line are left out, as receivers do.
+    """
+    text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(fields):
-        text = np.char.add(text, _field(values) if i < 3 or i % 4 != 3 else np.char.add("\n    ", _field(values)))
-    return np.char.add(text, "\n")
+        if i >= 3 and i % 4 == 3:
+            text = np.char.add(np.char.rstrip(text), "\n    ")
+        text = np.char.add(text, _field(values))
+    return np.char.add(np.char.rstrip(text), "\n")
 
 
 def _calendar_text(time: Datetimes) -> Strings:
@@ -119,6 +124,7 @@ def _kepler_text(records: KeplerRecords) -> Strings:
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
     toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
     week, sent = _week_and_transmission(records, shift, beidou)
+    # BeiDou's spare field between two others is 0: a blank there stops some readers.
     zero, none = np.zeros(len(records)), np.full(len(records), np.nan)
     # QZSS writes the flag: 0 for two hours, 1 for longer.
     fit = np.where(
