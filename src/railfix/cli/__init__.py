@@ -12,6 +12,7 @@ from typer.core import TyperGroup
 
 from railfix import __version__
 from railfix.cli.demo import demo as demo_command
+from railfix.cli.map import map_app
 from railfix.cli.run import run as run_command
 from railfix.errors import RailfixError
 
@@ -85,6 +86,7 @@ def railfix(
 
 app.command("run")(run_command)
 app.command("demo")(demo_command)
+app.add_typer(map_app)
 
 
 def main() -> None:

@@ -15,12 +15,13 @@ from railfix.config import Config
 from railfix.errors import SettingsError
 from railfix.navigation import Navigation
 from railfix.pipeline import EpochProcessor, State
+from railfix.rinex import read_navigation
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
 from railfix.run.inputs import Antenna, RunInputs, collected
 from railfix.run.output import OutputFolder
 from railfix.run.record import AlongSigma, along_sigma, run_record
-from railfix.run.sources import Line, Log, TrackReading, open_line, open_navigation
+from railfix.run.sources import Line, Log, TrackReading, open_line
 from railfix.run.tally import Tally
 from railfix.tables import observations_table, positions_table, rounded
 
@@ -122,7 +123,9 @@ def run_files(
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
-        navigation = open_navigation(inputs.nav, inputs.sp3)
+        navigation = read_navigation(
+            inputs.nav, sp3=inputs.sp3 or None, on_error="strict" if options.broken_lines == "stop" else "lenient"
+        )
         line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
         processor = EpochProcessor(config, navigation, line.trajectories)
         logs = {

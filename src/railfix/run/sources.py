@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -14,10 +14,8 @@ import numpy as np
 from railfix.antenna import Trajectory
 from railfix.epochs import Observations
 from railfix.errors import SettingsError
-from railfix.navigation import Navigation
-from railfix.rinex import read_navigation, scan_observations
+from railfix.rinex import scan_observations
 from railfix.run.inputs import Antenna
-from railfix.sp3 import read_sp3
 from railfix.track_map import Track, read_track
 from railfix.vehicle import Reference, Vehicle, antenna_trajectory, read_vehicle
 
@@ -107,17 +105,6 @@ def open_line(
         vehicle=body,
         trajectories={n: antenna_trajectory(centreline, body, n, reference=reading.reference) for n in antennas},
     )
-
-
-def open_navigation(nav: tuple[Path, ...], sp3: tuple[Path, ...]) -> Navigation:
-    """Read all navigation files as one, with precise orbits where given.
-
-    Raises
-    ------
-    InputFileError
-    """
-    navigation = read_navigation(nav)
-    return replace(navigation, precise=read_sp3(sp3)) if sp3 else navigation
 
 
 @dataclass(kw_only=True)
