@@ -59,7 +59,7 @@ def track_is_observations_under_another_name(bench: Bench) -> Options:
     return {"track": bench.write("obs.csv", bench.front.read_bytes())}
 
 
-@broken(INPUT, "rtk.pos", "railfix map from-positions")
+@broken(INPUT, "rtk.pos", ".csv")
 def track_is_positions(bench: Bench) -> Options:
     text = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns\n2026/05/12 03:00:00.000 35.0 135.0 100.0 1 9\n"
     return {"track": bench.write("rtk.pos", text)}
@@ -194,7 +194,7 @@ def track_without_a_height_datum(bench: Bench) -> Options:
 
 @broken(INPUT, "line.geojson")
 def track_with_text_for_coordinates(bench: Bench) -> Options:
-    words = [["135", "35", "1"], ["136", "35", "1"]]
+    words = [["one", "two", "three"], ["four", "five", "six"]]
     return geojson(bench, {"type": "LineString", "coordinates": words}, height_datum="ellipsoidal")
 
 
@@ -254,7 +254,7 @@ def vehicle_longer_than_the_track(bench: Bench) -> Options:
 # --- settings ----------------------------------------------------------------------------------
 
 
-@broken(INPUT, "absent.toml", "no such file")
+@broken(INPUT, "absent.toml", "configuration")
 def settings_missing(bench: Bench) -> Options:
     return {"config": bench.folder / "absent.toml"}
 

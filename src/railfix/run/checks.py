@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 
@@ -54,16 +54,30 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
             )
 
 
-def check_same_place(tally: Tally, *, enough: int = ENOUGH_TO_STOP) -> None:
+def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
     """Raise where all conventional positions lie far from the line.
+
+    Parameters
+    ----------
+    tally : Tally
+    antennas : {"all", "any"}
+        Whether every antenna must be elsewhere (half-way through a run, after a few positions of
+        each), or one is enough (at the end).
 
     Raises
     ------
     MismatchError
-        At least `enough` conventional positions, none within `ANOTHER_PLACE_M`.
+        There are conventional positions, none within `ANOTHER_PLACE_M`.
     """
-    for name, antenna in tally.antennas.items():
-        if antenna.conventional >= enough and antenna.conventional_nearest_m > ANOTHER_PLACE_M:
+    enough = ENOUGH_TO_STOP if antennas == "all" else 1
+    elsewhere = [
+        name
+        for name, antenna in tally.antennas.items()
+        if antenna.conventional >= enough and antenna.conventional_nearest_m > ANOTHER_PLACE_M
+    ]
+    if antennas == "any" or len(elsewhere) == len(tally.antennas):
+        for name in elsewhere:
+            antenna = tally.antennas[name]
             raise MismatchError(
                 f"the track lies {antenna.conventional_nearest_m / 1000:.0f} km from where the {name} log was "
                 "recorded; give the track of that line, and check the order of latitude and longitude"

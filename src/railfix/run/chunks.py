@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Final
 
 import numpy as np
 
 from railfix.epochs import Observations, concatenate
+
+#: Tags of two receivers that differ by no more than this belong to one instant [ns].
+SAME_INSTANT_NS: Final = 20_000_000
 
 
 def _spacing_ns(part: Observations) -> int:
@@ -21,7 +25,7 @@ def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Ob
 
     Each antenna keeps its own epochs. A chunk ends where the first of the parts at hand ends;
     what the others have beyond waits for the next chunk. Epochs that belong together but are
-    tagged a little apart (less than half the spacing of the epochs) stay in one chunk.
+    tagged a little apart (`SAME_INSTANT_NS`) stay in one chunk.
 
     Parameters
     ----------
@@ -50,7 +54,8 @@ def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Ob
         if not any(len(part) for part in waiting.values()):
             return
         if ends:
-            horizon = min(ends) + np.timedelta64(min(spacing[name] for name in live) // 2, "ns")
+            slack = min(SAME_INSTANT_NS, *(spacing[name] // 2 for name in live))
+            horizon = min(ends) + np.timedelta64(slack, "ns")
             cut = {n: int(np.searchsorted(p.time, horizon, side="right")) for n, p in waiting.items()}
         else:
             cut = {name: len(part) for name, part in waiting.items()}

@@ -61,15 +61,16 @@ class RunInputs:
         """
         for name, path in self.named():
             _check_file(name, path)
-        seen: dict[Path, str] = {}
+        seen: dict[Path, tuple[str, Path]] = {}
         for name, paths in self.logs.items():
             for path in paths:
                 whole = path.resolve()
                 if whole in seen:
+                    option, first = seen[whole]
                     raise InputFileError(
-                        path, f"is given twice (--{seen[whole]} and --{name}), expected each log once; name another"
+                        path, f"is given twice (--{option} {first} and --{name} {path}); give each log once"
                     )
-                seen[whole] = name
+                seen[whole] = (name, path)
 
     def fingerprints(self, pool: Executor) -> list[tuple[str, Path, Future[str]]]:
         """SHA-256 of every file, worked out beside the run."""
@@ -91,8 +92,8 @@ def _check_file(name: str, path: Path) -> None:
         if not path.is_file():
             what = "is no regular file" if path.exists() else "there is no such file"
             raise InputFileError(path, f"{what}; check what --{name} names")
-        with path.open("rb"):
-            pass
+        with path.open("rb") as file:
+            file.read(1)
     except OSError as error:
         raise InputFileError(path, f"cannot be read ({error.strerror}); check what --{name} names") from error
 
