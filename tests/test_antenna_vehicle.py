@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from railfix.antenna import Trajectory
 from railfix.errors import InputFileError, MismatchError, RailfixError, SettingsError
 from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.track_map import Track
+from railfix.track_map import Provenance, Track
+from railfix.track_map.from_positions import ANTENNA_PATH
 from railfix.vehicle import PATH_TOLERANCE_M, AntennaOffset, Vehicle, antenna_trajectory, body_pose, read_vehicle
 
 Floats = NDArray[np.float64]
@@ -260,6 +261,9 @@ def test_track_and_vehicle_that_do_not_fit() -> None:
         antenna_trajectory(_straight(100.0, cant_m=np.full(5, 50.0), radius_m=np.full(5, 300.0)), vehicle())
     with pytest.raises(SettingsError, match="no antenna 'rear'"):
         antenna_trajectory(_straight(100.0), vehicle(), "rear")
+    path = Track.from_ecef(_straight(100.0).ecef_m, provenance=Provenance(notes=(ANTENNA_PATH,)))
+    with pytest.raises(MismatchError, match="without a vehicle file"):
+        antenna_trajectory(path, vehicle())
     hairpin = to_ecef(np.array([[0.0, 0, 0], [0, 100, 0], [0.5, 100, 0], [0.5, 0, 0]]))
     with pytest.raises(MismatchError, match="turns"):
         antenna_trajectory(Track.from_ecef(hairpin), vehicle())
@@ -295,6 +299,7 @@ def test_vehicle_file(tmp_path: Path) -> None:
         ("bogie_distance_m = 13.8", "", SettingsError, "bogie_distance_m is missing"),
         ("13.8", "-13.8", SettingsError, "bogie_distance_m"),
         ("13.8", "13800", SettingsError, "bogie_distance_m"),
+        ("13.8", "'13.8'", SettingsError, "bogie_distance_m"),
         ("13.8", "nan", SettingsError, "bogie_distance_m"),
         ("1.067", "1067", SettingsError, "gauge_m"),
         ("1.067", "'wide'", SettingsError, "gauge_m"),

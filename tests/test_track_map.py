@@ -261,6 +261,7 @@ def test_geojson_collection_and_multi_line_are_a_route(tmp_path: Path) -> None:
         track = read_track(geojson(tmp_path, document), height_datum="ellipsoidal")
         np.testing.assert_allclose(track.latitude_deg, [35.0, 35.001, 35.002, 35.003], atol=1e-12)
         np.testing.assert_array_equal(track.section, [0, 0, 0, 1])
+        assert track.provenance.files == (str(tmp_path / "line.geojson"),)
     np.testing.assert_allclose(track.cant_m, [0.001, 0.002, 0.003, 0.005])
 
 
@@ -291,6 +292,14 @@ def test_broken_geojson_is_refused_in_one_sentence(tmp_path: Path, document: obj
     sentence = refused(geojson(tmp_path, document))
     assert said in sentence
     assert "line.geojson" in sentence
+
+
+def test_geojson_with_an_unknown_crs(tmp_path: Path) -> None:
+    member = {"crs": {"type": "name", "properties": {"name": "EPSG:0"}}}
+    document = feature(LINE, height_datum="ellipsoidal")
+    assert "'EPSG:0' is unknown" in refused(geojson(tmp_path, document | member), SettingsError)
+    assert "'EPSG:0' is unknown" in refused(geojson(tmp_path, document | member), SettingsError, crs="EPSG:6677")
+    assert "give --crs" in refused(geojson(tmp_path, document | {"crs": {"type": "name"}}))
 
 
 def test_geojson_that_is_no_json_names_the_line(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from railfix.antenna import Trajectory
 from railfix.errors import InputFileError, MismatchError, SettingsError
 from railfix.geodesy import enu_axes, geodetic_from_ecef
 from railfix.named_columns import misspelt, read_text
+from railfix.track_map.from_positions import ANTENNA_PATH
 from railfix.track_map.track import Track
 
 Floats = NDArray[np.float64]
@@ -38,7 +39,7 @@ _SETTLED_M: Final = 1e-7
 class AntennaOffset(BaseModel):
     """Phase centre of one antenna in the axes of the vehicle [m]."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
     along_m: float = Field(ge=-30.0, le=30.0)
     across_m: float = Field(default=0.0, ge=-2.5, le=2.5)
     up_m: float = Field(ge=0.0, le=8.0)
@@ -59,7 +60,7 @@ class Vehicle(BaseModel):
         Offsets by name: ``front``, ``rear``.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
     name: str = "vehicle"
     bogie_distance_m: float = Field(gt=0.5, le=30.0)
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
@@ -353,9 +354,11 @@ def antenna_trajectory(
     SettingsError
         The vehicle has no such antenna.
     MismatchError
-        Track and vehicle do not fit: the track is shorter than the vehicle, turns too sharply, or has
-        cant whose side is unknown.
+        Track and vehicle do not fit: the track is shorter than the vehicle, turns too sharply, has cant
+        whose side is unknown, or is an antenna's path itself.
     """
+    if ANTENNA_PATH in track.provenance.notes:
+        raise MismatchError(f"{track.name}: {ANTENNA_PATH}; use it without a vehicle file")
     if antenna not in vehicle.antennas:
         raise SettingsError(
             f"vehicle {vehicle.name!r} has no antenna {antenna!r}; it has {', '.join(vehicle.antennas)}"

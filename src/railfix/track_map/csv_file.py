@@ -92,6 +92,7 @@ def read_csv_segment(
     attributes["radius_m"] = straight_radius(attributes["radius_m"])
     return Segment(
         source=table.path,
+        file=table.path,
         latitude_deg=latitude,
         longitude_deg=longitude,
         height_m=height,

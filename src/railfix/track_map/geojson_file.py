@@ -127,12 +127,16 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
         raise InputFileError(path, "the 'crs' member has no properties.name; give --crs") from None
 
 
-def _to_wgs84(path: str, crs: str, values: Floats) -> tuple[Floats, Floats]:
-    """Latitude and longitude of coordinates in easting-northing or longitude-latitude order."""
+def _crs(path: str, crs: str) -> CRS:
     try:
-        system = CRS.from_user_input(crs)
+        return CRS.from_user_input(crs)
     except CRSError:
         raise SettingsError(f"{path}: the CRS {crs!r} is unknown; give for example EPSG:4326 or EPSG:6677") from None
+
+
+def _to_wgs84(path: str, crs: str, values: Floats) -> tuple[Floats, Floats]:
+    """Latitude and longitude of coordinates in easting-northing or longitude-latitude order."""
+    system = _crs(path, crs)
     if system.is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
@@ -176,7 +180,7 @@ def read_geojson_segments(
     if not isinstance(document, dict):
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
     named = _crs_member(str(path), document)
-    if crs is not None and named is not None and CRS.from_user_input(crs) != CRS.from_user_input(named):
+    if crs is not None and named is not None and _crs(str(path), crs) != _crs(str(path), named):
         raise SettingsError(f"{path}: --crs {crs} contradicts the file's own CRS {named}")
     used = crs or named or RFC_CRS
     return [_segment(line, used, height_datum, geoid, duplicates) for line in _lines(str(path), document, "", {})]
@@ -215,6 +219,7 @@ def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None,
     attributes["radius_m"] = straight_radius(attributes["radius_m"])
     return Segment(
         source=line.source,
+        file=line.path,
         latitude_deg=latitude,
         longitude_deg=longitude,
         height_m=height,

@@ -97,7 +97,7 @@ def join(
         sigma_plan_m=_sigma(pieces, "sigma_plan_m", sigma_plan_m, SIGMA_PLAN_M),
         sigma_height_m=_sigma(pieces, "sigma_height_m", sigma_height_m, SIGMA_HEIGHT_M),
         provenance=Provenance(
-            files=_unique(piece.source for piece in pieces),
+            files=_unique(piece.file for piece in pieces),
             crs=", ".join(_unique(piece.crs for piece in pieces)),
             height_datum_asked=height_datum_asked or "",
             height_datum_used=", ".join(_unique(piece.height_datum for piece in pieces)),

@@ -21,6 +21,8 @@ class Segment:
     ----------
     source : str
         The file, or the file and the feature in it.
+    file : str
+        The file alone.
     latitude_deg, longitude_deg, height_m : ndarray, shape (n,)
     kilometrage_m, cant_m, radius_m, gradient_permille : ndarray, shape (n,)
         NaN where not given.
@@ -32,6 +34,7 @@ class Segment:
     """
 
     source: str
+    file: str
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
@@ -49,6 +52,7 @@ class Segment:
         """The same piece run the other way: right curves become left ones, climbs become falls."""
         return Segment(
             source=self.source,
+            file=self.file,
             latitude_deg=self.latitude_deg[::-1],
             longitude_deg=self.longitude_deg[::-1],
             height_m=self.height_m[::-1],
