@@ -1,0 +1,292 @@
+"""The batch on the shipped run: files, rows, counts, provenance; the same whatever the chunks."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from polars.testing import assert_frame_equal
+
+from broken_bench import EPOCHS, Bench, bench_in
+from railfix.config import Config
+from railfix.demonstration import compare, demo_inputs, draw
+from railfix.errors import MismatchError, NoPositionError
+from railfix.pipeline import EpochProcessor, Result
+from railfix.reasons import POSITIONED, Reason, Status, reason_text
+from railfix.rinex import read_navigation, read_observations
+from railfix.run import RunInputs, RunOptions, RunSummary, run_files
+from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table, to_xarray
+from railfix.track_map import read_track
+from railfix.vehicle import antenna_trajectory, read_vehicle
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    return bench_in(tmp_path_factory.mktemp("bench"))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    out = tmp_path_factory.mktemp("whole") / "results"
+    return run_files(demo_inputs(), out=out, options=RunOptions(observations="write"))
+
+
+@pytest.fixture(scope="module")
+def record(whole: RunSummary) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads(whole.files["run.json"].read_text())
+    return loaded
+
+
+@pytest.fixture(scope="module")
+def result() -> Result:
+    inputs = demo_inputs()
+    assert inputs.vehicle is not None
+    observations = {"front": read_observations(inputs.front)[:50], "rear": read_observations(inputs.rear)[:50]}
+    track, vehicle = read_track(inputs.track), read_vehicle(inputs.vehicle)
+    trajectories = {
+        "front": antenna_trajectory(track, vehicle, "front"),
+        "rear": antenna_trajectory(track, vehicle, "rear"),
+    }
+    return EpochProcessor(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
+
+
+def inputs_of(bench: Bench) -> RunInputs:
+    return RunInputs(
+        front=(bench.front,), rear=(bench.rear,), nav=(bench.nav,), track=(bench.track,), vehicle=bench.vehicle
+    )
+
+
+def test_one_row_an_epoch_and_antenna_in_order(whole: RunSummary) -> None:
+    rows = pl.read_parquet(whole.files["positions.parquet"])
+    assert rows.columns == list(POSITION_COLUMNS)
+    assert rows.height == 4000
+    assert rows["time_gpst"].dtype == pl.Datetime("ns")
+    assert rows["time_gpst"].is_sorted()
+    assert rows["antenna"].to_list() == ["front", "rear"] * 2000
+
+
+def test_the_csv_file_holds_the_same_rows(whole: RunSummary) -> None:
+    exact = pl.read_parquet(whole.files["positions.parquet"])
+    text = whole.files["positions.csv"].read_text().splitlines()
+    assert text[1].startswith("2024-03-05T03:10:00.000000000,front,ok,")
+    rows = pl.read_csv(whole.files["positions.csv"], schema_overrides={"time_gpst": pl.Datetime("ns")})
+    assert rows.columns == exact.columns
+    for name in ("time_gpst", "antenna", "n_used", "n_rejected"):
+        assert rows[name].to_list() == exact[name].to_list()
+    for name, kind in exact.schema.items():
+        if kind == pl.Float64:
+            limit = 0.51e-9 if name.endswith("_deg") else 0.51e-4
+            assert ((rows[name] - exact[name]).abs().max() or 0.0) <= limit
+
+
+def test_pandas_reads_the_csv_file_without_help(whole: RunSummary) -> None:
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.read_csv(whole.files["positions.csv"], parse_dates=["time_gpst"])
+    assert frame.shape == (4000, len(POSITION_COLUMNS))
+    assert str(frame.time_gpst.dtype).startswith("datetime64")
+
+
+@pytest.mark.requirement("B7")
+def test_every_observation_has_a_row_and_the_reasons_add_up(whole: RunSummary, record: dict[str, Any]) -> None:
+    rows = pl.read_parquet(whole.files["observations.parquet"])
+    assert rows.columns == list(OBSERVATION_COLUMNS)
+    inputs = demo_inputs()
+    for name, paths in inputs.logs.items():
+        codes = int(np.isfinite(read_observations(paths).code_m).sum())
+        mine = rows.filter(pl.col("antenna") == name)
+        told = record["antennas"][name]
+        assert mine.height == codes == told["observations"]
+        assert told["observations_used"] + sum(told["observations_refused_by_first_reason"].values()) == codes
+        alone = told["observations_refused_by_one_reason_alone"]
+        for reason, count in alone.items():
+            assert mine.filter(pl.col("reason_text") == reason).height == count
+        assert sum(told["status"].values()) == told["epochs"] == 2000
+    texts = rows.select("reason", "reason_text").unique().rows()
+    assert all(reason_text(reason) == text for reason, text in texts)
+
+
+@pytest.mark.requirement("B7")
+def test_used_satellites_agree_between_the_two_tables(whole: RunSummary) -> None:
+    positions = pl.read_parquet(whole.files["positions.parquet"])
+    observations = pl.read_parquet(whole.files["observations.parquet"])
+    used = observations.filter(pl.col("reason") == 0).group_by("time_gpst", "antenna").len("used")
+    joined = positions.join(used, on=["time_gpst", "antenna"], how="left")
+    assert joined.filter(pl.col("n_used") != pl.col("used").fill_null(0)).height == 0
+
+
+def test_the_record_names_what_was_read(record: dict[str, Any]) -> None:
+    inputs = demo_inputs()
+    named = {(item["input"], item["path"]): item for item in record["inputs"]}
+    assert set(named) == {(name, str(path)) for name, path in inputs.named()}
+    for (_, path), item in named.items():
+        content = Path(path).read_bytes()
+        assert item["bytes"] == len(content)
+        assert item["sha256"] == hashlib.sha256(content).hexdigest()
+    assert record["versions"]["railfix"]
+    assert record["versions"]["numpy"] == np.__version__
+    assert record["settings_used"] == Config().as_dict()
+    assert record["positioning_rate"] == 1.0
+    assert record["line"]["vehicle"]["bogie_distance_m"] == 13.8
+    assert record["line"]["track"]["points"] == 189
+
+
+def test_the_parquet_files_carry_their_provenance(whole: RunSummary, record: dict[str, Any]) -> None:
+    footer = pl.read_parquet_metadata(whole.files["positions.parquet"])
+    assert footer["railfix"] == record["versions"]["railfix"]
+    assert all(item["sha256"] in footer["inputs"] for item in record["inputs"])
+
+
+def test_settings_asked_for_stand_beside_those_used(bench: Bench, tmp_path: Path) -> None:
+    config = Config.model_validate({"elevation": {"mask_deg": 15.0}})
+    summary = run_files(inputs_of(bench), config, out=tmp_path / "out", asked={"elevation": {"mask_deg": 15.0}})
+    record = json.loads(summary.files["run.json"].read_text())
+    assert record["settings_asked"] == {"elevation": {"mask_deg": 15.0}}
+    assert record["settings_used"]["elevation"]["mask_deg"] == 15.0
+    assert record["settings_used"]["min_satellites"] == 3
+
+
+def test_without_a_vehicle_the_output_says_so(bench: Bench, tmp_path: Path) -> None:
+    inputs = RunInputs(front=(bench.front,), nav=(bench.nav,), track=(bench.track,))
+    summary = run_files(inputs, out=tmp_path / "out")
+    record = json.loads(summary.files["run.json"].read_text())
+    assert any("no vehicle file: the track is taken as the antenna's own path" in note for note in record["notes"])
+    assert record["line"]["vehicle"] is None
+
+
+@pytest.mark.parametrize("epochs", [1, 7, 1000])
+def test_the_results_do_not_depend_on_the_chunks(
+    bench: Bench, tmp_path: Path, epochs: int, request: pytest.FixtureRequest
+) -> None:
+    inputs = demo_inputs() if epochs == 1000 else inputs_of(bench)
+    cut = run_files(inputs, out=tmp_path / "cut", options=RunOptions(chunk_epochs=epochs, observations="write"))
+    if epochs == 1000:
+        reference: RunSummary = request.getfixturevalue("whole")
+    else:
+        reference = run_files(inputs, out=tmp_path / "one", options=RunOptions(observations="write"))
+    for name, keys in (("positions.parquet", []), ("observations.parquet", ["time_gpst", "antenna", "satellite"])):
+        left, right = (pl.read_parquet(s.files[name]) for s in (cut, reference))
+        left, right = (t.sort(keys, maintain_order=True) if keys else t for t in (left, right))
+        assert_frame_equal(left, right, rel_tol=0, abs_tol=1e-9)
+
+
+def test_several_files_of_one_log_are_joined(bench: Bench, tmp_path: Path) -> None:
+    lines = bench.front.read_text().splitlines(keepends=True)
+    starts = [i for i, line in enumerate(lines) if line.startswith(">")]
+    head, middle = "".join(lines[: starts[0]]), starts[EPOCHS // 2]
+    one, two = tmp_path / "one.obs", tmp_path / "two.obs"
+    one.write_text(head + "".join(lines[starts[0] : middle]))
+    two.write_text(head + "".join(lines[middle:]))
+    common = {"nav": (bench.nav,), "track": (bench.track,)}
+    joined = run_files(RunInputs(front=(one, two), **common), out=tmp_path / "joined")
+    single = run_files(RunInputs(front=(bench.front,), **common), out=tmp_path / "single")
+    assert_frame_equal(*(pl.read_parquet(s.files["positions.parquet"]) for s in (joined, single)))
+
+
+def test_a_part_of_the_log(bench: Bench, tmp_path: Path) -> None:
+    options = RunOptions(start=datetime(2024, 3, 5, 3, 10, 1), end=datetime(2024, 3, 5, 3, 10, 2))
+    summary = run_files(inputs_of(bench), out=tmp_path / "out", options=options)
+    rows = pl.read_parquet(summary.files["positions.parquet"])
+    assert rows["time_gpst"].unique().len() == 10
+    assert str(rows["time_gpst"].min()) == "2024-03-05 03:10:01"
+
+
+def test_antennas_that_overlap_in_part_are_both_kept(bench: Bench, tmp_path: Path) -> None:
+    lines = bench.rear.read_text().splitlines(keepends=True)
+    starts = [i for i, line in enumerate(lines) if line.startswith(">")]
+    rear = tmp_path / "rear.obs"
+    rear.write_text("".join(lines[: starts[0]] + lines[starts[EPOCHS - 5] :]))
+    inputs = RunInputs(
+        front=(bench.front,), rear=(rear,), nav=(bench.nav,), track=(bench.track,), vehicle=bench.vehicle
+    )
+    summary = run_files(inputs, out=tmp_path / "out", options=RunOptions(chunk_epochs=4))
+    rows = pl.read_parquet(summary.files["positions.parquet"])
+    assert dict(rows["antenna"].value_counts().rows()) == {"front": EPOCHS, "rear": 5}
+    assert rows["time_gpst"].is_sorted()
+
+
+def test_epochs_without_a_position_keep_their_row(bench: Bench, tmp_path: Path) -> None:
+    lines = bench.front.read_text().splitlines(keepends=True)
+    starts = [i for i, line in enumerate(lines) if line.startswith(">")]
+    at = starts[10]
+    kept = [f"{lines[at][:32]}  2{lines[at][35:]}", *lines[at + 1 : at + 3]]
+    front = tmp_path / "front.obs"
+    front.write_text("".join(lines[:at] + kept + lines[starts[11] :]))
+    inputs = RunInputs(front=(front,), nav=(bench.nav,), track=(bench.track,))
+    summary = run_files(inputs, out=tmp_path / "out")
+    rows = pl.read_parquet(summary.files["positions.parquet"])
+    assert rows.height == EPOCHS
+    row = rows.row(10, named=True)
+    assert row["status"] == Status.TOO_FEW_SATELLITES.text
+    assert all(row[name] is None for name in ("chainage_m", "along_sigma_m", "latitude_deg", "x_m"))
+    assert summary.tally.antennas["front"].positioned == EPOCHS - 1
+    assert ",too_few_satellites,,,," in summary.files["positions.csv"].read_text()
+
+
+def test_errors_of_the_inputs_have_their_classes(bench: Bench, tmp_path: Path) -> None:
+    with pytest.raises(NoPositionError, match="too_few_satellites"):
+        run_files(inputs_of(bench), Config(min_satellites=40), out=tmp_path / "out")
+    late = RunOptions(start=datetime(2031, 1, 1))
+    with pytest.raises(MismatchError, match="time span"):
+        run_files(inputs_of(bench), out=tmp_path / "out", options=late)
+    assert not (tmp_path / "out").exists()
+
+
+def test_progress_is_told(bench: Bench, tmp_path: Path) -> None:
+    told: list[tuple[int, float | None]] = []
+    run_files(
+        inputs_of(bench),
+        out=tmp_path / "out",
+        options=RunOptions(chunk_epochs=10),
+        progress=lambda *, epochs, fraction: told.append((epochs, fraction)),
+    )
+    assert [epochs for epochs, _ in told] == [20, 40, 60]
+
+
+def test_tables_hold_the_arrays(result: Result) -> None:
+    positions = positions_table(result)
+    for name, antenna in result.antennas.items():
+        mine = positions.filter(pl.col("antenna") == name)
+        np.testing.assert_array_equal(mine["chainage_m"].to_numpy(), antenna.chainage_m)
+        np.testing.assert_array_equal(mine["y_m"].to_numpy(), antenna.ecef_m[:, 1])
+        np.testing.assert_array_equal(mine["conventional_z_m"].to_numpy(), antenna.conventional_ecef_m[:, 2])
+        np.testing.assert_array_equal(mine["time_gpst"].to_numpy(), antenna.time)
+    rows = observations_table(result).filter(antenna="rear", satellite="G01")
+    rear = result.antennas["rear"]
+    (channel,) = np.flatnonzero(rear.satellite == "G01")
+    np.testing.assert_array_equal(rows["residual_m"].to_numpy(), rear.residual_m[:, channel])
+
+
+def test_xarray_has_named_axes(result: Result) -> None:
+    pytest.importorskip("xarray")
+    front = result.antennas["front"]
+    data = to_xarray(front, attributes={"antenna": "front"})
+    assert dict(data.sizes) == {"time": 50, "channel": len(front.satellite), "xyz": 3}
+    np.testing.assert_array_equal(data.residual_m.values, front.residual_m)
+    assert data.attrs == {"antenna": "front"}
+    used = data.reason.where(data.satellite == "G11", drop=True)
+    assert (used.values == float(Reason.UNHEALTHY)).all()
+
+
+def test_the_demo_is_as_good_as_its_noise_allows(whole: RunSummary, tmp_path: Path) -> None:
+    comparison = compare(demo_inputs(), whole.files["positions.parquet"])
+    for antenna in comparison.antennas.values():
+        assert antenna.on_map.rate == 1.0
+        assert abs(antenna.on_map.mean_m) < 0.1
+        assert antenna.on_map.p95_m < 1.2
+        assert antenna.on_map.std_m < antenna.conventional.std_m
+    picture = draw(comparison, tmp_path / "picture.png")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert picture.stat().st_size > 20_000
+
+
+def test_positions_are_those_of_the_statuses(whole: RunSummary) -> None:
+    rows = pl.read_parquet(whole.files["positions.parquet"])
+    words = [status.text for status in POSITIONED]
+    has = rows["status"].cast(pl.String).is_in(words)
+    assert (rows["chainage_m"].is_not_null() == has).all()
