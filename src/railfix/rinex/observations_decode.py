@@ -141,12 +141,14 @@ def _without_repeats(lines: Lines, rows: Rows, epochs: int, log: FaultLog) -> Ro
     """The first row where a satellite occurs twice in an epoch."""
     key = rows.letter.astype(np.int64) * 100 + rows.number
     places, place = np.unique(key, return_inverse=True)
-    seat = np.full((epochs, len(places)), -1, dtype=np.int64)
-    order = np.arange(len(key))[::-1]
-    seat[rows.epoch[::-1], place[::-1]] = order  # the first of several is written last
-    again = seat[rows.epoch, place] != np.arange(len(key))
-    if not again.any():
+    row = np.arange(len(key))
+    seat = np.zeros((epochs, len(places)), dtype=np.int64)
+    seat[rows.epoch, place] = row
+    if (seat[rows.epoch, place] == row).all():
         return rows
+    _, first = np.unique(rows.epoch * len(places) + place, return_index=True)
+    again = np.ones(len(key), dtype=np.bool_)
+    again[first] = False
     log.faults(
         SATELLITES,
         lines.number[rows.line[again]],

@@ -20,6 +20,7 @@ from railfix.rinex.observations_log import EPOCHS, FaultLog
 
 #: An epoch never has more lines than its three-digit count tells, so this many are no epoch.
 _MAX_LINES = 1100 * 6
+_CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,9 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
         line, room = line[:-1], room[:-1]
         head = _first(head, len(line))
     broken = head.flaw != 0
+    if at_end and len(line) and not room[-1] and lines.length[line[-1]] < epoch_width(version):
+        log.fault(EPOCHS, int(lines.number[-1]), _CUT_EPOCH_LINE)
+        line, room, broken, head = line[:-1], room[:-1], broken[:-1], _first(head, len(line) - 1)
     log.faults(
         EPOCHS,
         lines.number[line[broken]],
@@ -200,7 +204,9 @@ class _Walk:
         rest = self._lines.length[position:]
         if at_end and k == len(self._line) and not rest.any():
             return len(self._lines)
-        self._log.fault(EPOCHS, int(self._lines.number[position]), _no_epoch(self._lines, position, 2.0))
+        cut = at_end and len(rest) == 1 and rest[0] < epoch_width(2.0)
+        message = _CUT_EPOCH_LINE if cut else _no_epoch(self._lines, position, 2.0)
+        self._log.fault(EPOCHS, int(self._lines.number[position]), message)
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _table(self) -> Epochs:
