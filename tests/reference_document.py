@@ -105,7 +105,7 @@ def _settings() -> list[str]:
 
 def _signature(item: Any) -> str:
     try:
-        text = str(inspect.signature(item))
+        text = re.sub(r"(: |-> )(['\"])(.*?)\2", r"\1\3", str(inspect.signature(item)))
     except (TypeError, ValueError):
         return ""
     return text if len(text) < 400 else "(...)"

@@ -269,7 +269,7 @@ def test_xarray_has_named_axes(result: Result) -> None:
     assert dict(data.sizes) == {"time": 50, "channel": len(front.satellite), "xyz": 3}
     np.testing.assert_array_equal(data.residual_m.values, front.residual_m)
     assert data.attrs == {"antenna": "front"}
-    used = data.reason.where(data.satellite == "G11", drop=True)
+    used = data.reason.where(data.satellite == "G02", drop=True)
     assert (used.values == float(Reason.UNHEALTHY)).all()
 
 
