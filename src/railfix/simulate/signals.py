@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.constants import CARRIER_FREQUENCY, SPEED_OF_LIGHT
+from railfix.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.epochs import ObservationHeader, Observations
 from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.navigation import KeplerRecords, Navigation
@@ -20,7 +20,7 @@ from railfix.simulate.constellation import made_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
 from railfix.simulate.disturbance import Geometry
 from railfix.simulate.motion import Motion, shuttle
-from railfix.simulate.satellites import Links, links, newest_record
+from railfix.simulate.satellites import links, newest_record
 from railfix.simulate.scenario import ANTENNAS, Scenario
 from railfix.timescale import seconds
 
@@ -40,7 +40,7 @@ CHUNK_EPOCHS: Final = 2000
 #: Spacing of the instants at which it is looked which satellites rise during the run [s].
 _LOOK_S: Final = 60.0
 #: Half the interval of the difference that gives range rates [s].
-_RATE_S: Final = 0.05
+_RATE_S: Final = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,52 +172,63 @@ class Simulation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Ranges:
-    """Clean quantities of all satellites at T epochs: shapes (T, S)."""
+class _Instant:
+    """Clean quantities of S satellites at T instants: shapes (T, S).
 
-    links: list[Links]
+    `path_m` is the distance with the troposphere, less the satellite clock; `ionosphere_m` is on L1.
+    """
+
     elevation_deg: Floats
     azimuth_deg: Floats
-    #: Distance plus troposphere less satellite clock, and its rate.
     path_m: Floats
-    path_rate_mps: Floats
+    ionosphere_m: Floats
 
 
-def _ranges(
-    simulation: Simulation, antenna: str, time: Times, satellites: NDArray[np.str_]
-) -> tuple[_Ranges, Geometry]:
-    scenario, records = simulation.scenario, simulation.navigation.kepler
-    tags = seconds(time - scenario.start)
-    late = simulation.clock_s(antenna, tags)
-    true_s = tags - late
-    truth, speed = simulation.truth(antenna, true_s)
-    # Rates as differences over a tenth of a second of the true motion, with the clock's steps left out.
-    before, after = (simulation.truth(antenna, true_s + d)[0].ecef_m for d in (-_RATE_S, _RATE_S))
-    found, rates = [], []
-    for satellite in satellites.tolist():
-        link = links(records, satellite, time, late, truth.ecef_m)
-        early, later = (
-            links(records, satellite, time, late - d, place) for d, place in ((-_RATE_S, before), (_RATE_S, after))
-        )
-        rates.append(
-            ((later.range_m - early.range_m) - SPEED_OF_LIGHT * (later.clock_s - early.clock_s)) / (2.0 * _RATE_S)
-        )
-        found.append(link)
+def _instant(
+    simulation: Simulation, time: Times, late_s: Floats, antenna_ecef_m: Floats, satellites: NDArray[np.str_]
+) -> _Instant:
+    """Signals that arrive at the antenna `late_s` before the tags."""
+    scale, navigation = simulation.scenario.sky, simulation.navigation
+    found = [links(navigation.kepler, name, time, late_s, antenna_ecef_m) for name in satellites.tolist()]
     sky = np.stack([link.satellite_ecef_m for link in found], axis=1)
-    elevation, azimuth = elevation_azimuth(sky, truth.ecef_m)
-    latitude, _, height = geodetic_from_ecef(truth.ecef_m)
-    troposphere = scenario.sky.troposphere_scale * troposphere_m(
-        latitude[:, None], height[:, None], np.maximum(elevation, 1.0)
+    elevation, azimuth = elevation_azimuth(sky, antenna_ecef_m)
+    latitude, longitude, height = (part[:, None] for part in geodetic_from_ecef(antenna_ecef_m))
+    # Far below the horizon nothing is tracked; the formulas only have to stay finite there.
+    raised = np.maximum(elevation, 1.0)
+    troposphere = troposphere_m(latitude, height, raised)
+    ionosphere = ionosphere_m(
+        navigation.klobuchar["G"],
+        seconds(time - time.astype("datetime64[D]"))[:, None],
+        latitude,
+        longitude,
+        raised,
+        azimuth,
+        frequency_hz=FREQUENCY_L1,
     )
     distance = np.stack([link.range_m - SPEED_OF_LIGHT * link.clock_s for link in found], axis=1)
-    _, heading = elevation_azimuth((truth.ecef_m + truth.forward)[:, None, :], truth.ecef_m)
-    ranges = _Ranges(
-        links=found,
+    return _Instant(
         elevation_deg=elevation,
         azimuth_deg=azimuth,
-        path_m=distance + troposphere,
-        path_rate_mps=np.stack(rates, axis=1),
+        path_m=distance + scale.troposphere_scale * troposphere,
+        ionosphere_m=scale.ionosphere_scale * ionosphere,
     )
+
+
+def _geometry(
+    simulation: Simulation, antenna: str, time: Times, satellites: NDArray[np.str_]
+) -> tuple[Geometry, _Instant, Floats, Floats]:
+    """Geometry by satellite, the instant of the epochs, and the rates of path and ionosphere [m/s].
+
+    Rates are differences over a hundredth of a second of the true motion; the clock's steps are left out.
+    """
+    late = simulation.clock_s(antenna, tags := seconds(time - simulation.scenario.start))
+    truth, speed = simulation.truth(antenna, tags - late)
+    now = _instant(simulation, time, late, truth.ecef_m, satellites)
+    before, after = (
+        _instant(simulation, time, late - d, simulation.truth(antenna, tags - late + d)[0].ecef_m, satellites)
+        for d in (-_RATE_S, _RATE_S)
+    )
+    _, heading = elevation_azimuth((truth.ecef_m + truth.forward)[:, None, :], truth.ecef_m)
     geometry = Geometry(
         antenna=antenna,
         time=time,
@@ -227,10 +238,11 @@ def _ranges(
         speed_mps=speed,
         antenna_ecef_m=truth.ecef_m,
         heading_deg=heading[:, 0],
-        elevation_deg=elevation,
-        azimuth_deg=azimuth,
+        elevation_deg=now.elevation_deg,
+        azimuth_deg=now.azimuth_deg,
     )
-    return ranges, geometry
+    path_rate = (after.path_m - before.path_m) / (2.0 * _RATE_S)
+    return geometry, now, path_rate, (after.ionosphere_m - before.ionosphere_m) / (2.0 * _RATE_S)
 
 
 def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Times) -> Floats:
@@ -259,26 +271,27 @@ def _piece(
     header: ObservationHeader,
 ) -> Piece:
     scenario, receiver = simulation.scenario, simulation.scenario.receiver
-    ranges, geometry = _ranges(simulation, antenna, time, satellites)
+    by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, antenna, time, satellites)
     names, signals = (np.array(part) for part in zip(*simulation.channels, strict=True))
     geometry = replace(
-        geometry,
+        by_satellite,
         satellite=names,
         signal=signals,
-        elevation_deg=ranges.elevation_deg[:, column],
-        azimuth_deg=ranges.azimuth_deg[:, column],
+        elevation_deg=now.elevation_deg[:, column],
+        azimuth_deg=now.azimuth_deg[:, column],
     )
     frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in simulation.channels])
     wavelength = SPEED_OF_LIGHT / frequency
-    ionosphere = _ionosphere(simulation, geometry, frequency)
+    scale = (FREQUENCY_L1 / frequency) ** 2
+    ionosphere = scale * now.ionosphere_m[:, column]
     clock = SPEED_OF_LIGHT * simulation.clock_s(antenna, seconds(time - scenario.start))
-    path = ranges.path_m[:, column] + clock[:, None]
+    path = now.path_m[:, column] + clock[:, None]
     delay = SPEED_OF_LIGHT * np.stack(
         [group_delay_s(simulation.navigation.kepler, n, g, time) for n, g in simulation.channels], axis=1
     )
     code = path + ionosphere + delay
     drift = SPEED_OF_LIGHT * simulation.clock_drift(antenna)
-    doppler = -(ranges.path_rate_mps[:, column] + drift) / wavelength
+    doppler = -(path_rate[:, column] - scale * ionosphere_rate[:, column] + drift) / wavelength
     sine = np.sin(np.radians(np.maximum(geometry.elevation_deg, 1.0)))
     second = np.array([g != SIGNALS[n[0]][0] for n, g in simulation.channels])
     cn0 = CN0_HORIZON_DBHZ + CN0_RISE_DBHZ * sine + CN0_SECOND_DB * second
@@ -290,7 +303,7 @@ def _piece(
         added_doppler, cn0 = added_doppler + extra.doppler_hz, cn0 + extra.cn0_db
     cn0 = np.round(cn0 / CN0_STEP_DBHZ) * CN0_STEP_DBHZ
     sigma = receiver.code_sigma_m * 10.0 ** ((45.0 - np.minimum(cn0, 50.0)) / 20.0) / sine
-    lost = ~_tracked(ranges.elevation_deg, scenario)[:, column] | np.isnan(added_code)
+    lost = ~_tracked(now.elevation_deg, scenario)[:, column] | np.isnan(added_code)
     phase = path - ionosphere + added_phase + receiver.phase_sigma_m * noise[:, :, 1]
     observations = Observations(
         time=time,
@@ -305,22 +318,6 @@ def _piece(
         header=header,
     )
     return Piece(observations=observations, geometry=geometry, clock_m=clock, code_sigma_m=sigma, clean_code_m=code)
-
-
-def _ionosphere(simulation: Simulation, geometry: Geometry, frequency_hz: Floats) -> Floats:
-    scale = simulation.scenario.sky.ionosphere_scale
-    latitude, longitude, _ = geodetic_from_ecef(geometry.antenna_ecef_m)
-    since_midnight = seconds(geometry.time - geometry.time.astype("datetime64[D]"))
-    delay = ionosphere_m(
-        simulation.navigation.klobuchar["G"],
-        since_midnight[:, None],
-        latitude[:, None],
-        longitude[:, None],
-        np.maximum(geometry.elevation_deg, 1.0),
-        geometry.azimuth_deg,
-        frequency_hz=frequency_hz,
-    )
-    return scale * delay
 
 
 def _tracked(elevation_deg: Floats, scenario: Scenario) -> NDArray[np.bool_]:
