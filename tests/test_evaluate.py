@@ -33,15 +33,16 @@ def test_reference_beside_the_line_counts_at_its_nearest_point():
 
 
 @pytest.mark.requirement("D2")
-def test_other_branch_of_a_hairpin_is_as_far_as_the_branches_are():
+def test_other_branch_of_a_hairpin_is_the_same_place_within_its_width():
     s = np.arange(0.0, 300.0, 5.0)
     out = np.stack([s, 0 * s, 0 * s], axis=1)
-    back = np.stack([s[::-1], 0 * s + 6.0, 0 * s], axis=1)
+    back = np.stack([s[::-1], 0 * s + 12.0, 0 * s], axis=1)
     hairpin = Trajectory.from_track(Track.from_ecef(synthetic.enu_to_ecef(np.concatenate([out, back]))))
     reference = hairpin.at_arc(np.array([100.0]))
-    opposite, _ = hairpin.nearest(reference + 6.0 * hairpin.tangent[len(s) - 1])
-    assert opposite[0] > 300.0
-    assert along_track_error(opposite, reference, hairpin) == pytest.approx([6.0], abs=1e-3)
+    beside = hairpin.arc_m[-1] - 100.0
+    assert along_track_error(np.array([beside + 4.0]), reference, hairpin) == pytest.approx([4.0], abs=1e-3)
+    strict = along_track_error(np.array([beside + 4.0]), reference, hairpin, same_place_m=5.0)
+    assert strict == pytest.approx([beside + 4.0 - 100.0], abs=1e-3)
 
 
 @pytest.mark.requirement("D2")

@@ -1,15 +1,17 @@
 """How good were the positions: the error along the line against a reference.
 
-The error is the distance on the map between the answer and the reference's own point on it,
+The error is the distance along the map between the answer and the reference's own point on it,
 positive toward the end of the line (P1 3.3).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from railfix.antenna import Trajectory
 from railfix.timescale import seconds
@@ -86,13 +88,13 @@ def interpolate_reference(
     return between
 
 
-def along_track_error(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
-    """Signed distance on the map from the reference's point to the answer, shape (T,) [m].
+def along_track_error(
+    arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory, *, same_place_m: float = 30.0
+) -> Floats:
+    """Signed distance along the map from the reference's point to the answer, shape (T,) [m].
 
-    The reference's point is the nearest one of the trajectory. The size is the straight distance
-    between the two points - along the line on any stretch of railway, and the metres between the
-    branches where a line passes the same place twice and the answer is on the other branch. The
-    sign is that of the distance along the line, + toward its end (P1 3.3).
+    Where the map passes the reference's place more than once (laps, a road's two carriageways), the
+    pass nearest to the answer counts: which of them it was, one epoch of ranges cannot tell.
 
     Parameters
     ----------
@@ -100,15 +102,42 @@ def along_track_error(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
         Answers along the trajectory; NaN where there is none.
     reference_ecef_m : ndarray, shape (T, 3) [m]
     trajectory : Trajectory
+    same_place_m : float
+        Passes of the map up to this far from the reference are its place. On a line that passes
+        every place once it has no effect.
 
     Returns
     -------
     ndarray, shape (T,) [m]
-        NaN where either is missing.
+        + toward the end of the line (P1 3.3); NaN where either is missing.
     """
-    reference_arc, _ = trajectory.nearest(reference_ecef_m)
-    apart = np.linalg.norm(trajectory.at_arc(arc_m) - trajectory.at_arc(reference_arc), axis=1)
-    return np.copysign(apart, arc_m - reference_arc)
+    error = np.full(len(arc_m), np.nan)
+    at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
+    if not len(at):
+        return error
+    reference, length = reference_ecef_m[at], trajectory.length_m
+    nearest_arc, offset = trajectory.nearest(reference)
+    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
+    lists = cKDTree(middle).query_ball_point(
+        reference, np.maximum(same_place_m, offset) + 0.5 * length.max(), return_sorted=True
+    )
+    which = np.repeat(np.arange(len(at)), [len(x) for x in lists])
+    section = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(which))
+    delta = reference[which] - trajectory.ecef_m[section]
+    along = np.einsum("pi,pi->p", delta, trajectory.tangent[section])
+    foot = np.clip(along, 0.0, length[section])
+    away = np.linalg.norm(delta - foot[:, None] * trajectory.tangent[section], axis=1)
+    # A pass is a local minimum of the distance along the line: no neighbouring section comes nearer.
+    joined = (which[1:] == which[:-1]) & (section[1:] == section[:-1] + 1)
+    passing = away <= same_place_m
+    passing[1:] &= ~joined | (away[1:] <= away[:-1])
+    passing[:-1] &= ~joined | (away[:-1] <= away[1:])
+    signed = np.concatenate([arc_m[at] - nearest_arc, (arc_m[at][which] - trajectory.arc_m[section] - foot)[passing]])
+    owner = np.concatenate([np.arange(len(at)), which[passing]])
+    order = np.lexsort((np.abs(signed), owner))
+    first = order[np.flatnonzero(np.r_[True, owner[order][1:] != owner[order][:-1]])]
+    error[at[owner[first]]] = signed[first]
+    return error
 
 
 def score(error_m: Floats, observed: NDArray[np.bool_]) -> Score:

@@ -27,7 +27,7 @@ PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 class CodeNoise:
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.
 
-    ``sigma = zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(elevation)``
+    ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
 
     Attributes
     ----------
@@ -36,18 +36,23 @@ class CodeNoise:
     zenith_sigma_m : float
         At the zenith and the reference C/N0. Only ratios matter to the position: what it is on a
         receiver is estimated from the residuals (`pipeline.AntennaState`).
+    floor_sigma_m : float
+        What neither C/N0 nor elevation sees: satellite clock and orbit, ionosphere, troposphere left over.
     cn0_reference_dbhz, cn0_cap_dbhz : float
         Above the cap a stronger signal is not a better one.
     """
 
     model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"
     zenith_sigma_m: float = 1.0
+    floor_sigma_m: float = 1.0
     cn0_reference_dbhz: float = 45.0
     cn0_cap_dbhz: float = 50.0
 
     def __post_init__(self) -> None:
         if not self.zenith_sigma_m > 0.0:
             raise ValueError(f"zenith_sigma_m must be positive, got {self.zenith_sigma_m}")
+        if not self.floor_sigma_m >= 0.0:
+            raise ValueError(f"floor_sigma_m must not be negative, got {self.floor_sigma_m}")
 
 
 def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
@@ -58,10 +63,10 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     noise = noise or CodeNoise()
     sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     sigma = noise.zenith_sigma_m / sine
-    if noise.model == "elevation":
-        return sigma
-    cn0 = np.where(np.isnan(cn0_dbhz), noise.cn0_reference_dbhz, np.minimum(cn0_dbhz, noise.cn0_cap_dbhz))
-    return np.asarray(sigma * 10.0 ** ((noise.cn0_reference_dbhz - cn0) / 20.0))
+    if noise.model == "cn0_elevation":
+        cn0 = np.where(np.isnan(cn0_dbhz), noise.cn0_reference_dbhz, np.minimum(cn0_dbhz, noise.cn0_cap_dbhz))
+        sigma = sigma * 10.0 ** ((noise.cn0_reference_dbhz - cn0) / 20.0)
+    return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 
 def channel_order(

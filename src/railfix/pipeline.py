@@ -37,9 +37,8 @@ Bits = NDArray[np.int64]
 
 #: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: A receiver on the ground is this far from the Earth's centre [m], within `EARTH_SHELL_M`.
-EARTH_RADIUS_M: Final = 6.371e6
-EARTH_SHELL_M: Final = 1e5
+#: Further from the line than this a raw 3-D position is no train on it, however bad the ranges [m].
+BESIDE_THE_LINE_M: Final = 1e5
 #: Stands for the satellite of a range without weight [m].
 SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
 
@@ -270,20 +269,22 @@ class EpochProcessor:
     ) -> Floats:
         """A place near the antenna to see the satellites from, shape (T, 3): good to some hundred metres.
 
-        A 3-D position from raw ranges of equal weight, started from the middle of the line at every
-        epoch so that no epoch depends on another; where that fails, the point of the line that fits best.
+        The point of the line nearest to a 3-D position from raw ranges of equal weight, started from the
+        middle of the line at every epoch so that no epoch depends on another; the 3-D position itself
+        where it is nowhere near the line; where there is none, the point of the line that fits best.
         """
-        middle = np.broadcast_to(index.trajectory.ecef_m.mean(axis=0), (len(code), 3))
+        trajectory = index.trajectory
+        middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(code), 3))
         clean = code + states.clock_m - states.group_delay_m
         ranges = _ranges(states, clean, np.full(code.shape, 1.0 / ANCHOR_SIGMA_M**2), reason, groups)
         point = single_point(ranges, middle, limits=self.config.single_point)
-        on_earth = np.abs(np.linalg.norm(point.ecef_m, axis=1) - EARTH_RADIUS_M) < EARTH_SHELL_M
-        anchor = np.where(on_earth[:, None], point.ecef_m, middle)
-        rest = np.flatnonzero(~on_earth)
+        arc, offset = trajectory.nearest(point.ecef_m)
+        beside = offset < BESIDE_THE_LINE_M
+        anchor = np.where(beside[:, None], trajectory.at_arc(arc), point.ecef_m)
+        rest = np.flatnonzero(np.isnan(anchor[:, 0]))
         if len(rest):
-            nowhere = replace(point.take(rest), ecef_m=np.full((len(rest), 3), np.nan))
-            vertex = search(ranges.take(rest), index, nowhere, limits=self.config.section).vertex
-            anchor[rest] = np.where((vertex >= 0)[:, None], index.trajectory.ecef_m[vertex], middle[rest])
+            vertex = search(ranges.take(rest), index, point.take(rest), limits=self.config.section).vertex
+            anchor[rest] = np.where((vertex >= 0)[:, None], trajectory.ecef_m[vertex], middle[rest])
         return anchor
 
     def _corrected(
