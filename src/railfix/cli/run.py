@@ -141,7 +141,7 @@ def run(
             rich_help_panel=CHOICES,
             help="Epochs in memory at a time; the results do not depend on it.",
         ),
-    ] = 6000,
+    ] = 3000,
 ) -> None:
     r"""Positions along the line from receiver logs, navigation files and a track map.
 

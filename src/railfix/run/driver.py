@@ -54,7 +54,7 @@ class RunOptions:
     observations: Literal["skip", "write"] = "skip"
     broken_lines: Literal["stop", "count"] = "stop"
     overwrite: Literal["refuse", "replace"] = "refuse"
-    chunk_epochs: int = 6000
+    chunk_epochs: int = 3000
     start: datetime | None = None
     end: datetime | None = None
     track: TrackReading = field(default_factory=TrackReading)
