@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hatanaka import rnx2crx
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from ncompress import compress
 
 from railfix.errors import InputFileError, MismatchError
@@ -205,7 +207,7 @@ WRONG_FILE: dict[str, tuple[bytes, str]] = {
     "compress damaged": (b"\x1f\x9d\x90" + b"\xff" * 200, "compress (.Z) data are damaged"),
     "Hatanaka cut short": (rnx2crx(text_of(good_3()))[:-60], "Hatanaka (CRX) data are cut short or damaged at line"),
     "Hatanaka header only": (rnx2crx(text_of(good_3()))[:200], "Hatanaka (CRX) data are cut short"),
-    "very long line": (text_of(header_3()) + b"> " * 40000, "longer than 65536 characters"),
+    "very long line": (text_of(header_3()) + b"> " * (9 << 19), "longer than 8388608 characters"),
 }  # fmt: skip
 
 
@@ -233,6 +235,23 @@ def test_missing_and_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(InputFileError, match=r"cannot be opened \(Permission denied\)"):
         read_observations(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "words"), [("  20000000.000  ", "C1C of G05 is"), ("G05  20000000.000  ", "no satellite name")]
+)
+def test_zeros_left_by_a_failing_recorder(tmp_path: Path, old: str, words: str) -> None:
+    lines = header_3()
+    for k in range(60):
+        lines += epoch_3(f"02 33 {k:02d}.0000000", {"G05": [field(2e7), field(1e8), field(None), field(45.0)]})
+    assert len(text_of(lines[:105])) > 5000  # zeros in the first block say that the whole file is binary
+    lines[106] = lines[106].replace(old, "\0" * (16 if old[0] == " " else 90_000))
+    path = write(tmp_path / "log", lines)
+    with pytest.raises(InputFileError, match=words) as caught:
+        read_observations(path)
+    assert caught.value.line == 107
+    assert str(caught.value).isprintable()
+    assert np.isfinite(read_observations(path, on_error="lenient").code_m).sum() == 59
 
 
 @pytest.mark.parametrize("pack", ["gzip", "hatanaka"])
@@ -272,3 +291,32 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
         scan_observations(tmp_path / "log", epochs=0)
     with pytest.raises(ValueError, match="no observation file"):
         read_observations([])
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    old=st.booleans(),
+    edits=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 3), st.binary(min_size=1, max_size=4)), min_size=1),
+)
+def test_whatever_is_broken_ends_in_one_sentence(
+    tmp_path: Path, old: bool, edits: list[tuple[int, int, bytes]]
+) -> None:
+    """Bytes overwritten, inserted and cut out anywhere, the header included."""
+    text = bytearray(text_of(good_2() if old else good_3()))
+    for place, cut, new in edits:
+        at = place % len(text)
+        text[at : at + cut] = new
+    path = tmp_path / "log"
+    path.write_bytes(text)
+    try:
+        strict = read_observations(path)
+    except InputFileError as error:
+        assert str(error).startswith(str(path))  # noqa: PT017
+    else:
+        assert not strict.problems
+    try:
+        lenient = read_observations(path, on_error="lenient")
+    except InputFileError:
+        return
+    assert len(lenient) > 0
+    assert (np.diff(lenient.time) > np.timedelta64(0)).all()

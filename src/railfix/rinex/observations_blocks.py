@@ -21,8 +21,8 @@ from railfix.timescale import bdt_to_gpst, utc_to_gpst
 
 #: Bytes of text read at a time: enough that arrays pay off, few enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: No line of a RINEX file is longer.
-_MAX_LINE_BYTES: Final = 1 << 16
+#: No line of a RINEX file is as long, not even one that a failing recorder filled with zeros.
+_MAX_LINE_BYTES: Final = 8 << 20
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 

@@ -210,8 +210,9 @@ def _read_one_by_one(flat: Words) -> tuple[Floats, Bools]:
     """Fields that have another shape: any decimal number that ends where the field ends."""
     value = np.full(len(flat), np.nan)
     wrong = np.ones(len(flat), dtype=np.bool_)
-    for i, raw in enumerate(flat.view("S16").ravel().tolist()):
-        text = raw.decode("latin-1").ljust(FIELD_WIDTH)
+    characters = flat.tobytes().decode("latin-1")
+    for i in range(len(flat)):
+        text = characters[FIELD_WIDTH * i : FIELD_WIDTH * (i + 1)]
         if not _DIGIT_OR_BLANK.fullmatch(text[14:]):
             continue
         if not text[:14].strip():

@@ -48,6 +48,7 @@ class FaultLog:
 
     def fault(self, what: str, line: int, message: str) -> None:
         """One fault at a 1-based line number."""
+        message = "".join(c if c.isprintable() else "?" for c in message)
         self.count(what, 1)
         self._problems += 1
         if self.strict:
