@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from conftest import ROOT
+from readme_example import real, shown, without_duration
 from reference_document import DOCUMENT, document
 from traceability import TABLE, marked_tests, table
 
@@ -66,3 +67,7 @@ def test_the_example_runs_and_prints_what_it_says(tmp_path: Path, monkeypatch: p
     report: list[str] = []
     results = doctest.DocTestRunner().run(test, out=report.append)
     assert results.failed == 0, "".join(report)
+
+
+def test_the_readme_shows_what_the_program_prints() -> None:
+    assert without_duration(shown()[1]) == without_duration(real()), "run python tests/readme_example.py"

@@ -143,7 +143,7 @@ class OutputFolder:
             for source in self._staged:
                 if (target := self.path / source.name).is_dir():
                     raise OutputError(f"{target}: is a folder, expected a file to replace; remove it")
-            for source in self._staged:
+            for source in sorted(self._staged):
                 files[source.name] = source.replace(self.path / source.name)
         return files
 
