@@ -5,12 +5,17 @@ question: how well do pseudoranges fit a place, whatever the receiver clock of e
 is? Subtracting the weighted mean of a constellation's satellites from its residuals and design
 rows is the same as solving for that clock (algebraically: the Schur complement of the clock
 block). What is left is a 3 x 3 system in the place alone.
+
+Where the offsets between the clocks are known to some sigma (`ClockTies`), what the means of the
+constellations say about each other is added back: each mean, less its offset, is one more
+observation of a common clock, which is eliminated in the same way.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +24,29 @@ from railfix.constants import CLOCK_GROUP
 from railfix.geodesy import range_with_rotation
 
 Floats = NDArray[np.float64]
+
+#: Sigma of an offset between clocks of which nothing is known [m].
+UNTIED_M: Final = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockTies:
+    """What is known of the clocks of the constellations against each other.
+
+    Attributes
+    ----------
+    offset_m : ndarray, shape (T, G) [m]
+        Receiver clock of each group less a clock common to all; any finite value where unknown.
+    sigma_m : ndarray, shape (T, G) [m]
+        Its standard deviation; `UNTIED_M` where nothing is known.
+    """
+
+    offset_m: Floats
+    sigma_m: Floats
+
+    def take(self, epochs: NDArray[np.bool_] | NDArray[np.intp]) -> ClockTies:
+        """The ties of some epochs, by mask or index."""
+        return ClockTies(offset_m=self.offset_m[epochs], sigma_m=self.sigma_m[epochs])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,12 +64,15 @@ class Ranges:
         1/sigma^2, 0 for what is not used.
     groups : tuple of slice
         Channels that share one receiver clock stand side by side; one slice a clock.
+    ties : ClockTies or None
+        What is known of these clocks against each other; None: nothing.
     """
 
     sat_ecef_m: Floats
     code_m: Floats
     weight: Floats
     groups: tuple[slice, ...]
+    ties: ClockTies | None = None
 
     def __len__(self) -> int:
         return len(self.code_m)
@@ -53,6 +84,7 @@ class Ranges:
             code_m=self.code_m[epochs],
             weight=self.weight[epochs],
             groups=self.groups,
+            ties=None if self.ties is None else self.ties.take(epochs),
         )
 
     @property
@@ -62,9 +94,14 @@ class Ranges:
 
     @property
     def n_clocks(self) -> NDArray[np.int64]:
-        """Receiver clocks that have at least one channel, shape (T,)."""
-        seen = [np.any(self.weight[:, group] > 0, axis=1) for group in self.groups]
-        return np.sum(seen, axis=0, dtype=np.int64) if seen else np.zeros(len(self), dtype=np.int64)
+        """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
+        seen = np.zeros((len(self), len(self.groups)), dtype=bool)
+        for g, group in enumerate(self.groups):
+            seen[:, g] = np.any(self.weight[:, group] > 0, axis=1)
+        if self.ties is None:
+            return np.count_nonzero(seen, axis=1)
+        tied = self.ties.sigma_m < UNTIED_M
+        return np.count_nonzero(seen & ~tied, axis=1) + np.any(seen & tied, axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,22 +166,58 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     weight = ranges.weight
     # Columns: the design row -u (three) and the residual.
     rows = np.concatenate([-los, (ranges.code_m - distance)[..., None]], axis=-1)
-    clocks = np.full((len(weight), len(ranges.groups)), np.nan)
+    totals = np.empty((len(weight), len(ranges.groups)))
+    means = np.empty((*totals.shape, 4))
     for g, group in enumerate(ranges.groups):
-        total = weight[:, group].sum(axis=1)
-        seen = total > 0
-        mean = np.matmul(weight[:, None, group], rows[:, group])[:, 0] / np.where(seen, total, 1.0)[:, None]
-        rows[:, group] -= mean[:, None, :]
-        clocks[:, g] = np.where(seen, mean[:, 3], np.nan)
+        totals[:, g] = weight[:, group].sum(axis=1)
+        safe = np.where(totals[:, g] > 0, totals[:, g], 1.0)
+        means[:, g] = np.matmul(weight[:, None, group], rows[:, group])[:, 0] / safe[:, None]
+        rows[:, group] -= means[:, g, None, :]
     rows *= (weight > 0)[..., None]
     system = np.matmul((rows * weight[..., None]).swapaxes(1, 2), rows)
+    clocks, residual = np.where(totals > 0, means[..., 3], np.nan), rows[..., 3]
+    if ranges.ties is not None:
+        apart, mass = _between_clocks(means, totals, ranges.ties)
+        system += np.matmul((apart * mass[..., None]).swapaxes(1, 2), apart)
+        # A clock lies between what its own satellites and what the others say.
+        own = totals * ranges.ties.sigma_m**2
+        shift = apart[..., 3] / (own + 1.0)
+        clocks = clocks - shift
+        for g, group in enumerate(ranges.groups):
+            residual[:, group] += shift[:, g, None] * (weight[:, group] > 0)
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],
         wsse=system[:, 3, 3],
         clock_m=clocks,
-        residual_m=rows[..., 3],
+        residual_m=residual,
     )
+
+
+def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Floats, Floats]:
+    """Means of the groups (last column: residual) less the common clock, and the weight of each.
+
+    Parameters
+    ----------
+    means : ndarray, shape (T, G, C)
+    totals : ndarray, shape (T, G) [1/m^2]
+        Weight of each mean, 0 where the group has no satellite.
+    ties : ClockTies
+
+    Returns
+    -------
+    apart : ndarray, shape (T, G, C)
+    mass : ndarray, shape (T, G) [1/m^2]
+    """
+    apart = means.copy()
+    apart[..., -1] -= ties.offset_m
+    seen = totals > 0
+    mass = np.where(seen, 1.0 / (1.0 / np.where(seen, totals, 1.0) + ties.sigma_m**2), 0.0)
+    total = mass.sum(axis=1)
+    common = np.einsum("tg,tgc->tc", mass, apart) / np.where(total > 0, total, 1.0)[:, None]
+    apart -= common[:, None, :]
+    apart *= seen[..., None]
+    return apart, mass
 
 
 def fit(ranges: Ranges, place_ecef_m: Floats) -> Floats:
@@ -153,14 +226,18 @@ def fit(ranges: Ranges, place_ecef_m: Floats) -> Floats:
     The ``q`` of the section search: `normal_equations(...).wsse` without the derivatives.
     """
     distance, _ = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    total = np.zeros(len(ranges))
-    for group in ranges.groups:
+    result = np.zeros(len(ranges))
+    totals, means = np.empty((2, len(ranges), len(ranges.groups)))
+    for g, group in enumerate(ranges.groups):
         weight = ranges.weight[:, group]
         residual = ranges.code_m[:, group] - distance[:, group]
-        mass = weight.sum(axis=1)
-        mean = (weight * residual).sum(axis=1) / np.where(mass > 0, mass, 1.0)
-        total += (weight * (residual - mean[:, None]) ** 2).sum(axis=1)
-    return total
+        totals[:, g] = weight.sum(axis=1)
+        means[:, g] = (weight * residual).sum(axis=1) / np.where(totals[:, g] > 0, totals[:, g], 1.0)
+        result += (weight * (residual - means[:, g, None]) ** 2).sum(axis=1)
+    if ranges.ties is not None:
+        apart, mass = _between_clocks(means[..., None], totals, ranges.ties)
+        result += (mass * apart[..., 0] ** 2).sum(axis=1)
+    return result
 
 
 def inverse_3x3(matrix: Floats) -> Floats:

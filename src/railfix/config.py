@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
+from railfix.clock_offsets import ClockOffsetLimits
 from railfix.constrained import ConstrainedLimits
 from railfix.errors import InputFileError, SettingsError
 from railfix.measurement import CodeNoise
@@ -65,7 +66,7 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
-    noise, elevation, single_point, section, constrained
+    noise, elevation, clock_offsets, single_point, section, constrained
         Limits of the rooms of these names.
     """
 
@@ -84,6 +85,7 @@ class Config(BaseModel):
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_prior: float = Field(default=100.0, gt=0)
     noise: CodeNoise = Field(default_factory=CodeNoise)
+    clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
     single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)
     section: SectionLimits = Field(default_factory=SectionLimits)
@@ -96,7 +98,7 @@ class Config(BaseModel):
             raise ValueError("name at least one constellation, each once")
         return value
 
-    @field_validator("noise", "elevation", "single_point", "section", "constrained", mode="before")
+    @field_validator("noise", "elevation", "clock_offsets", "single_point", "section", "constrained", mode="before")
     @classmethod
     def _known_keys(cls, value: Any, info: Any) -> Any:
         if isinstance(value, dict):

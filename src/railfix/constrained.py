@@ -206,6 +206,7 @@ def along_track_dilution(ranges: Ranges, trajectory: Trajectory, arc_m: Floats, 
         code_m=part.code_m,
         weight=(part.weight > 0).astype(np.float64),
         groups=part.groups,
+        ties=part.ties,
     )
     equations = normal_equations(unit, trajectory.at_arc(arc_m[at]))
     tangent = trajectory.tangent[section[at]]

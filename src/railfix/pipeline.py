@@ -8,7 +8,7 @@ result and the new state. A live epoch is a chunk of length one; any cutting giv
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -18,8 +18,10 @@ from scipy.stats import chi2
 
 from railfix.antenna import Trajectory
 from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
-from railfix.clock_elimination import Ranges, clock_groups
+from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges, clock_groups
+from railfix.clock_offsets import OffsetState, tie_clocks
 from railfix.config import Config
+from railfix.constants import CLOCK_GROUP
 from railfix.constrained import Constrained, constrained_position
 from railfix.epochs import Observations
 from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
@@ -27,13 +29,13 @@ from railfix.measurement import PLAUSIBLE_CODE_M, channel_order, code_sigma_m, f
 from railfix.navigation import Navigation
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import POSITIONED, Reason, Status
+from railfix.results import AntennaResult, AntennaState, Bits, Floats, Result, State
 from railfix.screens import Screened, elevation_screen
 from railfix.section import SearchIndex, Section, search
 from railfix.signals import carrier_frequency_hz
 from railfix.spp import SinglePoint, single_point
 
-Floats = NDArray[np.float64]
-Bits = NDArray[np.int64]
+__all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "State"]
 
 #: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
 ANCHOR_SIGMA_M: Final = 10.0
@@ -41,121 +43,6 @@ ANCHOR_SIGMA_M: Final = 10.0
 BESIDE_THE_LINE_M: Final = 1e5
 #: Stands for the satellite of a range without weight [m].
 SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AntennaState:
-    """What one antenna's epochs leave to the next.
-
-    Attributes
-    ----------
-    log_variance_sum, log_variance_weight : float
-        Sums behind the noise scale: the receiver's post-fit variance against the weights, averaged
-        as a logarithm so that multipath does not carry it.
-    """
-
-    log_variance_sum: float = 0.0
-    log_variance_weight: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class State:
-    """What a chunk leaves to the next, by antenna."""
-
-    antennas: Mapping[str, AntennaState] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, kw_only=True)
-class AntennaResult:
-    """All that was found for one antenna, T epochs by M channels (those of the observations given).
-
-    Attributes
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    satellite, signal : ndarray of str, shape (M,)
-    status : ndarray of int8, shape (T,)
-        `reasons.Status`.
-    chainage_m, kilometrage_m, arc_m : ndarray, shape (T,) [m]
-        Along the line (reference point named by the trajectory), its own marking, and along the
-        antenna's trajectory. NaN where the status has no position.
-    along_sigma_m : ndarray, shape (T,) [m]
-        Standard deviation along the line, the receiver's noise scale and the map error included.
-    noise_scale : ndarray, shape (T,)
-        Standard deviation of this receiver's ranges against the one the weights assume, as
-        estimated from all epochs so far.
-    ecef_m : ndarray, shape (T, 3) [m]
-        Antenna.
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-    n_used, n_rejected : ndarray of int, shape (T,)
-        Satellites used; satellites with a code that were not used.
-    conventional_ecef_m : ndarray, shape (T, 3) [m]
-        3-D single point from the same ranges.
-    conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]
-        Nearest point of the trajectory to it, and how far that is.
-    reason : ndarray of int64, shape (T, M)
-        `reasons.Reason` bits, 0 = used.
-    elevation_deg, azimuth_deg, cn0_dbhz, sigma_m, corrected_code_m, residual_m : ndarray, shape (T, M)
-        NaN where unknown; residuals of the position on the line.
-    satellites : SatelliteStates
-        Of the channels in `columns`.
-    columns : ndarray of int, shape (K,)
-        Channels that settings allow, in the order of the intermediate results below.
-    elevation_screen : Screened
-    single_point : SinglePoint
-    section : Section
-    constrained : Constrained
-    """
-
-    time: NDArray[np.datetime64]
-    satellite: NDArray[np.str_]
-    signal: NDArray[np.str_]
-    status: NDArray[np.int8]
-    chainage_m: Floats
-    kilometrage_m: Floats
-    arc_m: Floats
-    along_sigma_m: Floats
-    noise_scale: Floats
-    ecef_m: Floats
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    n_used: NDArray[np.int64]
-    n_rejected: NDArray[np.int64]
-    conventional_ecef_m: Floats
-    conventional_arc_m: Floats
-    conventional_chainage_m: Floats
-    conventional_offset_m: Floats
-    reason: Bits
-    elevation_deg: Floats
-    azimuth_deg: Floats
-    cn0_dbhz: Floats
-    sigma_m: Floats
-    corrected_code_m: Floats
-    residual_m: Floats
-    satellites: SatelliteStates
-    columns: NDArray[np.intp]
-    elevation_screen: Screened
-    single_point: SinglePoint
-    section: Section
-    constrained: Constrained
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """Results of one chunk.
-
-    Attributes
-    ----------
-    antennas : mapping of str to AntennaResult
-    notes : tuple of str
-        What was asked for and what was used in its place, one sentence each.
-    """
-
-    antennas: Mapping[str, AntennaResult]
-    notes: tuple[str, ...]
 
 
 class EpochProcessor:
@@ -244,25 +131,48 @@ class EpochProcessor:
         elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
         elevation_verdict = elevation_screen(elevation, limits=self.config.elevation)
         reason[elevation_verdict.reject] |= Reason.ELEVATION_MASK
-        _refuse_lone(reason, groups)
-
         frequency = carrier_frequency_hz(satellite, signal, obs.header.glonass_channel)
         corrected = self._corrected(obs.time, anchor, elevation, azimuth, frequency, states, code)
         sigma = code_sigma_m(cn0, elevation, noise=self.config.noise)
+        reason[(reason == 0) & ~(np.isfinite(corrected) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
         ranges = _ranges(states, corrected, 1.0 / sigma**2, reason, groups)
         point = single_point(ranges, anchor, limits=self.config.single_point)
-        section = search(ranges, index, point, limits=self.config.section)
-        enough = ranges.n_used >= self.config.min_satellites
-        constrained = constrained_position(
-            ranges, trajectory, np.where(enough, section.vertex, -1), limits=self.config.constrained
-        )
+        section, constrained = self._on_the_line(ranges, index, point)
+        ties, offsets = self._ties(obs.time, satellite, ranges, constrained, state)
+        if len(groups) > 1:
+            ranges = replace(ranges, ties=ties)
+            start = np.where(np.isnan(point.ecef_m), anchor, point.ecef_m)
+            tied = single_point(ranges, start, limits=self.config.single_point)
+            section, constrained = self._on_the_line(ranges, index, tied)
+        _refuse_lone(reason, groups, ties)
         status = self._status(code, ranges, trajectory, point, section, constrained)
         scale, state = self._noise_scale(ranges, constrained, state)
         found = _Found(
             columns=columns, states=states, elevation=elevation_verdict, azimuth_deg=azimuth, sigma_m=sigma,
             corrected_code_m=corrected, reason=reason, point=point, section=section, constrained=constrained,
+            clocks=_clock_letters(satellite, groups), ties=ties,
         )  # fmt: skip
-        return self._result(obs, trajectory, status, scale, found), state
+        return self._result(obs, trajectory, status, scale, found), replace(state, offsets=offsets)
+
+    def _on_the_line(self, ranges: Ranges, index: SearchIndex, point: SinglePoint) -> tuple[Section, Constrained]:
+        """Section search and constrained position where there are satellites enough."""
+        section = search(ranges, index, point, limits=self.config.section)
+        enough = ranges.n_used >= self.config.min_satellites
+        vertex = np.where(enough, section.vertex, -1)
+        return section, constrained_position(ranges, index.trajectory, vertex, limits=self.config.constrained)
+
+    def _ties(
+        self,
+        time: NDArray[np.datetime64],
+        satellite: NDArray[np.str_],
+        ranges: Ranges,
+        free: Constrained,
+        state: AntennaState,
+    ) -> tuple[ClockTies, OffsetState]:
+        """What is known of the clocks against that of the first constellation asked for."""
+        reference = CLOCK_GROUP[self.config.systems[0]]
+        clocks = _clock_letters(satellite, ranges.groups)
+        return tie_clocks(time, clocks, reference, ranges, free, state.offsets, limits=self.config.clock_offsets)
 
     def _anchor(
         self, index: SearchIndex, groups: tuple[slice, ...], states: SatelliteStates, code: Floats, reason: Bits
@@ -350,7 +260,7 @@ class EpochProcessor:
         sums = np.cumsum(np.r_[state.log_variance_sum, weight * level])
         weights = np.cumsum(np.r_[state.log_variance_weight, weight])
         scale = np.exp(0.5 * sums[1:] / (weights[1:] + self.config.noise_prior))
-        return scale, AntennaState(log_variance_sum=float(sums[-1]), log_variance_weight=float(weights[-1]))
+        return scale, replace(state, log_variance_sum=float(sums[-1]), log_variance_weight=float(weights[-1]))
 
     def _result(
         self, obs: Observations, trajectory: Trajectory, status: NDArray[np.int8], scale: Floats, found: _Found
@@ -403,6 +313,9 @@ class EpochProcessor:
             single_point=point,
             section=found.section,
             constrained=constrained,
+            clocks=found.clocks,
+            clock_offset_m=found.ties.offset_m,
+            clock_offset_sigma_m=found.ties.sigma_m,
         )
 
     def _whole_reason(self, obs: Observations, found: _Found) -> Bits:
@@ -429,6 +342,8 @@ class _Found:
     point: SinglePoint
     section: Section
     constrained: Constrained
+    clocks: tuple[str, ...]
+    ties: ClockTies
 
 
 def _refuse_codes(satellite: NDArray[np.str_], code: Floats) -> Bits:
@@ -454,12 +369,16 @@ def _refuse_satellites(reason: Bits, states: SatelliteStates) -> None:
         reason[observed & mask] |= bit
 
 
-def _refuse_lone(reason: Bits, groups: tuple[slice, ...]) -> None:
+def _refuse_lone(reason: Bits, groups: tuple[slice, ...], ties: ClockTies) -> None:
     """Add the reason of a satellite that determines its own clock and nothing else."""
-    for group in groups:
+    for g, group in enumerate(groups):
         used = reason[:, group] == 0
-        lone = used & (np.count_nonzero(used, axis=1) == 1)[:, None]
+        lone = used & (np.count_nonzero(used, axis=1) == 1)[:, None] & (ties.sigma_m[:, g, None] >= UNTIED_M)
         reason[:, group][lone] |= Reason.ALONE_ON_ITS_CLOCK
+
+
+def _clock_letters(satellite: NDArray[np.str_], groups: tuple[slice, ...]) -> tuple[str, ...]:
+    return tuple(CLOCK_GROUP[str(satellite[group.start])[0]] for group in groups)
 
 
 def _ranges(states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]) -> Ranges:

@@ -35,8 +35,8 @@ class Reason(IntFlag):
     ELEVATION_MASK = 1 << 7
     #: The only usable satellite of its clock: it determines that clock and nothing else.
     ALONE_ON_ITS_CLOCK = 1 << 8
-    #: No place to look from: elevation and delays are unknown.
-    NO_APPROXIMATE_POSITION = 1 << 9
+    #: A correction of its signal is unknown: its group delay is not broadcast, or it stands at the horizon.
+    NO_CORRECTION = 1 << 9
 
 
 class Status(IntEnum):

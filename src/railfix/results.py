@@ -1,0 +1,145 @@
+"""What the pipeline returns: every intermediate result, and the state that one chunk leaves to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.clock_offsets import OffsetState
+from railfix.constrained import Constrained
+from railfix.orbits import SatelliteStates
+from railfix.screens import Screened
+from railfix.section import Section
+from railfix.spp import SinglePoint
+
+Floats = NDArray[np.float64]
+Bits = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaState:
+    """What one antenna's epochs leave to the next.
+
+    Attributes
+    ----------
+    log_variance_sum, log_variance_weight : float
+        Sums behind the noise scale: the receiver's post-fit variance against the weights, averaged
+        as a logarithm so that multipath does not carry it.
+    offsets : OffsetState
+        What is known of the offsets between the clocks of the constellations.
+    """
+
+    log_variance_sum: float = 0.0
+    log_variance_weight: float = 0.0
+    offsets: OffsetState = field(default_factory=OffsetState)
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What a chunk leaves to the next, by antenna."""
+
+    antennas: Mapping[str, AntennaState] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaResult:
+    """All that was found for one antenna, T epochs by M channels (those of the observations given).
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite, signal : ndarray of str, shape (M,)
+    status : ndarray of int8, shape (T,)
+        `reasons.Status`.
+    chainage_m, kilometrage_m, arc_m : ndarray, shape (T,) [m]
+        Along the line (reference point named by the trajectory), its own marking, and along the
+        antenna's trajectory. NaN where the status has no position.
+    along_sigma_m : ndarray, shape (T,) [m]
+        Standard deviation along the line, the receiver's noise scale and the map error included.
+    noise_scale : ndarray, shape (T,)
+        Standard deviation of this receiver's ranges against the one the weights assume, as
+        estimated from all epochs so far.
+    ecef_m : ndarray, shape (T, 3) [m]
+        Antenna.
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+    n_used, n_rejected : ndarray of int, shape (T,)
+        Satellites used; satellites with a code that were not used.
+    conventional_ecef_m : ndarray, shape (T, 3) [m]
+        3-D single point from the same ranges.
+    conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]
+        Nearest point of the trajectory to it, and how far that is.
+    reason : ndarray of int64, shape (T, M)
+        `reasons.Reason` bits, 0 = used.
+    elevation_deg, azimuth_deg, cn0_dbhz, sigma_m, corrected_code_m, residual_m : ndarray, shape (T, M)
+        NaN where unknown; residuals of the position on the line.
+    satellites : SatelliteStates
+        Of the channels in `columns`.
+    columns : ndarray of int, shape (K,)
+        Channels that settings allow, in the order of the intermediate results below.
+    elevation_screen : Screened
+    single_point : SinglePoint
+        The conventional position: every constellation with a clock of its own.
+    section : Section
+    constrained : Constrained
+    clocks : tuple of str
+        Letter of each receiver clock of the results above, length G.
+    clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
+        What was known before each epoch of that clock against the reference clock.
+    """
+
+    time: NDArray[np.datetime64]
+    satellite: NDArray[np.str_]
+    signal: NDArray[np.str_]
+    status: NDArray[np.int8]
+    chainage_m: Floats
+    kilometrage_m: Floats
+    arc_m: Floats
+    along_sigma_m: Floats
+    noise_scale: Floats
+    ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    n_used: NDArray[np.int64]
+    n_rejected: NDArray[np.int64]
+    conventional_ecef_m: Floats
+    conventional_arc_m: Floats
+    conventional_chainage_m: Floats
+    conventional_offset_m: Floats
+    reason: Bits
+    elevation_deg: Floats
+    azimuth_deg: Floats
+    cn0_dbhz: Floats
+    sigma_m: Floats
+    corrected_code_m: Floats
+    residual_m: Floats
+    satellites: SatelliteStates
+    columns: NDArray[np.intp]
+    elevation_screen: Screened
+    single_point: SinglePoint
+    section: Section
+    constrained: Constrained
+    clocks: tuple[str, ...]
+    clock_offset_m: Floats
+    clock_offset_sigma_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Results of one chunk.
+
+    Attributes
+    ----------
+    antennas : mapping of str to AntennaResult
+    notes : tuple of str
+        What was asked for and what was used in its place, one sentence each.
+    """
+
+    antennas: Mapping[str, AntennaResult]
+    notes: tuple[str, ...]
