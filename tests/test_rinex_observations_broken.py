@@ -7,12 +7,12 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import ncompress
 import numpy as np
 import pytest
 from hatanaka import rnx2crx
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from ncompress import compress
 
 from railfix.errors import InputFileError, MismatchError
 from railfix.rinex import read_observations, scan_observations
@@ -272,7 +272,7 @@ def test_lenient_reads_what_comes_before_damage(tmp_path: Path, pack: str) -> No
 
 def test_compress_cut_short_ends_in_the_middle(tmp_path: Path) -> None:
     path = tmp_path / "log.Z"
-    path.write_bytes(compress(text_of(good_3()))[:-30])
+    path.write_bytes(ncompress.compress(text_of(good_3()))[:-30])
     with pytest.raises(InputFileError, match="ends in the middle of an epoch"):
         read_observations(path)
 
