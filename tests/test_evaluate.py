@@ -42,7 +42,7 @@ def test_other_branch_of_a_hairpin_is_the_same_place_within_its_width():
     beside = hairpin.arc_m[-1] - 100.0
     assert along_track_error(np.array([beside + 4.0]), reference, hairpin) == pytest.approx([4.0], abs=1e-3)
     strict = along_track_error(np.array([beside + 4.0]), reference, hairpin, same_place_m=5.0)
-    assert strict == pytest.approx([beside + 4.0 - 100.0], abs=1e-3)
+    assert strict == pytest.approx([np.hypot(12.0, 4.0)], abs=1e-3)  # straight across, not round the bend
 
 
 @pytest.mark.requirement("D2")

@@ -91,10 +91,13 @@ def interpolate_reference(
 def along_track_error(
     arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory, *, same_place_m: float = 30.0
 ) -> Floats:
-    """Signed distance along the map from the reference's point to the answer, shape (T,) [m].
+    """Signed distance on the map from the reference's point to the answer, shape (T,) [m].
 
-    Where the map passes the reference's place more than once (laps, a road's two carriageways), the
-    pass nearest to the answer counts: which of them it was, one epoch of ranges cannot tell.
+    The distance along the line. Where the map passes the reference's place more than once (laps, a
+    road's two carriageways) the pass nearest to the answer counts: which of them it was, one epoch
+    of ranges cannot tell. And where the line comes back to near itself (a crossing), the straight
+    distance between the two points counts if it is shorter. On a line that passes every place once
+    neither has an effect, but for the chord of a curve.
 
     Parameters
     ----------
@@ -103,8 +106,7 @@ def along_track_error(
     reference_ecef_m : ndarray, shape (T, 3) [m]
     trajectory : Trajectory
     same_place_m : float
-        Passes of the map up to this far from the reference are its place. On a line that passes
-        every place once it has no effect.
+        Passes of the map up to this far from the reference are its place.
 
     Returns
     -------
@@ -137,6 +139,8 @@ def along_track_error(
     order = np.lexsort((np.abs(signed), owner))
     first = order[np.flatnonzero(np.r_[True, owner[order][1:] != owner[order][:-1]])]
     error[at[owner[first]]] = signed[first]
+    straight = np.linalg.norm(trajectory.at_arc(arc_m[at]) - trajectory.at_arc(nearest_arc), axis=1)
+    error[at] = np.copysign(np.minimum(np.abs(error[at]), straight), error[at])
     return error
 
 
