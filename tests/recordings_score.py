@@ -38,8 +38,9 @@ class Outcome:
     name: str
     constrained: Score
     conventional: Score
+    error_m: np.ndarray
     result: AntennaResult | None
-    trajectory: Trajectory | None
+    trajectory: Trajectory
     ranges: Ranges | None = None
 
 
@@ -64,7 +65,7 @@ def outcome(name: str, antenna: AntennaResult, reference: np.ndarray, trajectory
     observed = np.isfinite(reference[:, 0]) & np.any((antenna.reason & 1) == 0, axis=1)
     error = along_track_error(antenna.arc_m, reference, trajectory)
     other = along_track_error(antenna.conventional_arc_m, reference, trajectory)
-    return Outcome(name, score(error, observed), score(other, observed), antenna, trajectory)
+    return Outcome(name, score(error, observed), score(other, observed), error, antenna, trajectory)
 
 
 def urbannav_f9p(data: Path, config: Config = SETTINGS) -> Outcome:
@@ -179,10 +180,12 @@ def smartloc(data: Path, config: Config = SETTINGS) -> Outcome:
     reference = interpolate_reference(log.time, time, ecef)
     observed = np.isfinite(reference[:, 0]) & np.isfinite(log.code_m).any(axis=1)
     nearest, _ = trajectory.nearest(point.ecef_m)
+    error = along_track_error(arc, reference, trajectory)
     return Outcome(
         "smartloc_berlin",
-        score(along_track_error(arc, reference, trajectory), observed),
+        score(error, observed),
         score(along_track_error(nearest, reference, trajectory), observed),
+        error,
         None,
         trajectory,
         ranges,
@@ -206,13 +209,18 @@ def main() -> int:
     head = "recording                  epochs  rate %   p50 m   p95 m   max m  wrong %"
     print(f"{head}  | conventional: rate %  p50 m  p95 m")
     outcomes = [run(data) for run in RECORDINGS.values()]
-    outcomes += [geonet(data, station, azimuth) for station in ("0759", "3040") for azimuth in (0, 45, 90, 135)]
+    stations = [geonet(data, station, azimuth) for station in ("0759", "3040") for azimuth in (0, 45, 90, 135)]
+    outcomes += stations
     for o in outcomes:
         a, b = o.constrained, o.conventional
         print(
             f"{o.name:26s} {a.epochs:6d} {100 * a.rate:7.2f} {a.p50_m:7.2f} {a.p95_m:7.2f} {a.max_m:7.1f} "
             f"{100 * a.wrong_place:8.2f}  | {100 * b.rate:20.2f} {b.p50_m:6.2f} {b.p95_m:6.2f}"
         )
+    together = np.concatenate([o.error_m for o in stations])
+    pooled = score(together, np.ones(len(together), dtype=bool))
+    head = f"{'geonet2005 all lines':26s} {pooled.epochs:6d} {100 * pooled.rate:7.2f}"
+    print(f"{head} {pooled.p50_m:7.2f} {pooled.p95_m:7.2f}")
     return 0
 
 

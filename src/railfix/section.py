@@ -227,7 +227,7 @@ def _ball(
 
 def _bend(distance_m: Floats) -> Floats:
     """What the linear model of a range can be wrong by at a distance from where it was made [m]."""
-    return distance_m**2 / (2.0 * _SHORTEST_RANGE) + _ROTATION_GRADIENT * distance_m
+    return np.asarray(distance_m**2 / (2.0 * _SHORTEST_RANGE) + _ROTATION_GRADIENT * distance_m)
 
 
 def _in_ball(
