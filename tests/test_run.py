@@ -19,7 +19,7 @@ from railfix.demonstration import compare, demo_inputs, draw
 from railfix.errors import MismatchError, NoPositionError
 from railfix.pipeline import EpochProcessor, Result
 from railfix.reasons import POSITIONED, Reason, Status, reason_text
-from railfix.rinex import read_navigation, read_observations
+from railfix.rinex import read_navigation, read_observations, scan_observations
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table, to_xarray
 from railfix.track_map import read_track
@@ -238,7 +238,7 @@ def test_errors_of_the_inputs_have_their_classes(bench: Bench, tmp_path: Path) -
 
 
 def test_progress_is_told(bench: Bench, tmp_path: Path) -> None:
-    told: list[tuple[int, float | None]] = []
+    told: list[tuple[int, float]] = []
     run_files(
         inputs_of(bench),
         out=tmp_path / "out",
@@ -246,6 +246,29 @@ def test_progress_is_told(bench: Bench, tmp_path: Path) -> None:
         progress=lambda *, epochs, fraction: told.append((epochs, fraction)),
     )
     assert [epochs for epochs, _ in told] == [20, 40, 60]
+    assert all(0.0 < fraction <= 1.0 for _, fraction in told)
+    assert told[-1][1] == 1.0
+
+
+@pytest.mark.parametrize("kind", ["plain", "gz", "crx", "crx.gz"])
+def test_the_share_of_a_packed_log_grows(whole: RunSummary, tmp_path: Path, kind: str) -> None:
+    """Progress needs to know how far the reading is, whatever the packing."""
+    import gzip
+
+    import hatanaka
+
+    assert whole
+    packed = gzip.decompress(demo_inputs().front[0].read_bytes())
+    content = {"plain": hatanaka.decompress, "gz": lambda c: gzip.compress(hatanaka.decompress(c))}.get(kind, bytes)(
+        packed
+    )
+    path = tmp_path / f"front.{kind}"
+    path.write_bytes(gzip.compress(content) if kind == "crx.gz" else content)
+    shares: list[float] = []
+    for _ in scan_observations(path, epochs=100, progress=shares.append):
+        pass
+    assert shares == sorted(shares)
+    assert 0.0 < shares[0] <= shares[-1] == 1.0
 
 
 def test_tables_hold_the_arrays(result: Result) -> None:

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from railfix.run import RunSummary
     from railfix.run.driver import Progress as ProgressCall
 
-#: Parts of the whole that the bar counts in.
-_STEPS = 1000
-
 
 @contextmanager
 def progress_bar() -> Iterator[ProgressCall]:
@@ -33,14 +30,13 @@ def progress_bar() -> Iterator[ProgressCall]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("positions", total=None, epochs=0, rate=0.0)
+        task = bar.add_task("positions", total=1.0, epochs=0, rate=0.0)
 
-        def show(*, epochs: int, fraction: float | None) -> None:
+        def show(*, epochs: int, fraction: float) -> None:
             elapsed = bar.tasks[task].elapsed or 0.0
             bar.update(
                 task,
-                total=None if fraction is None else _STEPS,
-                completed=0 if fraction is None else _STEPS * fraction,
+                completed=fraction,
                 epochs=epochs,
                 rate=epochs / elapsed if elapsed > 0 else 0.0,
             )

@@ -17,6 +17,7 @@ from __future__ import annotations
 import gzip
 import importlib.resources
 import io
+import os
 import re
 import shutil
 import subprocess
@@ -60,10 +61,17 @@ class ByteStream(io.BufferedIOBase):
         The file as it was named.
     """
 
-    def __init__(self, path: FilePath, source: IO[bytes], held: ExitStack) -> None:
+    def __init__(self, path: FilePath, source: IO[bytes], held: ExitStack, *, disk: IO[bytes] | None = None) -> None:
         self.path = str(path)
         self._source = source
         self._held = held
+        self._disk = source if disk is None else disk
+
+    @property
+    def share(self) -> float:
+        """Part of the bytes on disk that has been read, 0 to 1."""
+        number = self._disk.fileno()
+        return os.lseek(number, 0, os.SEEK_CUR) / max(os.fstat(number).st_size, 1)
 
     def readable(self) -> bool:
         """Always true."""
@@ -90,8 +98,10 @@ class ByteStream(io.BufferedIOBase):
 class _HatanakaStream(ByteStream):
     """Output of the Hatanaka decoder; its verdict is read where its output ends."""
 
-    def __init__(self, path: FilePath, process: subprocess.Popen[bytes], log: IO[bytes], held: ExitStack) -> None:
-        super().__init__(path, cast("IO[bytes]", process.stdout), held)
+    def __init__(
+        self, path: FilePath, process: subprocess.Popen[bytes], log: IO[bytes], held: ExitStack, *, disk: IO[bytes]
+    ) -> None:
+        super().__init__(path, cast("IO[bytes]", process.stdout), held, disk=disk)
         self._process = process
         self._log = log
         self._done = False
@@ -236,7 +246,7 @@ def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> Byte
     program = held.enter_context(importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / name))
     process = subprocess.Popen([str(program), "-"], stdin=source, stdout=subprocess.PIPE, stderr=log)
     held.callback(_end, process)
-    return _HatanakaStream(path, process, log, held.pop_all())
+    return _HatanakaStream(path, process, log, held.pop_all(), disk=source)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

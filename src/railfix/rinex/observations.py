@@ -22,7 +22,7 @@ An error in the header that changes how the file is read is raised in both.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from os import PathLike
@@ -96,6 +96,7 @@ def scan_observations(
     systems: Iterable[str] | None = None,
     start: np.datetime64 | str | None = None,
     end: np.datetime64 | str | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
     """Read the observation file or files of one receiver in pieces.
 
@@ -105,6 +106,8 @@ def scan_observations(
         As `read_observations`, of which this is the other form: the pieces concatenated are the whole.
     epochs : int
         Epochs of a piece; the last may have fewer.
+    progress : callable, optional
+        Called with the part of the files that has been read, 0 to 1, as the reading goes on.
 
     Yields
     ------
@@ -119,7 +122,7 @@ def scan_observations(
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
     wanted = _wanted(on_error=on_error, systems=systems, start=start, end=end)
-    return _pieces(_runs(_as_list(path), wanted), epochs)
+    return _pieces(_runs(_as_list(path), wanted, progress), epochs)
 
 
 def _as_list(path: Paths) -> list[str]:
@@ -148,13 +151,13 @@ def _wanted(
     return Wanted(on_error=on_error, systems=letters, **limits)
 
 
-def _runs(paths: list[str], wanted: Wanted) -> Iterator[Observations]:
+def _runs(paths: list[str], wanted: Wanted, progress: Callable[[float], None] | None = None) -> Iterator[Observations]:
     """Runs of epochs of all files, in order of time; at least one, and some epoch in all."""
     paths = paths if len(paths) == 1 else _in_order_of_time(paths, wanted)
     last: Observations | None = None
     reader: BlockReader | None = None
     found = 0
-    for path in paths:
+    for k, path in enumerate(paths):
         before, reader = reader, BlockReader(path, wanted, **({} if reader is None else {"after_ns": reader.last_ns}))
         joint = before is not None and before.epochs > 0
         for run in reader.blocks():
@@ -163,6 +166,8 @@ def _runs(paths: list[str], wanted: Wanted) -> Iterator[Observations]:
                 joint = False
             found += len(run)
             last = run if len(run) else last
+            if progress is not None:
+                progress((k + reader.share) / len(paths))
             yield run
         if not reader.epochs and wanted.on_error == "strict":
             raise InputFileError(path, "has a header but no epochs; the recording is empty or cut short")

@@ -62,6 +62,8 @@ class BlockReader:
         The last time tag read, wanted or not.
     epochs : int
         How many epochs in order were read, wanted or not.
+    share : float
+        Part of the file that has been read, 0 to 1.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class BlockReader:
         self.path = str(path)
         self.last_ns = after_ns
         self.epochs = 0
+        self.share = 0.0
         self._after_ns = after_ns
         self._wanted = wanted
         self._block_bytes = block_bytes
@@ -111,6 +114,7 @@ class BlockReader:
     def _read(self, stream: ByteStream) -> tuple[bytes, bool]:
         try:
             block = stream.read(self._block_bytes)
+            self.share = stream.share
         except InputFileError as error:
             if self._log.strict:
                 raise

@@ -29,8 +29,8 @@ from railfix.tables import observations_table, positions_table, rounded
 class Progress(Protocol):
     """Whoever wants to know how far a run is."""
 
-    def __call__(self, *, epochs: int, fraction: float | None) -> None:
-        """Epochs done so far, and the part of the logs that has been read where it is known."""
+    def __call__(self, *, epochs: int, fraction: float) -> None:
+        """Epochs done so far, and the part of the logs that has been read, 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -183,7 +183,7 @@ def _position(
         if options.observations == "write":
             folder.append_parquet("observations.parquet", observations_table(result))
         if progress is not None:
-            progress(epochs=tally.epochs, fraction=None)
+            progress(epochs=tally.epochs, fraction=min(log.share for log in logs.values()))
     return tally
 
 

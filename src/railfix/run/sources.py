@@ -118,6 +118,8 @@ class Log:
     broken_lines : {"stop", "count"}
     start, end : datetime or None
         First epoch, and the time before which the last one lies.
+    share : float
+        Part of the files that has been read, 0 to 1.
     problems : list of str
         Sentences on what was broken and passed over.
     passed_over : Counter of str
@@ -129,6 +131,7 @@ class Log:
     broken_lines: Literal["stop", "count"] = "stop"
     start: datetime | None = None
     end: datetime | None = None
+    share: float = 0.0
     problems: list[str] = field(default_factory=list)
     passed_over: Counter[str] = field(default_factory=Counter)
 
@@ -146,9 +149,13 @@ class Log:
             on_error="strict" if self.broken_lines == "stop" else "lenient",
             start=None if self.start is None else np.datetime64(self.start, "ns"),
             end=None if self.end is None else np.datetime64(self.end, "ns"),
+            progress=self._read_to,
         )
         for piece in pieces:
             self.problems += piece.problems
             self.passed_over.update(piece.passed_over)
             if len(piece):
                 yield piece
+
+    def _read_to(self, share: float) -> None:
+        self.share = share
