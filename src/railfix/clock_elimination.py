@@ -90,7 +90,7 @@ class Ranges:
     @property
     def n_used(self) -> NDArray[np.int64]:
         """Channels with weight, shape (T,)."""
-        return np.count_nonzero(self.weight, axis=1)
+        return np.asarray(np.count_nonzero(self.weight, axis=1), dtype=np.int64)
 
     @property
     def n_clocks(self) -> NDArray[np.int64]:
@@ -99,9 +99,9 @@ class Ranges:
         for g, group in enumerate(self.groups):
             seen[:, g] = np.any(self.weight[:, group] > 0, axis=1)
         if self.ties is None:
-            return np.count_nonzero(seen, axis=1)
+            return np.asarray(np.count_nonzero(seen, axis=1), dtype=np.int64)
         tied = self.ties.sigma_m < UNTIED_M
-        return np.count_nonzero(seen & ~tied, axis=1) + np.any(seen & tied, axis=1)
+        return np.asarray(np.count_nonzero(seen & ~tied, axis=1) + np.any(seen & tied, axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -398,4 +398,4 @@ def _satellites_refused(satellite: NDArray[np.str_], reason: Bits) -> NDArray[np
     member = (which[:, None] == np.arange(len(names))).astype(np.int64)
     seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.int64) @ member > 0
     used = (reason == 0).astype(np.int64) @ member > 0
-    return np.count_nonzero(seen & ~used, axis=1)
+    return np.asarray(np.count_nonzero(seen & ~used, axis=1), dtype=np.int64)

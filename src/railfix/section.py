@@ -206,7 +206,8 @@ def _ball(
     at = np.flatnonzero(np.isfinite(point.ecef_m[:, 0]))
     if not len(at):
         return radius, nearest
-    distance, vertex = index.tree.query(point.ecef_m[at])
+    found, vertex = index.tree.query(point.ecef_m[at])
+    distance = np.asarray(found, dtype=np.float64)
     delta = index.trajectory.ecef_m[vertex] - point.ecef_m[at]
     form = np.einsum("ti,tij,tj->t", delta, point.matrix[at], delta)
     bend = weight_norm[at] * _bend(distance)
