@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from railfix.epochs import Observations, concatenate
+from railfix.files import read_bytes
 from railfix.rinex import read_observations, scan_observations
-from railfix.rinex.files import read_bytes
 from railfix.rinex.observations_signals import KINDS, signal_of
 
 pytestmark = [pytest.mark.requirement("A7"), pytest.mark.filterwarnings("ignore")]

@@ -14,9 +14,10 @@ from hatanaka import rnx2crx
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from railfix import files
 from railfix.epochs import Observations, concatenate
 from railfix.errors import InputFileError
-from railfix.rinex import files, observations_blocks, observations_fields, read_observations, scan_observations
+from railfix.rinex import observations_blocks, observations_fields, read_observations, scan_observations
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
 
 pytestmark = pytest.mark.requirement("A7")

@@ -9,12 +9,14 @@ from typing import Final
 import numpy as np
 
 from railfix.errors import InputFileError
+from railfix.files import read_text_lines
 from railfix.navigation import PreciseEphemeris
-from railfix.rinex.files import read_text_lines
 from railfix.timescale import bdt_to_gpst, utc_to_gpst
 
 FilePath = str | PathLike[str]
 
+#: Time systems other than GPS time, by the names that files use.
+_TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
 #: Written where a clock is unknown [us].
 _NO_CLOCK: Final = 999_999.0
 
@@ -92,7 +94,7 @@ def _time_system(path: FilePath, lines: list[str]) -> str:
             system = line[9:12].strip().upper()
             if system in ("GPS", "GAL", "QZS", "CCC", ""):
                 return "GPS"
-            if system in ("UTC", "GLO", "BDT", "BDS"):
+            if system in _TO_GPST:
                 return system
             raise InputFileError(path, f"time system {system!r} is not read; GPS, GAL, QZS, BDT, UTC and GLO are")
     return "GPS"
@@ -100,10 +102,7 @@ def _time_system(path: FilePath, lines: list[str]) -> str:
 
 def _instant(line: str, system: str) -> np.datetime64:
     year, month, day, hour, minute = (int(line[a:b]) for a, b in ((3, 7), (8, 10), (11, 13), (14, 16), (17, 19)))
-    whole = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "ns")
-    time = whole + np.timedelta64(round(float(line[20:31]) * 1e9), "ns")
-    if system in ("UTC", "GLO"):
-        return np.datetime64(utc_to_gpst(time).item(), "ns")
-    if system in ("BDT", "BDS"):
-        return np.datetime64(bdt_to_gpst(time).item(), "ns")
-    return np.datetime64(time, "ns")
+    minute_start = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}")
+    own = minute_start + np.timedelta64(round(float(line[20:31]) * 1e9), "ns")
+    to_gpst = _TO_GPST.get(system)
+    return own if to_gpst is None else np.datetime64(to_gpst(own).astype(np.int64).item(), "ns")

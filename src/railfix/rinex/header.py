@@ -12,7 +12,7 @@ import numpy as np
 
 from railfix.epochs import ObservationHeader
 from railfix.errors import InputFileError
-from railfix.rinex.files import ByteStream
+from railfix.files import ByteStream
 from railfix.rinex.observations_signals import SYSTEMS, Column, columns_of
 
 #: Time systems of TIME OF FIRST OBS, and what a file of one constellation means without one.

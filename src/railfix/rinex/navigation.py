@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Final, Literal
 
 import numpy as np
 
 from railfix.errors import InputFileError
+from railfix.files import read_text_lines
 from railfix.navigation import Navigation
-from railfix.rinex.files import read_text_lines
 from railfix.rinex.navigation_records import RawRecord, glonass_records, kepler_records
-from railfix.sp3 import read_sp3
 
 FilePath = str | PathLike[str]
 
@@ -46,7 +45,6 @@ class _Reading:
 def read_navigation(
     paths: FilePath | Sequence[FilePath],
     *,
-    sp3: FilePath | Sequence[FilePath] | None = None,
     on_error: Literal["strict", "lenient"] = "strict",
 ) -> Navigation:
     """All records of one or several navigation files.
@@ -55,8 +53,6 @@ def read_navigation(
     ----------
     paths : path or sequence of paths
         Plain, gzip, compress.
-    sp3 : path or sequence of paths, optional
-        Precise ephemeris to be used in place of the broadcast orbits and clocks.
     on_error : {"strict", "lenient"}
         A broken record stops the reading, or is counted in `passed_over` and named in `notes`.
 
@@ -85,7 +81,7 @@ def read_navigation(
             klobuchar[letter] = np.array(values)
         else:
             reading.notes.append(f"ionosphere: the coefficients for {letter} are all zero, that is, not received")
-    navigation = Navigation(
+    return Navigation(
         kepler=kepler_records([r for r in reading.records if r.system != "R"]),
         glonass=glonass_records([r for r in reading.records if r.system == "R"]),
         klobuchar=klobuchar,
@@ -94,12 +90,13 @@ def read_navigation(
         notes=tuple(dict.fromkeys(reading.notes)),
         sources=tuple(str(p) for p in files),
     )
-    return navigation if sp3 is None else replace(navigation, precise=read_sp3(sp3))
 
 
 def _read_file(path: FilePath, reading: _Reading, *, lenient: bool) -> None:
     lines = read_text_lines(path)
     version, kind, begin = _read_header(path, lines, reading)
+    if not any(line.strip() for line in lines[begin:]):
+        raise InputFileError(path, "has a header but no record; the file is cut short, give the whole one")
     blocks: Iterable[_Block]
     if version < 3.0:
         blocks = _blocks_2(path, lines, begin, kind)
@@ -217,7 +214,7 @@ def _blocks_3(path: FilePath, lines: list[str], begin: int) -> Iterator[_Block]:
 
 
 def _cut(path: FilePath, lines: list[str], starts: list[int], default: str) -> Iterator[_Block]:
-    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         name = _name(path, start + 1, lines[start], default)
         text = lines[start:end]
         while text and not text[-1].strip():
@@ -227,7 +224,7 @@ def _cut(path: FilePath, lines: list[str], starts: list[int], default: str) -> I
 
 def _blocks_4(path: FilePath, lines: list[str], begin: int, reading: _Reading) -> Iterator[_Block]:
     starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
-    for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         parts = lines[start].split()
         if len(parts) < 4:
             raise InputFileError(path, "a '>' line must name record type, satellite and message", line=start + 1)
@@ -290,5 +287,5 @@ def _epoch_3(line: str) -> np.datetime64:
 
 
 def _instant(year: int, month: str, day: str, hour: str, minute: str, second: str) -> np.datetime64:
-    whole = np.datetime64(f"{year:04d}-{int(month):02d}-{int(day):02d}T{int(hour):02d}:{int(minute):02d}", "ns")
-    return np.datetime64(whole + np.timedelta64(round(float(second) * 1e9), "ns"), "ns")
+    minute_start = np.datetime64(f"{year:04d}-{int(month):02d}-{int(day):02d}T{int(hour):02d}:{int(minute):02d}")
+    return minute_start + np.timedelta64(round(float(second) * 1e9), "ns")

@@ -32,7 +32,7 @@ import numpy as np
 
 from railfix.epochs import Observations, concatenate
 from railfix.errors import InputFileError, MismatchError
-from railfix.rinex.files import FilePath
+from railfix.files import FilePath
 from railfix.rinex.observations_blocks import BlockReader, Wanted
 from railfix.rinex.observations_log import OnError
 from railfix.rinex.observations_signals import SYSTEMS

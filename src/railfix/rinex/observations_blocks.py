@@ -10,7 +10,7 @@ import numpy as np
 
 from railfix.epochs import Observations
 from railfix.errors import InputFileError
-from railfix.rinex.files import ByteStream, FilePath, open_stream
+from railfix.files import ByteStream, FilePath, open_stream
 from railfix.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.rinex.observations_decode import decode, lines_per_satellite
 from railfix.rinex.observations_epochs import Epochs, find_epochs

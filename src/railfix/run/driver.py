@@ -6,7 +6,7 @@ import sys
 import time as clock
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -23,6 +23,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.record import AlongSigma, along_sigma, run_record
 from railfix.run.sources import Line, Log, TrackReading, open_line
 from railfix.run.tally import Tally
+from railfix.sp3 import read_sp3
 from railfix.tables import observations_table, positions_table, rounded
 
 
@@ -123,9 +124,9 @@ def run_files(
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
-        navigation = read_navigation(
-            inputs.nav, sp3=inputs.sp3 or None, on_error="strict" if options.broken_lines == "stop" else "lenient"
-        )
+        navigation = read_navigation(inputs.nav, on_error="strict" if options.broken_lines == "stop" else "lenient")
+        if inputs.sp3:
+            navigation = replace(navigation, precise=read_sp3(inputs.sp3))
         line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
         processor = EpochProcessor(config, navigation, line.trajectories)
         logs = {
