@@ -65,7 +65,13 @@ def check(
     where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
-    Ends with exit code 6 where there is an error, 0 where there are warnings only or nothing.
+    Example:
+
+        railfix map check line.csv --out report
+
+    Exit codes: 0 nothing, or warnings only; 6 the track map has errors; 2 the command line was misused;
+    3 a file is not a track map; 4 an option is wrong; 8 the picture cannot be written; 1 a defect of
+    railfix.
     """
     from railfix.track_map import MapLimits, check_track, read_track
 
@@ -122,6 +128,13 @@ def from_positions_command(
     Positions of lesser quality and those at which the antenna stands are left out, the rest is thinned
     to the spacing; bends between two points are kept within 0.30 m. The map is the path of that
     antenna: use it without a vehicle file. A run over several laps gives several laps.
+
+    Example:
+
+        railfix map from-positions rtk.pos --out line.csv --quality 1
+
+    Exit codes: 0 done; 2 the command line was misused; 3 the file is no log of positions, or its
+    positions make no line; 4 an option is wrong; 8 the map cannot be written; 1 a defect of railfix.
     """
     from railfix.position_log import read_positions
     from railfix.track_map import from_position_log, write_track_csv
