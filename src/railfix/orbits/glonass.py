@@ -2,64 +2,115 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix.constants import EARTH_ROTATION_RATE_GLONASS, GM_GLONASS, PZ90_J2, PZ90_SEMI_MAJOR_AXIS
+from railfix.navigation import GlonassRecords
 
 Floats = NDArray[np.float64]
 
-#: Longest step of the integration [s]; the ICD's own accuracy statement is for 60 s.
-LONGEST_STEP_S: Final = 60.0
+#: Step of the integration [s]; the ICD's statement of accuracy is for 60 s.
+STEP_S: Final = 60.0
+#: Rows integrated at once: what stays in the cache.
+_BLOCK: Final = 8192
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
-    """Acceleration in the Earth-fixed frame: central force, J2, rotation, Moon and Sun, shape (n, 3) [m/s^2]."""
-    omega = EARTH_ROTATION_RATE_GLONASS
-    r2 = np.einsum("ni,ni->n", position, position)
-    r3 = r2 * np.sqrt(r2)
-    flat = 1.5 * PZ90_J2 * GM_GLONASS * PZ90_SEMI_MAJOR_AXIS**2 / (r2 * r3)
-    z2 = 5.0 * position[:, 2] ** 2 / r2
-    central = -GM_GLONASS / r3
-    result = luni_solar.copy()
-    result[:, 0] += (central - flat * (1.0 - z2) + omega**2) * position[:, 0] + 2.0 * omega * velocity[:, 1]
-    result[:, 1] += (central - flat * (1.0 - z2) + omega**2) * position[:, 1] - 2.0 * omega * velocity[:, 0]
-    result[:, 2] += (central - flat * (3.0 - z2)) * position[:, 2]
-    return result
-
-
-def propagate(position: Floats, velocity: Floats, luni_solar: Floats, duration_s: Floats) -> tuple[Floats, Floats]:
-    """States carried over durations, forward or backward, by Runge-Kutta of fourth order.
-
-    Each state takes its own number of equal steps of at most `LONGEST_STEP_S`, so that what it
-    becomes does not depend on the others.
+    """Acceleration in the Earth-fixed frame: central force, J2, rotation, Moon and Sun.
 
     Parameters
     ----------
-    position, velocity, luni_solar : ndarray, shape (n, 3)
-        Earth-fixed [m, m/s, m/s^2].
-    duration_s : ndarray, shape (n,) [s]
+    position, velocity, luni_solar : ndarray, shape (3, n) [m, m/s, m/s^2]
 
     Returns
     -------
-    position, velocity : ndarray, shape (n, 3)
+    ndarray, shape (3, n) [m/s^2]
     """
-    x, v = position.copy(), velocity.copy()
-    steps = np.ceil(np.abs(duration_s) / LONGEST_STEP_S).astype(np.int64)
-    step = duration_s / np.maximum(steps, 1)
-    for done in range(int(steps.max(initial=0))):
-        at = np.flatnonzero(steps > done)
-        h, force = step[at, None], luni_solar[at]
-        x0, v0 = x[at], v[at]
-        a1 = acceleration(x0, v0, force)
-        v1 = v0 + 0.5 * h * a1
-        a2 = acceleration(x0 + 0.5 * h * v0, v1, force)
-        v2 = v0 + 0.5 * h * a2
-        a3 = acceleration(x0 + 0.5 * h * v1, v2, force)
-        v3 = v0 + h * a3
-        a4 = acceleration(x0 + h * v2, v3, force)
-        x[at] = x0 + h / 6.0 * (v0 + 2.0 * v1 + 2.0 * v2 + v3)
-        v[at] = v0 + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-    return x, v
+    omega = EARTH_ROTATION_RATE_GLONASS
+    x, y, z = position
+    r2 = x * x + y * y + z * z
+    r3 = r2 * np.sqrt(r2)
+    flat = 1.5 * PZ90_J2 * GM_GLONASS * PZ90_SEMI_MAJOR_AXIS**2 / (r2 * r3)
+    z2 = 5.0 * z * z / r2
+    central = -GM_GLONASS / r3
+    plane = central - flat * (1.0 - z2) + omega**2
+    result = np.empty_like(position)
+    result[0] = luni_solar[0] + plane * x + 2.0 * omega * velocity[1]
+    result[1] = luni_solar[1] + plane * y - 2.0 * omega * velocity[0]
+    result[2] = luni_solar[2] + (central - flat * (3.0 - z2)) * z
+    return result
+
+
+def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: Floats) -> tuple[Floats, Floats]:
+    """One step of fourth order, forward or backward; arrays of shape (3, n), steps of shape (n,)."""
+    h = step_s
+    a1 = acceleration(position, velocity, luni_solar)
+    v1 = velocity + 0.5 * h * a1
+    a2 = acceleration(position + 0.5 * h * velocity, v1, luni_solar)
+    v2 = velocity + 0.5 * h * a2
+    a3 = acceleration(position + 0.5 * h * v1, v2, luni_solar)
+    v3 = velocity + h * a3
+    a4 = acceleration(position + h * v2, v3, luni_solar)
+    new_position = position + h / 6.0 * (velocity + 2.0 * (v1 + v2) + v3)
+    return new_position, velocity + h / 6.0 * (a1 + 2.0 * (a2 + a3) + a4)
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """States of all records at whole steps from their reference times, integrated once.
+
+    Attributes
+    ----------
+    position, velocity : ndarray, shape (3, records, 2 steps + 1) [m, m/s]
+        The reference time in the middle.
+    luni_solar : ndarray, shape (3, records) [m/s^2]
+    """
+
+    position: Floats
+    velocity: Floats
+    luni_solar: Floats
+
+    @classmethod
+    def from_records(cls, records: GlonassRecords, reach_s: float) -> Integrated:
+        """Integrate all records over `reach_s` to both sides and one step more."""
+        steps = int(np.ceil(reach_s / STEP_S)) + 1
+        luni_solar = np.ascontiguousarray(records.acceleration_ecef_mps2.T)
+        position = np.empty((3, len(records), 2 * steps + 1))
+        velocity = np.empty_like(position)
+        for direction in (1, -1):
+            x, v = records.position_ecef_m.T.copy(), records.velocity_ecef_mps.T.copy()
+            for i in range(steps + 1):
+                position[:, :, steps + direction * i], velocity[:, :, steps + direction * i] = x, v
+                x, v = runge_kutta(x, v, luni_solar, np.full(len(records), direction * STEP_S))
+        return cls(position, velocity, luni_solar)
+
+    def state(self, row: NDArray[np.int64], since_toe_s: Floats) -> tuple[Floats, Floats]:
+        """State a time after the reference time: from the whole step before it, outward.
+
+        Parameters
+        ----------
+        row : ndarray of int, shape (n,)
+            Of the records.
+        since_toe_s : ndarray, shape (n,) [s]
+            Within the reach.
+
+        Returns
+        -------
+        position, velocity : ndarray, shape (3, n)
+        """
+        middle = self.position.shape[2] // 2
+        node = np.trunc(since_toe_s / STEP_S)
+        rest = since_toe_s - node * STEP_S
+        at = row * self.position.shape[2] + node.astype(np.int64) + middle
+        position, velocity = np.empty((3, len(row))), np.empty((3, len(row)))
+        flat_position, flat_velocity = self.position.reshape(3, -1), self.velocity.reshape(3, -1)
+        for begin in range(0, len(row), _BLOCK):
+            part = slice(begin, begin + _BLOCK)
+            position[:, part], velocity[:, part] = runge_kutta(
+                flat_position[:, at[part]], flat_velocity[:, at[part]], self.luni_solar[:, row[part]], rest[part]
+            )
+        return position, velocity

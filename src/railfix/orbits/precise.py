@@ -13,8 +13,10 @@ from railfix.timescale import seconds
 
 Floats = NDArray[np.float64]
 
-#: Points of the interpolation polynomial (order 10), as is the custom for 15-minute positions.
-_POINTS: Final = 11
+#: Points of the interpolation polynomial (order 10): below a millimetre at 15 minutes spacing.
+POINTS: Final = 11
+#: States computed at once: what stays in the cache.
+_BLOCK: Final = 4096
 
 
 def precise_state(
@@ -29,59 +31,90 @@ def precise_state(
     column : ndarray of int, shape (n,)
         Satellite's column; -1 where it is not in the ephemeris.
     time : ndarray of datetime64[ns], shape (n,)
+        Within the file's first and last epoch.
     offset_s : ndarray, shape (n,) [s]
+        A fraction of a second (the travel of the signal).
 
     Returns
     -------
-    position_ecef_m, velocity_ecef_mps : ndarray, shape (n, 3)
+    position_ecef_m, velocity_ecef_mps : ndarray, shape (3, n)
         NaN where a node is missing or the time lies outside the file.
     clock_s : ndarray, shape (n,) [s]
         As given, plus the relativistic -2 r.v / c^2 that SP3 clocks leave out.
     """
+    if len(ephemeris.time) < POINTS:
+        raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
+    position, velocity, clock = np.empty((3, len(time))), np.empty((3, len(time))), np.empty(len(time))
+    for begin in range(0, len(time), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        block = _state(ephemeris, column[part], time[part], offset_s[part])
+        position[:, part], velocity[:, part], clock[part] = block
+    return position, velocity, clock
+
+
+def _state(
+    ephemeris: PreciseEphemeris, column: NDArray[np.intp], time: NDArray[np.datetime64], offset_s: Floats
+) -> tuple[Floats, Floats, Floats]:
     nodes = ephemeris.time
-    if len(nodes) < _POINTS:
-        raise ValueError(f"a precise ephemeris needs at least {_POINTS} epochs, got {len(nodes)}")
     right = np.searchsorted(nodes, time, side="right")
-    begin = np.clip(right - (_POINTS + 1) // 2, 0, len(nodes) - _POINTS)
-    index = begin[:, None] + np.arange(_POINTS)
-    at = seconds(nodes[index] - time[:, None]) - offset_s[:, None]
-    place = ephemeris.position_ecef_m[index, column[:, None]]
+    begin = np.clip(right - (POINTS + 1) // 2, 0, len(nodes) - POINTS)
+    index = begin + np.arange(POINTS)[:, None]
+    at = seconds(nodes[index] - time) - offset_s
+    place = np.moveaxis(ephemeris.position_ecef_m[index, column], -1, 0)
     # Nodes turned into the frame of the instant asked for: the orbit is smooth there.
-    angle = EARTH_ROTATION_RATE * at
-    cos, sin = np.cos(angle), np.sin(angle)
-    turned = np.stack(
-        [cos * place[..., 0] - sin * place[..., 1], sin * place[..., 0] + cos * place[..., 1], place[..., 2]], axis=-1
-    )
+    cos, sin = np.cos(EARTH_ROTATION_RATE * at), np.sin(EARTH_ROTATION_RATE * at)
+    turned = np.stack([cos * place[0] - sin * place[1], sin * place[0] + cos * place[1], place[2]])
     weight, slope = _lagrange_at_zero(at)
-    position = np.einsum("np,npi->ni", weight, turned)
-    velocity = np.einsum("np,npi->ni", slope, turned)
-    velocity[:, 0] += EARTH_ROTATION_RATE * position[:, 1]
-    velocity[:, 1] -= EARTH_ROTATION_RATE * position[:, 0]
-    inside = (column >= 0) & (right > 0) & ((right < len(nodes)) | (time == nodes[-1]))
-    position[~inside] = np.nan
-    velocity[~inside] = np.nan
+    position = _sum(weight * turned)
+    velocity = _sum(slope * turned)
+    velocity[0] += EARTH_ROTATION_RATE * position[1]
+    velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
     left = np.clip(right - 1, 0, len(nodes) - 2)
     step = seconds(nodes[left + 1] - nodes[left])
     part = (seconds(time - nodes[left]) + offset_s) / step
     before, after = ephemeris.clock_s[left, column], ephemeris.clock_s[left + 1, column]
-    inertial = velocity + EARTH_ROTATION_RATE * np.stack(
-        [-position[:, 1], position[:, 0], np.zeros(len(position))], axis=-1
-    )
-    relativity = -2.0 * np.einsum("ni,ni->n", position, inertial) / SPEED_OF_LIGHT**2
+    # r.v is the same with the Earth-fixed velocity: their difference stands across r.
+    relativity = -2.0 * _sum_axis0(position * velocity) / SPEED_OF_LIGHT**2
     clock = before + part * (after - before) + relativity
-    return position, velocity, np.where(inside, clock, np.nan)
+    outside = (column < 0) | (right == 0) | ((right == len(nodes)) & (time != nodes[-1]))
+    position[:, outside], velocity[:, outside], clock[outside] = np.nan, np.nan, np.nan
+    return position, velocity, clock
+
+
+def _sum(terms: Floats) -> Floats:
+    """Sum over the nodes (axis 1) in a fixed order."""
+    total = terms[:, 0].copy()
+    for i in range(1, terms.shape[1]):
+        total += terms[:, i]
+    return total
+
+
+def _sum_axis0(terms: Floats) -> Floats:
+    return np.asarray(terms[0] + terms[1] + terms[2])
 
 
 def _lagrange_at_zero(nodes: Floats) -> tuple[Floats, Floats]:
-    """Weights of the value and of the slope at 0 of the polynomial through nodes, shape (n, P)."""
-    points = nodes.shape[1]
+    """Weights of the value and of the slope at 0 of the polynomial through nodes, shape (P, n).
+
+    Products of ``-node`` over all nodes but one, and their derivatives, from the products before
+    and after that one.
+    """
+    points = len(nodes)
+    one, none = np.ones(nodes.shape[1]), np.zeros(nodes.shape[1])
+    before, after = [(one, none)], [(one, none)]
+    for i in range(points - 1):
+        value, rate = before[-1]
+        before.append((-nodes[i] * value, value - nodes[i] * rate))
+        value, rate = after[-1]
+        j = points - 1 - i
+        after.append((-nodes[j] * value, value - nodes[j] * rate))
     weight, slope = np.empty(nodes.shape), np.empty(nodes.shape)
     for i in range(points):
-        others = np.delete(np.arange(points), i)
-        gap = nodes[:, i, None] - nodes[:, others]
-        factor = -nodes[:, others] / gap
-        weight[:, i] = factor.prod(axis=1)
-        parts = [np.delete(factor, k, axis=1).prod(axis=1) / gap[:, k] for k in range(points - 1)]
-        slope[:, i] = np.sum(parts, axis=0)
+        (p, p_rate), (q, q_rate) = before[i], after[points - 1 - i]
+        gap = one
+        for j in range(points):
+            if j != i:
+                gap = gap * (nodes[i] - nodes[j])
+        weight[i], slope[i] = p * q / gap, (p_rate * q + p * q_rate) / gap
     return weight, slope

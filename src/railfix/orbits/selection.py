@@ -1,8 +1,10 @@
-"""Which record a satellite has at an epoch, and what it says about the signal.
+"""Which record a satellite has at an epoch.
 
 Among records the newest one transmitted before the epoch is taken. Where a file does not tell
-when a record was transmitted, the one whose reference time lies nearest is. Health is decided on
-the record taken: an older one that calls the satellite healthy does not win.
+when a record was transmitted, it serves from half-way since the record before it. Where every
+record of a satellite was transmitted after the epoch (a file that begins later than the log), the
+one whose reference time lies nearest is taken and flagged. Health is decided on the record taken:
+an older one that calls the satellite healthy does not win.
 """
 
 from __future__ import annotations
@@ -14,155 +16,132 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.constants import FREQUENCY_L1
-from railfix.navigation import GlonassRecords, KeplerRecords
-from railfix.signals import carrier_frequency_hz
+from railfix.navigation import KeplerRecords
 from railfix.timescale import timedelta
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Masks = NDArray[np.bool_]
 
-#: Longest distance of an epoch from toe [s]: GPS and QZSS half their fit interval (IS-GPS-200,
-#: 20.3.4.4), at least this; Galileo 4 h (OS SDD 2.1.1 table 9); BeiDou 6 h and GLONASS 30 min as
-#: is the custom of single-point programs (records are renewed every hour, every 30 minutes).
+#: Longest distance of an epoch from toe [s]: GPS and QZSS half the fit interval that the record
+#: states and never less than this (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour);
+#: Galileo 4 h (Galileo OS SDD 1.3, 2.4.2: no data older than that are broadcast). BeiDou (renewed
+#: every hour) and GLONASS (renewed every 30 min) state none: the limits are those of RTKLIB 2.4.3
+#: (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: Galileo: bits of the health word that concern the signal, by band (RINEX 3.05, table A8).
-GALILEO_HEALTH_BITS: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
-#: QZSS: bits of the six-bit health word that concern the signal, by band (L1 C/A, L2C, L5).
-QZSS_HEALTH_BITS: Final[Mapping[str, int]] = {"1": 0b010_000, "2": 0b001_000, "5": 0b000_100}
-
-
-@dataclass(frozen=True)
-class Lookup:
-    """Records of some satellites in one sorted list that a single search answers.
-
-    Attributes
-    ----------
-    record : ndarray of int, shape (n,)
-        Rows of the record table, satellite by satellite, each in order of availability.
-    first : mapping of str to int
-        Where a satellite's records begin.
-    key : ndarray of int64, shape (n,)
-        Satellite and time of availability since `origin` [ms] as one rising number.
-    origin : datetime64[ns]
-    """
-
-    record: Indices
-    first: Mapping[str, int]
-    key: Indices
-    origin: np.datetime64
-
-
+#: A record sent earlier than this before its validity begins has a wrong transmission time [s].
+_EARLY_S: Final = 3600.0
 #: Longest time that a lookup tells apart [ms]: 34 years, so that records of another year do no harm.
 _SPAN: Final = np.int64(2**40)
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 
-def make_lookup(records: KeplerRecords | GlonassRecords, rows: Indices, validity_s: Floats) -> Lookup:
-    """Sort rows of a record table for `find_records`.
+@dataclass(frozen=True)
+class Lookup:
+    """Records of all satellites in two sorted lists, each answered by a single search.
+
+    Attributes
+    ----------
+    number : mapping of str to int
+        Number of a satellite (or of its message: "E01 INAV") in the lists.
+    first : ndarray of int, shape (satellites,)
+        Where a satellite's records begin in both lists.
+    sent_key, sent_record : ndarray of int64, shape (n,)
+        Satellite and time of availability [ms since `origin`] as one rising number, and the row of
+        the record table.
+    toe_key, toe_record : ndarray of int64, shape (n,)
+        The same by reference time: from half-way since the one before.
+    origin : datetime64[ns]
+    """
+
+    number: Mapping[str, int]
+    first: Indices
+    sent_key: Indices
+    sent_record: Indices
+    toe_key: Indices
+    toe_record: Indices
+    origin: np.datetime64
+
+    def find(self, number: Indices, time: NDArray[np.datetime64]) -> tuple[Indices, Masks]:
+        """Newest record available at each epoch.
+
+        Parameters
+        ----------
+        number : ndarray of int, shape (M,)
+            Of `number`; -1 for a satellite that is not there.
+        time : ndarray of datetime64[ns], shape (T,)
+
+        Returns
+        -------
+        record : ndarray of int, shape (M, T)
+            Row of the record table; -1 where the satellite has none at all.
+        future : ndarray of bool, shape (M, T)
+            All records were transmitted after the epoch; the one of the nearest toe is given.
+        """
+        shape = (len(number), len(time))
+        if not len(self.sent_key):
+            return np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=bool)
+        base = np.maximum(number, 0)
+        wanted = base[:, None] * _SPAN + np.clip((time - self.origin) // _MILLISECOND, 0, _SPAN - 1)
+        found = np.searchsorted(self.sent_key, wanted, side="right") - 1
+        future = found < self.first[base][:, None]
+        record = self.sent_record[np.maximum(found, 0)]
+        if future.any():
+            nearest = np.searchsorted(self.toe_key, wanted[future], side="right") - 1
+            record[future] = self.toe_record[nearest]
+        absent = number < 0
+        if absent.any():
+            record[absent], future[absent] = -1, False
+        return record, future
+
+
+def make_lookup(
+    label: NDArray[np.str_],
+    toe: NDArray[np.datetime64],
+    transmitted: NDArray[np.datetime64],
+    validity_s: Floats,
+) -> Lookup:
+    """Sort the records of a table for `Lookup.find`.
 
     Parameters
     ----------
-    records : KeplerRecords or GlonassRecords
-    rows : ndarray of int, shape (n,)
-        Rows to choose from.
+    label : ndarray of str, shape (n,)
+        Satellite, or satellite and message.
+    toe, transmitted : ndarray of datetime64[ns], shape (n,)
     validity_s : ndarray, shape (n,) [s]
         Longest distance from toe.
     """
-    satellite, toe = records.satellite[rows], records.toe[rows]
-    transmitted = records.transmitted[rows]
-    known = ~np.isnat(transmitted) & (np.abs(transmitted - toe) <= timedelta(validity_s))
-    order = np.lexsort((toe, satellite))
-    available = np.where(known, transmitted, np.datetime64("NaT", "ns"))[order]
-    satellite, toe, rows = satellite[order], toe[order], rows[order]
-    if not len(rows):
-        return Lookup(record=rows, first={}, key=rows, origin=np.datetime64(0, "ns"))
-    same = np.r_[False, satellite[1:] == satellite[:-1]]
+    empty = np.empty(0, dtype=np.int64)
+    if not len(label):
+        return Lookup({}, empty, empty, empty, empty, empty, np.datetime64(0, "ns"))
+    names, number = np.unique(label, return_inverse=True)
+    number = number.astype(np.int64)
+    order = np.lexsort((toe, number))
+    toe, transmitted, number = toe[order], transmitted[order], number[order]
     middle = toe.copy()
     middle[1:] = toe[:-1] + (toe[1:] - toe[:-1]) // 2
-    # A record whose transmission is unknown serves from half-way since the one before it.
-    middle[~same] = toe[~same] - timedelta(np.full(int((~same).sum()), 86_400.0))
-    available = np.where(np.isnat(available), middle, available)
-    origin = available.min() - np.timedelta64(1, "D")
-    names, number = np.unique(satellite, return_inverse=True)
-    key = number.astype(np.int64) * _SPAN + (available - origin) // _MILLISECOND
-    resort = np.argsort(key, kind="stable")
-    first = {str(n): int(np.searchsorted(number, i)) for i, n in enumerate(names)}
-    return Lookup(record=rows[resort], first=first, key=key[resort], origin=np.datetime64(origin, "ns"))
-
-
-def find_records(
-    lookup: Lookup, satellite: NDArray[np.str_], time: NDArray[np.datetime64]
-) -> tuple[Indices, NDArray[np.bool_]]:
-    """Newest record available at each epoch.
-
-    Parameters
-    ----------
-    lookup : Lookup
-    satellite : ndarray of str, shape (M,)
-    time : ndarray of datetime64[ns], shape (T,)
-
-    Returns
-    -------
-    record : ndarray of int, shape (T, M)
-        Row of the record table; -1 where the satellite has none at all.
-    future : ndarray of bool, shape (T, M)
-        The satellite's first record was transmitted after the epoch: post-processing only.
-    """
-    first = np.array([lookup.first.get(s, -1) for s in satellite.tolist()], dtype=np.int64)
-    none = np.full((len(time), len(satellite)), -1, dtype=np.int64)
-    if not len(lookup.key) or not len(satellite):
-        return none, np.zeros(none.shape, dtype=bool)
-    start = np.maximum(first, 0)
-    number = lookup.key[start] // _SPAN
-    since = np.clip((time - lookup.origin) // _MILLISECOND, 0, _SPAN - 1)
-    found = np.searchsorted(lookup.key, number * _SPAN + since[:, None], side="right") - 1
-    future = (found < start) & (first >= 0)
-    row = lookup.record[np.maximum(found, start)]
-    return np.where(first >= 0, row, -1), future
+    known = ~np.isnat(transmitted) & (np.abs(transmitted - toe) <= timedelta(validity_s[order] + _EARLY_S))
+    first = np.searchsorted(number, np.arange(len(names)))
+    earliest = toe[first] - timedelta(validity_s[order][first] + _EARLY_S)
+    middle[first] = earliest
+    available = np.where(known, transmitted, middle)
+    origin: np.datetime64 = np.minimum(available.min(), earliest.min()) - np.timedelta64(1, "s")
+    sent = number * _SPAN + (available - origin) // _MILLISECOND
+    resort = np.argsort(sent, kind="stable")
+    middle[first] = origin
+    return Lookup(
+        number={str(name): i for i, name in enumerate(names)},
+        first=first,
+        sent_key=sent[resort],
+        sent_record=order[resort].astype(np.int64),
+        toe_key=number * _SPAN + (middle - origin) // _MILLISECOND,
+        toe_record=order.astype(np.int64),
+        origin=origin,
+    )
 
 
 def validity_s(records: KeplerRecords) -> Floats:
     """Longest distance of an epoch from toe for each record, shape (n,) [s]."""
     base = np.array([VALIDITY_S[s[0]] for s in records.satellite.tolist()], dtype=np.float64)
     return np.fmax(base, records.fit_interval_h * 1800.0)
-
-
-def kepler_unhealthy(records: KeplerRecords, signal_band: str) -> NDArray[np.bool_]:
-    """Records that call signals of a band unhealthy, shape (n,).
-
-    GPS: any of the six bits. QZSS: the L1 C/A, L2C or L5 bit of the band (IS-QZSS-PNT, 4.1.2.3).
-    Galileo: data validity and signal health of the band. BeiDou: SatH1.
-    """
-    system = records.satellite.astype("<U1")
-    bits = np.full(len(records), ~0, dtype=np.int64)
-    bits[system == "J"] = QZSS_HEALTH_BITS.get(signal_band, 0b111_110)
-    bits[system == "E"] = GALILEO_HEALTH_BITS.get(signal_band, 0b111_111_111)
-    return np.asarray((records.health & bits) != 0)
-
-
-def group_delay_s(records: KeplerRecords, band: str) -> Floats:
-    """Group delay of a band against the clock that the record broadcasts, shape (n,) [s].
-
-    GPS, QZSS: TGD on L1, scaled by (f1/f)^2 elsewhere (IS-GPS-200, 20.3.3.3.3.2; L5 would need an
-    inter-signal correction that these messages do not hold). Galileo: BGD E5b/E1 with I/NAV, E5a/E1
-    with F/NAV clocks, on E1; scaled on E5 (OS SIS ICD 5.1.5). BeiDou: the clock is that of B3I;
-    TGD1 on B1I, TGD2 on B2I, 0 on B3I, NaN on signals whose delay D1 and D2 messages do not hold.
-    """
-    delay = np.full(len(records), np.nan)
-    system = records.satellite.astype("<U1")
-    for letter in ("G", "J"):
-        here = system == letter
-        f = carrier_frequency_hz(np.array([letter + "01"]), np.array([band + "C"]))[0]
-        delay[here] = records.group_delay_1_s[here] * (FREQUENCY_L1 / f) ** 2
-    here = system == "E"
-    inav = records.message == "INAV"
-    bgd = np.where(inav, records.group_delay_2_s, records.group_delay_1_s)
-    f = carrier_frequency_hz(np.array(["E01"]), np.array([band + "C"]))[0]
-    delay[here] = bgd[here] * (FREQUENCY_L1 / f) ** 2
-    here = system == "C"
-    by_band = {"2": records.group_delay_1_s, "7": records.group_delay_2_s, "6": np.zeros(len(records))}
-    if band in by_band:
-        delay[here] = by_band[band][here]
-    return delay

@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix.constants import SPEED_OF_LIGHT
 from railfix.epochs import frozen
-from railfix.navigation import KeplerRecords, Navigation
-from railfix.orbits.glonass import propagate
-from railfix.orbits.kepler import GM, ROTATION, Elements, kepler_state
+from railfix.navigation import Navigation
+from railfix.orbits.kepler import kepler_state
 from railfix.orbits.precise import precise_state
-from railfix.orbits.selection import (
-    VALIDITY_S,
-    Lookup,
-    find_records,
-    group_delay_s,
-    kepler_unhealthy,
-    make_lookup,
-    validity_s,
-)
-from railfix.timescale import seconds
+from railfix.orbits.selection import VALIDITY_S
+from railfix.orbits.table import Plan, Table, table_of
+from railfix.timescale import seconds, timedelta
 
 Floats = NDArray[np.float64]
 Masks = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 Datetimes = NDArray[np.datetime64]
+
+#: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
+#: arithmetic on every element, arranged so that live epochs and whole logs are both fast.
+_SHORT: Final = 96
+#: Epochs of a channel computed at once: what stays in the cache.
+_BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,22 +39,26 @@ class SatelliteStates:
     Attributes
     ----------
     position_ecef_m : ndarray, shape (T, M, 3) [m]
-        In the Earth-fixed frame of the instant of transmission, not turned to reception.
+        In the Earth-fixed frame of the instant of transmission, not turned to reception
+        (`geodesy.range_with_rotation` does that).
     velocity_ecef_mps : ndarray, shape (T, M, 3) [m/s]
+        In the same frame: the derivative of `position_ecef_m`.
     clock_m : ndarray, shape (T, M) [m]
         c times the satellite clock, relativity included, group delay not.
     group_delay_m : ndarray, shape (T, M) [m]
-        Of the channel's signal: corrected code = code + clock_m - group_delay_m - delays.
+        Of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on
+        signals whose delay is not broadcast (`signal_health.group_delay_s` says which).
     age_s : ndarray, shape (T, M) [s]
         Epoch less the record's reference time, signed; 0 for a precise ephemeris.
     accuracy_m : ndarray, shape (T, M) [m]
-        As broadcast.
+        As broadcast; NaN for GLONASS and for a precise ephemeris.
     record : ndarray of int, shape (T, M)
-        Row of the record table of the constellation, -1 where there is none.
+        Row of the record table of the constellation, -1 where there is none. The record is named
+        also where it is too old, and where the channel has no code.
     no_record : ndarray of bool, shape (T, M)
         There is no record of the satellite at all.
     too_old : ndarray of bool, shape (T, M)
-        There are records, but none valid at the epoch.
+        There are records, but none valid at the epoch (judged where there is a code).
     unhealthy : ndarray of bool, shape (T, M)
         The record used calls the signal unhealthy.
     future_record : ndarray of bool, shape (T, M)
@@ -79,46 +82,6 @@ class SatelliteStates:
             object.__setattr__(self, item.name, frozen(getattr(self, item.name)))
 
 
-class _Table:
-    """What is prepared once for a `Navigation`: lookups, and record columns as one array each."""
-
-    def __init__(self, navigation: Navigation) -> None:
-        kepler, glonass = navigation.kepler, navigation.glonass
-        self.kepler = kepler
-        self.validity_s = validity_s(kepler)
-        system = kepler.satellite.astype("<U1")
-        galileo = system == "E"
-        rows = np.arange(len(kepler))
-        # Galileo: the message that belongs to the band first, the other one where it is all there is.
-        self.by_message = {
-            message: make_lookup(
-                kepler,
-                rows[~galileo | (kepler.message == message)],
-                self.validity_s[~galileo | (kepler.message == message)],
-            )
-            for message in ("INAV", "FNAV")
-        }
-        self.glonass = make_lookup(glonass, np.arange(len(glonass)), np.full(len(glonass), VALIDITY_S["R"]))
-        names = [item.name for item in fields(Elements) if item.name not in ("gm", "rotation", "geo")]
-        self.elements = np.stack([getattr(kepler, name) for name in names])
-        self.gm = np.array([GM.get(s, np.nan) for s in system.tolist()], dtype=np.float64)
-        self.rotation = np.array([ROTATION.get(s, np.nan) for s in system.tolist()], dtype=np.float64)
-        self.geo = kepler.message == "D2"
-        self.clock = np.stack([kepler.af0_s, kepler.af1, kepler.af2])
-        self.group_delay = {band: group_delay_s(kepler, band) for band in "125678"}
-        self.unhealthy = {band: kepler_unhealthy(kepler, band) for band in "125678"}
-
-    def take(self, rows: Indices) -> Elements:
-        names = [item.name for item in fields(Elements)]
-        values = [*self.elements[:, rows], self.gm[rows], self.rotation[rows], self.geo[rows]]
-        return Elements(**dict(zip(names, values, strict=True)))
-
-
-@lru_cache(maxsize=8)
-def _table(navigation: Navigation) -> _Table:
-    return _Table(navigation)
-
-
 def satellite_states(
     time: Datetimes,
     satellite: NDArray[np.str_],
@@ -131,7 +94,10 @@ def satellite_states(
     """Satellites at the instants of transmission ``time - code / c - dt_sv``.
 
     The receiver clock is in the time tag and in the code alike, so the instant needs no estimate
-    of it.
+    of it. No result depends on the other epochs or channels of the call, to the last bit.
+
+    Galileo channels on E5a take F/NAV records, all others I/NAV; where no such record is valid at
+    an epoch and one of the other message is, that one with its clock and group delay.
 
     Parameters
     ----------
@@ -142,151 +108,194 @@ def satellite_states(
         NaN where not observed.
     navigation : Navigation
         With `precise` set, positions and clocks come from there, and a satellite that it does not
-        have has no record; health still comes from broadcast records where there are any.
+        have has no record; health and group delays come from the nearest broadcast record of
+        whatever age, and a satellite without any has no record either.
     max_age_s : float, optional
         Tighter limit on the distance from toe than the records' own validity [s].
 
     Returns
     -------
     SatelliteStates
+
+    Raises
+    ------
+    ValueError
+        Shapes do not match.
     """
-    table = _table(navigation)
-    shape = code_m.shape
-    out = {name: np.full(shape, np.nan) for name in ("clock_m", "group_delay_m", "age_s", "accuracy_m")}
-    out["position_ecef_m"], out["velocity_ecef_mps"] = np.full((2, *shape, 3), np.nan)
-    record = np.full(shape, -1, dtype=np.int64)
-    masks = {name: np.zeros(shape, dtype=bool) for name in ("too_old", "unhealthy", "future_record")}
-
-    letters, bands = satellite.astype("<U1"), np.array([s[0] for s in signal.tolist()], dtype="<U1")
-    kepler = np.flatnonzero(np.isin(letters, list(GM)))
-    glonass = np.flatnonzero(letters == "R")
-    if len(kepler):
-        _kepler(table, navigation.kepler, time, satellite, bands, kepler, code_m, max_age_s, out, record, masks)
-    if len(glonass):
-        _glonass(table, navigation, time, satellite, glonass, code_m, max_age_s, out, record, masks)
-    no_record = record < 0
+    if code_m.shape != (len(time), len(satellite)) or len(signal) != len(satellite):
+        expected = (len(time), len(satellite))
+        raise ValueError(f"code_m has shape {code_m.shape}, expected {expected}; signal has {len(signal)} channels")
+    table = table_of(navigation)
+    plan = table.plan(satellite, signal)
+    found = _Found.empty(code_m.shape)
+    observed = np.isfinite(code_m)
+    if len(plan.kepler):
+        _fill_kepler(table, plan, time, code_m, observed, max_age_s, found)
+    if len(plan.glonass):
+        _fill_glonass(table, plan, time, code_m, observed, max_age_s, found)
     if navigation.precise is not None:
-        no_record = _precise(navigation, time, satellite, code_m, out)
-    return SatelliteStates(record=record, no_record=no_record, **masks, **out)
+        _fill_precise(navigation, satellite, time, code_m, observed, found)
+    return SatelliteStates(**vars(found))
 
 
-def _kepler_rows(
-    table: _Table, time: Datetimes, satellite: NDArray[np.str_], bands: NDArray[np.str_]
-) -> tuple[Indices, Masks]:
-    """Record of each epoch and channel; Galileo by the message that carries the band's clock."""
-    rows, future = np.empty((2, len(time), len(satellite)), dtype=np.int64)
-    preferred = np.where((np.char.startswith(satellite, "E")) & (bands == "5"), "FNAV", "INAV")
-    for message, other in (("INAV", "FNAV"), ("FNAV", "INAV")):
-        at = np.flatnonzero(preferred == message)
-        if not len(at):
-            continue
-        rows[:, at], future[:, at] = find_records(table.by_message[message], satellite[at], time)
-        without = at[[s not in table.by_message[message].first for s in satellite[at].tolist()]]
-        if len(without):
-            rows[:, without], future[:, without] = find_records(table.by_message[other], satellite[without], time)
-    return rows, future.astype(bool)
+@dataclass
+class _Found:
+    """The arrays of `SatelliteStates` while they are filled in."""
+
+    position_ecef_m: Floats
+    velocity_ecef_mps: Floats
+    clock_m: Floats
+    group_delay_m: Floats
+    age_s: Floats
+    accuracy_m: Floats
+    record: Indices
+    no_record: Masks
+    too_old: Masks
+    unhealthy: Masks
+    future_record: Masks
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> _Found:
+        position, velocity = np.full((2, *shape, 3), np.nan)
+        clock, delay, age, accuracy = np.full((4, *shape), np.nan)
+        no_record, too_old, unhealthy, future = np.zeros((4, *shape), dtype=bool)
+        no_record[...] = True
+        record = np.full(shape, -1, dtype=np.int64)
+        return cls(
+            position, velocity, clock, delay, age, accuracy, record, no_record, too_old, unhealthy, future
+        )  # fmt: skip
 
 
-def _kepler(
-    table: _Table,
-    kepler: KeplerRecords,
-    time: Datetimes,
-    satellite: NDArray[np.str_],
-    bands: NDArray[np.str_],
-    columns: NDArray[np.intp],
-    code_m: Floats,
-    max_age_s: float | None,
-    out: dict[str, Floats],
-    record: Indices,
-    masks: dict[str, Masks],
+def _limit(validity: NDArray[np.timedelta64], max_age_s: float | None) -> NDArray[np.timedelta64]:
+    return validity if max_age_s is None else np.minimum(validity, timedelta(max_age_s))
+
+
+def _fill_kepler(
+    table: Table, plan: Plan, time: Datetimes, code_m: Floats, observed: Masks, max_age_s: float | None, found: _Found
 ) -> None:
     """Fill in the channels of GPS, QZSS, Galileo and BeiDou."""
-    rows, future = _kepler_rows(table, time, satellite[columns], bands[columns])
-    record[:, columns] = rows
-    observed = np.isfinite(code_m[:, columns]) & (rows >= 0)
-    t, k = np.nonzero(observed)
-    row = rows[t, k]
+    toe, limit = table.navigation.kepler.toe, _limit(table.validity, max_age_s)
+    rows, future = table.lookup.find(plan.preferred, time)
+    valid = np.abs(time - toe[rows]) <= limit[rows]
+    if plan.any_other:
+        others, other_future = table.lookup.find(plan.other, time)
+        better = ~valid & (others >= 0) & (np.abs(time - toe[others]) <= limit[others])
+        rows, future, valid = np.where(better, others, rows), np.where(better, other_future, future), valid | better
+    valid &= rows >= 0
+    channels = plan.kepler
+    found.record[:, channels] = rows.T
+    found.no_record[:, channels] = (rows < 0).T
+    seen = observed[:, channels].T & (rows >= 0)
+    precise = table.navigation.precise is not None
+    usable = seen if precise else seen & valid
+    found.too_old[:, channels] = (seen & ~usable).T
+    found.future_record[:, channels] = (usable & future).T
+    for k, t, row in _groups(rows, usable):
+        _kepler_group(table, plan, k, t, row, time, code_m, found)
+
+
+def _groups(rows: Indices, usable: Masks) -> Iterator[tuple[Any, Any, Indices]]:
+    """Elements to compute together: channels, epochs (to index with) and their records' rows.
+
+    All together in a short chunk; else the run of one channel on one record, cut into blocks.
+    """
+    if rows.shape[1] < _SHORT:
+        k, t = np.nonzero(usable)
+        if len(k):
+            yield k, t, rows[k, t]
+        return
+    for channel, (row, wanted) in enumerate(zip(rows, usable, strict=True)):
+        at = np.flatnonzero(wanted)
+        if not len(at):
+            continue
+        of_at = row[at]
+        edges = (np.flatnonzero(of_at[1:] != of_at[:-1]) + 1).tolist()
+        for begin, end in zip([0, *edges], [*edges, len(at)], strict=True):
+            for first in range(begin, end, _BLOCK):
+                yield channel, at[first : min(first + _BLOCK, end)], of_at[begin : begin + 1]
+
+
+def _kepler_group(
+    table: Table, plan: Plan, k: Any, t: Any, row: Indices, time: Datetimes, code_m: Floats, found: _Found
+) -> None:
+    m, kepler = plan.kepler[k], table.navigation.kepler
     age = seconds(time[t] - kepler.toe[row])
-    limit = table.validity_s[row] if max_age_s is None else np.minimum(table.validity_s[row], max_age_s)
-    valid = np.abs(age) <= limit
-    masks["too_old"][t[~valid], columns[k[~valid]]] = True
-    t, k, row, age = t[valid], k[valid], row[valid], age[valid]
-    m = columns[k]
-    travel = -code_m[t, m] / SPEED_OF_LIGHT
-    since_toc = seconds(time[t] - kepler.toc[row]) + travel
-    offset = _polynomial(table.clock[:, row], since_toc)
-    since_toc -= offset
-    since_toe = age + travel - offset
-    position, velocity, relativity = kepler_state(table.take(row), since_toe)
-    out["position_ecef_m"][t, m], out["velocity_ecef_mps"][t, m] = position, velocity
-    out["clock_m"][t, m] = SPEED_OF_LIGHT * (_polynomial(table.clock[:, row], since_toc) + relativity)
-    out["age_s"][t, m], out["accuracy_m"][t, m] = age, kepler.accuracy_m[row]
-    masks["future_record"][t, m] = future[t, k]
-    for band in np.unique(bands[columns]).tolist():
-        here = bands[m] == band
-        out["group_delay_m"][t[here], m[here]] = SPEED_OF_LIGHT * table.group_delay[band][row[here]]
-        masks["unhealthy"][t[here], m[here]] = table.unhealthy[band][row[here]]
+    since_toe = age - code_m[t, m] / SPEED_OF_LIGHT
+    clock, ahead = table.clock[:, row], table.toe_after_toc_s[row]
+    since_toe = since_toe - _polynomial(clock, since_toe + ahead)
+    position, velocity, relativity = kepler_state(table.orbits.take(row), since_toe)
+    for i in range(3):
+        found.position_ecef_m[t, m, i], found.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
+    found.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
+    found.age_s[t, m], found.accuracy_m[t, m] = age, kepler.accuracy_m[row]
+    signal = plan.signal[k]
+    found.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
+    found.unhealthy[t, m] = plan.unhealthy[signal, row]
 
 
 def _polynomial(clock: Floats, since_toc_s: Floats) -> Floats:
     return np.asarray(clock[0] + since_toc_s * (clock[1] + since_toc_s * clock[2]))
 
 
-def _glonass(
-    table: _Table,
-    navigation: Navigation,
-    time: Datetimes,
-    satellite: NDArray[np.str_],
-    columns: NDArray[np.intp],
-    code_m: Floats,
-    max_age_s: float | None,
-    out: dict[str, Floats],
-    record: Indices,
-    masks: dict[str, Masks],
+def _fill_glonass(
+    table: Table, plan: Plan, time: Datetimes, code_m: Floats, observed: Masks, max_age_s: float | None, found: _Found
 ) -> None:
     """Fill in the channels of GLONASS; its code biases between channels are left as they are."""
-    records = navigation.glonass
-    rows, future = find_records(table.glonass, satellite[columns], time)
-    record[:, columns] = rows
-    t, k = np.nonzero(np.isfinite(code_m[:, columns]) & (rows >= 0))
-    row = rows[t, k]
+    records = table.navigation.glonass
+    limit = VALIDITY_S["R"] if max_age_s is None else min(VALIDITY_S["R"], max_age_s)
+    rows, future = table.glonass_lookup.find(plan.glonass_number, time)
+    channels = plan.glonass
+    found.record[:, channels] = rows.T
+    found.no_record[:, channels] = (rows < 0).T
+    k, t = np.nonzero(observed[:, channels].T & (rows >= 0))
+    row = rows[k, t]
     age = seconds(time[t] - records.toe[row])
-    valid = np.abs(age) <= (VALIDITY_S["R"] if max_age_s is None else min(VALIDITY_S["R"], max_age_s))
-    masks["too_old"][t[~valid], columns[k[~valid]]] = True
-    t, k, row, age = t[valid], k[valid], row[valid], age[valid]
-    m = columns[k]
+    valid = np.abs(age) <= limit
+    if table.navigation.precise is None:
+        found.too_old[t[~valid], channels[k[~valid]]] = True
+    k, t, row, age = k[valid], t[valid], row[valid], age[valid]
+    m = channels[k]
     since = age - code_m[t, m] / SPEED_OF_LIGHT
     bias, rate = records.clock_bias_s[row], records.relative_frequency[row]
-    since -= bias + rate * since
-    position, velocity = propagate(
-        records.position_ecef_m[row], records.velocity_ecef_mps[row], records.acceleration_ecef_mps2[row], since
-    )
-    out["position_ecef_m"][t, m], out["velocity_ecef_mps"][t, m] = position, velocity
-    out["clock_m"][t, m] = SPEED_OF_LIGHT * (bias + rate * since)
-    out["group_delay_m"][t, m] = 0.0
-    out["age_s"][t, m] = age
-    masks["future_record"][t, m] = future[t, k]
-    masks["unhealthy"][t, m] = records.health[row] != 0
+    since = since - (bias + rate * since)
+    position, velocity = table.integrated.state(row, since)
+    for i in range(3):
+        found.position_ecef_m[t, m, i], found.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
+    found.clock_m[t, m] = SPEED_OF_LIGHT * (bias + rate * since)
+    found.group_delay_m[t, m] = 0.0
+    found.age_s[t, m] = age
+    found.future_record[t, m] = future[k, t]
+    found.unhealthy[t, m] = records.health[row] != 0
 
 
-def _precise(
-    navigation: Navigation, time: Datetimes, satellite: NDArray[np.str_], code_m: Floats, out: dict[str, Floats]
-) -> Masks:
-    """Replace positions and clocks by the precise ones; returns which channels have none."""
+def _fill_precise(
+    navigation: Navigation,
+    satellite: NDArray[np.str_],
+    time: Datetimes,
+    code_m: Floats,
+    observed: Masks,
+    found: _Found,
+) -> None:
+    """Put positions and clocks of the precise ephemeris in place of the broadcast ones."""
     precise = navigation.precise
     if precise is None:
         raise ValueError("no precise ephemeris is given")
     known = {str(s): i for i, s in enumerate(precise.satellite)}
     column = np.array([known.get(s, -1) for s in satellite.tolist()], dtype=np.intp)
-    t, m = np.nonzero(np.isfinite(code_m))
+    glonass = np.char.startswith(satellite, "R")
+    found.group_delay_m[:, glonass] = 0.0
+    absent = (column < 0) | (found.no_record.all(axis=0) & ~glonass)
+    m, t = np.nonzero(observed.T & ~absent[:, None])
     travel = -code_m[t, m] / SPEED_OF_LIGHT
     _, _, clock = precise_state(precise, column[m], time[t], travel)
     position, velocity, clock = precise_state(precise, column[m], time[t], travel - np.nan_to_num(clock))
-    missing = np.isnan(position[:, 0]) | np.isnan(clock)
-    out["position_ecef_m"][t, m] = np.where(missing[:, None], np.nan, position)
-    out["velocity_ecef_mps"][t, m] = np.where(missing[:, None], np.nan, velocity)
-    out["clock_m"][t, m] = np.where(missing, np.nan, SPEED_OF_LIGHT * clock)
-    out["age_s"][t, m] = np.where(missing, np.nan, 0.0)
-    no_record = np.zeros(code_m.shape, dtype=bool)
-    no_record[t, m] = missing
-    return no_record
+    missing = np.isnan(position[0]) | np.isnan(clock)
+    for values in (found.position_ecef_m, found.velocity_ecef_mps, found.clock_m, found.age_s, found.accuracy_m):
+        values[...] = np.nan
+    for i in range(3):
+        found.position_ecef_m[t, m, i] = np.where(missing, np.nan, position[i])
+        found.velocity_ecef_mps[t, m, i] = np.where(missing, np.nan, velocity[i])
+    found.clock_m[t, m] = np.where(missing, np.nan, SPEED_OF_LIGHT * clock)
+    found.age_s[t, m] = np.where(missing, np.nan, 0.0)
+    found.no_record[...] = absent
+    found.no_record[t, m] = missing
