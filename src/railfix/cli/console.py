@@ -52,7 +52,7 @@ def show_summary(summary: RunSummary) -> None:
     console.print("Pseudoranges, by the first reason that refused them")
     console.print(_reasons(summary, names))
     for note in summary.notes:
-        console.print(f"note: {note}", markup=False)
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
     for path in summary.files.values():
         console.print(f"wrote {path}", markup=False, soft_wrap=True)
     rate = summary.tally.epochs / summary.wall_s
