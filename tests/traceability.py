@@ -105,6 +105,15 @@ def proofs() -> dict[str, list[str]]:
     return found
 
 
+def _cell(tests: list[str]) -> str:
+    """Tests by file, or that there are none."""
+    names: dict[str, list[str]] = {}
+    for test in sorted(set(tests)):
+        file, _, name = test.partition("::")
+        names.setdefault(file, []).append(name.removeprefix("test_").replace("_", " "))
+    return "<br>".join(f"`{file}`: {', '.join(of)}" for file, of in names.items()) or "**open**"
+
+
 def table() -> str:
     """The document as Markdown."""
     proven = proofs()
@@ -116,14 +125,13 @@ def table() -> str:
         "# Traceability",
         "",
         "Which test proves which requirement. Written by `python tests/traceability.py` from the markers",
-        '`@pytest.mark.requirement("A7")` of the tests; a row without a test is open.',
+        '`@pytest.mark.requirement("A7")` of the tests (their names without `test_`); a row without a test is open.',
     ]
     for heading, rows in ROWS.items():
         lines += ["", f"## {heading}", "", "| row | requirement | tests |", "|---|---|---|"]
         for row, text in rows.items():
             tests = proven.get(row, [])
-            cell = "<br>".join(f"`{t}`" for t in sorted(set(tests))) if tests else "**open**"
-            lines.append(f"| {row} | {text} | {cell} |")
+            lines.append(f"| {row} | {text} | {_cell(tests)} |")
     return "\n".join(lines) + "\n"
 
 
