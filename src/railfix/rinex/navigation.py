@@ -6,9 +6,9 @@ GPS, QZSS, Galileo, BeiDou and GLONASS records in the messages that carry the cl
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from os import PathLike
 from typing import Final, Literal
 
@@ -17,35 +17,33 @@ import numpy as np
 from railfix.errors import InputFileError
 from railfix.files import read_text_lines
 from railfix.navigation import Navigation
-from railfix.rinex.navigation_records import RawRecord, glonass_records, kepler_records
+from railfix.rinex.navigation_header import Gathered, read_header
+from railfix.rinex.navigation_records import (
+    FIELDS,
+    RawRecord,
+    first_fault,
+    glonass_records,
+    kepler_records,
+    number,
+)
 
 FilePath = str | PathLike[str]
 
-#: Lines of a record, the epoch line included, by constellation (RINEX 2.11 tables A4 and A11; 3.05 table A6 to A16).
-_LINES: Final = {"G": 8, "J": 8, "E": 8, "C": 8, "I": 8, "R": 4, "S": 4}
+#: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
+#: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
+_LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
 #: Classic messages by constellation as RINEX 4 names them.
 _MESSAGES: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV", "FNAV"), "C": ("D1", "D2"), "R": ("FDMA",)}
-_ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
-#: Navigation messages hold ten to forty numbers in fields of this width.
+#: Constellations whose records are known and passed over: SBAS, NavIC.
+_PASSED_OVER: Final = ("S", "I")
+#: Width of a number.
 _WIDTH: Final = 19
-
-
-@dataclass
-class _Reading:
-    """What has been gathered from one or several files."""
-
-    records: list[RawRecord] = field(default_factory=list)
-    klobuchar: dict[str, list[float]] = field(default_factory=dict)
-    leap_seconds: int | None = None
-    passed_over: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)
-    seen: set[tuple[object, ...]] = field(default_factory=set)
+#: ``> EPH G01 LNAV`` (RINEX 4.02, table A7).
+_TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z][ \d]\d) *(\S*)")
 
 
 def read_navigation(
-    paths: FilePath | Sequence[FilePath],
-    *,
-    on_error: Literal["strict", "lenient"] = "strict",
+    paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict", "lenient"] = "strict"
 ) -> Navigation:
     """All records of one or several navigation files.
 
@@ -59,6 +57,7 @@ def read_navigation(
     Returns
     -------
     Navigation
+        Without `precise` (`sp3.read_sp3` reads that, `dataclasses.replace` puts it in).
 
     Raises
     ------
@@ -69,211 +68,155 @@ def read_navigation(
     files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
     if not files:
         raise ValueError("at least one navigation file is needed")
-    reading = _Reading()
+    gathered = Gathered(lenient=on_error == "lenient")
     for path in files:
-        _read_file(path, reading, lenient=on_error == "lenient")
-    if not reading.records:
+        _read_file(path, gathered)
+    if not gathered.records:
         names = ", ".join(str(p) for p in files)
         raise InputFileError(names, "has no usable GPS, QZSS, Galileo, BeiDou or GLONASS record")
-    klobuchar = {}
-    for letter, values in reading.klobuchar.items():
-        if any(values):
-            klobuchar[letter] = np.array(values)
-        else:
-            reading.notes.append(f"ionosphere: the coefficients for {letter} are all zero, that is, not received")
     return Navigation(
-        kepler=kepler_records([r for r in reading.records if r.system != "R"]),
-        glonass=glonass_records([r for r in reading.records if r.system == "R"]),
-        klobuchar=klobuchar,
-        leap_seconds=reading.leap_seconds,
-        passed_over=dict(reading.passed_over),
-        notes=tuple(dict.fromkeys(reading.notes)),
+        kepler=kepler_records([r for r in gathered.records if r.system != "R"]),
+        glonass=glonass_records([r for r in gathered.records if r.system == "R"]),
+        klobuchar=gathered.received_klobuchar(),
+        leap_seconds=gathered.leap_seconds,
+        passed_over=dict(gathered.passed_over),
+        notes=tuple(dict.fromkeys(gathered.notes)),
         sources=tuple(str(p) for p in files),
     )
 
 
-def _read_file(path: FilePath, reading: _Reading, *, lenient: bool) -> None:
-    lines = read_text_lines(path)
-    version, kind, begin = _read_header(path, lines, reading)
-    if not any(line.strip() for line in lines[begin:]):
-        raise InputFileError(path, "has a header but no record; the file is cut short, give the whole one")
-    blocks: Iterable[_Block]
-    if version < 3.0:
-        blocks = _blocks_2(path, lines, begin, kind)
-    elif version < 4.0:
-        blocks = _blocks_3(path, lines, begin)
-    else:
-        blocks = _blocks_4(path, lines, begin, reading)
-    for block in blocks:
-        expected = _LINES.get(block.system)
-        if block.system not in _MESSAGES:
-            reading.passed_over[block.system if expected else f"unknown {block.system!r}"] += 1
-            continue
-        if block.message and block.message not in _MESSAGES[block.system]:
-            reading.passed_over[f"{block.system} {block.message}"] += 1
-            continue
-        try:
-            record = _parse(path, block, version)
-        except InputFileError as error:
-            if not lenient:
-                raise
-            reading.passed_over["broken"] += 1
-            reading.notes.append(f"passed over: {error}")
-            continue
-        key = (record.satellite, record.epoch, block.message, tuple(record.numbers))
-        if key in reading.seen:
-            reading.passed_over["duplicate"] += 1
-            continue
-        reading.seen.add(key)
-        reading.records.append(record)
-
-
-def _read_header(path: FilePath, lines: list[str], reading: _Reading) -> tuple[float, str, int]:
-    """Version, file type letter and first line after the header."""
-    first = lines[0] if lines else ""
-    if first[60:80].strip() != "RINEX VERSION / TYPE":
-        raise InputFileError(path, "is no RINEX file: its first line lacks 'RINEX VERSION / TYPE'", line=1)
-    try:
-        version = float(first[:9])
-    except ValueError:
-        raise InputFileError(path, f"RINEX version {first[:9].strip()!r} is no number", line=1) from None
-    kind = first[20:21].upper()
-    if kind == "O":
-        raise InputFileError(path, "is a RINEX observation file, a navigation file was expected", line=1)
-    if kind not in ("N", "G", "H") and not (kind == "E" and version >= 3.0):
-        raise InputFileError(path, f"is RINEX of type {kind!r}, a navigation file (N) was expected", line=1)
-    if not 2.0 <= version < 5.0:
-        raise InputFileError(path, f"RINEX version {version:g} is not read; 2, 3 and 4 are", line=1)
-    for number, line in enumerate(lines):
-        label = line[60:80].strip()
-        if label == "END OF HEADER":
-            return version, kind, number + 1
-        try:
-            _header_line(line, label, reading)
-        except ValueError:
-            raise InputFileError(
-                path, f"header record {label} holds no number where one is due", line=number + 1
-            ) from None
-    raise InputFileError(path, "has no END OF HEADER; the file is cut or no RINEX navigation file")
-
-
-def _header_line(line: str, label: str, reading: _Reading) -> None:
-    if label == "LEAP SECONDS" and line[:6].strip():
-        reading.leap_seconds = int(line[:6])
-    elif label in ("ION ALPHA", "ION BETA"):
-        _keep_ion("G", "AB"[label == "ION BETA"], [_number(line[2 + 12 * i : 14 + 12 * i]) for i in range(4)], reading)
-    elif label == "IONOSPHERIC CORR" and line[:3] in _ION_LETTER and line[3] in "AB":
-        values = [_number(line[5 + 12 * i : 17 + 12 * i]) for i in range(4)]
-        _keep_ion(_ION_LETTER[line[:3]], line[3], values, reading)
-    elif label == "IONOSPHERIC CORR":
-        reading.passed_over[f"ionosphere {line[:4].strip()}"] += 1
-
-
-def _keep_ion(letter: str, half: str, values: list[float], reading: _Reading) -> None:
-    """Keep four coefficients; the first set of a constellation that is not all zero stays."""
-    stored = reading.klobuchar.setdefault(letter, [0.0] * 8)
-    part = slice(0, 4) if half == "A" else slice(4, 8)
-    if not any(stored[part]):
-        stored[part] = [0.0 if np.isnan(v) else v for v in values]
-
-
-def _number(text: str) -> float:
-    """One FORTRAN number; blank is NaN."""
-    text = text.strip()
-    return float(text.replace("D", "E").replace("d", "e")) if text else float("nan")
-
-
 @dataclass(frozen=True)
 class _Block:
-    """Lines of one record: satellite, message (empty before RINEX 4), first line's number, column of the numbers."""
+    """Lines of one record: where they stand, what names the satellite, the message (empty before RINEX 4)."""
 
-    system: str
-    satellite: str
-    message: str
     line: int
+    name: str
+    message: str
     text: list[str]
 
 
-def _name(path: FilePath, line: int, text: str, system: str = "") -> str:
-    letter = text[0] if text[:1].isalpha() else system
-    digits = text[1:3] if text[:1].isalpha() else text[:2]
-    if not digits.strip().isdigit():
-        raise InputFileError(path, f"{text[:3]!r} is no satellite", line=line)
-    return f"{letter}{int(digits):02d}"
-
-
-def _blocks_2(path: FilePath, lines: list[str], begin: int, kind: str) -> Iterator[_Block]:
-    default = {"N": "G", "G": "R", "H": "S"}[kind]
-    starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
-    yield from _cut(path, lines, starts, default)
-
-
-def _blocks_3(path: FilePath, lines: list[str], begin: int) -> Iterator[_Block]:
-    starts = [i for i in range(begin, len(lines)) if lines[i][:1].isalpha()]
-    yield from _cut(path, lines, starts, "")
-
-
-def _cut(path: FilePath, lines: list[str], starts: list[int], default: str) -> Iterator[_Block]:
-    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
-        name = _name(path, start + 1, lines[start], default)
-        text = lines[start:end]
-        while text and not text[-1].strip():
-            text.pop()
-        yield _Block(name[0], name, "", start + 1, text)
-
-
-def _blocks_4(path: FilePath, lines: list[str], begin: int, reading: _Reading) -> Iterator[_Block]:
-    starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
-    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
-        parts = lines[start].split()
-        if len(parts) < 4:
-            raise InputFileError(path, "a '>' line must name record type, satellite and message", line=start + 1)
-        kind, satellite, message = parts[1:4]
-        if kind == "ION":
-            _ion_4(path, satellite[0], message, lines[start + 1 : end], start + 2, reading)
-        elif kind == "EPH":
-            name = _name(path, start + 1, satellite)
-            yield _Block(name[0], name, message, start + 2, [x for x in lines[start + 1 : end] if x.strip()])
+def _read_file(path: FilePath, gathered: Gathered) -> None:
+    lines = read_text_lines(path)
+    version, kind, begin = read_header(path, lines, gathered)
+    if not any(line.strip() for line in lines[begin:]):
+        raise InputFileError(path, "has a header but no record; the file is cut short, give the whole one")
+    blocks = _blocks_4(path, lines, begin, gathered) if version >= 4.0 else _blocks(path, lines, begin, version, kind)
+    for block in blocks:
+        try:
+            record = _record(path, block, version, gathered)
+        except InputFileError as error:
+            gathered.refuse(error)
         else:
-            reading.passed_over[kind] += 1
+            if record is not None:
+                gathered.add(record)
 
 
-def _ion_4(path: FilePath, letter: str, message: str, text: list[str], line: int, reading: _Reading) -> None:
-    if letter not in "GCJ" or message not in ("LNAV", "D1D2") or len(text) < 3:
-        reading.passed_over[f"ION {letter} {message}"] += 1
+def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
+    """Records of versions 2 and 3: they begin where a line does not begin with blanks."""
+    starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
+    first = starts[0] if starts else len(lines)
+    stray = next((i for i in range(begin, first) if lines[i].strip()), None)
+    if stray is not None:
+        raise InputFileError(
+            path, f"{lines[stray].strip()!r} belongs to no record: no satellite before", line=stray + 1
+        )
+    letter = {"N": "G", "G": "R", "H": "S"}[kind] if version < 3.0 else ""
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
+        text = lines[start]
+        name = letter + text[:2] if letter and not text[:1].isalpha() else text[:3]
+        yield _Block(start + 1, name, "", [x for x in lines[start:end] if x.strip()])
+
+
+def _refuse_stray(path: FilePath, lines: list[str], begin: int, starts: list[int]) -> None:
+    for i in range(begin, starts[0] if starts else len(lines)):
+        if lines[i].strip():
+            raise InputFileError(path, f"{lines[i].strip()!r} stands before the first record", line=i + 1)
+
+
+def _blocks_4(path: FilePath, lines: list[str], begin: int, gathered: Gathered) -> Iterator[_Block]:
+    """Ephemerides of version 4; ionosphere is kept, other records are counted."""
+    starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
+    _refuse_stray(path, lines, begin, starts)
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
+        title = _TITLE.match(lines[start])
+        text = [x for x in lines[start + 1 : end] if x.strip()]
+        try:
+            if title is None:
+                what = f"{lines[start].strip()!r} is no '> EPH G01 LNAV': record type, satellite, message"
+                raise InputFileError(path, what, line=start + 1)
+            kind, name, message = title.groups()
+            if kind == "EPH":
+                yield _Block(start + 2, name, message, text)
+            elif kind == "ION":
+                _ionosphere_4(path, name[0], message, text, start + 2, gathered)
+            else:
+                gathered.passed_over[kind] += 1
+        except InputFileError as error:
+            gathered.refuse(error)
+
+
+def _ionosphere_4(path: FilePath, letter: str, message: str, text: list[str], line: int, gathered: Gathered) -> None:
+    """Klobuchar coefficients of version 4 (RINEX 4.02, table A34); other models are counted."""
+    if letter not in "GCJ" or message not in ("LNAV", "D1D2"):
+        gathered.passed_over[f"ION {letter} {message}"] += 1
         return
+    if len(text) < 3:
+        raise InputFileError(path, f"ionosphere record has {len(text)} lines, 3 are due; the file is cut", line=line)
     try:
-        values = _fields(text[0], 23, 3) + _fields(text[1], 4, 4) + _fields(text[2], 4, 1)
+        fields = [(text[0], 23 + 19 * i) for i in range(3)] + [(text[1], 4 + 19 * i) for i in range(4)] + [(text[2], 4)]
+        values = [number(row[column : column + _WIDTH]) for row, column in fields]
     except ValueError:
         raise InputFileError(path, "ionosphere record holds no number where one is due", line=line) from None
-    _keep_ion(letter, "A", values[:4], reading)
-    _keep_ion(letter, "B", values[4:], reading)
+    gathered.keep_ionosphere(letter, "A", values[:4])
+    gathered.keep_ionosphere(letter, "B", values[4:])
 
 
-def _fields(line: str, begin: int, count: int) -> list[float]:
-    return [_number(line[begin + _WIDTH * i : begin + _WIDTH * (i + 1)]) for i in range(count)]
-
-
-def _parse(path: FilePath, block: _Block, version: float) -> RawRecord:
-    """Epoch and numbers of one record."""
-    first, needed = block.text[0] if block.text else "", _LINES[block.system]
-    if len(block.text) < needed:
-        lost = f"record of {block.satellite} has {len(block.text)} lines, {needed} are due"
-        raise InputFileError(path, f"{lost}; the file is cut or damaged", line=block.line)
-    column = 22 if version < 3.0 else 23
+def _record(path: FilePath, block: _Block, version: float, gathered: Gathered) -> RawRecord | None:
+    """One record, or None where it is of a kind that is passed over, which is counted."""
+    system, digits = block.name[:1], block.name[1:].strip()
+    if system not in (*_LINES, *_PASSED_OVER) or not (digits.isdigit() and int(digits)):
+        raise InputFileError(path, f"{block.name!r} is no satellite", line=block.line - (version >= 4.0))
+    satellite = f"{system}{int(digits):02d}"
+    if system in _PASSED_OVER or (block.message and block.message not in _MESSAGES[system]):
+        gathered.passed_over[f"{system} {block.message}".strip()] += 1
+        return None
+    fewest, most = _LINES[system]
+    count = len(block.text)
+    if not fewest <= count <= most:
+        fault = "the file is cut or damaged" if count < fewest else "the line that begins the next record is damaged"
+        raise InputFileError(
+            path, f"record of {satellite} has {count} lines, {fewest} are due; {fault}", line=block.line
+        )
+    first = block.text[0]
     try:
         epoch = _epoch_2(first) if version < 3.0 else _epoch_3(first)
     except ValueError:
-        what = f"epoch {first[3:column].strip()!r} of {block.satellite} is no date and time"
+        what = f"epoch {first[3 : 22 if version < 3.0 else 23].strip()!r} of {satellite} is no date and time"
         raise InputFileError(path, what, line=block.line) from None
+    numbers = _numbers(path, block, satellite, shift=19 if version >= 3.0 else 18)
+    record = RawRecord(system, satellite, block.message, epoch, numbers, version)
+    fault_at = first_fault(record)
+    if fault_at is not None:
+        field, message = fault_at
+        raise InputFileError(path, f"record of {satellite}: {message}", line=block.line + (field + 1) // 4)
+    return record
+
+
+def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> list[float]:
+    """Numbers of a record in the order of the file; blank is NaN."""
+    names = FIELDS[satellite[0]]
     numbers: list[float] = []
-    for i, line in enumerate(block.text[:needed]):
+    for k, name in enumerate(names):
+        # Three numbers stand on the first line, after satellite and time; four on each of the others.
+        row, place = divmod(k + 1, 4)
+        text = block.text[row]
+        column = shift - 15 + _WIDTH * place
         try:
-            numbers += _fields(line, column, 3) if i == 0 else _fields(line, column - 19, 4)
+            numbers.append(number(text[column : column + _WIDTH]))
         except ValueError:
-            what = f"record of {block.satellite}: a field is no number in {line.strip()!r}"
-            raise InputFileError(path, what, line=block.line + i) from None
-    return RawRecord(block.system, block.satellite, block.message, epoch, numbers, version, str(path), block.line)
+            what = f"record of {satellite}: {name} {text[column : column + _WIDTH].strip()!r} is no number"
+            raise InputFileError(path, what, line=block.line + row) from None
+    return numbers
 
 
 def _epoch_2(line: str) -> np.datetime64:

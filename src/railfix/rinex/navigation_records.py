@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.errors import InputFileError
 from railfix.navigation import GlonassRecords, KeplerRecords
 from railfix.timescale import bdt_to_gpst, nearest_week, seconds, timedelta, utc_to_gpst
 
@@ -20,8 +19,29 @@ _KEPLER: Final = (
     "af0_s af1 af2 iode crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot "
     "i_dot data_source week flag accuracy_m health group_delay_1_s group_delay_2_s transmitted fit"
 ).split()
-#: Fields without which there is no orbit.
-_NEEDED: Final = "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot".split()
+#: Numbers of a GLONASS record in the order of the file.
+_GLONASS: Final = (
+    "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
+    "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
+).split()
+#: Names of the numbers of a record by constellation.
+FIELDS: Final[Mapping[str, Sequence[str]]] = {**dict.fromkeys("GJEC", _KEPLER), "R": _GLONASS}
+#: Numbers without which there is no orbit or no clock.
+_NEEDED: Final = frozenset(
+    "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
+    "clock_bias x x_velocity y y_velocity z z_velocity".split()
+)
+#: What a number lies between: clocks within a second; orbits between 10 000 and 70 000 km; time in its week.
+_BETWEEN: Final = {
+    "af0_s": (-1.0, 1.0),
+    "clock_bias": (-1.0, 1.0),
+    "sqrt_a": (3.1e3, 8.4e3),
+    "eccentricity": (0.0, 0.3),
+    "toe_sow_s": (0.0, 604_800.0),
+}
+#: Distance of a satellite from the Earth's centre [km].
+_RADIUS_KM: Final = (10_000.0, 70_000.0)
+_BLANK: Final = float("nan")
 #: Transmission times further than this from toe are no transmission times [s].
 _TRANSMISSION_S: Final = 2 * 86_400.0
 
@@ -36,24 +56,45 @@ class RawRecord:
     epoch: np.datetime64
     numbers: list[float]
     version: float
-    path: str
-    line: int
 
 
-def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Records of GPS, QZSS, Galileo and BeiDou.
+def number(text: str) -> float:
+    """One FORTRAN number; blank is NaN, always the same one, so that equal records compare equal.
 
     Raises
     ------
-    InputFileError
-        A number without which there is no orbit is blank.
+    ValueError
+        It is no finite number.
     """
-    table = np.array([r.numbers[: len(_KEPLER)] for r in raw], dtype=np.float64).reshape(len(raw), len(_KEPLER))
+    text = text.strip()
+    if not text:
+        return _BLANK
+    value = float(text.replace("D", "E").replace("d", "e"))
+    if not np.isfinite(value):
+        raise ValueError(f"{text!r} is no number")
+    return value
+
+
+def first_fault(record: RawRecord) -> tuple[int, str] | None:
+    """Index of the first number that cannot be, and what is wrong with it; None for a sound record."""
+    for k, (name, value) in enumerate(zip(FIELDS[record.system], record.numbers, strict=True)):
+        if name in _NEEDED and np.isnan(value):
+            return k, f"{name} is blank"
+        low, high = _BETWEEN.get(name, (-np.inf, np.inf))
+        if value < low or value > high:
+            return k, f"{name} is {value:g}, it lies between {low:g} and {high:g}"
+    if record.system == "R":
+        radius = float(np.linalg.norm(record.numbers[3:15:4]))
+        low, high = _RADIUS_KM
+        if not low <= radius <= high:
+            return 3, f"x, y, z is {radius:g} km from the Earth's centre, it lies between {low:g} and {high:g}"
+    return None
+
+
+def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
+    """Records of GPS, QZSS, Galileo and BeiDou; a number that is blank and not needed is 0 (RINEX 3.05, 6.4)."""
+    table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_KEPLER))
     column = dict(zip(_KEPLER, table.T, strict=True))
-    for name in _NEEDED:
-        if np.isnan(column[name]).any():
-            bad = raw[int(np.argmax(np.isnan(column[name])))]
-            raise InputFileError(bad.path, f"record of {bad.satellite} lacks {name}", line=bad.line)
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
     system = satellite.astype("<U1")
     own = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
@@ -119,18 +160,9 @@ def _fit_interval(system: NDArray[np.str_], fit: Floats) -> Floats:
 
 
 def glonass_records(raw: Sequence[RawRecord]) -> GlonassRecords:
-    """Records of GLONASS: UTC becomes GPS time, kilometres become metres.
-
-    Raises
-    ------
-    InputFileError
-        A position or velocity is blank.
-    """
-    table = np.array([r.numbers[:15] for r in raw], dtype=np.float64).reshape(len(raw), 15)
+    """Records of GLONASS: UTC becomes GPS time, kilometres become metres."""
+    table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_GLONASS))
     state = table[:, 3:15].reshape(-1, 3, 4)
-    if np.isnan(state[:, :, :2]).any():
-        bad = raw[int(np.argmax(np.isnan(state[:, :, :2]).any(axis=(1, 2))))]
-        raise InputFileError(bad.path, f"record of {bad.satellite} lacks a position or velocity", line=bad.line)
     utc = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
     toe = utc_to_gpst(utc)
     frame = table[:, 2]
