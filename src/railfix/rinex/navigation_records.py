@@ -39,8 +39,8 @@ _BETWEEN: Final = {
     "eccentricity": (0.0, 0.3),
     "toe_sow_s": (0.0, 604_800.0),
 }
-#: Distance of a satellite from the Earth's centre [km].
-_RADIUS_KM: Final = (10_000.0, 70_000.0)
+#: Distance of a satellite from the Earth's centre [km]: above its surface.
+_RADIUS_KM: Final = (6_400.0, 70_000.0)
 _BLANK: Final = float("nan")
 #: Transmission times further than this from toe are no transmission times [s].
 _TRANSMISSION_S: Final = 2 * 86_400.0
