@@ -212,3 +212,12 @@ class Navigation:
     notes: tuple[str, ...] = ()
     precise: PreciseEphemeris | None = None
     sources: tuple[str, ...] = ()
+
+
+def glonass_channels(navigation: Navigation) -> dict[str, int]:
+    """Frequency channel of each GLONASS satellite, as its records say.
+
+    For logs whose header lacks GLONASS SLOT / FRQ #: the form of `ObservationHeader.glonass_channel`.
+    """
+    records = navigation.glonass
+    return dict(zip(records.satellite.tolist(), records.frequency_channel.tolist(), strict=True))

@@ -124,7 +124,7 @@ def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: 
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         text = lines[start]
         name = letter + text[:2] if letter and not text[:1].isalpha() else text[:3]
-        yield _Block(start + 1, name, "", [x for x in lines[start:end] if x.strip()])
+        yield _Block(start + 1, name, "", lines[start:end])
 
 
 def _refuse_stray(path: FilePath, lines: list[str], begin: int, starts: list[int]) -> None:
@@ -139,7 +139,7 @@ def _blocks_4(path: FilePath, lines: list[str], begin: int, gathered: Gathered) 
     _refuse_stray(path, lines, begin, starts)
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         title = _TITLE.match(lines[start])
-        text = [x for x in lines[start + 1 : end] if x.strip()]
+        text = lines[start + 1 : end]
         try:
             if title is None:
                 what = f"{lines[start].strip()!r} is no '> EPH G01 LNAV': record type, satellite, message"
@@ -181,7 +181,9 @@ def _record(path: FilePath, block: _Block, version: float, gathered: Gathered) -
         gathered.passed_over[f"{system} {block.message}".strip()] += 1
         return None
     fewest, most = _LINES[system]
-    count = len(block.text)
+    # A line of blank fields belongs to its record, one more than are due does not.
+    count = next((k for k in range(len(block.text), fewest, -1) if block.text[k - 1].strip()), fewest)
+    count = min(count, len(block.text))
     if not fewest <= count <= most:
         fault = "the file is cut or damaged" if count < fewest else "the line that begins the next record is damaged"
         raise InputFileError(
