@@ -114,12 +114,7 @@ def _read_file(path: FilePath, gathered: Gathered) -> None:
 def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
     """Records of versions 2 and 3: they begin where a line does not begin with blanks."""
     starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
-    first = starts[0] if starts else len(lines)
-    stray = next((i for i in range(begin, first) if lines[i].strip()), None)
-    if stray is not None:
-        raise InputFileError(
-            path, f"{lines[stray].strip()!r} belongs to no record: no satellite before", line=stray + 1
-        )
+    _refuse_stray(path, lines, begin, starts)
     letter = {"N": "G", "G": "R", "H": "S"}[kind] if version < 3.0 else ""
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         text = lines[start]
@@ -232,5 +227,8 @@ def _epoch_3(line: str) -> np.datetime64:
 
 
 def _instant(year: int, month: str, day: str, hour: str, minute: str, second: str) -> np.datetime64:
+    seconds = float(second)
+    if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):
+        raise ValueError(year, second)
     minute_start = np.datetime64(f"{year:04d}-{int(month):02d}-{int(day):02d}T{int(hour):02d}:{int(minute):02d}")
-    return minute_start + np.timedelta64(round(float(second) * 1e9), "ns")
+    return minute_start + np.timedelta64(round(seconds * 1e9), "ns")

@@ -1,0 +1,146 @@
+"""Broken navigation files: one sentence that names the file, the line and what is wrong, and nothing half-read."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from navigation_text import header, label, record, record_2, write
+from railfix.errors import InputFileError
+from railfix.navigation import Navigation
+from railfix.rinex import read_navigation
+
+pytestmark = pytest.mark.requirement("A7")
+
+GOOD = record("G01")
+LINES = GOOD.splitlines(keepends=True)
+
+
+def _damaged(line: int, old: str, new: str) -> str:
+    lines = LINES.copy()
+    assert old in lines[line], "the damage must hit"
+    lines[line] = lines[line].replace(old, new, 1)
+    return header() + GOOD.replace("G01", "G02") + "".join(lines)
+
+
+#: Content, line that the error must name (None: the whole file), words that it must say.
+CASES: dict[str, tuple[str, int | None, str]] = {
+    "observation file": (header(kind="OBSERVATION DATA") + GOOD, 1, "observation file"),
+    "meteorological file": (header(kind="METEOROLOGICAL DATA") + GOOD, 1, "navigation file .N. was expected"),
+    "no RINEX": ("$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\n", 1, "no RINEX file"),
+    "version no number": (header().replace("     3.04", "    three", 1) + GOOD, 1, "version .* no number"),
+    "version 1": (header(1.0) + GOOD, 1, "version 1 is not read"),
+    "version 5": (header(5.0) + GOOD, 1, "version 5 is not read"),
+    "header without end": (header(end="COMMENT"), None, "END OF HEADER"),
+    "header alone": (header(), None, "no record"),
+    "header and blank lines": (header() + "\n\n  \n", None, "no record"),
+    "leap seconds in words": (header(lines=[label("   ten", "LEAP SECONDS")]) + GOOD, 2, "LEAP SECONDS"),
+    "ionosphere in words": (header(lines=[label("GPSA   0.11oops", "IONOSPHERIC CORR")]) + GOOD, 2, "IONOSPHERIC CORR"),
+    "only SBAS": (header() + "".join(record("S22").splitlines(keepends=True)[:4]), None, "no usable"),
+    "cut in the middle of a record": (header() + GOOD + "".join(LINES[:5]), 11, "G01 has 5 lines, 8 are due"),
+    "a line of a record lost": (header() + "".join(LINES[:3] + LINES[4:]) + GOOD, 3, "G01 has 7 lines, 8 are due"),
+    "name of the next record lost": (header() + GOOD + GOOD.replace("G01", "   "), 3, "G01 has 16 lines, 8 are due"),
+    "record before any name": (header() + "".join(LINES[1:]) + GOOD, 3, "before the first record"),
+    "unknown constellation": (header() + GOOD.replace("G01", "X01"), 3, "'X01' is no satellite"),
+    "satellite zero": (header() + GOOD.replace("G01", "G00"), 3, "'G00' is no satellite"),
+    "satellite in letters": (header() + GOOD.replace("G01", "Gxx"), 3, "'Gxx' is no satellite"),
+    "month 13": (_damaged(0, "2020 06", "2020 13"), 11, "epoch .* of G01 is no date"),
+    "year 9020": (_damaged(0, "2020 06", "9020 06"), 11, "epoch .* of G01 is no date"),
+    "endless second": (_damaged(0, "08 00 00", "08 00inf"), 11, "epoch .* of G01 is no date"),
+    "31 June": (_damaged(0, "06 26", "06 31"), 11, "epoch .* of G01 is no date"),
+    "blank time": (_damaged(0, "08 00 00", "        "), 11, "epoch .* of G01 is no date"),
+    "letters in a clock": (_damaged(0, "1.234567890123D-04", "1.2345oooo0123D-04"), 11, "G01: af0_s '-1.2345oooo"),
+    "letters in an orbit": (_damaged(2, "5.153700000000D+03", "5.1537OO000000D+03"), 13, "G01: sqrt_a '5.1537OO"),
+    "not a number": (_damaged(3, "4.608000000000D+05", "               nan"), 14, "G01: toe_sow_s 'nan' is no number"),
+    "infinite": (_damaged(1, "1.234500000000D+00", "               inf"), 12, "G01: m0 'inf' is no number"),
+    "root of the axis zero": (_damaged(2, "5.153700000000D+03", "0.000000000000D+00"), 13, "G01: sqrt_a is 0"),
+    "root of the axis blank": (_damaged(2, "5.153700000000D+03", " " * 18), 13, "G01: sqrt_a is blank"),
+    "hyperbola": (_damaged(2, "1.230000000000D-02", "1.230000000000D+00"), 13, "G01: eccentricity is 1.23"),
+    "time outside the week": (_damaged(3, "4.608000000000D+05", "6.608000000000D+05"), 14, "G01: toe_sow_s is 660800"),
+    "clock of hours": (_damaged(0, "1.234567890123D-04", "1.234567890123D+04"), 11, "G01: af0_s is -12345.7"),
+    "columns shifted": (_damaged(4, "    ", "     "), 15, "G01: "),
+    "GLONASS in the Earth's centre": (
+        header() + record("R05", {"x": 0.0, "y": 0.0, "z": 0.0}), 4, "R05: x, y, z is 0 km"),
+    "GLONASS without velocity": (header() + record("R05", {"y_velocity": None}), 5, "R05: y_velocity is blank"),
+    "GLONASS with six lines": (header() + record("R05", {"extra": [1.0] * 8}), 3, "R05 has 6 lines, 4 are due"),
+    "version 2 cut": (header(2.1) + record_2(" 1", time="20  6 26  8  0  0.0")[:-80], 3, "G01 has 7 lines"),
+    "version 2 without a number": (header(2.1) + record_2(" x", time="20  6 26  8  0  0.0"), 3, "'G x' is no"),
+    "version 4 title": (header(4.0) + "> EPH\n" + GOOD, 3, "'> EPH' is no"),
+    "version 4 ionosphere cut": (header(4.0) + "> ION G01 LNAV\n    2020 06 26 00 00 00\n", 4, "record has 1 line"),
+    "version 4 without titles": (header(4.0) + GOOD, 3, "before the first record"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_error_names_file_line_and_cause(tmp_path: Path, case: str) -> None:
+    text, line, words = CASES[case]
+    path = write(tmp_path, text)
+    with pytest.raises(InputFileError, match=words) as caught:
+        read_navigation(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert caught.value.line == line
+    assert "\n" not in message
+    assert caught.value.exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (bytes(range(256)) * 4, "binary"),
+        (gzip.compress((header() + GOOD).encode())[:-20], "damaged|early|cut|ends"),
+        (b"PK\x03\x04" + b"x" * 100, "zip"),
+    ],
+    ids=["empty", "binary", "gzip cut", "zip"],
+)
+def test_files_that_are_no_text(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "a.nav"
+    path.write_bytes(content)
+    with pytest.raises(InputFileError, match=words):
+        read_navigation(path)
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    with pytest.raises(InputFileError, match="no such file"):
+        read_navigation(tmp_path / "none.nav")
+    with pytest.raises(InputFileError, match="directory"):
+        read_navigation(tmp_path)
+    with pytest.raises(ValueError, match="at least one"):
+        read_navigation([])
+
+
+def test_one_broken_file_of_several_is_named(tmp_path: Path) -> None:
+    good = write(tmp_path, header() + GOOD, "good.nav")
+    bad = write(tmp_path, header() + "".join(LINES[:4]), "bad.nav")
+    with pytest.raises(InputFileError, match=r"bad\.nav, line 3"):
+        read_navigation([good, bad])
+
+
+@given(data=st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damage_anywhere_is_an_error_or_a_table(tmp_path: Path, data: st.DataObject) -> None:
+    """A changed, lost or added character never ends in anything but a sentence, or numbers that are finite."""
+    text = header() + GOOD + record("E03") + record("R05") + record("C03")
+    at = data.draw(st.integers(0, len(text) - 1))
+    length = data.draw(st.sampled_from([0, 1, 1, 30]))
+    put = data.draw(st.text(alphabet="0123456789 .-+DEGRx\n", max_size=3))
+    path = write(tmp_path, text[:at] + put + text[at + length :])
+    try:
+        navigation = read_navigation(path)
+    except InputFileError as error:
+        named = str(error)
+        navigation = None
+    if navigation is None:
+        assert str(path) in named
+        return
+    assert isinstance(navigation, Navigation)
+    assert np.isfinite(navigation.kepler.sqrt_a).all()
+    assert np.isfinite(navigation.glonass.position_ecef_m).all()
+    lenient = read_navigation(path, on_error="lenient")
+    assert len(lenient.kepler) == len(navigation.kepler)
