@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from os import PathLike
 from typing import Final
 
@@ -11,14 +12,26 @@ import numpy as np
 from railfix.errors import InputFileError
 from railfix.files import read_text_lines
 from railfix.navigation import PreciseEphemeris
+from railfix.orbits.precise import POINTS
 from railfix.timescale import bdt_to_gpst, utc_to_gpst
 
 FilePath = str | PathLike[str]
 
+#: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
+_GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
 #: Time systems other than GPS time, by the names that files use.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
 #: Written where a clock is unknown [us].
 _NO_CLOCK: Final = 999_999.0
+
+
+@dataclass
+class _States:
+    """States as they are read: epoch [ns of GPS time], satellite, position [km] and clock [us]."""
+
+    epoch: list[int] = field(default_factory=list)
+    satellite: list[str] = field(default_factory=list)
+    numbers: list[list[float]] = field(default_factory=list)
 
 
 def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
@@ -32,77 +45,95 @@ def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
     Returns
     -------
     PreciseEphemeris
-        Where files overlap the first one given for an epoch counts.
+        Where files overlap, what the file given first says of an epoch and satellite counts.
 
     Raises
     ------
     InputFileError
-        A file is missing, no SP3 file, in an unknown time system, or broken.
+        A file is missing, no SP3 file, in an unknown time system, or broken; or all together hold
+        fewer epochs than the interpolation needs.
     """
     files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
-    states: dict[tuple[np.datetime64, str], tuple[float, float, float, float]] = {}
+    if not files:
+        raise ValueError("at least one SP3 file is needed")
+    states = _States()
     for path in files:
-        for key, state in _read_file(path).items():
-            states.setdefault(key, state)
-    times = np.array(sorted({key[0] for key in states}), dtype="datetime64[ns]")
-    satellites = sorted({key[1] for key in states})
-    row = {t: i for i, t in enumerate(times.tolist())}
-    column = {s: i for i, s in enumerate(satellites)}
+        _read_file(path, states)
+    source = ", ".join(str(p) for p in files)
+    times, row = np.unique(np.array(states.epoch, dtype=np.int64), return_inverse=True)
+    satellites, column = np.unique(np.array(states.satellite, dtype="<U3"), return_inverse=True)
+    if len(times) < POINTS:
+        raise InputFileError(source, f"has {len(times)} epochs, the interpolation of orbits needs at least {POINTS}")
     grid = np.full((len(times), len(satellites), 4), np.nan)
-    for (time, satellite), state in states.items():
-        grid[row[int(time.astype(np.int64))], column[satellite]] = state
+    # Written backward, so that of several the first one stays.
+    grid[row[::-1], column[::-1]] = np.array(states.numbers)[::-1]
+    position, clock = grid[..., :3], grid[..., 3]
+    position[(position == 0.0).all(axis=-1)] = np.nan
+    clock[np.abs(clock) >= _NO_CLOCK] = np.nan
     return PreciseEphemeris(
-        time=times,
-        satellite=np.array(satellites, dtype="<U3"),
-        position_ecef_m=grid[..., :3],
-        clock_s=grid[..., 3],
-        source=", ".join(str(p) for p in files),
+        time=times.astype("datetime64[ns]"),
+        satellite=satellites,
+        position_ecef_m=position * 1e3,
+        clock_s=clock * 1e-6,
+        source=source,
     )
 
 
-def _read_file(path: FilePath) -> dict[tuple[np.datetime64, str], tuple[float, float, float, float]]:
+def _read_file(path: FilePath, states: _States) -> None:
     lines = read_text_lines(path)
-    if not lines or lines[0][:2] not in ("#a", "#c", "#d"):
-        raise InputFileError(path, "is no SP3 file: its first line must begin with #a, #c or #d", line=1)
+    if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
+        raise InputFileError(path, "is no SP3 file: its first line must begin with #a, #b, #c or #d", line=1)
     system = _time_system(path, lines)
-    found: dict[tuple[np.datetime64, str], tuple[float, float, float, float]] = {}
-    time: np.datetime64 | None = None
+    epoch: int | None = None
+    before = len(states.epoch)
     for number, line in enumerate(lines, start=1):
         try:
             if line.startswith("*"):
-                time = _instant(line, system)
+                epoch = _instant(line, system)
             elif line.startswith("P"):
-                if time is None:
+                if epoch is None:
                     raise InputFileError(path, "a position stands before the first epoch", line=number)
-                letter = line[1] if line[1].isalpha() else "G"
-                x, y, z, clock = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(4))
-                absent = x == y == z == 0.0
-                place = (np.nan,) * 3 if absent else (x * 1e3, y * 1e3, z * 1e3)
-                bias = np.nan if abs(clock) >= _NO_CLOCK else clock * 1e-6
-                found[time, f"{letter}{int(line[2:4]):02d}"] = (*place, bias)
+                states.satellite.append(_satellite(line[1:4]))
+                states.numbers.append(_numbers(line))
+                states.epoch.append(epoch)
         except ValueError:
-            raise InputFileError(path, f"{line.strip()!r} holds no number where one is due", line=number) from None
-    if not found:
-        raise InputFileError(path, "holds no satellite position")
-    return found
+            what = f"{line.strip()!r} holds no satellite, time or number where one is due"
+            raise InputFileError(path, what, line=number) from None
+    if len(states.epoch) == before:
+        raise InputFileError(path, "holds no satellite position; the file is cut short, give the whole one")
+
+
+def _satellite(text: str) -> str:
+    """``G01``; SP3-a leaves the letter of GPS out, and blanks stand for zeros."""
+    letter = text[0] if text[0].isalpha() else "G"
+    return f"{letter}{int(text[1:]):02d}"
+
+
+def _numbers(line: str) -> list[float]:
+    """Position [km] and clock [us]; a clock left blank is unknown."""
+    x, y, z = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(3))
+    clock = line[46:60].strip()
+    return [x, y, z, float(clock) if clock else np.nan]
 
 
 def _time_system(path: FilePath, lines: list[str]) -> str:
-    """Time system of the first %c line; SP3-a has none and is in GPS time."""
-    for line in lines:
+    """Time system of the first %c line."""
+    for number, line in enumerate(lines, start=1):
         if line.startswith("%c"):
             system = line[9:12].strip().upper()
-            if system in ("GPS", "GAL", "QZS", "CCC", ""):
-                return "GPS"
-            if system in _TO_GPST:
-                return system
-            raise InputFileError(path, f"time system {system!r} is not read; GPS, GAL, QZS, BDT, UTC and GLO are")
+            if system not in _GPST and system not in _TO_GPST:
+                what = f"time system {system!r} is not read; GPS, GAL, QZS, BDT, UTC and GLO are"
+                raise InputFileError(path, what, line=number)
+            return system
     return "GPS"
 
 
-def _instant(line: str, system: str) -> np.datetime64:
+def _instant(line: str, system: str) -> int:
+    """Nanoseconds of GPS time since 1970."""
     year, month, day, hour, minute = (int(line[a:b]) for a, b in ((3, 7), (8, 10), (11, 13), (14, 16), (17, 19)))
-    minute_start = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}")
+    if not 1980 <= year < 2100:
+        raise ValueError(year)
+    minute_start = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "ns")
     own = minute_start + np.timedelta64(round(float(line[20:31]) * 1e9), "ns")
     to_gpst = _TO_GPST.get(system)
-    return own if to_gpst is None else np.datetime64(to_gpst(own).astype(np.int64).item(), "ns")
+    return int((own if to_gpst is None else to_gpst(own)).astype(np.int64))

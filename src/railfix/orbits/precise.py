@@ -15,6 +15,8 @@ Floats = NDArray[np.float64]
 
 #: Points of the interpolation polynomial (order 10): below a millimetre at 15 minutes spacing.
 POINTS: Final = 11
+#: No state between two epochs further apart than this many times the usual interval: the file has a gap there.
+_GAP: Final = 1.5
 #: States computed at once: what stays in the cache.
 _BLOCK: Final = 4096
 
@@ -38,22 +40,27 @@ def precise_state(
     Returns
     -------
     position_ecef_m, velocity_ecef_mps : ndarray, shape (3, n)
-        NaN where a node is missing or the time lies outside the file.
+        NaN where a node is missing or the time lies outside the file or in a gap of it.
     clock_s : ndarray, shape (n,) [s]
         As given, plus the relativistic -2 r.v / c^2 that SP3 clocks leave out.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
     position, velocity, clock = np.empty((3, len(time))), np.empty((3, len(time))), np.empty(len(time))
+    longest_s = _GAP * float(np.median(seconds(np.diff(ephemeris.time))))
     for begin in range(0, len(time), _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        block = _state(ephemeris, column[part], time[part], offset_s[part])
+        block = _state(ephemeris, longest_s, column[part], time[part], offset_s[part])
         position[:, part], velocity[:, part], clock[part] = block
     return position, velocity, clock
 
 
 def _state(
-    ephemeris: PreciseEphemeris, column: NDArray[np.intp], time: NDArray[np.datetime64], offset_s: Floats
+    ephemeris: PreciseEphemeris,
+    longest_s: float,
+    column: NDArray[np.intp],
+    time: NDArray[np.datetime64],
+    offset_s: Floats,
 ) -> tuple[Floats, Floats, Floats]:
     nodes = ephemeris.time
     right = np.searchsorted(nodes, time, side="right")
@@ -78,6 +85,7 @@ def _state(
     relativity = -2.0 * _sum_axis0(position * velocity) / SPEED_OF_LIGHT**2
     clock = before + part * (after - before) + relativity
     outside = (column < 0) | (right == 0) | ((right == len(nodes)) & (time != nodes[-1]))
+    outside |= step > longest_s
     position[:, outside], velocity[:, outside], clock[outside] = np.nan, np.nan, np.nan
     return position, velocity, clock
 

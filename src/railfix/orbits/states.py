@@ -129,9 +129,9 @@ def satellite_states(
     plan = table.plan(satellite, signal)
     found = _Found.empty(code_m.shape)
     observed = np.isfinite(code_m)
-    if len(plan.kepler):
+    if len(plan.kepler) and len(navigation.kepler):
         _fill_kepler(table, plan, time, code_m, observed, max_age_s, found)
-    if len(plan.glonass):
+    if len(plan.glonass) and len(navigation.glonass):
         _fill_glonass(table, plan, time, code_m, observed, max_age_s, found)
     if navigation.precise is not None:
         _fill_precise(navigation, satellite, time, code_m, observed, found)

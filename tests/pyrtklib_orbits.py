@@ -1,0 +1,78 @@
+"""States of satellites by pyrtklib5 (RTKLIB in C), an independent program; development only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyrtklib5 as rtk
+
+from railfix.constants import SPEED_OF_LIGHT
+from railfix.navigation import GlonassRecords, KeplerRecords
+from railfix.timescale import to_week
+
+_SYSTEMS = {"G": rtk.SYS_GPS, "J": rtk.SYS_QZS, "E": rtk.SYS_GAL, "C": rtk.SYS_CMP, "R": rtk.SYS_GLO}
+
+
+def instant(time: np.datetime64) -> Any:
+    week, sow = to_week(time)
+    return rtk.gpst2time(int(week), float(sow))
+
+
+def satellite_number(name: str) -> int:
+    return int(rtk.satno(_SYSTEMS[name[0]], int(name[1:]) + (192 if name[0] == "J" else 0)))
+
+
+def kepler_ephemeris(records: KeplerRecords, row: int) -> Any:
+    eph = rtk.eph_t()
+    eph.sat = satellite_number(str(records.satellite[row]))
+    eph.toe, eph.toc = instant(records.toe[row]), instant(records.toc[row])
+    eph.toes, eph.A = float(records.toe_sow_s[row]), float(records.sqrt_a[row]) ** 2
+    names = {
+        "f0": "af0_s", "f1": "af1", "f2": "af2", "e": "eccentricity", "M0": "m0", "deln": "delta_n", "OMG0": "omega0",
+        "i0": "i0", "omg": "omega", "OMGd": "omega_dot", "idot": "i_dot", "cuc": "cuc", "cus": "cus", "crc": "crc",
+        "crs": "crs", "cic": "cic", "cis": "cis",
+    }  # fmt: skip
+    for theirs, ours in names.items():
+        setattr(eph, theirs, float(getattr(records, ours)[row]))
+    return eph
+
+
+def glonass_ephemeris(records: GlonassRecords, row: int) -> Any:
+    eph = rtk.geph_t()
+    eph.sat = satellite_number(str(records.satellite[row]))
+    eph.toe = instant(records.toe[row])
+    eph.taun, eph.gamn = -float(records.clock_bias_s[row]), float(records.relative_frequency[row])
+    for i in range(3):
+        eph.pos[i] = float(records.position_ecef_m[row, i])
+        eph.vel[i] = float(records.velocity_ecef_mps[row, i])
+        eph.acc[i] = float(records.acceleration_ecef_mps2[row, i])
+    return eph
+
+
+def state(ephemeris: Any, time: np.datetime64, code_m: float) -> tuple[list[float], float]:
+    """Position [m] and clock [m] at the instant of transmission of a code, as RTKLIB's satposs finds it."""
+    is_glonass = isinstance(ephemeris, rtk.geph_t)
+    sent = rtk.timeadd(instant(time), -code_m / SPEED_OF_LIGHT)
+    clock = rtk.geph2clk(sent, ephemeris) if is_glonass else rtk.eph2clk(sent, ephemeris)
+    sent = rtk.timeadd(sent, -clock)
+    place, bias, variance = rtk.Arr1Ddouble(3), rtk.Arr1Ddouble(1), rtk.Arr1Ddouble(1)
+    (rtk.geph2pos if is_glonass else rtk.eph2pos)(sent, ephemeris, place, bias, variance)
+    return [place[i] for i in range(3)], bias[0] * SPEED_OF_LIGHT
+
+
+def troposphere_m(latitude_deg: float, height_m: float, elevation_deg: float, humidity: float) -> float:
+    position, angles = rtk.Arr1Ddouble(3), rtk.Arr1Ddouble(2)
+    position[0], position[1], position[2] = np.radians(latitude_deg), 0.0, height_m
+    angles[0], angles[1] = 0.0, np.radians(elevation_deg)
+    return float(rtk.tropmodel(rtk.gpst2time(2000, 0.0), position, angles, humidity))
+
+
+def ionosphere_m(time: np.datetime64, place_deg: tuple[float, float], elevation_deg: float, azimuth_deg: float,
+                 coefficients: list[float]) -> float:  # fmt: skip
+    ion, position, angles = rtk.Arr1Ddouble(8), rtk.Arr1Ddouble(3), rtk.Arr1Ddouble(2)
+    for i, value in enumerate(coefficients):
+        ion[i] = value
+    position[0], position[1], position[2] = np.radians(place_deg[0]), np.radians(place_deg[1]), 50.0
+    angles[0], angles[1] = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return float(rtk.ionmodel(instant(time), ion, position, angles))
