@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,32 +16,22 @@ from scipy.special import digamma
 from scipy.stats import chi2
 
 from railfix.antenna import Trajectory
-from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
-from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges, clock_groups
+from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges
 from railfix.clock_offsets import OffsetState, tie_clocks
 from railfix.config import Config
 from railfix.constants import CLOCK_GROUP
 from railfix.constrained import Constrained, constrained_position
 from railfix.epochs import Observations
-from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.measurement import PLAUSIBLE_CODE_M, channel_order, code_sigma_m, first_available
+from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
-from railfix.orbits import SatelliteStates, satellite_states
+from railfix.preparation import Prepared, prepare
 from railfix.reasons import POSITIONED, Reason, Status
 from railfix.results import AntennaResult, AntennaState, Bits, Floats, Result, State
-from railfix.screens import Screened, elevation_screen
+from railfix.screens import elevation_screen
 from railfix.section import SearchIndex, Section, search
-from railfix.signals import carrier_frequency_hz
 from railfix.spp import SinglePoint, single_point
 
 __all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "State"]
-
-#: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
-ANCHOR_SIGMA_M: Final = 10.0
-#: Further from the line than this a raw 3-D position is no train on it, however bad the ranges [m].
-BESIDE_THE_LINE_M: Final = 1e5
-#: Stands for the satellite of a range without weight [m].
-SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
 
 
 class EpochProcessor:
@@ -54,8 +43,6 @@ class EpochProcessor:
     navigation : Navigation
     trajectories : mapping of str to Trajectory
         The trajectory of each antenna, one or two ("front", "rear").
-    glonass_channel : mapping of str to int, optional
-        Frequency channels where the observation header does not tell.
     """
 
     def __init__(self, config: Config, navigation: Navigation, trajectories: Mapping[str, Trajectory]) -> None:
@@ -74,6 +61,7 @@ class EpochProcessor:
         }
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._klobuchar, self.notes = self._ionosphere()
+        self._off_map_excess = float(chi2.isf(config.off_map_risk, 2))
 
     def _ionosphere(self) -> tuple[Floats | None, tuple[str, ...]]:
         """Klobuchar coefficients to use, and what there is to say about them."""
@@ -109,50 +97,44 @@ class EpochProcessor:
         unknown = sorted(set(observations) - set(self.trajectories))
         if unknown:
             raise ValueError(f"no trajectory for antenna {', '.join(unknown)}")
-        before = state.antennas if state else {}
-        results, after = {}, dict(before)
+        after = dict(state.antennas) if state else {}
+        prepared: dict[str, Prepared] = {}
         for name, part in observations.items():
-            results[name], after[name] = self._antenna(name, part, before.get(name, AntennaState()))
+            prepared[name], after[name] = self._screened(name, part, after.get(name, AntennaState()))
+        # Screens that compare the codes of two antennas stand here.
+        results: dict[str, AntennaResult] = {}
+        for name, one in prepared.items():
+            found, after[name] = self._positioned(one, self._index[name], after[name])
+            results[name] = self._result(one, self.trajectories[name], found)
+        # Screens that compare the positions of two antennas stand here.
         return Result(antennas=results, notes=self.notes), State(antennas=after)
 
-    def _antenna(self, name: str, obs: Observations, state: AntennaState) -> tuple[AntennaResult, AntennaState]:
-        trajectory, index = self.trajectories[name], self._index[name]
-        columns = channel_order(obs.satellite, obs.signal, systems=self.config.systems, signals=self.config.signals)
-        satellite, signal = obs.satellite[columns], obs.signal[columns]
-        groups = clock_groups(satellite.astype("<U1"))
-        code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
+    def _screened(self, name: str, obs: Observations, state: AntennaState) -> tuple[Prepared, AntennaState]:
+        """Corrected ranges of one antenna, and what the screens of one antenna refuse."""
+        one = prepare(obs, self.config, self.navigation, self._index[name], self._klobuchar)
+        verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
+        one.screened("elevation", verdict, Reason.ELEVATION_MASK)
+        return one, state
 
-        reason = _refuse_codes(satellite, code)
-        states = satellite_states(
-            obs.time, satellite, signal, code, self.navigation, max_age_s=self.config.max_ephemeris_age_s
-        )
-        _refuse_satellites(reason, states)
-        anchor = self._anchor(index, groups, states, code, reason)
-        elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
-        elevation_verdict = elevation_screen(elevation, limits=self.config.elevation)
-        reason[elevation_verdict.reject] |= Reason.ELEVATION_MASK
-        frequency = carrier_frequency_hz(satellite, signal, obs.header.glonass_channel)
-        corrected = self._corrected(obs.time, anchor, elevation, azimuth, frequency, states, code)
-        sigma = code_sigma_m(cn0, elevation, noise=self.config.noise)
-        reason[(reason == 0) & ~(np.isfinite(corrected) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
-        ranges = _ranges(states, corrected, 1.0 / sigma**2, reason, groups)
-        point = single_point(ranges, anchor, limits=self.config.single_point)
+    def _positioned(self, one: Prepared, index: SearchIndex, state: AntennaState) -> tuple[_Found, AntennaState]:
+        """Conventional and constrained position, status and noise scale of one antenna."""
+        ranges = one.ranges()
+        point = single_point(ranges, one.anchor_ecef_m, limits=self.config.single_point)
         section, constrained = self._on_the_line(ranges, index, point)
-        ties, offsets = self._ties(obs.time, satellite, ranges, constrained, state)
-        if len(groups) > 1:
+        ties, offsets = self._ties(one, ranges, constrained, state)
+        tied = point
+        if len(one.groups) > 1:
             ranges = replace(ranges, ties=ties)
-            start = np.where(np.isnan(point.ecef_m), anchor, point.ecef_m)
+            start = np.where(np.isnan(point.ecef_m), one.anchor_ecef_m, point.ecef_m)
             tied = single_point(ranges, start, limits=self.config.single_point)
             section, constrained = self._on_the_line(ranges, index, tied)
-        _refuse_lone(reason, groups, ties)
-        status = self._status(code, ranges, trajectory, point, section, constrained)
+        one.refuse(_alone(one, ties), Reason.ALONE_ON_ITS_CLOCK)
         scale, state = self._noise_scale(ranges, constrained, state)
+        status = self._status(one.code_m, ranges, index.trajectory, tied, section, constrained)
         found = _Found(
-            columns=columns, states=states, elevation=elevation_verdict, azimuth_deg=azimuth, sigma_m=sigma,
-            corrected_code_m=corrected, reason=reason, point=point, section=section, constrained=constrained,
-            clocks=_clock_letters(satellite, groups), ties=ties,
-        )  # fmt: skip
-        return self._result(obs, trajectory, status, scale, found), replace(state, offsets=offsets)
+            point=point, section=section, constrained=constrained, ties=ties, status=status, noise_scale=scale
+        )
+        return found, replace(state, offsets=offsets)
 
     def _on_the_line(self, ranges: Ranges, index: SearchIndex, point: SinglePoint) -> tuple[Section, Constrained]:
         """Section search and constrained position where there are satellites enough."""
@@ -162,59 +144,12 @@ class EpochProcessor:
         return section, constrained_position(ranges, index.trajectory, vertex, limits=self.config.constrained)
 
     def _ties(
-        self,
-        time: NDArray[np.datetime64],
-        satellite: NDArray[np.str_],
-        ranges: Ranges,
-        free: Constrained,
-        state: AntennaState,
+        self, one: Prepared, ranges: Ranges, free: Constrained, state: AntennaState
     ) -> tuple[ClockTies, OffsetState]:
         """What is known of the clocks against that of the first constellation asked for."""
         reference = CLOCK_GROUP[self.config.systems[0]]
-        clocks = _clock_letters(satellite, ranges.groups)
-        return tie_clocks(time, clocks, reference, ranges, free, state.offsets, limits=self.config.clock_offsets)
-
-    def _anchor(
-        self, index: SearchIndex, groups: tuple[slice, ...], states: SatelliteStates, code: Floats, reason: Bits
-    ) -> Floats:
-        """A place near the antenna to see the satellites from, shape (T, 3): good to some hundred metres.
-
-        The point of the line nearest to a 3-D position from raw ranges of equal weight, started from the
-        middle of the line at every epoch so that no epoch depends on another; the 3-D position itself
-        where it is nowhere near the line; where there is none, the point of the line that fits best.
-        """
-        trajectory = index.trajectory
-        middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(code), 3))
-        clean = code + states.clock_m - states.group_delay_m
-        ranges = _ranges(states, clean, np.full(code.shape, 1.0 / ANCHOR_SIGMA_M**2), reason, groups)
-        point = single_point(ranges, middle, limits=self.config.single_point)
-        arc, offset = trajectory.nearest(point.ecef_m)
-        beside = offset < BESIDE_THE_LINE_M
-        anchor = np.where(beside[:, None], trajectory.at_arc(arc), point.ecef_m)
-        rest = np.flatnonzero(np.isnan(anchor[:, 0]))
-        if len(rest):
-            vertex = search(ranges.take(rest), index, point.take(rest), limits=self.config.section).vertex
-            anchor[rest] = np.where((vertex >= 0)[:, None], trajectory.ecef_m[vertex], middle[rest])
-        return anchor
-
-    def _corrected(
-        self,
-        time: NDArray[np.datetime64],
-        anchor: Floats,
-        elevation: Floats,
-        azimuth: Floats,
-        frequency: Floats,
-        states: SatelliteStates,
-        code: Floats,
-    ) -> Floats:
-        """P = code + c dt_sv - c TGD - I - T, shape (T, K)."""
-        latitude, longitude, height = geodetic_from_ecef(anchor)
-        corrected = code + states.clock_m - states.group_delay_m
-        if self._klobuchar is not None:
-            corrected -= klobuchar_delay_m(time, latitude, longitude, elevation, azimuth, self._klobuchar, frequency)
-        if self.config.troposphere == "saastamoinen":
-            corrected -= saastamoinen_delay_m(latitude, height, elevation)
-        return corrected
+        time = one.observations.time
+        return tie_clocks(time, one.clocks, reference, ranges, free, state.offsets, limits=self.config.clock_offsets)
 
     def _status(
         self,
@@ -231,7 +166,7 @@ class EpochProcessor:
         position = trajectory.at_arc(constrained.arc_m)
         away = np.linalg.norm(position - point.ecef_m, axis=1)
         misfit = (constrained.wsse - point.wsse) / np.maximum(1.0, constrained.wsse / np.maximum(redundancy, 1))
-        lost = (away > config.off_map_m) & (misfit > chi2.isf(config.off_map_risk, 2))
+        lost = (away > config.off_map_m) & (misfit > self._off_map_excess)
         beyond = constrained.overshoot_m > np.maximum(4.0 * constrained.sigma_m, trajectory.sigma_plan_m)
         conditions = [
             (~np.isfinite(code).any(axis=1), Status.NO_OBSERVATION),
@@ -262,29 +197,27 @@ class EpochProcessor:
         scale = np.exp(0.5 * sums[1:] / (weights[1:] + self.config.noise_prior))
         return scale, replace(state, log_variance_sum=float(sums[-1]), log_variance_weight=float(weights[-1]))
 
-    def _result(
-        self, obs: Observations, trajectory: Trajectory, status: NDArray[np.int8], scale: Floats, found: _Found
-    ) -> AntennaResult:
+    def _result(self, one: Prepared, trajectory: Trajectory, found: _Found) -> AntennaResult:
         """Everything side by side, coordinates only where the status has them."""
-        point, constrained = found.point, found.constrained
-        has = np.isin(status, [s.value for s in POSITIONED])
+        obs, point, constrained, scale = one.observations, found.point, found.constrained, found.noise_scale
+        has = np.isin(found.status, [s.value for s in POSITIONED])
         arc = np.where(has, constrained.arc_m, np.nan)
         ecef = trajectory.at_arc(arc)
         latitude, longitude, height = geodetic_from_ecef(ecef)
         nearest, offset = trajectory.nearest(point.ecef_m)
         exact, total = constrained.exact_map_sigma_m**2, constrained.sigma_m**2
-        reason = self._whole_reason(obs, found)
+        reason = self._whole_reason(one)
 
         def whole(values: Floats) -> Floats:
             full = np.full(obs.code_m.shape, np.nan)
-            full[:, found.columns] = values
+            full[:, one.columns] = values
             return full
 
         return AntennaResult(
             time=obs.time,
             satellite=obs.satellite,
             signal=obs.signal,
-            status=status,
+            status=found.status,
             chainage_m=trajectory.chainage_at(arc),
             kilometrage_m=trajectory.kilometrage_at(arc),
             arc_m=arc,
@@ -294,102 +227,61 @@ class EpochProcessor:
             latitude_deg=latitude,
             longitude_deg=longitude,
             height_m=height,
-            n_used=np.count_nonzero(found.reason == 0, axis=1),
+            n_used=np.count_nonzero(one.reason == 0, axis=1),
             n_rejected=_satellites_refused(obs.satellite, reason),
             conventional_ecef_m=point.ecef_m,
             conventional_arc_m=nearest,
             conventional_chainage_m=trajectory.chainage_at(nearest),
             conventional_offset_m=offset,
             reason=reason,
-            elevation_deg=whole(found.elevation.metric),
-            azimuth_deg=whole(found.azimuth_deg),
+            elevation_deg=whole(one.elevation_deg),
+            azimuth_deg=whole(one.azimuth_deg),
             cn0_dbhz=obs.cn0_dbhz,
-            sigma_m=whole(found.sigma_m),
-            corrected_code_m=whole(found.corrected_code_m),
-            residual_m=whole(np.where(found.reason == 0, constrained.residual_m, np.nan)),
-            satellites=found.states,
-            columns=found.columns,
-            elevation_screen=found.elevation,
+            sigma_m=whole(one.sigma_m),
+            corrected_code_m=whole(one.corrected_code_m),
+            residual_m=whole(np.where(one.reason == 0, constrained.residual_m, np.nan)),
+            satellites=one.satellites,
+            columns=one.columns,
+            screens=one.screens,
             single_point=point,
             section=found.section,
             constrained=constrained,
-            clocks=found.clocks,
+            clocks=one.clocks,
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,
         )
 
-    def _whole_reason(self, obs: Observations, found: _Found) -> Bits:
+    def _whole_reason(self, one: Prepared) -> Bits:
         """Reasons of all channels, those that settings leave out included, shape (T, M)."""
+        obs = one.observations
         reason = np.where(np.isfinite(obs.code_m), 0, int(Reason.NOT_OBSERVED))
         selected = np.isin(obs.system, self.config.systems)
         reason[:, ~selected] |= Reason.SYSTEM_NOT_SELECTED
-        reason[:, np.setdiff1d(np.flatnonzero(selected), found.columns)] |= Reason.OTHER_SIGNAL_TAKEN
-        reason[:, found.columns] = found.reason
+        reason[:, np.setdiff1d(np.flatnonzero(selected), one.columns)] |= Reason.OTHER_SIGNAL_TAKEN
+        reason[:, one.columns] = one.reason
         return reason
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Found:
-    """What the rooms said of the channels that settings allow."""
+    """Where one antenna is."""
 
-    columns: NDArray[np.intp]
-    states: SatelliteStates
-    elevation: Screened
-    azimuth_deg: Floats
-    sigma_m: Floats
-    corrected_code_m: Floats
-    reason: Bits
     point: SinglePoint
     section: Section
     constrained: Constrained
-    clocks: tuple[str, ...]
     ties: ClockTies
+    status: NDArray[np.int8]
+    noise_scale: Floats
 
 
-def _refuse_codes(satellite: NDArray[np.str_], code: Floats) -> Bits:
-    """Reasons that the codes alone give, shape (T, K)."""
-    observed = np.isfinite(code)
-    plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
-    taken = first_available(satellite, plausible)
-    reason = np.zeros(code.shape, dtype=np.int64)
-    reason[~observed] |= Reason.NOT_OBSERVED
-    reason[observed & ~plausible] |= Reason.IMPLAUSIBLE_CODE
-    reason[plausible & ~taken] |= Reason.OTHER_SIGNAL_TAKEN
-    return reason
-
-
-def _refuse_satellites(reason: Bits, states: SatelliteStates) -> None:
-    """Add the reasons of the ephemerides to observed channels."""
-    observed = (reason & Reason.NOT_OBSERVED) == 0
-    for mask, bit in (
-        (states.no_record, Reason.NO_EPHEMERIS),
-        (states.too_old, Reason.EPHEMERIS_TOO_OLD),
-        (states.unhealthy, Reason.UNHEALTHY),
-    ):
-        reason[observed & mask] |= bit
-
-
-def _refuse_lone(reason: Bits, groups: tuple[slice, ...], ties: ClockTies) -> None:
-    """Add the reason of a satellite that determines its own clock and nothing else."""
-    for g, group in enumerate(groups):
-        used = reason[:, group] == 0
-        lone = used & (np.count_nonzero(used, axis=1) == 1)[:, None] & (ties.sigma_m[:, g, None] >= UNTIED_M)
-        reason[:, group][lone] |= Reason.ALONE_ON_ITS_CLOCK
-
-
-def _clock_letters(satellite: NDArray[np.str_], groups: tuple[slice, ...]) -> tuple[str, ...]:
-    return tuple(CLOCK_GROUP[str(satellite[group.start])[0]] for group in groups)
-
-
-def _ranges(states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]) -> Ranges:
-    """Ranges to be fitted: what has a reason gets no weight and harmless numbers."""
-    used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
-    return Ranges(
-        sat_ecef_m=np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M),
-        code_m=np.where(used, code, 0.0),
-        weight=np.where(used, weight, 0.0),
-        groups=groups,
-    )
+def _alone(one: Prepared, ties: ClockTies) -> NDArray[np.bool_]:
+    """Satellites that determine their own clock and nothing else, shape (T, K)."""
+    alone = np.zeros(one.reason.shape, dtype=bool)
+    for g, group in enumerate(one.groups):
+        used = one.reason[:, group] == 0
+        lone = (np.count_nonzero(used, axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
+        alone[:, group] = used & lone[:, None]
+    return alone
 
 
 def _satellites_refused(satellite: NDArray[np.str_], reason: Bits) -> NDArray[np.int64]:

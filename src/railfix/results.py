@@ -79,7 +79,8 @@ class AntennaResult:
         Of the channels in `columns`.
     columns : ndarray of int, shape (K,)
         Channels that settings allow, in the order of the intermediate results below.
-    elevation_screen : Screened
+    screens : mapping of str to Screened
+        Metric and verdict of each screen that was on, by name, shape (T, K).
     single_point : SinglePoint
         The conventional position: every constellation with a clock of its own.
     section : Section
@@ -118,7 +119,7 @@ class AntennaResult:
     residual_m: Floats
     satellites: SatelliteStates
     columns: NDArray[np.intp]
-    elevation_screen: Screened
+    screens: Mapping[str, Screened]
     single_point: SinglePoint
     section: Section
     constrained: Constrained

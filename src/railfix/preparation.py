@@ -1,0 +1,215 @@
+"""From observations to corrected ranges with the reasons so far: everything before a position is sought."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
+from railfix.clock_elimination import Ranges, clock_groups
+from railfix.config import Config
+from railfix.constants import CLOCK_GROUP
+from railfix.epochs import Observations
+from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.measurement import PLAUSIBLE_CODE_M, channel_order, code_sigma_m, first_available
+from railfix.navigation import Navigation
+from railfix.orbits import SatelliteStates, satellite_states
+from railfix.reasons import Reason
+from railfix.screens import Screened
+from railfix.section import SearchIndex, search
+from railfix.signals import carrier_frequency_hz
+from railfix.spp import single_point
+
+Floats = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+Bits = NDArray[np.int64]
+
+#: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
+ANCHOR_SIGMA_M: Final = 10.0
+#: Further from the line than this a raw 3-D position is no train on it, however bad the ranges [m].
+BESIDE_THE_LINE_M: Final = 1e5
+#: Stands for the satellite of a range without weight [m].
+SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prepared:
+    """One antenna's chunk before any position: T epochs by the K channels that settings allow.
+
+    Attributes
+    ----------
+    observations : Observations
+    columns : ndarray of int, shape (K,)
+        Where the channels stand in the observations.
+    satellite, signal : ndarray of str, shape (K,)
+    groups : tuple of slice
+        Channels of one receiver clock.
+    code_m, doppler_hz, cn0_dbhz : ndarray, shape (T, K)
+    frequency_hz : ndarray, shape (K,)
+    satellites : SatelliteStates
+    anchor_ecef_m : ndarray, shape (T, 3) [m]
+        Where the satellites are seen from.
+    elevation_deg, azimuth_deg : ndarray, shape (T, K)
+    corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
+    reason : ndarray of int64, shape (T, K)
+        Written to by `refuse` alone.
+    screens : dict of str to Screened
+        What each screen measured and said.
+    """
+
+    observations: Observations
+    columns: NDArray[np.intp]
+    satellite: NDArray[np.str_]
+    signal: NDArray[np.str_]
+    groups: tuple[slice, ...]
+    code_m: Floats
+    doppler_hz: Floats
+    cn0_dbhz: Floats
+    frequency_hz: Floats
+    satellites: SatelliteStates
+    anchor_ecef_m: Floats
+    elevation_deg: Floats
+    azimuth_deg: Floats
+    corrected_code_m: Floats
+    sigma_m: Floats
+    reason: Bits
+    screens: dict[str, Screened] = field(default_factory=dict)
+
+    @property
+    def clocks(self) -> tuple[str, ...]:
+        """Letter of each receiver clock."""
+        return tuple(CLOCK_GROUP[str(self.satellite[group.start])[0]] for group in self.groups)
+
+    def refuse(self, mask: Masks, reason: Reason) -> None:
+        """Add a reason to observed channels; nothing ever takes one away."""
+        self.reason[mask & ((self.reason & Reason.NOT_OBSERVED) == 0)] |= reason
+
+    def screened(self, name: str, verdict: Screened, reason: Reason) -> None:
+        """Keep what a screen said, and act on it."""
+        self.screens[name] = verdict
+        self.refuse(verdict.reject, reason)
+
+    def ranges(self) -> Ranges:
+        """What may be fitted now."""
+        return usable_ranges(self.satellites, self.corrected_code_m, 1.0 / self.sigma_m**2, self.reason, self.groups)
+
+
+def prepare(
+    obs: Observations, config: Config, navigation: Navigation, index: SearchIndex, klobuchar: Floats | None
+) -> Prepared:
+    """Choose channels, find their satellites, correct their codes, weigh them.
+
+    Parameters
+    ----------
+    obs : Observations
+    config : Config
+    navigation : Navigation
+    index : SearchIndex
+        Of the antenna's trajectory.
+    klobuchar : ndarray, shape (8,), or None
+        Ionospheric coefficients; None leaves the ionosphere uncorrected.
+
+    Returns
+    -------
+    Prepared
+        With the reasons of codes, satellites and corrections; the screens come after.
+    """
+    columns = channel_order(obs.satellite, obs.signal, systems=config.systems, signals=config.signals)
+    satellite, signal = obs.satellite[columns], obs.signal[columns]
+    groups = clock_groups(satellite.astype("<U1"))
+    code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
+    reason = _reasons_of_codes(satellite, code)
+    states = satellite_states(obs.time, satellite, signal, code, navigation, max_age_s=config.max_ephemeris_age_s)
+    observed = (reason & Reason.NOT_OBSERVED) == 0
+    for mask, bit in (
+        (states.no_record, Reason.NO_EPHEMERIS),
+        (states.too_old, Reason.EPHEMERIS_TOO_OLD),
+        (states.unhealthy, Reason.UNHEALTHY),
+    ):
+        reason[observed & mask] |= bit
+    clean = code + states.clock_m - states.group_delay_m
+    anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
+    elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
+    frequency = carrier_frequency_hz(satellite, signal, obs.header.glonass_channel)
+    latitude, longitude, height = geodetic_from_ecef(anchor)
+    if klobuchar is not None:
+        clean = clean - klobuchar_delay_m(obs.time, latitude, longitude, elevation, azimuth, klobuchar, frequency)
+    if config.troposphere == "saastamoinen":
+        clean = clean - saastamoinen_delay_m(latitude, height, elevation)
+    sigma = code_sigma_m(cn0, elevation, noise=config.noise)
+    reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
+    return Prepared(
+        observations=obs,
+        columns=columns,
+        satellite=satellite,
+        signal=signal,
+        groups=groups,
+        code_m=code,
+        doppler_hz=obs.doppler_hz[:, columns],
+        cn0_dbhz=cn0,
+        frequency_hz=frequency,
+        satellites=states,
+        anchor_ecef_m=anchor,
+        elevation_deg=elevation,
+        azimuth_deg=azimuth,
+        corrected_code_m=clean,
+        sigma_m=sigma,
+        reason=reason,
+    )
+
+
+_ANCHOR_WEIGHT: Final = np.array(1.0 / ANCHOR_SIGMA_M**2)
+
+
+def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
+    """A place near the antenna to see the satellites from, shape (T, 3): good to some hundred metres.
+
+    The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
+    the middle of the line at every epoch so that no epoch depends on another; the 3-D position
+    itself where it is nowhere near the line; where there is none, the point of the line that fits
+    best.
+    """
+    trajectory = index.trajectory
+    middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
+    point = single_point(ranges, middle, limits=config.single_point)
+    arc, offset = trajectory.nearest(point.ecef_m)
+    beside = offset < BESIDE_THE_LINE_M
+    anchor = np.where(beside[:, None], trajectory.at_arc(arc), point.ecef_m)
+    rest = np.flatnonzero(np.isnan(anchor[:, 0]))
+    if len(rest):
+        vertex = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
+        anchor[rest] = np.where((vertex >= 0)[:, None], trajectory.ecef_m[vertex], middle[rest])
+    return anchor
+
+
+def _reasons_of_codes(satellite: NDArray[np.str_], code: Floats) -> Bits:
+    """Reasons that the codes alone give, shape (T, K)."""
+    observed = np.isfinite(code)
+    plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
+    taken = first_available(satellite, plausible)
+    reason = np.zeros(code.shape, dtype=np.int64)
+    reason[~observed] |= Reason.NOT_OBSERVED
+    reason[observed & ~plausible] |= Reason.IMPLAUSIBLE_CODE
+    reason[plausible & ~taken] |= Reason.OTHER_SIGNAL_TAKEN
+    return reason
+
+
+def usable_ranges(
+    states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
+) -> Ranges:
+    """Ranges to be fitted: what has a reason, or no number, gets no weight and harmless numbers."""
+    used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
+    return Ranges(
+        sat_ecef_m=np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M),
+        code_m=np.where(used, code, 0.0),
+        weight=np.where(used, weight, 0.0),
+        groups=groups,
+    )
+
+
+def without(ranges: Ranges, dropped: Masks) -> Ranges:
+    """The same ranges, some of them without weight."""
+    return replace(ranges, weight=np.where(dropped, 0.0, ranges.weight))
