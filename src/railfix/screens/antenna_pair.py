@@ -1,0 +1,325 @@
+"""Pseudorange difference of two antennas against their spacing (P1 2.3(3), figure 5, table 6: 5 m).
+
+The same satellite is further from the rear antenna than from the front one by the part of their
+spacing that points to it: ``L (cos el cos(az - heading) cos gradient + sin el sin gradient)``. A
+difference that does not fit has multipath in one of the two, and which one is not known.
+
+Clocks. P1 runs both receivers on one frequency standard, with one-pulse-per-second: then the
+difference has no clock in it. Otherwise the clock difference is the median over the satellites of a
+constellation, and an error of that median is common to them all. A clock difference also means that
+the two receivers looked at different instants, and so does a difference of the time tags: with range
+rates given, the satellites' way in between is taken out (1 ms is up to 0.8 m).
+
+What the angles leave open. Gradient, sway and map leave the elevation open by 3 deg and the azimuth
+relative to the car body by 3.5 deg (P1). Multipath below the difference that these make is not found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railfix.constants import SPEED_OF_LIGHT
+from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.screens.medians import clock_columns, enough_satellites, row_median
+from railfix.screens.result import Screened
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Masks = NDArray[np.bool_]
+
+#: What each way to treat the clocks is called in the output.
+CLOCKS: Final = {
+    "common": "the receivers' clocks are common by hardware",
+    "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaPairLimits:
+    """Limits of the screen by two antennas.
+
+    Attributes
+    ----------
+    limit_m : float [m]
+        Largest difference from what is expected; P1 table 6: 5.
+    elevation_error_deg, azimuth_error_deg : float [deg]
+        By which the satellite's direction from the car body may be wrong; P1 2.3(3): 3 and 3.5.
+    clocks : {"common", "median"}
+        See `CLOCKS`.
+    least_satellites : int
+        "median": satellites of a constellation that both antennas need.
+    tag_tolerance_s : float [s]
+        Largest difference of the time tags of a pair of epochs.
+    """
+
+    limit_m: float = 5.0
+    elevation_error_deg: float = 3.0
+    azimuth_error_deg: float = 3.5
+    clocks: Literal["common", "median"] = "median"
+    least_satellites: int = 4
+    tag_tolerance_s: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.limit_m < np.inf:
+            raise ValueError(f"limit_m must be positive and finite, got {self.limit_m}")
+        for name in ("elevation_error_deg", "azimuth_error_deg"):
+            if not 0.0 <= getattr(self, name) <= 90.0:
+                raise ValueError(f"{name} must lie in [0, 90], got {getattr(self, name)}")
+        if self.clocks not in CLOCKS:
+            raise ValueError(f"clocks must be one of {', '.join(CLOCKS)}, got {self.clocks!r}")
+        if self.least_satellites < 3:
+            raise ValueError(f"least_satellites must be at least 3 for a median, got {self.least_satellites}")
+        if not 0.0 <= self.tag_tolerance_s < 1.0:
+            raise ValueError(f"tag_tolerance_s must lie in [0, 1), got {self.tag_tolerance_s}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaPairScreened(Screened):
+    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured less expected [m].
+
+    Attributes
+    ----------
+    expected_m : ndarray, shape (P, C) [m]
+        Pseudorange of the rear antenna less that of the front one, from the spacing.
+    ambiguity_m : ndarray, shape (P, C) [m]
+        What the errors of the angles explain; within it nothing is refused, whatever the limit.
+    clock_m : ndarray, shape (P, C) [m]
+        Clock of the rear receiver less that of the front one, as taken out; 0 where common.
+    clocks : str
+        How the clocks were treated, in words.
+    """
+
+    expected_m: Floats
+    ambiguity_m: Floats
+    clock_m: Floats
+    clocks: str
+
+
+def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
+    """Epochs of two receivers that belong together.
+
+    Parameters
+    ----------
+    time_front, time_rear : array_like of datetime64[ns], shapes (F,), (R,)
+        Rising.
+    tolerance_s : float [s]
+        Largest difference of the tags.
+
+    Returns
+    -------
+    index_front, index_rear : ndarray of int, shape (P,)
+        Each epoch is in one pair at most: with the nearest of the other that has it nearest too.
+    """
+    front = np.asarray(time_front, dtype="datetime64[ns]").astype(np.int64)
+    rear = np.asarray(time_rear, dtype="datetime64[ns]").astype(np.int64)
+    if not len(front) or not len(rear):
+        return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
+    to_rear, to_front = _nearest(front, rear), _nearest(rear, front)
+    at = np.arange(len(front))
+    mutual = to_front[to_rear] == at
+    close = np.abs(front - rear[to_rear]) <= round(tolerance_s * 1e9)
+    index = np.flatnonzero(mutual & close)
+    return index, to_rear[index]
+
+
+def _nearest(values: NDArray[np.int64], among: NDArray[np.int64]) -> Indices:
+    """Index of the nearest of rising numbers, the earlier of two equally near."""
+    after = np.clip(np.searchsorted(among, values), 1, max(len(among) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(among) - 1)
+    return np.where(np.abs(values - among[before]) <= np.abs(among[after] - values), before, after)
+
+
+def pair_channels(
+    satellite_front: NDArray[np.str_],
+    signal_front: NDArray[np.str_],
+    satellite_rear: NDArray[np.str_],
+    signal_rear: NDArray[np.str_],
+) -> tuple[Indices, Indices]:
+    """Channels of the same satellite and signal at both receivers, in the order of the front one's."""
+    rear = {key: m for m, key in enumerate(zip(satellite_rear.tolist(), signal_rear.tolist(), strict=True))}
+    keys = enumerate(zip(satellite_front.tolist(), signal_front.tolist(), strict=True))
+    pairs = [(m, rear[key]) for m, key in keys if key in rear]
+    both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    return both[:, 0], both[:, 1]
+
+
+def on_channels(verdict: Masks, shape: tuple[int, int], epochs: Indices, channels: Indices) -> Masks:
+    """A verdict on pairs laid on one antenna's own epochs and channels, shape `shape`.
+
+    Both antennas get it: which of the two has the multipath is not known.
+    """
+    whole = np.zeros(shape, dtype=bool)
+    whole[np.ix_(epochs, channels)] = verdict
+    return whole
+
+
+def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
+    """Heading, gradient and length of the line from the rear to the front antenna.
+
+    Parameters
+    ----------
+    front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
+        On their trajectories at the same instant. Both may be wrong along the track by as much as the
+        line stays straight: only their difference counts.
+
+    Returns
+    -------
+    heading_deg, gradient_permille, spacing_m : ndarray, shape (P,)
+    """
+    front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
+    latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)
+    enu = np.einsum("pij,pj->pi", enu_axes(latitude, longitude), front - rear)
+    level = np.hypot(enu[:, 0], enu[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        gradient = 1e3 * enu[:, 2] / level
+    heading = np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360.0
+    return heading, gradient, np.hypot(level, enu[:, 2])
+
+
+def expected_difference_m(
+    elevation_deg: ArrayLike,
+    azimuth_deg: ArrayLike,
+    *,
+    heading_deg: ArrayLike,
+    gradient_permille: ArrayLike,
+    spacing_m: ArrayLike,
+) -> Floats:
+    """Pseudorange of the rear antenna less that of the front one, clocks alike, shape (P, C) [m].
+
+    Parameters
+    ----------
+    elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
+    heading_deg, gradient_permille, spacing_m : array_like, shape (P,) or scalar
+        From the rear to the front antenna. For a train that faces falling chainage the heading is that
+        of the line turned by 180 deg, and the gradient has the other sign.
+    """
+    elevation, azimuth = np.radians(elevation_deg), np.radians(azimuth_deg)
+    heading, spacing = (np.asarray(value, dtype=np.float64)[..., None] for value in (heading_deg, spacing_m))
+    climb = np.arctan(np.asarray(gradient_permille, dtype=np.float64) / 1e3)[..., None]
+    level = np.cos(elevation) * np.cos(azimuth - np.radians(heading)) * np.cos(climb)
+    return np.asarray(spacing * (level + np.sin(elevation) * np.sin(climb)))
+
+
+def ambiguity_m(
+    elevation_deg: ArrayLike,
+    relative_azimuth_deg: ArrayLike,
+    spacing_m: ArrayLike,
+    *,
+    elevation_error_deg: float = 3.0,
+    azimuth_error_deg: float = 3.5,
+) -> Floats:
+    """Largest change of the expected difference that the errors of the angles explain [m].
+
+    Of all directions within the errors the one that differs most: 1.1 m at most at 18.2 m spacing (P1
+    2.3(3)), for a low satellite abeam.
+
+    Parameters
+    ----------
+    elevation_deg, relative_azimuth_deg : array_like, shapes that broadcast [deg]
+        Azimuth less heading.
+    spacing_m : array_like [m]
+    elevation_error_deg, azimuth_error_deg : float [deg]
+    """
+    elevation = np.radians(np.asarray(elevation_deg, dtype=np.float64))
+    azimuth = np.radians(np.asarray(relative_azimuth_deg, dtype=np.float64))
+    exact = np.cos(elevation) * np.cos(azimuth)
+    # the product of two cosines is extremal where each of them is
+    ends = _extremes(elevation, np.radians(elevation_error_deg)), _extremes(azimuth, np.radians(azimuth_error_deg))
+    changes = [np.abs(a * b - exact) for a, b in product(*ends)]
+    return np.asarray(np.asarray(spacing_m, dtype=np.float64) * np.max(changes, axis=0))
+
+
+def _extremes(angle: Floats, error: float) -> tuple[Floats, Floats]:
+    """Least and largest cosine within an error of an angle; NaN for NaN."""
+    ends = np.cos(angle - error), np.cos(angle + error)
+    low, high = np.minimum(*ends), np.maximum(*ends)
+    zero = np.abs((angle + np.pi) % (2.0 * np.pi) - np.pi) <= error
+    half = np.abs(angle % (2.0 * np.pi) - np.pi) <= error
+    return np.where(half, -1.0, low), np.where(zero, 1.0, high)
+
+
+def antenna_pair_screen(
+    code_front_m: ArrayLike,
+    code_rear_m: ArrayLike,
+    elevation_deg: ArrayLike,
+    azimuth_deg: ArrayLike,
+    *,
+    satellite: NDArray[np.str_],
+    heading_deg: ArrayLike,
+    gradient_permille: ArrayLike,
+    spacing_m: ArrayLike,
+    tag_difference: ArrayLike | None = None,
+    range_rate_mps: ArrayLike | None = None,
+    limits: AntennaPairLimits | None = None,
+) -> AntennaPairScreened:
+    """Refuse satellites whose two pseudoranges do not differ as the antennas' places say.
+
+    Parameters
+    ----------
+    code_front_m, code_rear_m : array_like, shape (P, C) [m]
+        Pseudoranges of pairs of epochs (`pair_epochs`) and channels (`pair_channels`), raw or
+        corrected alike; NaN where absent.
+    elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
+    satellite : ndarray of str, shape (C,)
+    heading_deg, gradient_permille, spacing_m : array_like, shape (P,) or scalar
+        From the rear to the front antenna (`spacing_direction`); NaN where unknown: not judged.
+    tag_difference : array_like of timedelta64[ns], shape (P,), optional
+        Time tags of the rear receiver less those of the front one.
+    range_rate_mps : array_like, shape (P, C) [m/s], optional
+        ``-lambda D``, NaN where unknown: then left out. Without them the instants count as one.
+    limits : AntennaPairLimits, optional
+
+    Returns
+    -------
+    AntennaPairScreened
+        NaN metric, and no refusal, where a pseudorange is missing at either antenna, and, with
+        clocks "median", where fewer than `least_satellites` of the clock are there.
+    """
+    limits = limits or AntennaPairLimits()
+    front, rear = np.asarray(code_front_m, dtype=np.float64), np.asarray(code_rear_m, dtype=np.float64)
+    expected = expected_difference_m(
+        elevation_deg, azimuth_deg, heading_deg=heading_deg, gradient_permille=gradient_permille, spacing_m=spacing_m
+    )
+    rate = np.zeros(front.shape) if range_rate_mps is None else np.nan_to_num(np.asarray(range_rate_mps))
+    later = np.zeros(len(front)) if tag_difference is None else seconds(tag_difference)
+    raw = rear - front - expected - rate * later[:, None]
+    clock = np.zeros(raw.shape)
+    if limits.clocks == "median":
+        clock = _clock_difference(raw, rate, satellite, least=limits.least_satellites)
+        raw = raw + rate * clock / SPEED_OF_LIGHT
+    metric = raw - clock
+    relative = np.asarray(azimuth_deg) - np.asarray(heading_deg, dtype=np.float64)[..., None]
+    zone = ambiguity_m(
+        elevation_deg,
+        relative,
+        np.asarray(spacing_m, dtype=np.float64)[..., None],
+        elevation_error_deg=limits.elevation_error_deg,
+        azimuth_error_deg=limits.azimuth_error_deg,
+    )
+    return AntennaPairScreened(
+        metric=metric,
+        reject=np.abs(metric) > np.maximum(limits.limit_m, zone),
+        expected_m=expected,
+        ambiguity_m=zone,
+        clock_m=clock,
+        clocks=CLOCKS[limits.clocks],
+    )
+
+
+def _clock_difference(raw: Floats, rate: Floats, satellite: NDArray[np.str_], *, least: int) -> Floats:
+    """Median of each constellation, shape (P, C) [m]; the instants that it moves are allowed for."""
+    clock = np.full(raw.shape, np.nan)
+    for columns in clock_columns(satellite):
+        part = raw[:, columns]
+        first = row_median(part)
+        second = row_median(part + rate[:, columns] * first / SPEED_OF_LIGHT)
+        enough = enough_satellites(np.isfinite(part), satellite[columns], least)
+        clock[:, columns] = np.where(enough, second, np.nan)
+    return clock

@@ -1,0 +1,281 @@
+"""Change of the pseudorange against the Doppler (P1 2.3(2), figure 4, table 6: 1.5 m).
+
+Over a short interval the range changes by the mean of the two Dopplers times interval and
+wavelength. The Doppler is hardly touched by multipath, so a pseudorange that changes otherwise has
+jumped. The screen sees *changes*: a multipath error that stays is invisible to it.
+
+Receiver clock. A step of the clock moves all pseudoranges alike, and the median over the satellites
+of a constellation takes it out. A step also spoils the interval: time tags are told by the
+receiver's clock, so between two tags ``dt - step`` has really passed, and 4 ms times a range rate of
+800 m/s are 3.2 m that differ from satellite to satellite. The interval is therefore corrected by the
+step that the codes themselves show, before the Doppler is applied.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railfix.constants import SPEED_OF_LIGHT
+from railfix.epochs import frozen
+from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
+from railfix.screens.medians import clock_columns, enough_satellites, row_median
+from railfix.screens.result import Screened
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+Datetimes = NDArray[np.datetime64]
+
+_NS: Final = 1e9
+
+
+@dataclass(frozen=True, kw_only=True)
+class DopplerScreened(Screened):
+    """Verdict of the Doppler screen; the metric is P1's, from one epoch to the next [m].
+
+    Attributes
+    ----------
+    limit_m : ndarray, shape (T, M) [m]
+        NaN where the metric is.
+    level_m : ndarray, shape (T, M) [m]
+        How far a suspected satellite stands from the level it had before its jump, 0 where it is
+        not suspected, NaN where the metric is.
+    """
+
+    limit_m: Floats
+    level_m: Floats
+
+
+def _none(kind: str) -> NDArray[np.str_]:
+    return np.empty(0, dtype=kind)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DopplerState:
+    """The last epoch seen, and the satellites under suspicion then; shapes (M,).
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        NaT before the first epoch.
+    satellite, signal : ndarray of str
+        Channels; those of the next chunk may be others.
+    code_m, doppler_hz, code_sigma_m : ndarray
+        NaN where absent.
+    level_m : ndarray [m]
+        See `DopplerScreened`.
+    since : ndarray of datetime64[ns]
+        Time of the jump, NaT where not suspected.
+    scale_sum, scale_epochs : float
+        Sum of the logarithms of the receiver's scale, and how many epochs are in it (mode "receiver").
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    satellite: NDArray[np.str_] = field(default_factory=lambda: _none("<U3"))
+    signal: NDArray[np.str_] = field(default_factory=lambda: _none("<U2"))
+    code_m: Floats = field(default_factory=lambda: np.empty(0))
+    doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
+    code_sigma_m: Floats = field(default_factory=lambda: np.empty(0))
+    level_m: Floats = field(default_factory=lambda: np.empty(0))
+    since: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
+    scale_sum: float = 0.0
+    scale_epochs: float = 0.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, frozen(value))
+
+
+def doppler_screen(
+    time: ArrayLike,
+    code_m: ArrayLike,
+    doppler_hz: ArrayLike,
+    *,
+    satellite: NDArray[np.str_],
+    signal: NDArray[np.str_],
+    frequency_hz: ArrayLike,
+    break_before: ArrayLike | None = None,
+    code_sigma_m: ArrayLike | None = None,
+    limits: DopplerLimits | None = None,
+    state: DopplerState | None = None,
+) -> tuple[DopplerScreened, DopplerState]:
+    """Refuse pseudoranges that changed otherwise than their Doppler says.
+
+    The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the
+    channels of one receiver clock (GPS and QZSS share one).
+
+    Which of the two epochs was the bad one, a single difference does not tell. A satellite that
+    jumps beyond the limit is suspected and refused, and its jumps are added up to a level. When the
+    level is back within the limit, the satellite is where it was before and is used again at once
+    (its jump back is beyond the limit, and not refused). When `hold_s` has passed without that, the
+    new level is taken as the good one. So a passing reflection costs its own epochs, and the end of a
+    reflection that was there from the first epoch on costs `hold_s` of good ones.
+
+    Parameters
+    ----------
+    time : array_like of datetime64[ns], shape (T,)
+    code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
+        NaN where absent. Codes that cannot be one (0, 1e9) are the caller's to leave out.
+    satellite, signal : ndarray of str, shape (M,)
+    frequency_hz : array_like, shape (M,) [Hz]
+        Carrier; NaN where unknown: not judged.
+    break_before : array_like of bool, shape (T,), optional
+        Nothing is differenced across the step into these epochs.
+    code_sigma_m : array_like, shape (T, M) [m], optional
+        Noise of the codes, asked for by mode "sigma"; NaN there: not judged.
+    limits : DopplerLimits, optional
+    state : DopplerState, optional
+        Left by the chunk before.
+
+    Returns
+    -------
+    DopplerScreened
+        NaN metric, and no refusal, where there is no epoch before within `longest_interval_s`, where
+        the satellite lacks code or Doppler at either epoch, and where its clock has fewer than
+        `least_satellites` satellites. A suspicion ends there: the level is lost.
+    DopplerState
+        To be passed on with the next chunk.
+
+    Raises
+    ------
+    ValueError
+        Mode "sigma" without `code_sigma_m`.
+    """
+    limits = limits or DopplerLimits()
+    when = np.asarray(time, dtype="datetime64[ns]")
+    code, doppler = np.asarray(code_m, dtype=np.float64), np.asarray(doppler_hz, dtype=np.float64)
+    if code_sigma_m is None and limits.mode == "sigma":
+        raise ValueError("mode 'sigma' needs code_sigma_m")
+    sigma = np.full(code.shape, np.nan) if code_sigma_m is None else np.asarray(code_sigma_m, dtype=np.float64)
+    before = _aligned(state or DopplerState(), satellite, signal)
+    if not len(when):
+        nothing = np.empty(code.shape)
+        empty = DopplerScreened(metric=nothing, reject=nothing.astype(bool), limit_m=nothing, level_m=nothing)
+        return empty, state or DopplerState()
+    codes, dopplers, sigmas = (
+        np.vstack([first, rest])
+        for first, rest in (
+            (before.code_m, code),
+            (before.doppler_hz, doppler),
+            (before.code_sigma_m, sigma),
+        )
+    )
+    interval = _intervals(when, before.time, break_before, limits)
+    rate = -SPEED_OF_LIGHT / np.asarray(frequency_hz, dtype=np.float64) * (dopplers[1:] + dopplers[:-1]) / 2.0
+    metric = _jumps(np.diff(codes, axis=0), rate, interval, satellite, least=limits.least_satellites)
+    limit, sum_log, weight = _limit_m(interval, metric, sigmas, before, limits)
+    metric = np.where(np.isnan(limit), np.nan, metric)
+    limit = np.where(np.isnan(metric), np.nan, limit)
+    reject, level, since = _suspicion(when, metric, limit, before, hold_s=limits.hold_s)
+    after = DopplerState(
+        time=when[-1], satellite=satellite, signal=signal, code_m=code[-1].copy(), doppler_hz=doppler[-1].copy(),
+        code_sigma_m=sigma[-1].copy(), level_m=level[-1].copy(), since=since,
+        scale_sum=sum_log, scale_epochs=weight,
+    )  # fmt: skip
+    return DopplerScreened(metric=metric, reject=reject, limit_m=limit, level_m=level), after
+
+
+def _aligned(state: DopplerState, satellite: NDArray[np.str_], signal: NDArray[np.str_]) -> DopplerState:
+    """The state on the channels of this chunk; channels that left have no observation in it anyway."""
+    row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
+    found = np.array([row.get(key, -1) for key in zip(satellite.tolist(), signal.tolist(), strict=True)], dtype=int)
+    known = found >= 0
+
+    def moved(values: Floats) -> Floats:
+        return np.where(known, np.append(values, np.nan)[found], np.nan)
+
+    never = np.datetime64("NaT", "ns")
+    return DopplerState(
+        time=state.time,
+        satellite=satellite,
+        signal=signal,
+        code_m=moved(state.code_m),
+        doppler_hz=moved(state.doppler_hz),
+        code_sigma_m=moved(state.code_sigma_m),
+        level_m=moved(state.level_m),
+        since=np.where(known, np.append(state.since, never)[found], never),
+        scale_sum=state.scale_sum,
+        scale_epochs=state.scale_epochs,
+    )
+
+
+def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | None, limits: DopplerLimits) -> Floats:
+    """Interval into each epoch by the tags, shape (T,) [s]; NaN where nothing may be differenced."""
+    interval = seconds(np.diff(np.concatenate([[last], time])))
+    possible = (interval > 0.0) & (interval <= limits.longest_interval_s)
+    if break_before is not None:
+        possible &= ~np.asarray(break_before, dtype=bool)
+    return np.where(possible, interval, np.nan)
+
+
+def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: NDArray[np.str_], *, least: int) -> Floats:
+    """Change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
+    metric = np.full(change.shape, np.nan)
+    for columns in clock_columns(satellite):
+        raw = change[:, columns] - rate[:, columns] * interval[:, None]
+        # what the clock stepped by was not time that passed
+        passed = interval[:, None] - row_median(raw) / SPEED_OF_LIGHT
+        raw = change[:, columns] - rate[:, columns] * passed
+        enough = enough_satellites(np.isfinite(raw), satellite[columns], least)
+        metric[:, columns] = np.where(enough, raw - row_median(raw), np.nan)
+    return metric
+
+
+def _limit_m(
+    interval: Floats, metric: Floats, sigmas: Floats, before: DopplerState, limits: DopplerLimits
+) -> tuple[Floats, float, float]:
+    """Limit of each change, shape (T, M) [m], and the sums of the receiver's scale."""
+    total, epochs = before.scale_sum, before.scale_epochs
+    if limits.mode == "sigma":
+        return expected_limit_m(interval, sigmas, limits=limits), total, epochs
+    if limits.mode == "receiver":
+        row, total, epochs = receiver_limit_m(interval, metric, total, epochs, limits=limits)
+    else:
+        row = doppler_limit_m(interval, limits=limits)
+    return np.broadcast_to(row[:, None], metric.shape), total, epochs
+
+
+def _suspicion(
+    time: Datetimes, metric: Floats, limit: Floats, before: DopplerState, *, hold_s: float
+) -> tuple[Masks, Floats, Datetimes]:
+    """Refusals, levels, and since when the satellites suspected at the end are; a loop over jumps only.
+
+    Levels are summed from the jump on, one after the other, so that a cut between does not show.
+    """
+    ns, hold = time.astype(np.int64), int(hold_s * _NS)
+    reject = np.zeros(metric.shape, dtype=bool)
+    level = np.where(np.isnan(metric), np.nan, 0.0)
+    since = np.full(metric.shape[1], np.datetime64("NaT", "ns"))
+    jumped = np.abs(metric) > limit
+    carried = ~np.isnat(before.since)
+    for m in np.flatnonzero(jumped.any(axis=0) | carried).tolist():
+        starts = np.flatnonzero(jumped[:, m])
+        blind = np.flatnonzero(np.isnan(metric[:, m]))
+        k, start, old = 0, before.since[m], float(before.level_m[m])
+        if not carried[m]:
+            k, start, old = int(starts[0]), time[starts[0]], 0.0
+        while True:
+            known = int(blind[i]) if (i := int(np.searchsorted(blind, k))) < len(blind) else len(ns)
+            held = int(np.searchsorted(ns, int(start.astype(np.int64)) + hold, side="right"))
+            end = min(known, held)
+            levels = np.cumsum(np.concatenate([[old], metric[k:end, m]]))[1:]
+            back = np.flatnonzero(np.abs(levels) <= limit[k:end, m])
+            stop = k + int(back[0]) if len(back) else end
+            reject[k:stop, m] = True
+            level[k:stop, m] = levels[: stop - k]
+            if stop == len(ns):
+                since[m] = start
+                break
+            # the epoch of coming back is not judged again; the one after the hold is
+            i = int(np.searchsorted(starts, stop + 1 if len(back) else stop))
+            if i == len(starts):
+                break
+            k, old = int(starts[i]), 0.0
+            start = time[k]
+    return reject, level, since
