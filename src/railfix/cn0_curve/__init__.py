@@ -10,21 +10,23 @@ from railfix.cn0_curve.curve import (
     Cn0Samples,
     CurveFit,
     fit_cn0_curve,
-    kind_names,
     satellite_kind,
 )
 from railfix.cn0_curve.file import read_cn0_curve, write_cn0_curve
+from railfix.cn0_curve.from_log import Cn0Calibration, cn0_curve_from_log, satellite_elevation_deg
 
 __all__ = [
     "KINDS",
+    "Cn0Calibration",
     "Cn0Curve",
     "Cn0CurveSource",
     "Cn0Mean",
     "Cn0Samples",
     "CurveFit",
+    "cn0_curve_from_log",
     "fit_cn0_curve",
-    "kind_names",
     "read_cn0_curve",
+    "satellite_elevation_deg",
     "satellite_kind",
     "write_cn0_curve",
 ]

@@ -13,7 +13,7 @@ below the lowest bin there is no curve.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
@@ -36,11 +36,11 @@ _QZSS_GEO: Final = frozenset({7, 8})
 #: Kinds of satellites of one transmit power, and what they are called.
 KINDS: Final[dict[str, str]] = {
     "G": "GPS",
-    "J": "QZSS, inclined",
-    "J-GEO": "QZSS, geostationary",
+    "J": "QZSS",
+    "J-GEO": "QZSS GEO",
     "E": "Galileo",
-    "C": "BeiDou, medium orbit",
-    "C-HIGH": "BeiDou, geostationary and inclined geosynchronous",
+    "C": "BeiDou MEO",
+    "C-HIGH": "BeiDou GEO, IGSO",
     "R": "GLONASS",
     "S": "SBAS",
     "I": "NavIC",
@@ -313,8 +313,3 @@ def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
     # C/N0 is told in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
     kept = values[np.abs(values - middle) <= clip_sigma * max(spread, 0.5)]
     return float(kept.mean()), spread
-
-
-def kind_names(curve: Cn0Curve) -> Sequence[str]:
-    """What the curves are of, in words."""
-    return [f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}" for mean in curve.means]

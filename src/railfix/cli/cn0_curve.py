@@ -1,0 +1,123 @@
+"""``railfix cn0-curve``: mean C/N0 over elevation of an antenna and receiver, from a day of open sky."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from railfix.errors import OutputError, SettingsError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from railfix.cn0_curve import Cn0Curve
+
+
+def cn0_curve(
+    observations: Annotated[
+        list[Path],
+        typer.Argument(metavar="OBS...", help="RINEX observation file or files of one receiver, about a day."),
+    ],
+    *,
+    nav: Annotated[
+        list[Path],
+        typer.Option("--nav", metavar="FILE", help="RINEX navigation file of that day; repeat it for several."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="CURVE.toml", help="Curve to write.")],
+    plot: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Picture of the samples, the mean and the threshold.")
+    ] = None,
+    position: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAT,LON,HEIGHT",
+            help="Where the antenna stood, in degrees and metres, to some kilometres; else what the header says.",
+        ),
+    ] = None,
+    bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
+    lenient: Annotated[
+        bool, typer.Option("--lenient", help="Count broken lines of the files and go on, instead of stopping.")
+    ] = False,
+) -> None:
+    """Fit the mean C/N0 over elevation of one antenna and receiver.
+
+    Let the antenna stand under open sky for about a day, with the receiver that the train will have:
+    the curve belongs to the two together. It is fitted for each constellation and signal, and the file
+    says what it was made from. Positioning then refuses signals that are 10 dB-Hz below the mean at their
+    elevation; without a curve there is only the floor that is the same for all.
+
+    Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
+
+    Exit codes as `railfix --help` says; 5 where the position or the navigation files do not fit the log.
+    """
+    from railfix.cn0_curve import CurveFit, cn0_curve_from_log, write_cn0_curve
+
+    try:
+        fit = CurveFit(bin_deg=bin_deg)
+    except ValueError as error:
+        raise SettingsError(f"--bin: {error}") from None
+    place = None if position is None else _position(position)
+    for path in (out, plot):
+        if path is not None and not path.parent.is_dir():
+            raise OutputError(f"{path}: the folder {path.parent} does not exist")
+    made = cn0_curve_from_log(
+        observations, nav, position_ecef_m=place, fit=fit, on_error="lenient" if lenient else "strict"
+    )
+    if plot is not None:
+        from railfix.plots.screens import draw_cn0_curve
+
+        draw_cn0_curve(plot, made.curve, made.samples)
+    write_cn0_curve(made.curve, out)
+    _print_curve(made.curve, made.notes)
+    for path in (out, plot):
+        if path is not None:
+            typer.echo(f"wrote {path}")
+
+
+def _position(text: str) -> NDArray[np.float64]:
+    from railfix.geodesy import ecef_from_geodetic
+
+    try:
+        latitude, longitude, height = (float(part) for part in text.split(","))
+    except ValueError:
+        raise SettingsError(f"--position {text!r}: expected LAT,LON,HEIGHT, for example 35.63,139.74,60") from None
+    if not (-90.0 <= latitude <= 90.0 and -180.0 <= longitude <= 360.0 and -1e4 < height < 1e5):
+        raise SettingsError(f"--position {text!r}: latitude, longitude in degrees and height in metres were expected")
+    return ecef_from_geodetic(latitude, longitude, height)
+
+
+def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from railfix.cn0_curve import KINDS
+
+    console, source = Console(highlight=False), curve.source
+    console.print(
+        f"antenna {source.antenna or 'not named'}, receiver {source.receiver or 'not named'}; "
+        f"{source.epochs:,} epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz over elevation",
+        markup=False,
+    )
+    table = Table("satellites", "signal", show_edge=False)
+    for name in ("samples", "elevation", "15 deg", "45 deg", "75 deg", "spread"):
+        table.add_column(name, justify="right")
+    for mean in curve.means:
+        half = (mean.elevation_deg[1] - mean.elevation_deg[0]) / 2.0
+        table.add_row(
+            KINDS.get(mean.kind, mean.kind),
+            mean.signal,
+            f"{int(mean.count.sum()):,}",
+            f"{mean.elevation_deg[0] - half:.0f}-{mean.elevation_deg[-1] + half:.0f}",
+            *(_number(float(value)) for value in mean.at([15.0, 45.0, 75.0])),
+            f"{float(mean.spread_db.mean()):.1f}",
+        )
+    console.print(table)
+    for note in notes:
+        console.print(f"note: {note}", markup=False)
+
+
+def _number(value: float) -> str:
+    return "-" if value != value else f"{value:.1f}"

@@ -1,0 +1,180 @@
+"""Pictures of the screens: the C/N0 curve as P1's figure 3, and each metric against its limit."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
+from railfix.errors import OutputError
+from railfix.screens import Cn0Limits
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+#: Colours that stay apart for the colour-blind (Okabe and Ito).
+_MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#56b4e9"
+_COLUMNS: Final = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenPicture:
+    """What is drawn of one screen, T epochs by M channels (M = 1 for a screen of positions).
+
+    Attributes
+    ----------
+    title : str
+    label : str
+        What the metric is, with its unit.
+    metric : ndarray, shape (T, M)
+    reject : ndarray of bool, shape (T, M)
+    limit : ndarray or float
+        Broadcasts to (T, M).
+    sides : {"both", "above", "below"}
+        Where the screen refuses: beyond the limit to both sides, above it, or below it.
+    """
+
+    title: str
+    label: str
+    metric: Floats
+    reject: NDArray[np.bool_]
+    limit: Floats | float
+    sides: str = "both"
+
+    def __post_init__(self) -> None:
+        if self.sides not in ("both", "above", "below"):
+            raise ValueError(f"sides must be 'both', 'above' or 'below', got {self.sides!r}")
+
+
+def draw_screen(
+    path: str | PathLike[str], picture: ScreenPicture, time: NDArray[np.datetime64], chainage_m: Floats | None = None
+) -> Path:
+    """Draw a metric against its limit over time, and over chainage where it is known.
+
+    Parameters
+    ----------
+    path : path
+        PNG file; it appears whole or not at all.
+    picture : ScreenPicture
+    time : ndarray of datetime64[ns], shape (T,)
+    chainage_m : ndarray, shape (T,) [m], optional
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    places: list[tuple[str, NDArray[Any]]] = [("GPS time", time)]
+    if chainage_m is not None:
+        places.append(("chainage [m]", chainage_m))
+    figure = Figure(figsize=(12, 4.2 * len(places)), layout="constrained")
+    judged = int(np.count_nonzero(np.isfinite(picture.metric)))
+    refused = int(np.count_nonzero(picture.reject))
+    share = f"{100 * refused / judged:.2f} %" if judged else "none"
+    figure.suptitle(f"{picture.title}: {judged:,} judged, {refused:,} refused ({share})")
+    for axes, (name, along) in zip(np.ravel(figure.subplots(len(places), 1)), places, strict=True):
+        _draw_metric(axes, picture, along)
+        axes.set_xlabel(name)
+    return _save(figure, path)
+
+
+def _draw_metric(axes: Axes, picture: ScreenPicture, along: NDArray[Any]) -> None:
+    where = np.broadcast_to(along[:, None], picture.metric.shape)
+    for mask, colour, name in ((~picture.reject, _KEPT, "used"), (picture.reject, _REJECTED, "refused")):
+        axes.plot(where[mask], picture.metric[mask], ".", ms=2, color=colour, label=name, rasterized=True)
+    limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
+    finite = np.isfinite(limit).any(axis=1)
+    # one line for all channels: the tightest limit of each epoch, where channels differ
+    least = np.full(len(limit), np.nan)
+    least[finite] = np.nanmin(limit[finite], axis=1)
+    order = np.argsort(along, kind="stable")
+    for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
+        axes.plot(along[order], sign * least[order], "-", lw=0.8, color=_FLOOR, label="limit" if sign > 0 else None)
+    if finite.any():
+        top = 6.0 * float(np.nanmedian(least))
+        values = picture.metric[np.isfinite(picture.metric)]
+        if picture.sides != "below" and len(values) and np.abs(values).max() > top:
+            axes.set_yscale("symlog", linthresh=top / 2.0)
+    axes.set_ylabel(picture.label)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small", markerscale=4, loc="upper right")
+
+
+def draw_cn0_curve(
+    path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples, *, limits: Cn0Limits | None = None
+) -> Path:
+    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3).
+
+    Parameters
+    ----------
+    path : path
+        PNG file; it appears whole or not at all.
+    curve : Cn0Curve
+    samples : Cn0Samples
+        What the curve was fitted on.
+    limits : Cn0Limits, optional
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    limits = limits or Cn0Limits()
+    rows = -(-len(curve.means) // _COLUMNS)
+    figure = Figure(figsize=(4.0 * min(_COLUMNS, len(curve.means)), 3.0 * rows), layout="constrained")
+    source = curve.source
+    figure.suptitle(f"{source.antenna or 'antenna not named'}, {source.receiver or 'receiver not named'}")
+    panels = np.ravel(figure.subplots(rows, min(_COLUMNS, len(curve.means)), sharex=True, sharey=True))
+    for axes, mean in zip(panels, curve.means, strict=False):
+        _draw_mean(axes, mean, samples, limits)
+    for axes in panels[len(curve.means) :]:
+        axes.set_visible(False)
+    panels[0].legend(fontsize="x-small", loc="lower right")
+    return _save(figure, path)
+
+
+def _draw_mean(axes: Axes, mean: Cn0Mean, samples: Cn0Samples, limits: Cn0Limits) -> None:
+    from matplotlib.colors import LogNorm
+
+    elevation, cn0 = samples.of(mean.kind, mean.signal)
+    axes.hist2d(elevation, cn0, bins=[np.arange(0, 91, 1.0), np.arange(10, 61, 0.5)], cmap="Greys", norm=LogNorm())
+    at = np.linspace(0.0, 90.0, 361)
+    level = mean.at(at)
+    axes.plot(at, level, "-", color=_MEAN, label="mean")
+    axes.plot(mean.elevation_deg, mean.mean_dbhz, ".", color=_MEAN, ms=4)
+    if limits.deficit_dbhz is not None:
+        axes.plot(at, level - limits.deficit_dbhz, "--", color=_LIMIT, label=f"mean - {limits.deficit_dbhz:g} dB-Hz")
+    if limits.floor_dbhz is not None:
+        axes.axhline(limits.floor_dbhz, color=_FLOOR, lw=0.8, ls=":", label=f"floor {limits.floor_dbhz:g} dB-Hz")
+    axes.set_title(f"{KINDS.get(mean.kind, mean.kind)}, {mean.signal}", fontsize="small")
+    axes.set_xlim(0, 90)
+    axes.set_ylim(10, 60)
+    axes.set_xlabel("elevation [deg]", fontsize="small")
+    axes.set_ylabel("C/N0 [dB-Hz]", fontsize="small")
+    axes.label_outer()
+    axes.grid(alpha=0.3)
+
+
+def _save(figure: Figure, path: str | PathLike[str]) -> Path:
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        figure.savefig(temporary, format="png", dpi=110)
+        temporary.replace(target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path}: the picture cannot be written ({error.strerror})") from None
+    return target
