@@ -144,7 +144,9 @@ def detect(
     wsse : array_like, shape (T,)
         Weighted sum of squared residuals; NaN where there is no position.
     residual_m : array_like, shape (T, M) [m]
-        Residuals, 0 (or NaN) where not used; asked for in fixed mode only.
+        Residuals, 0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel`
+        allow for the map error, those of a `Constrained` position do not: the same only where the
+        map is taken as exact, as in P1 (a sigma of a millimetre).
     freedom : array_like of int, shape (T,)
         Ranges beyond the unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space - 3.
     limits : RaimLimits, optional

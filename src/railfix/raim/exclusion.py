@@ -24,6 +24,8 @@ Booleans = NDArray[np.bool_]
 
 #: Share of its error that a range must show in the residuals, so that its error can be told at all.
 LEAST_REDUNDANCY: Final = 1e-9
+#: Share of a WSSE within which two are the same number.
+_ROUNDING: Final = 1e-9
 #: Numbers of a subset array that a block of epochs holds: about what a core's cache does.
 _BLOCK_SIZE: Final = 40_000
 
@@ -247,8 +249,9 @@ def _choose(
     passing[at, best] = False
     shift = _moves(parts, trial, rows)
     apart = np.linalg.norm(shift - shift[at, best][:, None, :], axis=2)
-    lead = (drop[at, best][:, None] - drop) / scale[rows, None] ** 2
-    rival = passing & (lead <= limits.separation) & ~(apart < limits.same_position_m)
+    most = drop[at, best][:, None]
+    margin = limits.separation * scale[rows, None] ** 2 + _ROUNDING * most
+    rival = passing & (most - drop <= margin) & ~(apart < limits.same_position_m)
     inseparable = rival.any(axis=1)
     second = np.argmin(np.where(np.where(inseparable[:, None], rival, passing), statistic, np.inf), axis=1)
     has_second = passing.any(axis=1)

@@ -1,0 +1,307 @@
+"""Exclusion of one and two satellites: against trying every subset by solving again, and by hand."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import raim_oracle as oracle
+import synthetic
+from railfix.clock_elimination import UNTIED_M, Ranges
+from railfix.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude
+
+pytestmark = pytest.mark.requirement("B4")
+
+SYSTEMS = [
+    ("GGGGGGGG", None),
+    ("GGGGGEEE", None),
+    ("GGGGEECC", None),
+    ("GGGGEEC", None),
+    ("GGGGGEEE", (0.0, 1.0)),
+    ("GGGGECC", (0.0, 0.5, UNTIED_M)),
+    ("GGGG", None),
+    ("GGEE", None),
+]
+BIG = st.floats(-200.0, 200.0)
+
+
+def check_against_trying(case: oracle.Problem, model: LinearModel, limits: RaimLimits, scale: float) -> None:
+    outcome, best = oracle.exclusion_by_trying(case, limits, scale)
+    got = exclude(model, limits=limits, scale=scale)
+    assert Outcome(got.outcome[0]) == outcome
+    if best is None:
+        assert (got.best == -1).all()
+        assert np.isnan(got.own_error_m).all()
+        return
+    members = list(best.members)
+    if outcome is not Outcome.INSEPARABLE:  # of equals, which comes first is arbitrary
+        assert [b for b in got.best[0] if b >= 0] == members
+        assert np.flatnonzero(got.excluded[0]).tolist() == members
+        assert got.own_error_m[0, members] == pytest.approx(best.own_m, rel=1e-4, abs=1e-3)
+        assert got.position_change_m[0] == pytest.approx(best.move_m, rel=1e-4, abs=1e-3)
+    assert got.statistic_after[0] == pytest.approx(best.statistic, rel=1e-4, abs=1e-4)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    system=st.sampled_from(SYSTEMS),
+    faults=st.dictionaries(st.integers(0, 3), BIG, max_size=3),
+    scale=st.sampled_from([1.0, 0.7, 3.0]),
+    limits=st.sampled_from(
+        [
+            RaimLimits(),
+            RaimLimits(separation_risk=1.0),
+            RaimLimits(separation_risk=1.0, min_redundancy=2),
+            RaimLimits(same_position_m=5.0),
+            RaimLimits(max_excluded=1, false_alarm=1e-2),
+            RaimLimits(mode="fixed"),
+            RaimLimits(mode="fixed", separation_risk=1.0),
+        ]
+    ),
+)
+@settings(max_examples=200, deadline=None)
+def test_line_equals_trying_every_subset(seed, system, faults, scale, limits):
+    systems, ties = system
+    arc = np.array([731.0])
+    ranges = oracle.made(arc, systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
+    model = constrained_model(ranges, oracle.LINE, arc)
+    if np.isfinite(model.wsse[0]):
+        check_against_trying(oracle.problem_on_line(ranges, 0, arc[0]), model, limits, scale)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    system=st.sampled_from(SYSTEMS[:5]),
+    faults=st.dictionaries(st.integers(0, 3), BIG, max_size=2),
+    limits=st.sampled_from([RaimLimits(), RaimLimits(separation_risk=1.0), RaimLimits(mode="fixed")]),
+)
+@settings(max_examples=200, deadline=None)
+def test_space_equals_trying_every_subset(seed, system, faults, limits):
+    systems, ties = system
+    ranges = oracle.made(np.array([731.0]), systems, seed=seed, tie_sigma_m=ties, faults_m=faults)
+    place = oracle.LINE.at_arc(np.array([731.0]))
+    model = oracle.point_model(ranges, place)
+    if np.isfinite(model.wsse[0]):
+        check_against_trying(oracle.problem_in_space(ranges, 0, place[0]), model, limits, 1.0)
+
+
+def test_every_outcome_is_reached_by_the_cases():
+    """The comparisons above would prove nothing if all cases ended alike."""
+    reached = set()
+    arc = np.full(200, 731.0)
+    for systems, ties in SYSTEMS:
+        for faults in ({}, {0: 60.0}, {0: 60.0, 2: -90.0}, {0: 60.0, 1: 80.0, 2: -90.0, 3: 150.0}):
+            ranges = oracle.made(arc, systems, seed=6, tie_sigma_m=ties, faults_m=faults)
+            reached |= set(exclude(constrained_model(ranges, oracle.LINE, arc)).outcome.tolist())
+    only_three = oracle.only(oracle.made(arc, "GGGEEE", seed=6), [0, 3])
+    reached |= set(exclude(constrained_model(only_three, oracle.LINE, arc)).outcome.tolist())
+    assert reached == {o.value for o in Outcome}
+
+
+@pytest.mark.parametrize("mode", ["chi_square", "fixed"])
+@pytest.mark.parametrize("size", [(60.0,), (-45.0, 70.0), (80.0, 80.0)])
+def test_faults_of_one_and_two_satellites_are_found(mode, size):
+    """Eleven satellites, every one and every pair in turn: found, nothing else blamed."""
+    systems = "GGGGGGEEEEE"
+    pairs = [(i, j) for i in range(11) for j in range(11) if i != j] if len(size) == 2 else [(i,) for i in range(11)]
+    arc = np.repeat(np.linspace(100.0, 1900.0, 6), len(pairs))
+    clean = oracle.made(arc, systems, seed=3, sigma_m=np.full(11, 0.8))
+    code, truth = clean.code_m.copy(), np.zeros(clean.code_m.shape, dtype=bool)
+    for t in range(len(arc)):
+        members = list(pairs[t % len(pairs)])
+        code[t, members] += size
+        truth[t, members] = True
+    ranges = replace(clean, code_m=code)
+    got, model = oracle.solved(ranges, arc)
+    found = exclude(model, limits=RaimLimits(mode=mode))
+    right = (found.excluded == truth).all(axis=1)
+    done = found.outcome <= Outcome.EXCLUDED_TWO
+    assert right.mean() >= 0.97
+    assert right[done].all()
+    assert np.nanmax(np.abs(np.where(truth, found.own_error_m - (code - clean.code_m), np.nan)[right])) < 10.0
+    # What it says of the position and of the statistic is what a new solution finds.
+    after, rest = oracle.solved(replace(ranges, weight=np.where(found.excluded, 0.0, ranges.weight)), arc)
+    assert got.arc_m + found.position_change_m[:, 0] == pytest.approx(after.arc_m, abs=1e-3)
+    statistic = after.wsse if mode == "chi_square" else (rest.residual_m**2).sum(axis=1)
+    # Lines of sight turn by 1e-6 while the position moves by tens of metres.
+    assert found.statistic_after[done] == pytest.approx(statistic[done], rel=1e-3, abs=1e-3)
+
+
+def parallel_case(along: int) -> Ranges:
+    """Satellites ahead at one elevation, the others across the track: the first one's range is 100 m too long."""
+    azimuth = np.radians(np.r_[np.full(along, 36.87), [126.87, 306.87] * 3])
+    elevation = np.radians(np.r_[np.full(along, 30.0), [20.0, 25.0, 40.0, 50.0, 65.0, 75.0]])
+    los = np.stack(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=1
+    )
+    place = oracle.LINE.at_arc(np.array([1000.0]))[0]
+    sat = place + synthetic.enu_to_ecef(2.2e7 * los) - synthetic.enu_to_ecef(np.zeros(3))
+    sigma = np.full(len(azimuth), 0.5)
+    return oracle.made(
+        np.array([1000.0]), "G" * len(azimuth), seed=2, faults_m={0: 100.0}, sat_ecef_m=sat[None], sigma_m=sigma
+    )
+
+
+def test_parallel_lines_of_sight_that_alone_tell_the_place_cannot_be_separated():
+    model = constrained_model(parallel_case(2), oracle.LINE, np.array([1000.0]))
+    got = exclude(model)
+    assert got.outcome[0] == Outcome.INSEPARABLE
+    assert not got.excluded.any()
+    assert {got.best[0, 0], got.alternative[0, 0]} == {0, 1}
+    assert got.alternative_shift_m[0] == pytest.approx(100.0 / np.cos(np.radians(30.0)), rel=0.03)
+    # A third satellite ahead tells which.
+    got = exclude(constrained_model(parallel_case(3), oracle.LINE, np.array([1000.0])))
+    assert got.outcome[0] == Outcome.EXCLUDED_ONE
+    assert got.best[0].tolist() == [0, -1]
+    assert got.own_error_m[0, 0] == pytest.approx(100.0, abs=3.0)
+
+
+def test_two_satellites_of_a_clock_of_their_own():
+    """Which of them is wrong cannot be told, but the position without either is the same."""
+    arc = np.array([731.0])
+    ranges = oracle.made(arc, "GGGGGGEE", seed=11, faults_m={7: 50.0})
+    model = constrained_model(ranges, oracle.LINE, arc)
+    got = exclude(model)
+    assert got.outcome[0] == Outcome.INSEPARABLE
+    assert {got.best[0, 0], got.alternative[0, 0]} == {6, 7}
+    assert got.alternative_shift_m[0] == pytest.approx(0.0, abs=1e-9)
+    assert np.isfinite(got.own_error_m[0]).sum() == 1
+    got = exclude(model, limits=RaimLimits(same_position_m=0.01))
+    assert got.outcome[0] == Outcome.EXCLUDED_ONE
+    assert got.excluded[0, 6:].sum() == 1
+
+
+def test_fixed_limit_by_hand():
+    """Equal weights, one clock, a position that the ranges do not move: residuals are deviations from the mean.
+
+    Six satellites with the along-track rows (1, -1, 1, -1, 0, 0): d is the difference of the pairs. One range
+    30 m long on a satellite across the track: residuals 25 and five of -5, 750 m^2; without it 0.
+    """
+    row = np.array([1.0, -1.0, 1.0, -1.0, 0.0, 0.0])
+    design = np.zeros((1, 6, 3))
+    design[0, :, 0] = row
+    misfit = np.array([[0.0, 0.0, 0.0, 0.0, 30.0, 0.0]])
+    model = LinearModel(
+        root_weight=np.ones((1, 6)),
+        clock=np.zeros(6, dtype=np.intp),
+        clock_covariance_m2=np.full((1, 1, 1), 1 / 6),
+        design=design,
+        covariance_m2=np.diag([0.25, 1e-12, 1e-12])[None],
+        prior=np.diag([0.0, 1e12, 1e12]),
+        misfit=misfit,
+        freedom=np.array([4]),
+        interest=1,
+    )
+    limits = RaimLimits(mode="fixed")
+    assert model.residual_m[0].tolist() == pytest.approx([-5, -5, -5, -5, 25, -5])
+    got = exclude(model, limits=limits)
+    assert got.detection.statistic[0] == pytest.approx(750.0)
+    assert got.detection.threshold[0] == 100.0
+    assert got.outcome[0] == Outcome.EXCLUDED_ONE
+    assert got.best[0].tolist() == [4, -1]
+    assert got.own_error_m[0, 4] == pytest.approx(30.0)
+    assert got.statistic_after[0] == pytest.approx(0.0, abs=1e-9)
+    # 12 m: 12^2 x 5/6 = 120 m^2 is over the limit, and so is the own error squared, 144 m^2.
+    got = exclude(replace(model, misfit=misfit * 0.4), limits=limits)
+    assert (got.detection.statistic[0], got.outcome[0]) == (pytest.approx(120.0), Outcome.EXCLUDED_ONE)
+    # 7.5 and -7.5 m: 112.5 m^2 together, but alone either is 7.5 / (5/6) = 9 m off: nothing may be excluded.
+    misfit = np.array([[0.0, 0.0, 0.0, 0.0, 7.5, -7.5]])
+    got = exclude(replace(model, misfit=misfit), limits=limits)
+    assert (got.detection.statistic[0], got.outcome[0]) == (pytest.approx(112.5), Outcome.UNRESOLVED)
+    # 9 and -9 m: 10.8 m off either way, and 64.8 m^2 is left: which of the two cannot be told.
+    got = exclude(replace(model, misfit=1.2 * misfit), limits=limits)
+    assert (got.detection.statistic[0], got.outcome[0]) == (pytest.approx(162.0), Outcome.INSEPARABLE)
+    assert got.statistic_after[0] == pytest.approx(64.8)
+    # 40 and 30 m on the two: both go, and 4 - 2 degrees of freedom are left.
+    misfit = np.array([[0.0, 0.0, 0.0, 0.0, 40.0, 30.0]])
+    got = exclude(replace(model, misfit=misfit), limits=limits)
+    assert got.outcome[0] == Outcome.EXCLUDED_TWO
+    assert got.own_error_m[0, 4:] == pytest.approx([40.0, 30.0])
+    # ... unless three must be left, or one is the most.
+    for other in (replace(limits, min_redundancy=3), replace(limits, max_excluded=1), replace(limits, max_excluded=0)):
+        assert exclude(replace(model, misfit=misfit), limits=other).outcome[0] == Outcome.UNRESOLVED
+
+
+def mixed_case() -> tuple[Ranges, np.ndarray]:
+    """Epochs of all kinds: clean, one fault, two, three, few satellites, channels without weight."""
+    arc = np.linspace(100.0, 1900.0, 120)
+    ranges = oracle.made(arc, "GGGGGGEEEECC", seed=21, tie_sigma_m=(0.0, 1.0, UNTIED_M))
+    rng = np.random.default_rng(5)
+    code, weight = ranges.code_m.copy(), ranges.weight.copy()
+    for t in range(120):
+        code[t, rng.choice(12, t % 4, replace=False)] += rng.uniform(20, 200, t % 4)
+        weight[t, rng.choice(12, t % 10, replace=False)] = 0.0
+    for array in (code, weight):
+        array.flags.writeable = False
+    return replace(ranges, code_m=code, weight=weight), arc
+
+
+def test_all_epochs_at_once_is_epoch_by_epoch():
+    ranges, arc = mixed_case()
+    model = constrained_model(ranges, oracle.LINE, arc)
+    scale = np.linspace(0.7, 2.0, len(arc))
+    whole = exclude(model, scale=scale)
+    assert len(set(whole.outcome.tolist())) >= 5
+    for t in range(len(arc)):
+        one = exclude(model.take(np.array([t])), scale=scale[t])
+        for item in fields(whole):
+            if item.name != "detection":
+                a, b = getattr(whole, item.name)[t], getattr(one, item.name)[0]
+                assert a == pytest.approx(b, rel=1e-6, abs=1e-6, nan_ok=True), item.name
+
+
+def test_unused_channels_are_never_named():
+    ranges, arc = mixed_case()
+    got = exclude(constrained_model(ranges, oracle.LINE, arc), limits=RaimLimits(separation_risk=1.0))
+    unused = ranges.weight == 0
+    assert not (got.excluded & unused).any()
+    assert np.isnan(got.own_error_m[unused]).all()
+    for named in (got.best, got.alternative):
+        t, k = np.nonzero(named >= 0)
+        assert len(t) > 10
+        assert not unused[t, named[t, k]].any()
+
+
+def test_order_of_satellites_changes_nothing():
+    ranges, arc = mixed_case()
+    order = np.r_[np.random.default_rng(1).permutation(6), 6 + np.random.default_rng(2).permutation(4), 11, 10]
+    shuffled = replace(
+        ranges,
+        sat_ecef_m=ranges.sat_ecef_m[:, order],
+        code_m=ranges.code_m[:, order],
+        weight=ranges.weight[:, order],
+    )
+    one, two = (exclude(constrained_model(r, oracle.LINE, arc)) for r in (ranges, shuffled))
+    assert np.array_equal(one.outcome, two.outcome)
+    assert np.array_equal(one.excluded[:, order], two.excluded)
+    clear = one.outcome != Outcome.INSEPARABLE  # of equals, the first channel
+    assert one.own_error_m[clear][:, order] == pytest.approx(two.own_error_m[clear], rel=1e-6, nan_ok=True)
+
+
+def test_epochs_that_cannot_be_tested():
+    arc = np.array([500.0, np.nan, 700.0, 900.0])
+    ranges = oracle.made(np.nan_to_num(arc, nan=500.0), "GGGGGG", seed=5, faults_m={2: 300.0})
+    weight = ranges.weight.copy()
+    weight[2, 2:] = 0.0
+    weight[3] = 0.0
+    got = exclude(constrained_model(replace(ranges, weight=weight), oracle.LINE, arc))
+    assert got.outcome.tolist() == [Outcome.EXCLUDED_ONE] + [Outcome.UNTESTABLE] * 3
+    assert got.position_change_m[1:].tolist() == [[0.0]] * 3
+    nothing = exclude(constrained_model(ranges, oracle.LINE, arc).take(np.zeros(4, dtype=bool)))
+    assert nothing.excluded.shape == (0, 6)
+
+
+@pytest.mark.slow
+def test_forty_satellites_take_a_fraction_of_a_millisecond():
+    """36 000 failing epochs of 40 satellites, all pairs, in under 10 s: 0.28 ms each."""
+    arc = np.linspace(50.0, 1950.0, 3000)
+    ranges = oracle.made(arc, "G" * 12 + "E" * 10 + "C" * 10 + "R" * 8, seed=1, faults_m={3: 100.0, 20: -60.0})
+    began = time.perf_counter()
+    got = exclude(constrained_model(ranges, oracle.LINE, arc))
+    assert (time.perf_counter() - began) / len(arc) < 10.0 / 36_000
+    assert (got.outcome == Outcome.EXCLUDED_TWO).mean() > 0.95

@@ -1,0 +1,153 @@
+"""The linear model of RAIM: against the solvers, and against a design with one column a clock and one row a prior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import raim_oracle as oracle
+import synthetic
+from railfix.clock_elimination import UNTIED_M, ClockTies
+from railfix.constrained import constrained_position
+from railfix.raim import constrained_model, point_model
+from railfix.raim.model import compact
+from railfix.spp import single_point
+
+pytestmark = pytest.mark.requirement("B6")
+
+#: Systems of a case and what is known of their clocks.
+CASES = [
+    ("GGGGGGG", None),
+    ("GGGGEEEE", None),
+    ("GGGJEECCC", None),
+    ("GGGGEECR", None),
+    ("GGGGEEEE", (0.0, 1.0)),
+    ("GGGGEC", (0.0, 1.0, 2.0)),
+    ("GGGGECC", (0.0, 0.5, UNTIED_M)),
+    ("GGGEEE", (0.0, 0.0)),
+]
+
+
+@pytest.mark.parametrize(("systems", "ties"), CASES)
+def test_model_is_the_solvers_own(systems, ties):
+    """WSSE and sigma of the constrained position and of the 3-D one."""
+    arc = np.linspace(100.0, 1900.0, 30)
+    ranges = oracle.made(arc, systems, seed=4, tie_sigma_m=ties)
+    got, model = oracle.solved(ranges, arc)
+    assert model.wsse == pytest.approx(got.wsse, rel=1e-5, abs=1e-5)
+    assert np.sqrt(model.covariance_m2[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-9)
+    assert np.sqrt(model.position_covariance_m2(np.ones(30))[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-9)
+    assert (model.freedom == ranges.n_used - ranges.n_clocks - 1).all()
+
+    point = single_point(ranges, np.broadcast_to(oracle.LINE.ecef_m[0], (30, 3)))
+    model = point_model(ranges, point.ecef_m)
+    solved = np.isfinite(point.wsse)
+    assert solved.all() == (len(systems) > 3 + ranges.n_clocks[0] - 1)
+    assert model.wsse[solved] == pytest.approx(point.wsse[solved], rel=1e-4, abs=1e-4)
+    trace = np.einsum("tii->t", point.covariance_m2)
+    assert np.einsum("tii->t", model.covariance_m2)[solved] == pytest.approx(trace[solved], rel=1e-6)
+
+
+@given(seed=st.integers(0, 2**32 - 1), case=st.sampled_from(CASES), space=st.booleans())
+@settings(max_examples=200, deadline=None)
+def test_model_is_least_squares_with_all_columns(seed, case, space):
+    systems, ties = case
+    arc = np.array([731.0])
+    ranges = oracle.made(arc, systems, seed=seed, tie_sigma_m=ties)
+    if space:
+        place = oracle.LINE.at_arc(arc) + 0.3
+        model, full = point_model(ranges, place), oracle.problem_in_space(ranges, 0, place[0])
+        if full.freedom < 0:
+            return
+    else:
+        model, full = constrained_model(ranges, oracle.LINE, arc), oracle.problem_on_line(ranges, 0, arc[0])
+    step, cofactors, residual = full.solve()
+    covariance = cofactors[:3, :3] * np.outer(full.scale_of[:3], full.scale_of[:3])
+    size = float(np.sqrt(np.trace(covariance)))
+    assert model.freedom[0] == full.freedom
+    assert model.step_m[0] == pytest.approx(step[:3], abs=1e-5 * (1 + size))
+    assert model.covariance_m2[0] == pytest.approx(covariance, rel=1e-5, abs=1e-6 * size**2)
+    assert model.residual[0] == pytest.approx(residual[: len(systems)], abs=1e-5 * (1 + size))
+    assert model.wsse[0] == pytest.approx((residual**2).sum(), rel=1e-6, abs=1e-5)
+
+
+@pytest.mark.parametrize(("systems", "ties"), CASES)
+def test_projector_gives_residuals_and_redundancy(systems, ties):
+    """nu = S y, its diagonal the redundancy; the redundancies add up to the degrees of freedom, priors apart."""
+    arc = np.linspace(100.0, 1900.0, 20)
+    ranges = oracle.made(arc, systems, seed=8, tie_sigma_m=ties)
+    for model in (constrained_model(ranges, oracle.LINE, arc), point_model(ranges, oracle.LINE.at_arc(arc))):
+        if model.freedom[0] < 0:
+            continue
+        parts = compact(model)
+        assert np.einsum("tij,tj->ti", parts.projector, model.misfit) == pytest.approx(model.residual, abs=1e-8)
+        assert np.einsum("tii->ti", parts.projector) == pytest.approx(model.redundancy, abs=1e-12)
+        assert np.abs(parts.projector - parts.projector.swapaxes(1, 2)).max() < 1e-13
+        if ties is None and model.interest == 2:
+            assert model.redundancy.sum(axis=1) == pytest.approx(model.freedom, abs=1e-9)
+
+
+def test_map_error_is_carried_once_and_not_scaled():
+    """Position variance = scale^2 of the ranges' part + the map's part; both by simulation."""
+    arc = np.full(20_000, 731.0)
+    sat = np.broadcast_to(synthetic.satellites(np.random.default_rng(2), 1, "GGGGG"), (20_000, 5, 3))
+    sigma = np.array([0.4, 0.5, 0.3, 0.6, 0.5])
+    ranges = oracle.made(arc, "GGGGG", seed=2, noise=3.0, sat_ecef_m=sat.copy(), sigma_m=sigma)
+    got, model = oracle.solved(ranges, arc)
+    expected = model.position_covariance_m2(np.full(len(arc), 3.0))[0, 0, 0] ** 0.5
+    assert np.std(got.arc_m - arc) == pytest.approx(expected, rel=0.02)
+    assert expected < 2.95 * got.sigma_m[0]
+
+
+def test_unused_channels_leave_no_trace():
+    arc = np.linspace(100.0, 1900.0, 10)
+    whole = oracle.made(arc, "GGGGGEEEE", seed=5)
+    part = oracle.only(whole, [0, 1, 3, 4, 6, 8])
+    code = part.code_m.copy()
+    code[:, [2, 5, 7]] = 0.0
+    model, other = (constrained_model(r, oracle.LINE, arc) for r in (part, replace(part, code_m=code)))
+    assert np.array_equal(model.residual, other.residual)
+    assert (model.residual[:, [2, 5, 7]] == 0).all()
+    assert (model.redundancy[:, [2, 5, 7]] == 0).all()
+    assert np.isnan(model.sigma_m[:, [2, 5, 7]]).all()
+    parts = compact(model)
+    assert parts.projector.shape == (10, 6, 6)
+    assert parts.channel[0].tolist() == [0, 1, 3, 4, 6, 8]
+
+
+def test_epochs_without_a_position_are_nan():
+    arc = np.array([500.0, np.nan, 700.0])
+    ranges = oracle.made(np.full(3, 500.0), "GGGGGG", seed=5)
+    for model in (
+        constrained_model(ranges, oracle.LINE, arc, section=np.array([25, -1, 35])),
+        point_model(ranges, oracle.LINE.at_arc(arc)),
+    ):
+        assert np.isnan(model.wsse).tolist() == [False, True, False]
+        assert np.isnan(model.covariance_m2[1]).all()
+
+
+def test_section_of_a_shared_point():
+    """At a point of a curved line the two sections have different tangents."""
+    line = synthetic.line(spacing_m=20.0)
+    vertex = np.array([10])
+    ranges = synthetic.ranges(line, line.arc_m[vertex])
+    before, after = (constrained_model(ranges, line, line.arc_m[vertex], section=vertex + k) for k in (-1, 0))
+    default = constrained_model(ranges, line, line.arc_m[vertex])
+    assert np.array_equal(default.design, after.design)
+    assert not np.array_equal(default.design, before.design)
+
+
+def test_ties_of_some_epochs_go_with_them():
+    arc = np.linspace(100.0, 1900.0, 6)
+    ranges = oracle.made(arc, "GGGEEE", seed=1)
+    sigma = np.tile([0.0, 1.0], (6, 1))
+    sigma[3:, 1] = UNTIED_M
+    tied = replace(ranges, ties=ClockTies(offset_m=np.zeros((6, 2)), sigma_m=sigma))
+    got = constrained_position(tied, oracle.LINE, np.argmin(np.abs(oracle.LINE.arc_m - arc[:, None]), axis=1))
+    model = constrained_model(tied, oracle.LINE, got.arc_m)
+    assert model.freedom.tolist() == [4, 4, 4, 3, 3, 3]
+    assert np.array_equal(model.take(np.array([4, 1])).wsse, model.wsse[[4, 1]])
