@@ -97,7 +97,8 @@ def test_positions_and_clocks_of_rtklib(name: str, recordings: Path, tmp_path: P
                 numbers_of = (float(x[row]) for x in (nav.kepler.af0_s, nav.kepler.af1, nav.kepler.m0))
                 eph = by_content.get((name_of, *numbers_of))
             if eph is None:
-                missing += 1
+                # This build of RTKLIB ends at C46: the others are compared with the other program.
+                missing += name_of != 0
                 continue
             worst = np.maximum(worst, compare(nav, row, eph, of_glonass=of_glonass))
     assert missing == 0
