@@ -28,7 +28,7 @@ from railfix.timescale import timedelta
 from railfix.track_map import Track, from_positions
 
 #: Screens of health and elevation only, mask as the recordings' table was made with.
-SETTINGS = parse_config({"elevation": {"mask_deg": 15.0}})
+SETTINGS = parse_config({"screens": ["elevation"], "elevation": {"mask_deg": 15.0}})
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import tomllib
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
@@ -26,6 +26,7 @@ from railfix.clock_offsets import ClockOffsetLimits
 from railfix.constrained import ConstrainedLimits
 from railfix.errors import InputFileError, SettingsError
 from railfix.measurement import CodeNoise
+from railfix.raim import RaimLimits
 from railfix.screens import ElevationLimits
 from railfix.section import SectionLimits
 from railfix.spp import SinglePointLimits
@@ -40,6 +41,10 @@ DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
 }
 
 
+#: Names of the screens, in the order in which they are asked.
+SCREENS: Final = ("elevation", "raim")
+
+
 class Config(BaseModel):
     """Settings of the positioning, each with its default and where that comes from.
 
@@ -50,6 +55,11 @@ class Config(BaseModel):
         metres between them.
     signals : mapping of str to tuple of str
         Signals of each constellation in order of preference; the first one observed is used.
+    screens : tuple of str
+        Screens that are on; health and validity of the satellites are no screens and always asked.
+    failed_checks : {"keep", "drop"}
+        Coordinates of positions that a check has failed (`reasons.CHECK_FAILED`): kept beside the
+        status that says so, or dropped as P1 does.
     min_satellites : int
         Satellites asked for (P1 3.2: 3; 2 is possible and doubtful on curves).
     dilution_limit : float
@@ -66,7 +76,7 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
-    noise, elevation, clock_offsets, single_point, section, constrained
+    noise, elevation, raim, clock_offsets, single_point, section, constrained
         Limits of the rooms of these names.
     """
 
@@ -74,6 +84,8 @@ class Config(BaseModel):
 
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
+    screens: tuple[Literal["elevation", "raim"], ...] = SCREENS
+    failed_checks: Literal["keep", "drop"] = "keep"
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)
     off_map_m: float = Field(default=200.0, gt=0)
@@ -85,6 +97,7 @@ class Config(BaseModel):
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_prior: float = Field(default=100.0, gt=0)
     noise: CodeNoise = Field(default_factory=CodeNoise)
+    raim: RaimLimits = Field(default_factory=RaimLimits)
     clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
     single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)
@@ -98,7 +111,16 @@ class Config(BaseModel):
             raise ValueError("name at least one constellation, each once")
         return value
 
-    @field_validator("noise", "elevation", "clock_offsets", "single_point", "section", "constrained", mode="before")
+    @field_validator("screens")
+    @classmethod
+    def _screens_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(value)) != len(value):
+            raise ValueError("name each screen once")
+        return tuple(name for name in SCREENS if name in value)
+
+    @field_validator(
+        "noise", "elevation", "raim", "clock_offsets", "single_point", "section", "constrained", mode="before"
+    )
     @classmethod
     def _known_keys(cls, value: Any, info: Any) -> Any:
         if isinstance(value, dict):

@@ -24,9 +24,10 @@ from railfix.constrained import Constrained, constrained_position
 from railfix.epochs import Observations
 from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
-from railfix.preparation import Prepared, prepare
-from railfix.reasons import POSITIONED, Reason, Status
-from railfix.results import AntennaResult, AntennaState, Bits, Floats, Result, State
+from railfix.preparation import Prepared, prepare, without
+from railfix.raim import Outcome, constrained_model, detect, exclude
+from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
+from railfix.results import AntennaResult, AntennaState, Bits, Floats, Raim, Result, State, patched
 from railfix.screens import elevation_screen
 from railfix.section import SearchIndex, Section, search
 from railfix.spp import SinglePoint, single_point
@@ -61,6 +62,8 @@ class EpochProcessor:
         }
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._klobuchar, self.notes = self._ionosphere()
+        dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
+        self._with_coordinates = [status.value for status in POSITIONED if status not in dropped]
         self._off_map_excess = float(chi2.isf(config.off_map_risk, 2))
 
     def _ionosphere(self) -> tuple[Floats | None, tuple[str, ...]]:
@@ -112,36 +115,80 @@ class EpochProcessor:
     def _screened(self, name: str, obs: Observations, state: AntennaState) -> tuple[Prepared, AntennaState]:
         """Corrected ranges of one antenna, and what the screens of one antenna refuse."""
         one = prepare(obs, self.config, self.navigation, self._index[name], self._klobuchar)
-        verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
-        one.screened("elevation", verdict, Reason.ELEVATION_MASK)
+        if "elevation" in self.config.screens:
+            verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
+            one.screened("elevation", verdict, Reason.ELEVATION_MASK)
         return one, state
 
     def _positioned(self, one: Prepared, index: SearchIndex, state: AntennaState) -> tuple[_Found, AntennaState]:
-        """Conventional and constrained position, status and noise scale of one antenna."""
+        """Conventional and constrained position, exclusion, status and noise scale of one antenna."""
         ranges = one.ranges()
         point = single_point(ranges, one.anchor_ecef_m, limits=self.config.single_point)
-        section, constrained = self._on_the_line(ranges, index, point)
-        ties, offsets = self._ties(one, ranges, constrained, state)
-        tied = point
+        place = self._on_the_line(ranges, index, point)
+        ties, offsets = self._ties(one, ranges, place.constrained, state)
         if len(one.groups) > 1:
             ranges = replace(ranges, ties=ties)
             start = np.where(np.isnan(point.ecef_m), one.anchor_ecef_m, point.ecef_m)
             tied = single_point(ranges, start, limits=self.config.single_point)
-            section, constrained = self._on_the_line(ranges, index, tied)
+            place = self._on_the_line(ranges, index, tied)
         one.refuse(_alone(one, ties), Reason.ALONE_ON_ITS_CLOCK)
-        scale, state = self._noise_scale(ranges, constrained, state)
-        status = self._status(one.code_m, ranges, index.trajectory, tied, section, constrained)
-        found = _Found(
-            point=point, section=section, constrained=constrained, ties=ties, status=status, noise_scale=scale
-        )
+        scale, state = self._noise_scale(ranges, place.constrained, state)
+        ranges, place, raim = self._fault_free(ranges, index, place, scale)
+        one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
+        status = self._status(one.code_m, ranges, index.trajectory, place, raim)
+        found = _Found(point=point, place=place, ties=ties, raim=raim, status=status, noise_scale=scale)
         return found, replace(state, offsets=offsets)
 
-    def _on_the_line(self, ranges: Ranges, index: SearchIndex, point: SinglePoint) -> tuple[Section, Constrained]:
+    def _fault_free(
+        self, ranges: Ranges, index: SearchIndex, place: _Place, scale: Floats
+    ) -> tuple[Ranges, _Place, Raim]:
+        """RAIM: where a fault is detected and its satellites are found, the position without them."""
+        limits, constrained = self.config.raim, place.constrained
+        found = detect(constrained.wsse, constrained.residual_m, _redundancy(ranges), limits=limits, scale=scale)
+        raim = Raim(
+            outcome=np.where(found.testable, Outcome.PASSED, Outcome.UNTESTABLE).astype(np.int8),
+            statistic=found.statistic,
+            threshold=found.threshold,
+            excluded=np.zeros(ranges.code_m.shape, dtype=bool),
+            own_error_m=np.full(ranges.code_m.shape, np.nan),
+        )
+        failing = np.flatnonzero(found.detected)
+        if "raim" not in self.config.screens:
+            raim.outcome[:] = Outcome.UNTESTABLE
+            return ranges, place, raim
+        if not len(failing):
+            return ranges, place, raim
+        arc, section = constrained.arc_m[failing], constrained.section[failing]
+        model = constrained_model(ranges.take(failing), index.trajectory, arc, section=section)
+        exclusion = exclude(model, limits=limits, scale=scale[failing])
+        raim.outcome[failing] = exclusion.outcome
+        raim.excluded[failing], raim.own_error_m[failing] = exclusion.excluded, exclusion.own_error_m
+        again = failing[exclusion.excluded.any(axis=1)]
+        if len(again):
+            ranges = without(ranges, raim.excluded)
+            part = ranges.take(again)
+            rest = single_point(part, place.point.ecef_m[again], limits=self.config.single_point)
+            mended = self._on_the_line(part, index, rest)
+            constrained = mended.constrained
+            # Without the fault the best section can be another one: is the rest of one mind there too?
+            once_more = detect(
+                constrained.wsse, constrained.residual_m, _redundancy(part), limits=limits, scale=scale[again]
+            )
+            raim.outcome[again[once_more.detected]] = Outcome.UNRESOLVED
+            place = _Place(
+                point=patched(place.point, again, mended.point),
+                section=patched(place.section, again, mended.section),
+                constrained=patched(place.constrained, again, mended.constrained),
+            )
+        return ranges, place, raim
+
+    def _on_the_line(self, ranges: Ranges, index: SearchIndex, point: SinglePoint) -> _Place:
         """Section search and constrained position where there are satellites enough."""
         section = search(ranges, index, point, limits=self.config.section)
         enough = ranges.n_used >= self.config.min_satellites
         vertex = np.where(enough, section.vertex, -1)
-        return section, constrained_position(ranges, index.trajectory, vertex, limits=self.config.constrained)
+        constrained = constrained_position(ranges, index.trajectory, vertex, limits=self.config.constrained)
+        return _Place(point=point, section=section, constrained=constrained)
 
     def _ties(
         self, one: Prepared, ranges: Ranges, free: Constrained, state: AntennaState
@@ -152,17 +199,11 @@ class EpochProcessor:
         return tie_clocks(time, one.clocks, reference, ranges, free, state.offsets, limits=self.config.clock_offsets)
 
     def _status(
-        self,
-        code: Floats,
-        ranges: Ranges,
-        trajectory: Trajectory,
-        point: SinglePoint,
-        section: Section,
-        constrained: Constrained,
+        self, code: Floats, ranges: Ranges, trajectory: Trajectory, place: _Place, raim: Raim
     ) -> NDArray[np.int8]:
         """The status of each epoch, shape (T,), decided once, from numbers, the gravest first."""
-        config = self.config
-        redundancy = ranges.n_used - ranges.n_clocks - 1
+        config, redundancy = self.config, _redundancy(ranges)
+        point, section, constrained = place.point, place.section, place.constrained
         position = trajectory.at_arc(constrained.arc_m)
         away = np.linalg.norm(position - point.ecef_m, axis=1)
         misfit = (constrained.wsse - point.wsse) / np.maximum(1.0, constrained.wsse / np.maximum(redundancy, 1))
@@ -174,6 +215,7 @@ class EpochProcessor:
             (constrained.dilution > config.dilution_limit, Status.UNOBSERVABLE),
             (~np.isfinite(constrained.arc_m), Status.NO_CONVERGENCE),
             (lost | beyond, Status.OFF_MAP),
+            (np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE]), Status.INCONSISTENT),
             ((section.excess <= config.section.threshold) | (redundancy < config.section.redundancy), Status.AMBIGUOUS),
         ]
         return np.select([c for c, _ in conditions], [s.value for _, s in conditions], Status.OK).astype(np.int8)
@@ -181,12 +223,12 @@ class EpochProcessor:
     def _noise_scale(
         self, ranges: Ranges, constrained: Constrained, state: AntennaState
     ) -> tuple[Floats, AntennaState]:
-        """Standard deviation of this receiver's ranges against the weights', from all epochs so far.
+        """Standard deviation of this receiver's ranges against the weights', from the epochs before.
 
         The mean of the logarithm of wsse / degrees of freedom, each weighted by its degrees of
         freedom, less what the logarithm of a chi-square variable is lower by.
         """
-        freedom = (ranges.n_used - ranges.n_clocks - 1).astype(np.float64)
+        freedom = _redundancy(ranges).astype(np.float64)
         usable = (freedom > 0) & (constrained.wsse > 0)
         safe = np.where(usable, freedom, 1.0)
         level = np.log(np.where(usable, constrained.wsse, 1.0) / safe) - (digamma(safe / 2) - np.log(safe / 2))
@@ -194,13 +236,13 @@ class EpochProcessor:
         # cumsum from the carried sums: the same additions in the same order however epochs are cut.
         sums = np.cumsum(np.r_[state.log_variance_sum, weight * level])
         weights = np.cumsum(np.r_[state.log_variance_weight, weight])
-        scale = np.exp(0.5 * sums[1:] / (weights[1:] + self.config.noise_prior))
+        scale = np.exp(0.5 * sums[:-1] / (weights[:-1] + self.config.noise_prior))
         return scale, replace(state, log_variance_sum=float(sums[-1]), log_variance_weight=float(weights[-1]))
 
     def _result(self, one: Prepared, trajectory: Trajectory, found: _Found) -> AntennaResult:
         """Everything side by side, coordinates only where the status has them."""
-        obs, point, constrained, scale = one.observations, found.point, found.constrained, found.noise_scale
-        has = np.isin(found.status, [s.value for s in POSITIONED])
+        obs, point, constrained, scale = one.observations, found.point, found.place.constrained, found.noise_scale
+        has = np.isin(found.status, self._with_coordinates)
         arc = np.where(has, constrained.arc_m, np.nan)
         ecef = trajectory.at_arc(arc)
         latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -244,8 +286,9 @@ class EpochProcessor:
             columns=one.columns,
             screens=one.screens,
             single_point=point,
-            section=found.section,
+            section=found.place.section,
             constrained=constrained,
+            raim=found.raim,
             clocks=one.clocks,
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,
@@ -263,15 +306,29 @@ class EpochProcessor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Found:
-    """Where one antenna is."""
+class _Place:
+    """Where one set of ranges puts an antenna: in space, at a point of the line, on the line."""
 
     point: SinglePoint
     section: Section
     constrained: Constrained
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found:
+    """Where one antenna is: conventionally, and on the line, with what was decided on the way."""
+
+    point: SinglePoint
+    place: _Place
     ties: ClockTies
+    raim: Raim
     status: NDArray[np.int8]
     noise_scale: Floats
+
+
+def _redundancy(ranges: Ranges) -> NDArray[np.int64]:
+    """Ranges beyond the clocks and the distance along the line, shape (T,)."""
+    return np.asarray(ranges.n_used - ranges.n_clocks - 1, dtype=np.int64)
 
 
 def _alone(one: Prepared, ties: ClockTies) -> NDArray[np.bool_]:

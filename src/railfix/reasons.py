@@ -37,6 +37,16 @@ class Reason(IntFlag):
     ALONE_ON_ITS_CLOCK = 1 << 8
     #: A correction of its signal is unknown: its group delay is not broadcast, or it stands at the horizon.
     NO_CORRECTION = 1 << 9
+    #: Weaker than the absolute floor of C/N0.
+    CN0_FLOOR = 1 << 10
+    #: Weaker than an open sky gives at its elevation.
+    CN0_CURVE = 1 << 11
+    #: The code changed otherwise than its Doppler says.
+    DOPPLER = 1 << 12
+    #: The codes of the two antennas differ otherwise than their spacing says.
+    ANTENNA_PAIR = 1 << 13
+    #: Excluded by RAIM: its own error against all others is over the limit.
+    FAULT_EXCLUDED = 1 << 14
 
 
 class Status(IntEnum):
@@ -56,6 +66,10 @@ class Status(IntEnum):
     NO_CONVERGENCE = 5
     #: No position: this antenna has no observation at this epoch.
     NO_OBSERVATION = 6
+    #: A position, but the ranges contradict each other and no exclusion mends it.
+    INCONSISTENT = 7
+    #: A position, but the two antennas' positions are not as far apart as the antennas.
+    ANTENNAS_DISAGREE = 8
 
     @property
     def text(self) -> str:
@@ -63,8 +77,10 @@ class Status(IntEnum):
         return self.name.lower()
 
 
-#: Statuses that come with coordinates.
-POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP)
+#: Positions that a check has failed: with coordinates or without, as `Config.failed_checks` says.
+CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE)
+#: Statuses that come with coordinates (those of `CHECK_FAILED` unless they are dropped).
+POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, *CHECK_FAILED)
 
 
 def reason_text(reason: int) -> str:

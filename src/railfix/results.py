@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,34 @@ from railfix.screens import Screened
 from railfix.section import Section
 from railfix.spp import SinglePoint
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Rows = TypeVar("Rows", bound="DataclassInstance")
 Floats = NDArray[np.float64]
 Bits = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Raim:
+    """Detection and exclusion of T epochs.
+
+    Attributes
+    ----------
+    outcome : ndarray of int8, shape (T,)
+        `raim.Outcome`.
+    statistic, threshold : ndarray, shape (T,)
+        Before any exclusion; in noise variances, or in m^2 with the fixed limit.
+    excluded : ndarray of bool, shape (T, K)
+    own_error_m : ndarray, shape (T, K) [m]
+        Error of the channels that stand against the rest; NaN elsewhere.
+    """
+
+    outcome: NDArray[np.int8]
+    statistic: Floats
+    threshold: Floats
+    excluded: NDArray[np.bool_]
+    own_error_m: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +88,7 @@ class AntennaResult:
         Standard deviation along the line, the receiver's noise scale and the map error included.
     noise_scale : ndarray, shape (T,)
         Standard deviation of this receiver's ranges against the one the weights assume, as
-        estimated from all epochs so far.
+        estimated from the epochs before.
     ecef_m : ndarray, shape (T, 3) [m]
         Antenna.
     latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
@@ -85,6 +112,8 @@ class AntennaResult:
         The conventional position: every constellation with a clock of its own.
     section : Section
     constrained : Constrained
+    raim : Raim
+        Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
     clocks : tuple of str
         Letter of each receiver clock of the results above, length G.
     clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
@@ -123,6 +152,7 @@ class AntennaResult:
     single_point: SinglePoint
     section: Section
     constrained: Constrained
+    raim: Raim
     clocks: tuple[str, ...]
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats
@@ -144,3 +174,13 @@ class Result:
 
     antennas: Mapping[str, AntennaResult]
     notes: tuple[str, ...]
+
+
+def patched(whole: Rows, epochs: NDArray[np.intp], part: Rows) -> Rows:
+    """The same result with some epochs replaced, by index; every field has the epochs on axis 0."""
+    values = {}
+    for item in fields(whole):
+        array = np.array(getattr(whole, item.name))
+        array[epochs] = getattr(part, item.name)
+        values[item.name] = array
+    return replace(whole, **values)
