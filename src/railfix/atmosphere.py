@@ -36,7 +36,7 @@ def klobuchar_delay_m(
     Returns
     -------
     ndarray, shape (T, M) [m]
-        NaN where an angle or frequency is NaN, and at or below the horizon.
+        NaN where an angle, a coordinate or a frequency is NaN, and at or below the horizon.
     """
     alpha, beta = np.asarray(coefficients, dtype=np.float64).reshape(2, 4)
     elevation = np.where(elevation_deg > 0.0, elevation_deg, np.nan) / 180.0
@@ -52,7 +52,8 @@ def klobuchar_delay_m(
     period = np.maximum(_cubic(beta, magnetic), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    delay = slant * np.where(np.abs(phase) < 1.57, 5e-9 + amplitude * cosine, 5e-9)
+    # Asked this way round, NaN stays NaN and does not become the delay of the night.
+    delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
 
