@@ -17,7 +17,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
     2: ("files", "rinex", "sp3", "position_log", "orbits", "atmosphere"),
     3: ("track_map", "antenna", "vehicle"),
     4: ("clock_elimination", "clock_offsets", "measurement", "section", "constrained", "spp", "screens", "raim", "carrier", "cn0_curve"),
-    5: ("config", "results", "preparation", "pipeline"),
+    5: ("config", "results", "preparation", "pairing", "pipeline"),
     6: ("simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),
 }
 FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}

@@ -53,6 +53,9 @@ class Trajectory:
         Lean of the body, positive to the right; 0 where the track is taken as the path.
     reference : str
         The point of the vehicle whose chainage is given.
+    body_chainage_m : ndarray, shape (V,), or None [m]
+        Chainage of the middle between the bogies when the antenna is at the point, strictly rising: where
+        one antenna is, it tells where the other one of the same vehicle is. None without a vehicle.
     sigma_plan_m, sigma_height_m : float [m]
         Standard deviations of the map, carried into the solution.
     notes : tuple of str
@@ -66,6 +69,7 @@ class Trajectory:
     cant_m: Floats
     roll_deg: Floats
     reference: str = "antenna"
+    body_chainage_m: Floats | None = None
     sigma_plan_m: float = SIGMA_PLAN_M
     sigma_height_m: float = SIGMA_HEIGHT_M
     notes: tuple[str, ...] = ()
@@ -188,6 +192,20 @@ class Trajectory:
     def chainage_at(self, arc_m: ArrayLike) -> Floats:
         """Chainage of the reference point at an arc length [m]; NaN beyond the ends and for NaN."""
         return self._interpolate(arc_m, self.chainage_m)
+
+    def body_at(self, arc_m: ArrayLike) -> Floats:
+        """Chainage of the vehicle's middle when the antenna is at arcs [m]; NaN without a vehicle or off the path."""
+        if self.body_chainage_m is None:
+            return np.full(np.shape(arc_m), np.nan)
+        return self._interpolate(arc_m, self.body_chainage_m)
+
+    def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
+        """Where the antenna is when the vehicle's middle is at chainages [m]; NaN without a vehicle or off the path."""
+        if self.body_chainage_m is None:
+            return np.full(np.shape(body_chainage_m), np.nan)
+        return np.interp(
+            np.asarray(body_chainage_m, dtype=np.float64), self.body_chainage_m, self.arc_m, left=np.nan, right=np.nan
+        )
 
     def arc_at_chainage(self, chainage_m: ArrayLike) -> Floats:
         """Arc length at a chainage of the reference point [m]; NaN beyond the ends and for NaN."""

@@ -16,18 +16,19 @@ configuration file uses::
 from __future__ import annotations
 
 import tomllib
+from dataclasses import fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, ValidationInfo, field_validator
 
 from railfix.clock_offsets import ClockOffsetLimits
 from railfix.constrained import ConstrainedLimits
 from railfix.errors import InputFileError, SettingsError
 from railfix.measurement import CodeNoise
 from railfix.raim import RaimLimits
-from railfix.screens import ElevationLimits
+from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
 from railfix.section import SectionLimits
 from railfix.spp import SinglePointLimits
 
@@ -42,7 +43,23 @@ DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
 
 
 #: Names of the screens, in the order in which they are asked.
-SCREENS: Final = ("elevation", "raim")
+SCREENS: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
+
+
+#: Settings that are the limits of a room.
+ROOMS: Final = (
+    "noise",
+    "elevation",
+    "cn0",
+    "doppler",
+    "antenna_pair",
+    "raim",
+    "antenna_spacing",
+    "clock_offsets",
+    "single_point",
+    "section",
+    "constrained",
+)
 
 
 class Config(BaseModel):
@@ -57,6 +74,8 @@ class Config(BaseModel):
         Signals of each constellation in order of preference; the first one observed is used.
     screens : tuple of str
         Screens that are on; health and validity of the satellites are no screens and always asked.
+    cn0_curve : path or None
+        File of the mean C/N0 over elevation (``railfix cn0-curve``); without it the floor alone judges.
     failed_checks : {"keep", "drop"}
         Coordinates of positions that a check has failed (`reasons.CHECK_FAILED`): kept beside the
         status that says so, or dropped as P1 does.
@@ -76,7 +95,9 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
-    noise, elevation, raim, clock_offsets, single_point, section, constrained
+    noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
+        Limits of the weights and the screens.
+    clock_offsets, single_point, section, constrained
         Limits of the rooms of these names.
     """
 
@@ -84,7 +105,8 @@ class Config(BaseModel):
 
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    screens: tuple[Literal["elevation", "raim"], ...] = SCREENS
+    screens: tuple[Literal["elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing"], ...] = SCREENS
+    cn0_curve: Path | None = None
     failed_checks: Literal["keep", "drop"] = "keep"
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)
@@ -97,6 +119,10 @@ class Config(BaseModel):
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_prior: float = Field(default=100.0, gt=0)
     noise: CodeNoise = Field(default_factory=CodeNoise)
+    cn0: Cn0Limits = Field(default_factory=lambda: Cn0Limits(floor_dbhz=None))
+    doppler: DopplerLimits = Field(default_factory=lambda: DopplerLimits(mode="receiver"))
+    antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
+    antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
     clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
@@ -118,17 +144,17 @@ class Config(BaseModel):
             raise ValueError("name each screen once")
         return tuple(name for name in SCREENS if name in value)
 
-    @field_validator(
-        "noise", "elevation", "raim", "clock_offsets", "single_point", "section", "constrained", mode="before"
-    )
+    @field_validator(*ROOMS, mode="before")
     @classmethod
-    def _known_keys(cls, value: Any, info: Any) -> Any:
-        if isinstance(value, dict):
-            annotation = cls.model_fields[info.field_name].annotation
-            known = set(getattr(annotation, "__dataclass_fields__", {}))
+    def _known_keys(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse misspelt settings of a room; those left out keep this model's defaults, not the room's."""
+        if isinstance(value, dict) and info.field_name:
+            default = cls.model_fields[info.field_name].get_default(call_default_factory=True)
+            known = {item.name for item in fields(default)}
             unknown = sorted(set(value) - known)
             if unknown:
                 raise ValueError(f"unknown setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
+            return {name: getattr(default, name) for name in known} | value
         return value
 
     def as_dict(self) -> dict[str, Any]:

@@ -18,17 +18,19 @@ from scipy.stats import chi2
 from railfix.antenna import Trajectory
 from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges
 from railfix.clock_offsets import OffsetState, tie_clocks
+from railfix.cn0_curve import read_cn0_curve
 from railfix.config import Config
 from railfix.constants import CLOCK_GROUP
 from railfix.constrained import Constrained, constrained_position
 from railfix.epochs import Observations
 from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
+from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
 from railfix.preparation import Prepared, prepare, without
 from railfix.raim import Outcome, constrained_model, detect, exclude
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.results import AntennaResult, AntennaState, Bits, Floats, Raim, Result, State, patched
-from railfix.screens import elevation_screen
+from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
 from railfix.section import SearchIndex, Section, search
 from railfix.spp import SinglePoint, single_point
 
@@ -61,7 +63,9 @@ class EpochProcessor:
             for name, trajectory in trajectories.items()
         }
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
-        self._klobuchar, self.notes = self._ionosphere()
+        self._cn0_curve = None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve)
+        self._klobuchar, notes = self._ionosphere()
+        self.notes = (*notes, *self._what_screens_lack())
         dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
         self._with_coordinates = [status.value for status in POSITIONED if status not in dropped]
         self._off_map_excess = float(chi2.isf(config.off_map_risk, 2))
@@ -75,6 +79,22 @@ class EpochProcessor:
                 note = f"ionosphere: klobuchar asked for, coefficients broadcast by {name} used"
                 return self.navigation.klobuchar[letter], (() if letter == "G" else (note,))
         return None, ("ionosphere: klobuchar asked for, no coefficients received, delay left uncorrected",)
+
+    def _what_screens_lack(self) -> tuple[str, ...]:
+        """Screens that were asked for and cannot judge, one sentence each."""
+        screens, lacking = self.config.screens, []
+        if "cn0" in screens and self._cn0_curve is None:
+            floor = self.config.cn0.floor_dbhz
+            rest = "nothing is judged" if floor is None else f"the floor of {floor:g} dB-Hz alone judges"
+            lacking.append(f"screen cn0: asked for without a curve over elevation (cn0_curve), {rest}")
+        two = len(self.trajectories) > 1
+        bodies = all(t.body_chainage_m is not None for t in self.trajectories.values())
+        for name in ("antenna_pair", "antenna_spacing"):
+            if name in screens and two and not bodies:
+                lacking.append(
+                    f"screen {name}: asked for, but without a vehicle file the spacing is unknown; not judged"
+                )
+        return tuple(lacking)
 
     def process(self, observations: Mapping[str, Observations], state: State | None = None) -> tuple[Result, State]:
         """Positions of one chunk.
@@ -104,12 +124,15 @@ class EpochProcessor:
         prepared: dict[str, Prepared] = {}
         for name, part in observations.items():
             prepared[name], after[name] = self._screened(name, part, after.get(name, AntennaState()))
-        # Screens that compare the codes of two antennas stand here.
-        results: dict[str, AntennaResult] = {}
+        pair = self._pair(prepared)
+        if pair is not None and "antenna_pair" in self.config.screens:
+            screen_antenna_pair(pair, self.config.antenna_pair)
+        found: dict[str, _Found] = {}
         for name, one in prepared.items():
-            found, after[name] = self._positioned(one, self._index[name], after[name])
-            results[name] = self._result(one, self.trajectories[name], found)
-        # Screens that compare the positions of two antennas stand here.
+            found[name], after[name] = self._positioned(one, self._index[name], after[name])
+        if pair is not None and "antenna_spacing" in self.config.screens:
+            self._screen_spacing(pair, found)
+        results = {name: self._result(one, self.trajectories[name], found[name]) for name, one in prepared.items()}
         return Result(antennas=results, notes=self.notes), State(antennas=after)
 
     def _screened(self, name: str, obs: Observations, state: AntennaState) -> tuple[Prepared, AntennaState]:
@@ -118,7 +141,65 @@ class EpochProcessor:
         if "elevation" in self.config.screens:
             verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
             one.screened("elevation", verdict, Reason.ELEVATION_MASK)
+        if "cn0" in self.config.screens:
+            signals = cn0_screen(
+                one.cn0_dbhz,
+                one.elevation_deg,
+                satellite=one.satellite,
+                signal=one.signal,
+                limits=self.config.cn0,
+                curve=self._cn0_curve,
+            )
+            one.screened("cn0_floor", signals.floor, Reason.CN0_FLOOR)
+            one.screened("cn0_curve", signals.curve, Reason.CN0_CURVE)
+        if "doppler" in self.config.screens:
+            changes, doppler = doppler_screen(
+                obs.time,
+                np.where((one.reason & Reason.IMPLAUSIBLE_CODE) == 0, one.code_m, np.nan),
+                one.doppler_hz,
+                satellite=one.satellite,
+                signal=one.signal,
+                frequency_hz=one.frequency_hz,
+                break_before=obs.break_before,
+                code_sigma_m=one.sigma_m,
+                limits=self.config.doppler,
+                state=state.doppler,
+            )
+            one.screened("doppler", changes, Reason.DOPPLER)
+            state = replace(state, doppler=doppler)
         return one, state
+
+    def _pair(self, prepared: Mapping[str, Prepared]) -> AntennaPair | None:
+        """Epochs that two antennas of one vehicle have in common, None where there are no such antennas."""
+        if len(prepared) < 2 or any(self.trajectories[name].body_chainage_m is None for name in prepared):
+            return None
+        tolerance = self.config.antenna_pair.tag_tolerance_s
+        return pair_antennas(
+            prepared["front"],
+            prepared["rear"],
+            self.trajectories["front"],
+            self.trajectories["rear"],
+            tolerance_s=tolerance,
+        )
+
+    def _screen_spacing(self, pair: AntennaPair, found: dict[str, _Found]) -> None:
+        """Compare the positions of the two antennas; both get the status where they do not fit."""
+        arcs = {name: found[name].place.constrained.arc_m for name in ("front", "rear")}
+        chainage = {name: self.trajectories[name].chainage_at(arcs[name]) for name in arcs}
+        front, rear = chainage["front"][pair.front_epoch], chainage["rear"][pair.rear_epoch]
+        along = np.nan_to_num(pair.spacing.along_m)
+        verdict = antenna_spacing_screen(
+            front, rear, np.abs(along), facing=np.sign(along).astype(int), limits=self.config.antenna_spacing
+        )
+        for name, epochs in (("front", pair.front_epoch), ("rear", pair.rear_epoch)):
+            one, metric = found[name], np.full(len(found[name].status), np.nan)
+            metric[epochs] = verdict.metric
+            reject = np.zeros(len(metric), dtype=bool)
+            reject[epochs] = verdict.reject
+            doubtful = reject & np.isin(one.status, self._with_coordinates)
+            status = np.where(doubtful, Status.ANTENNAS_DISAGREE, one.status).astype(np.int8)
+            pair.prepared[name].screens["antenna_spacing"] = Screened(metric=metric, reject=reject)
+            found[name] = replace(one, status=status)
 
     def _positioned(self, one: Prepared, index: SearchIndex, state: AntennaState) -> tuple[_Found, AntennaState]:
         """Conventional and constrained position, exclusion, status and noise scale of one antenna."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from railfix.clock_offsets import OffsetState
 from railfix.constrained import Constrained
 from railfix.orbits import SatelliteStates
-from railfix.screens import Screened
+from railfix.screens import DopplerState, Screened
 from railfix.section import Section
 from railfix.spp import SinglePoint
 
@@ -57,11 +57,14 @@ class AntennaState:
         as a logarithm so that multipath does not carry it.
     offsets : OffsetState
         What is known of the offsets between the clocks of the constellations.
+    doppler : DopplerState or None
+        The last epoch that the Doppler screen has seen.
     """
 
     log_variance_sum: float = 0.0
     log_variance_weight: float = 0.0
     offsets: OffsetState = field(default_factory=OffsetState)
+    doppler: DopplerState | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +110,8 @@ class AntennaResult:
     columns : ndarray of int, shape (K,)
         Channels that settings allow, in the order of the intermediate results below.
     screens : mapping of str to Screened
-        Metric and verdict of each screen that was on, by name, shape (T, K).
+        Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which
+        judges positions, has shape (T,).
     single_point : SinglePoint
         The conventional position: every constellation with a clock of its own.
     section : Section

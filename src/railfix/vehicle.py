@@ -389,6 +389,7 @@ def antenna_trajectory(
         cant_m=np.full_like(cant, np.nan) if np.isnan(track.cant_m).all() else cant,
         roll_deg=np.degrees(body.roll_rad),
         reference=reference,
+        body_chainage_m=middle,
         sigma_plan_m=track.sigma_plan_m,
         sigma_height_m=track.sigma_height_m,
         notes=(*line.notes, *track.provenance.notes),
