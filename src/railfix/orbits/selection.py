@@ -1,10 +1,12 @@
 """Which record a satellite has at an epoch.
 
 Among records the newest one transmitted before the epoch is taken. Where a file does not tell
-when a record was transmitted, it serves from half-way since the record before it. Where every
-record of a satellite was transmitted after the epoch (a file that begins later than the log), the
-one whose reference time lies nearest is taken and flagged. Health is decided on the record taken:
-an older one that calls the satellite healthy does not win.
+when a record was transmitted, it serves from half-way since the record before it. Where the
+newest is out of its validity (expired while an older one lasts, or sent long before it begins),
+or where every record was transmitted after the epoch (a file that begins later than the log), the
+one whose reference time lies nearest is taken if it is valid, and flagged if it was not on the
+air yet. Health is decided on the record taken: an older one that calls the satellite healthy does
+not win.
 """
 
 from __future__ import annotations
@@ -53,6 +55,8 @@ class Lookup:
     toe_key, toe_record : ndarray of int64, shape (n,)
         The same by reference time: from half-way since the one before.
     origin : datetime64[ns]
+    toe, available : ndarray of datetime64[ns], shape (n,)
+        Reference time, and time since when it serves, by row of the record table.
     """
 
     number: Mapping[str, int]
@@ -62,38 +66,52 @@ class Lookup:
     toe_key: Indices
     toe_record: Indices
     origin: np.datetime64
+    toe: NDArray[np.datetime64]
+    available: NDArray[np.datetime64]
 
-    def find(self, number: Indices, time: NDArray[np.datetime64]) -> tuple[Indices, Masks]:
-        """Newest record available at each epoch.
+    def find(
+        self, number: Indices, time: NDArray[np.datetime64], limit: NDArray[np.timedelta64]
+    ) -> tuple[Indices, Masks, Masks]:
+        """Record of each satellite at each epoch.
 
         Parameters
         ----------
         number : ndarray of int, shape (M,)
             Of `number`; -1 for a satellite that is not there.
         time : ndarray of datetime64[ns], shape (T,)
+        limit : ndarray of timedelta64, shape (n,)
+            Longest distance of an epoch from toe, by row of the record table.
 
         Returns
         -------
         record : ndarray of int, shape (M, T)
             Row of the record table; -1 where the satellite has none at all.
+        valid : ndarray of bool, shape (M, T)
+            The epoch lies within the limit of the record.
         future : ndarray of bool, shape (M, T)
-            All records were transmitted after the epoch; the one of the nearest toe is given.
+            The record was transmitted after the epoch.
         """
         shape = (len(number), len(time))
         if not len(self.sent_key):
-            return np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=bool)
+            return np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         base = np.maximum(number, 0)
         wanted = base[:, None] * _SPAN + np.clip((time - self.origin) // _MILLISECOND, 0, _SPAN - 1)
         found = np.searchsorted(self.sent_key, wanted, side="right") - 1
         future = found < self.first[base][:, None]
         record = self.sent_record[np.maximum(found, 0)]
-        if future.any():
-            nearest = np.searchsorted(self.toe_key, wanted[future], side="right") - 1
-            record[future] = self.toe_record[nearest]
+        valid = (np.abs(time - self.toe[record]) <= limit[record]) & ~future
+        if not valid.all():
+            m, t = np.nonzero(~valid)
+            nearest = self.toe_record[np.searchsorted(self.toe_key, wanted[m, t], side="right") - 1]
+            lasting = np.abs(time[t] - self.toe[nearest]) <= limit[nearest]
+            taken = lasting | future[m, t]
+            record[m, t] = np.where(taken, nearest, record[m, t])
+            valid[m, t] = lasting
+            future[m, t] = taken & (self.available[nearest] > time[t])
         absent = number < 0
         if absent.any():
-            record[absent], future[absent] = -1, False
-        return record, future
+            record[absent], valid[absent], future[absent] = -1, False, False
+        return record, valid, future
 
 
 def make_lookup(
@@ -114,7 +132,7 @@ def make_lookup(
     """
     empty = np.empty(0, dtype=np.int64)
     if not len(label):
-        return Lookup({}, empty, empty, empty, empty, empty, np.datetime64(0, "ns"))
+        return Lookup({}, empty, empty, empty, empty, empty, np.datetime64(0, "ns"), toe, toe)
     names, number = np.unique(label, return_inverse=True)
     number = number.astype(np.int64)
     order = np.lexsort((toe, number))
@@ -129,6 +147,7 @@ def make_lookup(
     origin: np.datetime64 = np.minimum(available.min(), earliest.min()) - np.timedelta64(1, "s")
     sent = number * _SPAN + (available - origin) // _MILLISECOND
     resort = np.argsort(sent, kind="stable")
+    by_row = np.argsort(order)
     middle[first] = origin
     return Lookup(
         number={str(name): i for i, name in enumerate(names)},
@@ -138,6 +157,8 @@ def make_lookup(
         toe_key=number * _SPAN + (middle - origin) // _MILLISECOND,
         toe_record=order.astype(np.int64),
         origin=origin,
+        toe=toe[by_row],
+        available=available[by_row],
     )
 
 

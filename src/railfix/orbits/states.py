@@ -13,8 +13,7 @@ from railfix.constants import SPEED_OF_LIGHT
 from railfix.epochs import frozen
 from railfix.navigation import Navigation
 from railfix.orbits.kepler import kepler_state
-from railfix.orbits.precise import precise_state
-from railfix.orbits.selection import VALIDITY_S
+from railfix.orbits.precise import precise_clock_s, precise_state
 from railfix.orbits.table import Plan, Table, table_of
 from railfix.timescale import seconds, timedelta
 
@@ -174,14 +173,13 @@ def _fill_kepler(
     table: Table, plan: Plan, time: Datetimes, code_m: Floats, observed: Masks, max_age_s: float | None, found: _Found
 ) -> None:
     """Fill in the channels of GPS, QZSS, Galileo and BeiDou."""
-    toe, limit = table.navigation.kepler.toe, _limit(table.validity, max_age_s)
-    rows, future = table.lookup.find(plan.preferred, time)
-    valid = np.abs(time - toe[rows]) <= limit[rows]
+    limit = _limit(table.validity, max_age_s)
+    rows, valid, future = table.lookup.find(plan.preferred, time, limit)
     if plan.any_other:
-        others, other_future = table.lookup.find(plan.other, time)
-        better = ~valid & (others >= 0) & (np.abs(time - toe[others]) <= limit[others])
+        others, other_valid, other_future = table.lookup.find(plan.other, time, limit)
+        # What was on the air goes before what is right after the fact.
+        better = other_valid & (~valid | (future & ~other_future))
         rows, future, valid = np.where(better, others, rows), np.where(better, other_future, future), valid | better
-    valid &= rows >= 0
     channels = plan.kepler
     found.record[:, channels] = rows.T
     found.no_record[:, channels] = (rows < 0).T
@@ -242,19 +240,18 @@ def _fill_glonass(
 ) -> None:
     """Fill in the channels of GLONASS; its code biases between channels are left as they are."""
     records = table.navigation.glonass
-    limit = VALIDITY_S["R"] if max_age_s is None else min(VALIDITY_S["R"], max_age_s)
-    rows, future = table.glonass_lookup.find(plan.glonass_number, time)
+    rows, valid, future = table.glonass_lookup.find(
+        plan.glonass_number, time, _limit(table.glonass_validity, max_age_s)
+    )
     channels = plan.glonass
     found.record[:, channels] = rows.T
     found.no_record[:, channels] = (rows < 0).T
-    k, t = np.nonzero(observed[:, channels].T & (rows >= 0))
-    row = rows[k, t]
-    age = seconds(time[t] - records.toe[row])
-    valid = np.abs(age) <= limit
+    seen = observed[:, channels].T & (rows >= 0)
     if table.navigation.precise is None:
-        found.too_old[t[~valid], channels[k[~valid]]] = True
-    k, t, row, age = k[valid], t[valid], row[valid], age[valid]
-    m = channels[k]
+        found.too_old[:, channels] = (seen & ~valid).T
+    k, t = np.nonzero(seen & valid)
+    m, row = channels[k], rows[k, t]
+    age = seconds(time[t] - records.toe[row])
     since = age - code_m[t, m] / SPEED_OF_LIGHT
     bias, rate = records.clock_bias_s[row], records.relative_frequency[row]
     since = since - (bias + rate * since)
@@ -287,7 +284,8 @@ def _fill_precise(
     absent = (column < 0) | (found.no_record.all(axis=0) & ~glonass)
     m, t = np.nonzero(observed.T & ~absent[:, None])
     travel = -code_m[t, m] / SPEED_OF_LIGHT
-    _, _, clock = precise_state(precise, column[m], time[t], travel)
+    # As with broadcast clocks, the instant is found without the relativistic part (below 0.4 microseconds).
+    clock = precise_clock_s(precise, column[m], time[t], travel)
     position, velocity, clock = precise_state(precise, column[m], time[t], travel - np.nan_to_num(clock))
     missing = np.isnan(position[0]) | np.isnan(clock)
     for values in (found.position_ecef_m, found.velocity_ecef_mps, found.clock_m, found.age_s, found.accuracy_m):

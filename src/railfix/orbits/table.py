@@ -69,9 +69,9 @@ class Table:
         self.orbits = Orbits.from_records(kepler)
         self.clock = np.stack([kepler.af0_s, kepler.af1, kepler.af2])
         self.toe_after_toc_s = seconds(kepler.toe - kepler.toc)
-        self.glonass_lookup = make_lookup(
-            glonass.satellite, glonass.toe, glonass.transmitted, np.full(len(glonass), VALIDITY_S["R"])
-        )
+        validity = np.full(len(glonass), VALIDITY_S["R"])
+        self.glonass_validity = timedelta(validity)
+        self.glonass_lookup = make_lookup(glonass.satellite, glonass.toe, glonass.transmitted, validity)
         self._plans: dict[tuple[bytes, ...], Plan] = {}
 
     @cached_property
