@@ -220,13 +220,13 @@ def candidates(case: Problem, size: int, limits: RaimLimits, scale: float) -> It
             )
 
 
-def exclusion_by_trying(case: Problem, limits: RaimLimits, scale: float) -> tuple[Outcome, Candidate | None]:
-    """The rule of `exclude`, one epoch, as plainly as it can be written."""
+def exclusion_by_trying(case: Problem, limits: RaimLimits, scale: float) -> tuple[Outcome, list[Candidate]]:
+    """The rule of `exclude`, one epoch, as plainly as it can be written; the best subset, and its equals."""
     if case.freedom < 1:
-        return Outcome.UNTESTABLE, None
+        return Outcome.UNTESTABLE, []
     limit = chi2.isf(limits.false_alarm, case.freedom) if limits.mode == "chi_square" else limits.fixed_limit_m2
     if case.statistic((), limits.mode, scale) < limit:
-        return Outcome.PASSED, None
+        return Outcome.PASSED, []
     for size in range(1, limits.max_excluded + 1):
         if case.freedom - size < limits.min_redundancy:
             break
@@ -236,5 +236,6 @@ def exclusion_by_trying(case: Problem, limits: RaimLimits, scale: float) -> tupl
             rivals = [c for c in others if c.wsse - best.wsse <= limits.separation + 1e-6]
             rivals = [c for c in rivals if np.linalg.norm(c.move_m - best.move_m) >= limits.same_position_m]
             accepted = Outcome.EXCLUDED_ONE if size == 1 else Outcome.EXCLUDED_TWO
-            return (Outcome.INSEPARABLE if rivals else accepted), best
-    return Outcome.UNRESOLVED, None
+            equals = [c for c in others if c.statistic - best.statistic < 1e-6]
+            return (Outcome.INSEPARABLE if rivals else accepted), [best, *equals]
+    return Outcome.UNRESOLVED, []
