@@ -25,6 +25,10 @@ Floats = NDArray[np.float64]
 
 #: P1 2.3(1) asks for about a day; below this a note is made [s].
 _SHORT_S: Final = 12 * 3600.0
+#: P1 table 6: signals this far below the mean are refused [dB-Hz].
+_DEFICIT_DBHZ: Final = 10.0
+#: Elevation from which that is looked at [deg], and the share of the calibration itself that is worth a note.
+_LOOKED_AT_DEG, _REFUSED_SHARE = 15.0, 0.01
 #: A satellite further below the horizon than this cannot be seen from where the antenna is said to be [deg].
 _BELOW_DEG: Final = -5.0
 #: Share of satellites below the horizon that is put down to odd records.
@@ -176,6 +180,16 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
     without = [f"{KINDS.get(kind, kind)} {signal}" for kind, signal in samples.keys() if (kind, signal) not in fitted]  # noqa: SIM118
     if without:
         notes.append(f"too few samples over elevation, no curve: {', '.join(without)}")
+    for mean in curve.means:
+        elevation, cn0 = samples.of(mean.kind, mean.signal)
+        high = elevation >= _LOOKED_AT_DEG
+        refused = np.count_nonzero(mean.at(elevation[high]) - cn0[high] > _DEFICIT_DBHZ)
+        if refused > _REFUSED_SHARE * np.count_nonzero(high):
+            share = 100.0 * refused / np.count_nonzero(high)
+            notes.append(
+                f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of this open sky lie "
+                f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; its satellites differ, or the sky is not open"
+            )
     return tuple(notes)
 
 

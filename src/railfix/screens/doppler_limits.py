@@ -156,7 +156,9 @@ def receiver_limit_m(
     Notes
     -----
     The scale is that of changes at the short interval: what an epoch shows is divided by the growth
-    of the noise with the interval. An epoch's own changes count in its scale.
+    of the noise with the interval. An epoch's own changes count in its scale. Of a dozen satellites the
+    scale comes out a tenth to a seventh too small (their own median is taken out, and logarithms are
+    averaged, so that an epoch full of multipath does not carry it).
     """
     growth = _growth(interval_s, limits)
     shown = row_median(np.abs(metric_m))[:, 0] / _MEDIAN_NORMAL / growth

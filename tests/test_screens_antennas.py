@@ -1,0 +1,425 @@
+"""Two antennas: pseudoranges against their spacing, positions against it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+
+from conftest import ROOT
+from railfix.constants import SPEED_OF_LIGHT
+from railfix.epochs import Observations
+from railfix.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
+from railfix.orbits import satellite_states
+from railfix.rinex import read_navigation, read_observations
+from railfix.screens import (
+    AntennaPairLimits,
+    AntennaPairScreened,
+    AntennaSpacingLimits,
+    ambiguity_m,
+    antenna_pair_screen,
+    antenna_spacing_screen,
+    expected_difference_m,
+    on_channels,
+    pair_channels,
+    pair_epochs,
+    spacing_direction,
+)
+from railfix.signals import carrier_frequency_hz
+from railfix.timescale import timedelta
+
+START = np.datetime64("2021-01-01T00:00:00", "ns")
+NAN = np.nan
+
+b3 = pytest.mark.requirement("B3")
+b5 = pytest.mark.requirement("B5")
+
+
+# -- the ambiguity zone -------------------------------------------------------------------------------------
+
+
+@b3
+def test_the_paper_s_ambiguity_zone() -> None:
+    """P1 2.3(3): about 1.1 m at 18.2 m spacing from 3 deg of elevation and 3.5 deg of azimuth."""
+    elevation, azimuth = np.meshgrid(np.linspace(0, 90, 181), np.linspace(0, 360, 721))
+    zone = ambiguity_m(elevation, azimuth, 18.2)
+    assert zone.max() == pytest.approx(1.11, abs=0.03)
+    # a low satellite abeam: 18.2 sin 3.5 deg
+    assert ambiguity_m(0.0, 90.0, 18.2) == pytest.approx(18.2 * np.sin(np.radians(3.5)))
+    # straight ahead at the horizon: 18.2 (1 - cos 3 cos 3.5)
+    assert ambiguity_m(0.0, 0.0, 18.2) == pytest.approx(18.2 * (1 - np.cos(np.radians(3)) * np.cos(np.radians(3.5))))
+
+
+@b3
+@settings(max_examples=50)
+@given(
+    elevation=st.floats(0, 87), azimuth=st.floats(0, 360), by_elevation=st.floats(0, 10), by_azimuth=st.floats(0, 10)
+)
+def test_the_zone_is_the_largest_change_within_the_errors(
+    elevation: float, azimuth: float, by_elevation: float, by_azimuth: float
+) -> None:
+    zone = float(ambiguity_m(elevation, azimuth, 20.0, elevation_error_deg=by_elevation, azimuth_error_deg=by_azimuth))
+    e = np.radians(elevation + np.linspace(-by_elevation, by_elevation, 41))[:, None]
+    a = np.radians(azimuth + np.linspace(-by_azimuth, by_azimuth, 41))
+    direct = np.abs(20 * np.cos(e) * np.cos(a) - 20 * np.cos(e[20]) * np.cos(a[20])).max()
+    assert direct <= zone + 1e-9
+    assert zone <= direct + 0.01
+
+
+# -- the expected difference --------------------------------------------------------------------------------
+
+
+@b3
+@settings(max_examples=40)
+@given(heading=st.floats(0, 360), gradient=st.floats(-80, 80), spacing=st.floats(0.5, 40), seed=st.integers(0, 1000))
+def test_expected_difference_is_that_of_two_ranges(heading: float, gradient: float, spacing: float, seed: int) -> None:
+    """The second formula: two antennas, satellites far away, ranges."""
+    rng = np.random.default_rng(seed)
+    climb, turn = np.arctan(gradient / 1e3), np.radians(heading)
+    forward = np.array([np.cos(climb) * np.sin(turn), np.cos(climb) * np.cos(turn), np.sin(climb)])
+    axes, middle = enu_axes(35.0, 135.0), ecef_from_geodetic(35.0, 135.0, 50.0)
+    front, rear = middle + spacing / 2 * forward @ axes, middle - spacing / 2 * forward @ axes
+    direction = rng.standard_normal((6, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    satellites = middle + 2.4e7 * direction
+    elevation, azimuth = elevation_azimuth(satellites[None], middle[None])
+    h, g, s = spacing_direction(front[None], rear[None])
+    assert s[0] == pytest.approx(spacing, abs=1e-6)
+    assert g[0] == pytest.approx(gradient, abs=0.01)
+    assert (h[0] - heading + 180) % 360 - 180 == pytest.approx(0, abs=1e-3)
+    ranges = [np.linalg.norm(satellites - place, axis=1) for place in (front, rear)]
+    expected = expected_difference_m(elevation, azimuth, heading_deg=h, gradient_permille=g, spacing_m=s)
+    np.testing.assert_allclose(expected[0], ranges[1] - ranges[0], atol=1e-4)
+
+
+# -- pairs --------------------------------------------------------------------------------------------------
+
+
+@b3
+@pytest.mark.parametrize(
+    ("front", "rear", "pairs"),
+    [
+        ([0, 1, 2], [0, 1, 2], [(0, 0), (1, 1), (2, 2)]),
+        ([0, 1, 2], [1, 2, 3], [(1, 0), (2, 1)]),
+        ([0, 1, 2], [0.004, 1.01, 2.011], [(0, 0), (1, 1)]),  # exactly at the tolerance is a pair
+        ([0, 0.004, 1], [0.003, 1], [(1, 0), (2, 1)]),  # the nearer of two
+        ([0], [5], []),
+        ([], [0], []),
+        ([3], [], []),
+        ([0, 1, 2, 3], [2], [(2, 0)]),
+    ],
+)
+def test_pairs_of_epochs(front: list[float], rear: list[float], pairs: list[tuple[int, int]]) -> None:
+    times = [START + timedelta(np.array(values, dtype=float)) for values in (front, rear)]
+    a, b = pair_epochs(*times, tolerance_s=0.01)
+    assert list(zip(a.tolist(), b.tolist(), strict=True)) == pairs
+    b, a = pair_epochs(*times[::-1], tolerance_s=0.01)
+    assert list(zip(a.tolist(), b.tolist(), strict=True)) == pairs
+
+
+@b3
+def test_pairs_of_channels_and_verdicts_on_both_antennas() -> None:
+    front, rear = ["G01 1C", "G01 5Q", "E05 1C", "C20 2I"], ["C20 2I", "G01 1C", "J02 1C"]
+    split = [np.array([name.split() for name in names]).T for names in (front, rear)]
+    a, b = pair_channels(*split[0], *split[1])
+    assert a.tolist() == [0, 3]
+    assert b.tolist() == [1, 0]
+    verdict = np.array([[True, False], [False, True]])
+    on_front = on_channels(verdict, (3, 4), np.array([0, 2]), a)
+    on_rear = on_channels(verdict, (2, 3), np.array([0, 1]), b)
+    assert np.argwhere(on_front).tolist() == [[0, 0], [2, 3]]
+    assert np.argwhere(on_rear).tolist() == [[0, 1], [1, 0]]
+
+
+# -- the screen ---------------------------------------------------------------------------------------------
+
+SATELLITES = np.array(["G01", "G02", "G03", "G04", "E01"])
+
+
+def two_antennas(
+    epochs: int = 6, *, spacing_m: float = 18.2, clock_m: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Codes of antennas that head north-east on a climb of 20 per mille, and what the screen is told."""
+    rng = np.random.default_rng(8)
+    elevation = np.broadcast_to([15.0, 30.0, 45.0, 80.0, 25.0], (epochs, 5)).copy()
+    azimuth = np.broadcast_to([45.0, 225.0, 135.0, 0.0, 60.0], (epochs, 5)).copy()
+    told = {
+        "heading_deg": np.full(epochs, 45.0),
+        "gradient_permille": np.full(epochs, 20.0),
+        "spacing_m": np.full(epochs, spacing_m),
+    }
+    front = rng.uniform(2e7, 2.5e7, (epochs, 5))
+    rear = front + expected_difference_m(elevation, azimuth, **told) + clock_m
+    return front, rear, {"elevation_deg": elevation, "azimuth_deg": azimuth, **told}
+
+
+def paired(front: np.ndarray, rear: np.ndarray, told: dict[str, np.ndarray], **more: object) -> AntennaPairScreened:
+    for array in (front, rear, *told.values()):
+        array.flags.writeable = False
+    return antenna_pair_screen(front, rear, satellite=SATELLITES, **told, **more)
+
+
+#: Error of the front code, of the rear code -> refused on both.
+TRUTH_TABLE = [
+    (0.0, 0.0, False),
+    (4.9, 0.0, False),
+    (5.1, 0.0, True),
+    (0.0, -5.1, True),
+    (0.0, 80.0, True),
+    (7.0, 7.0, False),  # the same error in both is not seen
+    (NAN, 30.0, False),
+    (30.0, NAN, False),
+]
+
+
+@b3
+@pytest.mark.parametrize(("front_m", "rear_m", "refused"), TRUTH_TABLE)
+@pytest.mark.parametrize("clocks", ["common", "median"])
+def test_truth_table(front_m: float, rear_m: float, refused: bool, clocks: str) -> None:
+    clock = 300.0 if clocks == "median" else 0.0
+    front, rear, told = two_antennas(clock_m=clock)
+    front[2, 1] += front_m
+    rear[2, 1] += rear_m
+    satellite_rates = np.zeros(front.shape)
+    result = paired(
+        front, rear, told, limits=AntennaPairLimits(clocks=clocks, least_satellites=3), range_rate_mps=satellite_rates
+    )
+    expected = np.zeros(front.shape, dtype=bool)
+    expected[2, 1] = refused
+    np.testing.assert_array_equal(result.reject, expected)
+    assert np.isnan(result.metric[2, 1]) == np.isnan(front_m + rear_m)
+    if clocks == "median":
+        assert np.isnan(result.metric[:, 4]).all(), "one Galileo satellite has no clock to be compared with"
+        assert "median" in result.clocks
+    else:
+        assert np.isfinite(result.metric[:, 4]).all()
+        assert "common" in result.clocks
+
+
+@b3
+def test_exactly_at_the_limit_is_used() -> None:
+    front = np.full((1, 5), 2.0**24)
+    rear = front + np.array([5.0, 5.0 + 2.0**-20, -5.0, 0.0, 0.0])
+    told = {"elevation_deg": np.full((1, 5), 90.0), "azimuth_deg": np.zeros((1, 5))}
+    result = antenna_pair_screen(
+        front, rear, satellite=SATELLITES, heading_deg=0.0, gradient_permille=0.0, spacing_m=np.zeros(1),
+        limits=AntennaPairLimits(clocks="common"), **told,
+    )  # fmt: skip
+    assert result.reject.tolist() == [[False, True, False, False, False]]
+
+
+@b3
+def test_a_limit_below_the_zone_is_the_zone() -> None:
+    front, rear, told = two_antennas()
+    rear += 0.7
+    result = paired(front, rear, told, limits=AntennaPairLimits(limit_m=0.1, clocks="common"))
+    np.testing.assert_allclose(result.metric, 0.7, atol=1e-6)
+    np.testing.assert_array_equal(result.reject, result.ambiguity_m < 0.7)
+    assert 0 < result.reject.sum() < result.reject.size
+
+
+@b3
+def test_instants_of_separate_clocks() -> None:
+    """Tags alike, clocks 0.5 ms apart: the satellites moved meanwhile, by up to 0.4 m."""
+    rate = np.broadcast_to([-790.0, 610.0, -300.0, 250.0, 5.0], (6, 5)).copy()
+    for tag_s, clock_s in ((0.0, 5e-4), (2e-3, 0.0), (-1e-3, -1e-3)):
+        front, rear, told = two_antennas(clock_m=SPEED_OF_LIGHT * clock_s)
+        rear += rate * (tag_s - clock_s)
+        tags = timedelta(np.full(6, tag_s))
+        limits = AntennaPairLimits(least_satellites=4)
+        result = paired(front, rear, told, limits=limits, tag_difference=tags, range_rate_mps=rate)
+        np.testing.assert_allclose(result.metric[:, :4], 0.0, atol=2e-3)
+        np.testing.assert_allclose(result.clock_m[:, 0], SPEED_OF_LIGHT * clock_s, atol=2e-3)
+
+
+@b3
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_order_and_cutting_do_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    front, rear, told = two_antennas(clock_m=1e5)
+    rear += rng.normal(0, 4, rear.shape)
+    rear[rng.random(rear.shape) < 0.1] = np.nan
+    limits = AntennaPairLimits(least_satellites=3)
+    whole = paired(front, rear, told, limits=limits)
+    single = [paired(front[[i]], rear[[i]], {k: v[[i]] for k, v in told.items()}, limits=limits) for i in range(6)]
+    np.testing.assert_array_equal(whole.metric, np.concatenate([r.metric for r in single]))
+    order = rng.permutation(5)
+    other = antenna_pair_screen(
+        front[:, order], rear[:, order], satellite=SATELLITES[order], limits=limits,
+        **{k: v[:, order] if v.ndim == 2 else v for k, v in told.items()},
+    )  # fmt: skip
+    np.testing.assert_array_equal(whole.metric[:, order], other.metric)
+
+
+@b3
+@pytest.mark.parametrize(
+    "wrong", [{"limit_m": 0.0}, {"clocks": "rubidium"}, {"least_satellites": 2}, {"azimuth_error_deg": -1.0}]
+)
+def test_pair_limits_are_checked(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        AntennaPairLimits(**wrong)  # type: ignore[arg-type]
+
+
+# -- real antennas ------------------------------------------------------------------------------------------
+
+
+def _two_logs(
+    front: Observations,
+    rear: Observations,
+    navigation: Path,
+    heading: tuple[ArrayLike, ArrayLike, ArrayLike],
+    **limits: object,
+) -> AntennaPairScreened:
+    """The screen on the first-band codes above 15 deg of two logs."""
+    epochs = pair_epochs(front.time, rear.time, tolerance_s=0.01)
+    channels = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
+    keep = np.isin(front.signal[channels[0]], ("1C", "2I")) & np.isin(front.system[channels[0]], list("GJEC"))
+    a, b = (c[keep] for c in channels)
+    satellite, signal = front.satellite[a], front.signal[a]
+    code = front.code_m[np.ix_(epochs[0], a)], rear.code_m[np.ix_(epochs[1], b)]
+    states = satellite_states(front.time[epochs[0]], satellite, signal, code[0], read_navigation(navigation))
+    place = np.broadcast_to(front.header.approximate_ecef_m, (len(epochs[0]), 3))
+    elevation, azimuth = elevation_azimuth(states.position_ecef_m, place)
+    rate = -SPEED_OF_LIGHT / carrier_frequency_hz(satellite, signal) * front.doppler_hz[np.ix_(epochs[0], a)]
+    return antenna_pair_screen(
+        np.where(elevation > 15, code[0], np.nan), code[1], elevation, azimuth, satellite=satellite,
+        heading_deg=heading[0], gradient_permille=heading[1], spacing_m=np.broadcast_to(heading[2], len(place)),
+        tag_difference=rear.time[epochs[1]] - front.time[epochs[0]], range_rate_mps=rate,
+        limits=AntennaPairLimits(**limits),  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+@b3
+def test_two_receivers_on_one_roof(recordings: Path) -> None:
+    folder = recordings / "dual" / "mosaic_x2_99cm"
+    front, rear = (read_observations(folder / name) for name in ("rover.obs", "base.obs"))
+    # rover less base: east -0.223, north -0.965, up 0.010
+    heading = np.degrees(np.arctan2(-0.223, -0.965)) % 360
+    gradient, spacing = 1e3 * 0.010 / np.hypot(0.223, 0.965), np.sqrt(0.223**2 + 0.965**2 + 0.010**2)
+    result = _two_logs(front, rear, folder / "base.nav", (heading, gradient, spacing))
+    judged = np.isfinite(result.metric)
+    rms = float(np.sqrt(np.mean(result.metric[judged] ** 2)))
+    share = float(result.reject.sum() / judged.sum())
+    wrong = _two_logs(front, rear, folder / "base.nav", ((heading + 180) % 360, -gradient, spacing))
+    rms_wrong = float(np.sqrt(np.nanmean(wrong.metric**2)))
+    print(f"two mosaic-X5 0.990 m apart: rms {rms:.3f} m (turned round {rms_wrong:.3f}), refused {share:.4f}")
+    assert judged.sum() > 3000
+    assert rms < 1.0
+    assert rms_wrong > 1.1 * rms, "the spacing is seen"
+    assert share < 0.01
+
+
+@b3
+def test_steps_on_one_of_two_real_receivers_are_found(recordings: Path) -> None:
+    folder = recordings / "dual" / "mosaic_x2_99cm"
+    front, rear = (read_observations(folder / name) for name in ("rover.obs", "base.obs"))
+    told = (193.0, 10.0, 0.990)
+    clean = _two_logs(front, rear, folder / "base.nav", told)
+    found, wrong = {}, 0
+    for step in (3.0, 10.0, 30.0):
+        hits = 0
+        for m in range(clean.metric.shape[1]):
+            if not np.isfinite(clean.metric[:, m]).any():
+                continue
+            biased = np.where(np.arange(clean.metric.shape[1]) == m, step, 0.0)
+            verdict = np.abs(clean.metric + biased) > 5.0
+            hits += int(verdict[:, m].sum())
+            wrong += int((verdict & ~clean.reject)[:, np.arange(clean.metric.shape[1]) != m].sum())
+        found[step] = hits / np.isfinite(clean.metric).sum()
+    print(f"found of steps on one receiver: {found}")
+    assert found[10.0] > 0.99
+    assert found[30.0] == 1.0
+    assert wrong == 0
+
+
+@b3
+@b5
+def test_the_demonstration_s_antennas() -> None:
+    """18.2 m apart on a line with a curve, moving, no multipath: what is left is noise, from the zenith down."""
+    folder = ROOT / "data" / "demo"
+    front, rear = (read_observations(folder / f"{name}.crx.gz") for name in ("front", "rear"))
+    truth = pl.read_csv(folder / "truth.csv.gz")
+    places = [truth.filter(pl.col("antenna") == name) for name in ("front", "rear")]
+    ecef = [place.select("x_m", "y_m", "z_m").to_numpy() for place in places]
+    assert places[0]["time_gpst"].to_list()[-1] == str(front.time[-1])
+    direction = spacing_direction(*ecef)
+    result = _two_logs(front, rear, folder / "nav.rnx.gz", direction)
+    turned = _two_logs(front, rear, folder / "nav.rnx.gz", ((direction[0] + 180) % 360, -direction[1], direction[2]))
+    strong = np.nanmedian(front.cn0_dbhz, axis=0)[np.isfinite(result.expected_m).any(axis=0)] > 47.0
+    rms, other = (float(np.sqrt(np.nanmean(r.metric[:, strong] ** 2))) for r in (result, turned))
+    share = float(result.reject.sum() / np.isfinite(result.metric).sum())
+    high = float(result.reject[:, strong].sum() / np.isfinite(result.metric[:, strong]).sum())
+    print(f"demo: rms of strong satellites {rms:.2f} m, turned {other:.2f}; refused {share:.4f}, strong {high:.5f}")
+    assert rms < 1.0 < 4.0 * rms < other
+    assert high < 1e-3
+    chainage = [place["chainage_m"].to_numpy() for place in places]
+    positions = antenna_spacing_screen(*chainage, 18.2)
+    # on the curve the chord of the car body is shorter than the track by a centimetre
+    assert np.abs(positions.metric).max() < 0.02
+    assert antenna_spacing_screen(*chainage, 18.2, facing=-1).reject.all()
+
+
+# -- positions ----------------------------------------------------------------------------------------------
+
+#: Front, rear, spacing, facing -> metric, refused.
+POSITIONS = [
+    (118.2, 100.0, 18.2, 1, 0.0, False),
+    (100.0, 118.2, 18.2, -1, 0.0, False),
+    (100.0, 118.2, 18.2, 1, -36.4, True),  # the order is wrong
+    (100.0, 118.2, 18.2, 0, 0.0, False),  # the order is not known
+    (123.0, 100.0, 18.0, 1, 5.0, False),  # exactly at the limit
+    (113.0, 100.0, 18.0, 1, -5.0, False),
+    (123.1, 100.0, 18.0, 1, 5.1, True),
+    (100.0, 123.1, 18.0, -1, 5.1, True),
+    (112.9, 100.0, 18.0, 1, -5.1, True),
+    (100.0, 100.0, 0.0, 1, 0.0, False),  # both chainages of one reference point
+    (106.0, 100.0, 0.0, 1, 6.0, True),
+    (106.0, 100.0, 0.0, -1, -6.0, True),
+    (NAN, 100.0, 18.0, 1, NAN, False),
+    (100.0, NAN, 18.0, 1, NAN, False),
+    (100.0, 90.0, NAN, 1, NAN, False),
+]
+
+
+@b5
+def test_positions_truth_table() -> None:
+    front, rear, spacing, facing, metric, refused = (np.array(column) for column in zip(*POSITIONS, strict=True))
+    for array in (front, rear, spacing):
+        array.flags.writeable = False
+    result = antenna_spacing_screen(front, rear, spacing, facing=facing)
+    np.testing.assert_allclose(result.metric, metric, atol=1e-9)
+    assert result.reject.tolist() == refused.tolist()
+    for i in range(len(front)):
+        single = antenna_spacing_screen(front[i : i + 1], rear[i : i + 1], spacing[i], facing=int(facing[i]))
+        np.testing.assert_array_equal(single.metric, result.metric[i : i + 1])
+        assert single.reject.tolist() == [refused[i]]
+
+
+@b5
+@given(
+    front=st.floats(-1e5, 1e5), rear=st.floats(-1e5, 1e5), spacing=st.floats(0, 200), facing=st.sampled_from([-1, 0, 1])
+)
+def test_turning_the_line_round_changes_nothing(front: float, rear: float, spacing: float, facing: int) -> None:
+    one = antenna_spacing_screen(np.array([front]), np.array([rear]), spacing, facing=facing)
+    other = antenna_spacing_screen(np.array([-front]), np.array([-rear]), spacing, facing=-facing)
+    np.testing.assert_array_equal(one.metric, other.metric)
+    wide = antenna_spacing_screen(
+        np.array([front]), np.array([rear]), spacing, facing=facing, limits=AntennaSpacingLimits(limit_m=6.0)
+    )
+    assert not (wide.reject & ~one.reject).any()
+
+
+@b5
+def test_positions_are_checked() -> None:
+    with pytest.raises(ValueError, match="limit_m"):
+        AntennaSpacingLimits(limit_m=-1.0)
+    with pytest.raises(ValueError, match="facing"):
+        antenna_spacing_screen([1.0], [2.0], 3.0, facing=2)
+    with pytest.raises(ValueError, match="spacing_m"):
+        antenna_spacing_screen([1.0], [2.0], -3.0)
