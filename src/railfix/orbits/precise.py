@@ -21,6 +21,17 @@ _GAP: Final = 1.5
 _BLOCK: Final = 4096
 
 
+def precise_clock_s(
+    ephemeris: PreciseEphemeris, column: NDArray[np.intp], time: NDArray[np.datetime64], offset_s: Floats
+) -> Floats:
+    """Clocks at ``time + offset`` as the file has them, straight between its epochs, shape (n,) [s]."""
+    left = np.clip(np.searchsorted(ephemeris.time, time, side="right") - 1, 0, len(ephemeris.time) - 2)
+    step = seconds(ephemeris.time[left + 1] - ephemeris.time[left])
+    part = (seconds(time - ephemeris.time[left]) + offset_s) / step
+    before, after = ephemeris.clock_s[left, column], ephemeris.clock_s[left + 1, column]
+    return np.asarray(before + part * (after - before))
+
+
 def precise_state(
     ephemeris: PreciseEphemeris, column: NDArray[np.intp], time: NDArray[np.datetime64], offset_s: Floats
 ) -> tuple[Floats, Floats, Floats]:
@@ -71,21 +82,19 @@ def _state(
     # Nodes turned into the frame of the instant asked for: the orbit is smooth there.
     cos, sin = np.cos(EARTH_ROTATION_RATE * at), np.sin(EARTH_ROTATION_RATE * at)
     turned = np.stack([cos * place[0] - sin * place[1], sin * place[0] + cos * place[1], place[2]])
-    weight, slope = _lagrange_at_zero(at)
+    windows, which = np.unique(begin, return_inverse=True)
+    weight, slope = _lagrange_at_zero(at, _gaps(nodes, windows)[:, which])
     position = _sum(weight * turned)
     velocity = _sum(slope * turned)
     velocity[0] += EARTH_ROTATION_RATE * position[1]
     velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
-    left = np.clip(right - 1, 0, len(nodes) - 2)
-    step = seconds(nodes[left + 1] - nodes[left])
-    part = (seconds(time - nodes[left]) + offset_s) / step
-    before, after = ephemeris.clock_s[left, column], ephemeris.clock_s[left + 1, column]
     # r.v is the same with the Earth-fixed velocity: their difference stands across r.
     relativity = -2.0 * _sum_axis0(position * velocity) / SPEED_OF_LIGHT**2
-    clock = before + part * (after - before) + relativity
+    clock = precise_clock_s(ephemeris, column, time, offset_s) + relativity
+    left = np.clip(right - 1, 0, len(nodes) - 2)
     outside = (column < 0) | (right == 0) | ((right == len(nodes)) & (time != nodes[-1]))
-    outside |= step > longest_s
+    outside |= seconds(nodes[left + 1] - nodes[left]) > longest_s
     position[:, outside], velocity[:, outside], clock[outside] = np.nan, np.nan, np.nan
     return position, velocity, clock
 
@@ -102,11 +111,19 @@ def _sum_axis0(terms: Floats) -> Floats:
     return np.asarray(terms[0] + terms[1] + terms[2])
 
 
-def _lagrange_at_zero(nodes: Floats) -> tuple[Floats, Floats]:
+def _gaps(nodes: NDArray[np.datetime64], windows: NDArray[np.intp]) -> Floats:
+    """Products of the differences of each node to the others of its window, shape (P, windows)."""
+    index = windows + np.arange(POINTS)[:, None]
+    difference = seconds(nodes[index][:, None] - nodes[index][None])
+    difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
+    return np.asarray(difference.prod(axis=1))
+
+
+def _lagrange_at_zero(nodes: Floats, gaps: Floats) -> tuple[Floats, Floats]:
     """Weights of the value and of the slope at 0 of the polynomial through nodes, shape (P, n).
 
     Products of ``-node`` over all nodes but one, and their derivatives, from the products before
-    and after that one.
+    and after that one, over the products of the differences.
     """
     points = len(nodes)
     one, none = np.ones(nodes.shape[1]), np.zeros(nodes.shape[1])
@@ -120,9 +137,5 @@ def _lagrange_at_zero(nodes: Floats) -> tuple[Floats, Floats]:
     weight, slope = np.empty(nodes.shape), np.empty(nodes.shape)
     for i in range(points):
         (p, p_rate), (q, q_rate) = before[i], after[points - 1 - i]
-        gap = one
-        for j in range(points):
-            if j != i:
-                gap = gap * (nodes[i] - nodes[j])
-        weight[i], slope[i] = p * q / gap, (p_rate * q + p * q_rate) / gap
+        weight[i], slope[i] = p * q / gaps[i], (p_rate * q + p * q_rate) / gaps[i]
     return weight, slope
