@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -87,12 +88,12 @@ class Ranges:
             ties=None if self.ties is None else self.ties.take(epochs),
         )
 
-    @property
+    @cached_property
     def n_used(self) -> NDArray[np.int64]:
         """Channels with weight, shape (T,)."""
         return np.asarray(np.count_nonzero(self.weight, axis=1), dtype=np.int64)
 
-    @property
+    @cached_property
     def n_clocks(self) -> NDArray[np.int64]:
         """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
         seen = np.zeros((len(self), len(self.groups)), dtype=bool)

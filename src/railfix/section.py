@@ -18,6 +18,7 @@ Both are exact, not heuristic: a test holds them against `exhaustive_search`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
 from typing import Final
 
@@ -68,7 +69,7 @@ class SectionLimits:
         if self.separation_m < 0.0 or self.redundancy < 0:
             raise ValueError("separation_m and redundancy must not be negative")
 
-    @property
+    @cached_property
     def threshold(self) -> float:
         """Excess of q that noise of unit variance explains."""
         return float(chi2.isf(self.ambiguity_risk, 1))

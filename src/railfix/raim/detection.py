@@ -8,7 +8,7 @@ P1 2.3(4) and table 6 compare the sum of squared residuals in metres with a fixe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -90,12 +90,12 @@ class RaimLimits:
         if not (self.fixed_limit_m2 > 0.0 and self.alarm_limit_m > 0.0 and self.same_position_m >= 0.0):
             raise ValueError("fixed_limit_m2 and alarm_limit_m must be positive, same_position_m not negative")
 
-    @property
+    @cached_property
     def separation(self) -> float:
         """WSSE by which another exclusion must fit worse, in noise variances."""
         return float(chi2.isf(self.separation_risk, 1))
 
-    @property
+    @cached_property
     def own_error(self) -> float:
         """Square of an excluded satellite's own error over its sigma that noise does not reach."""
         return float(chi2.isf(self.false_alarm, 1))
