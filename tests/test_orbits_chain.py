@@ -1,4 +1,4 @@
-"""The whole chain on real logs: from a navigation file to states at the instants of transmission, as RTKLIB has them."""
+"""The whole chain on real logs: from navigation file to states at the instants of transmission, as RTKLIB has them."""
 
 from __future__ import annotations
 
