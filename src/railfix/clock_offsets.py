@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges
-from railfix.constrained import Constrained
+from railfix.spp import SinglePoint
 from railfix.timescale import seconds
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ def tie_clocks(
     clocks: tuple[str, ...],
     reference: str,
     ranges: Ranges,
-    free: Constrained,
+    free: SinglePoint,
     state: OffsetState,
     *,
     limits: ClockOffsetLimits | None = None,
@@ -84,8 +84,8 @@ def tie_clocks(
         Letter of the clock that the others are told against.
     ranges : Ranges
         Without ties.
-    free : Constrained
-        Solution with every clock on its own.
+    free : SinglePoint
+        Position with every clock on its own, where one range at least is redundant.
     state : OffsetState
     limits : ClockOffsetLimits, optional
 
@@ -100,7 +100,7 @@ def tie_clocks(
     information, moment = dict(state.information), dict(state.moment)
     step = seconds(np.diff(np.r_[np.asarray([state.last], dtype="datetime64[ns]"), time]))
     fresh = np.clip(np.nan_to_num(step, nan=0.0) / limits.correlation_s, 0.0, 1.0)
-    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 1, 1)
+    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
     base = clocks.index(reference) if reference in clocks else -1
     if base >= 0:
@@ -113,7 +113,7 @@ def tie_clocks(
         if base >= 0:
             one, two = ranges.weight[:, ranges.groups[g]], ranges.weight[:, ranges.groups[base]]
             usable = (np.count_nonzero(one, axis=1) >= 2) & (np.count_nonzero(two, axis=1) >= 2)
-            usable &= np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 1)
+            usable &= np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
             variance = misfit * (1.0 / np.maximum(one.sum(axis=1), 1e-12) + 1.0 / np.maximum(two.sum(axis=1), 1e-12))
             weight = np.where(usable, fresh / np.where(usable, variance, 1.0), 0.0)
             difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)

@@ -205,13 +205,13 @@ class EpochProcessor:
         """Conventional and constrained position, exclusion, status and noise scale of one antenna."""
         ranges = one.ranges()
         point = single_point(ranges, one.anchor_ecef_m, limits=self.config.single_point)
-        place = self._on_the_line(ranges, index, point)
-        ties, offsets = self._ties(one, ranges, place.constrained, state)
+        ties, offsets = self._ties(one, ranges, point, state)
+        tied = point
         if len(one.groups) > 1:
             ranges = replace(ranges, ties=ties)
             start = np.where(np.isnan(point.ecef_m), one.anchor_ecef_m, point.ecef_m)
             tied = single_point(ranges, start, limits=self.config.single_point)
-            place = self._on_the_line(ranges, index, tied)
+        place = self._on_the_line(ranges, index, tied)
         one.refuse(_alone(one, ties), Reason.ALONE_ON_ITS_CLOCK)
         scale, state = self._noise_scale(ranges, place.constrained, state)
         ranges, place, raim = self._fault_free(ranges, index, place, scale)
@@ -272,7 +272,7 @@ class EpochProcessor:
         return _Place(point=point, section=section, constrained=constrained)
 
     def _ties(
-        self, one: Prepared, ranges: Ranges, free: Constrained, state: AntennaState
+        self, one: Prepared, ranges: Ranges, free: SinglePoint, state: AntennaState
     ) -> tuple[ClockTies, OffsetState]:
         """What is known of the clocks against that of the first constellation asked for."""
         reference = CLOCK_GROUP[self.config.systems[0]]
