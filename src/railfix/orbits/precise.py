@@ -76,16 +76,17 @@ def _state(
     nodes = ephemeris.time
     right = np.searchsorted(nodes, time, side="right")
     begin = np.clip(right - (POINTS + 1) // 2, 0, len(nodes) - POINTS)
-    index = begin + np.arange(POINTS)[:, None]
-    at = seconds(nodes[index] - time) - offset_s
-    place = np.moveaxis(ephemeris.position_ecef_m[index, column], -1, 0)
-    # Nodes turned into the frame of the instant asked for: the orbit is smooth there.
-    cos, sin = np.cos(EARTH_ROTATION_RATE * at), np.sin(EARTH_ROTATION_RATE * at)
-    turned = np.stack([cos * place[0] - sin * place[1], sin * place[0] + cos * place[1], place[2]])
     windows, which = np.unique(begin, return_inverse=True)
-    weight, slope = _lagrange_at_zero(at, _gaps(nodes, windows)[:, which])
-    position = _sum(weight * turned)
-    velocity = _sum(slope * turned)
+    index = windows + np.arange(POINTS)[:, None]
+    since = seconds(nodes[index] - nodes[windows])
+    # Nodes turned into the frame that the Earth has at the first of them: it does not turn, the orbit is smooth there.
+    place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
+    turned = np.stack(_turned(EARTH_ROTATION_RATE * since[..., None], place))
+    own = seconds(time - nodes[begin]) + offset_s
+    weight, slope = _lagrange_at_zero(since[:, which] - own, _gaps(since)[:, which])
+    chosen = turned[:, :, which, column]
+    position = np.stack(_turned(-EARTH_ROTATION_RATE * own, _sum(weight * chosen)))
+    velocity = np.stack(_turned(-EARTH_ROTATION_RATE * own, _sum(slope * chosen)))
     velocity[0] += EARTH_ROTATION_RATE * position[1]
     velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
@@ -111,10 +112,15 @@ def _sum_axis0(terms: Floats) -> Floats:
     return np.asarray(terms[0] + terms[1] + terms[2])
 
 
-def _gaps(nodes: NDArray[np.datetime64], windows: NDArray[np.intp]) -> Floats:
+def _turned(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
+    """Vectors, components first, turned about the Earth's axis."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
+
+
+def _gaps(since_s: Floats) -> Floats:
     """Products of the differences of each node to the others of its window, shape (P, windows)."""
-    index = windows + np.arange(POINTS)[:, None]
-    difference = seconds(nodes[index][:, None] - nodes[index][None])
+    difference = since_s[:, None] - since_s[None]
     difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
     return np.asarray(difference.prod(axis=1))
 
