@@ -1,0 +1,233 @@
+"""Phase jumps against the line: what one epoch's change of the phases says of itself.
+
+Between two epochs the antenna moved by one unknown distance along a known line and the clock by
+one unknown; every further satellite is a check, good to a centimetre at any rate of the log and
+without Dopplers. The worst channel is taken out until the others agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.antenna import Trajectory
+from railfix.epochs import frozen
+from railfix.geodesy import range_with_rotation
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContinuityLimits:
+    """Limits of the test.
+
+    Attributes
+    ----------
+    phase_m, drift_mps : float
+        Standard deviation of a change of phase: at once, and for each second between the epochs
+        (satellite clocks, delays).
+    aside_m, aside_share : float
+        Standard deviation across the line of the change of place: at once (map points), and as
+        share of the way (a position that is 5 m off on a curve of 300 m radius sees it turned by
+        0.017).
+    sigmas : float
+        A channel is out from so many standard deviations of its own residual on.
+    refused : int
+        Channels that may be taken out; where more would have to be, none is kept as joined.
+    max_gap_s : float
+        Longest interval that is judged.
+    """
+
+    phase_m: float = 0.012
+    drift_mps: float = 0.008
+    aside_m: float = 0.02
+    aside_share: float = 0.02
+    sigmas: float = 4.5
+    refused: int = 8
+    max_gap_s: float = 31.0
+
+    def __post_init__(self) -> None:
+        for name in ("phase_m", "drift_mps", "aside_m", "aside_share", "sigmas", "max_gap_s"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.refused < 0:
+            raise ValueError(f"refused must not be negative, got {self.refused}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContinuityState:
+    """The last epoch of a chunk, by channel.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+    channels : tuple of (str, str)
+    phase_m : ndarray, shape (M,) [m]
+        Corrected phase; NaN where not used.
+    sat_ecef_m : ndarray, shape (M, 3) [m]
+    arc_m : float
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    channels: tuple[tuple[str, str], ...] = ()
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))
+    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    arc_m: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackJumps:
+    """Verdict on the change of each phase into its epoch, T epochs by M channels.
+
+    Attributes
+    ----------
+    jump : ndarray of bool, shape (T, M)
+        True where the phase does not fit: its arc begins anew.
+    metric_m : ndarray, shape (T, M) [m]
+        Change of phase less what the channels kept say; NaN where not judged.
+    judged : ndarray of bool, shape (T, M)
+    moved_m : ndarray, shape (T,) [m]
+        Way along the line since the epoch before, from the phases; NaN where not known.
+    moved_sigma_m : ndarray, shape (T,) [m]
+    """
+
+    jump: Masks
+    metric_m: Floats
+    judged: Masks
+    moved_m: Floats
+    moved_sigma_m: Floats
+
+
+def track_jumps(
+    time: NDArray[np.datetime64],
+    satellite: NDArray[np.str_],
+    signal: NDArray[np.str_],
+    phase_m: Floats,
+    sat_ecef_m: Floats,
+    slip: Masks,
+    trajectory: Trajectory,
+    arc_m: Floats,
+    state: ContinuityState | None = None,
+    *,
+    limits: ContinuityLimits | None = None,
+) -> tuple[TrackJumps, ContinuityState]:
+    """Phases that jump against the others and the line.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite, signal : ndarray of str, shape (M,)
+    phase_m : ndarray, shape (T, M) [m]
+        Corrected phases (`observation_model.corrected_phase_m`), NaN where not used.
+    sat_ecef_m : ndarray, shape (T, M, 3) [m]
+        Satellites where there is a phase.
+    slip : ndarray of bool, shape (T, M)
+        Slips already known: not judged again.
+    trajectory : Trajectory
+    arc_m : ndarray, shape (T,) [m]
+        Positions of codes alone, good to some metres; NaN: the epoch cannot judge nor be judged.
+    state : ContinuityState, optional
+    limits : ContinuityLimits, optional
+
+    Returns
+    -------
+    TrackJumps
+    ContinuityState
+    """
+    limits, state = limits or ContinuityLimits(), state or ContinuityState()
+    channels = tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
+    place = {key: i for i, key in enumerate(state.channels)}
+    at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
+    last_phase, last_sat = np.full(len(channels), np.nan), np.full((len(channels), 3), np.nan)
+    last_phase[at >= 0], last_sat[at >= 0] = state.phase_m[at[at >= 0]], state.sat_ecef_m[at[at >= 0]]
+
+    phase = np.concatenate([last_phase[None], phase_m])
+    sats = np.concatenate([last_sat[None], sat_ecef_m])
+    arc = np.r_[state.arc_m, arc_m]
+    dt = seconds(np.diff(np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), time])))
+    able = np.isfinite(arc[1:]) & np.isfinite(arc[:-1]) & (dt <= limits.max_gap_s)
+    judged = able[:, None] & ~slip & np.isfinite(phase[1:]) & np.isfinite(phase[:-1])
+
+    distance, los, axes = _around(sats, trajectory, arc)
+    change = np.diff(phase - distance, axis=0)
+    way = np.diff(arc)
+    design = np.concatenate([-np.matmul(los[1:], axes[1:].swapaxes(1, 2)), np.ones((*change.shape, 1))], axis=-1)
+    sigma = np.hypot(limits.phase_m, limits.drift_mps * np.where(able, dt, 0.0))
+    aside = np.hypot(limits.aside_m, limits.aside_share * np.where(able, way, 0.0))
+    kept, residual, step, variance, decided = _consistent(design, change, judged, sigma, aside, limits)
+    jump = judged & ~(kept & decided[:, None])
+    known = able & decided & np.isfinite(variance)
+    after = state
+    if len(time):
+        after = ContinuityState(
+            time=time[-1],
+            channels=channels,
+            phase_m=frozen(phase_m[-1].copy()),
+            sat_ecef_m=frozen(sat_ecef_m[-1].copy()),
+            arc_m=float(arc_m[-1]),
+        )
+    found = TrackJumps(
+        jump=jump,
+        metric_m=np.where(judged, residual, np.nan),
+        judged=judged,
+        moved_m=np.where(known, way + step, np.nan),
+        moved_sigma_m=np.where(known, np.sqrt(np.where(known, variance, 1.0)), np.nan),
+    )
+    return found, after
+
+
+def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, Floats, Floats]:
+    """Ranges, lines of sight and axes (along, across, up) at places on the line."""
+    safe = np.where(np.isfinite(arc), arc, 0.0)
+    section, along = trajectory.segment_at(safe)
+    where = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
+    distance, los = range_with_rotation(sats, where[:, None, :])
+    axes = np.stack([trajectory.tangent[section], trajectory.across[section], trajectory.up[section]], axis=1)
+    return distance, los, axes
+
+
+def _consistent(
+    design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
+) -> tuple[Masks, Floats, Floats, Floats, Masks]:
+    """Channels that agree, the worst taken out one by one.
+
+    Returns the mask of those kept, residuals of all, step along the line with its variance, and
+    where the rest agrees. Where there is nothing to check with, all are kept.
+    """
+    design = np.where(judged[..., None], design, 0.0)
+    change = np.where(judged, change, 0.0)
+    prior = np.zeros((len(change), 4, 4))
+    prior[:, 0, 0] = prior[:, 3, 3] = 1e-12
+    prior[:, 1, 1] = prior[:, 2, 2] = aside**-2.0
+    kept = judged.copy()
+    active = np.flatnonzero(judged.any(axis=1))
+    residual, (step, variance) = np.zeros(change.shape), np.full((2, len(change)), np.nan)
+    decided = np.ones(len(change), dtype=bool)
+    for removed in range(limits.refused + 1):
+        if not len(active):
+            break
+        rows, weight = design[active], kept[active] / sigma[active, None] ** 2
+        inverse = np.linalg.inv(np.matmul((rows * weight[..., None]).swapaxes(1, 2), rows) + prior[active])
+        right = np.matmul((weight * change[active])[:, None, :], rows)[:, 0]
+        x = np.matmul(inverse, right[..., None])[..., 0]
+        left = change[active] - np.matmul(rows, x[..., None])[..., 0]
+        # Variance of each residual; channels that nothing checks have none left.
+        checked = sigma[active, None] ** 2 - np.einsum("tmi,tij,tmj->tm", rows, inverse, rows)
+        size = np.where(
+            kept[active] & (checked > 0.02 * sigma[active, None] ** 2),
+            np.abs(left) / np.sqrt(np.maximum(checked, 1e-12)),
+            0.0,
+        )
+        residual[active], step[active], variance[active] = left, x[:, 0], inverse[:, 0, 0]
+        worst = np.argmax(size, axis=1)
+        bad = size[np.arange(len(active)), worst] > limits.sigmas
+        if removed == limits.refused:
+            decided[active[bad]] = False
+            break
+        kept[active[bad], worst[bad]] = False
+        active = active[bad]
+    return kept, residual, step, variance, decided
