@@ -63,6 +63,8 @@ CASES: dict[str, tuple[str, int | None, str]] = {
     "hyperbola": (_damaged(2, "1.230000000000D-02", "1.230000000000D+00"), 13, "G01: eccentricity is 1.23"),
     "time outside the week": (_damaged(3, "4.608000000000D+05", "6.608000000000D+05"), 14, "G01: toe_sow_s is 660800"),
     "clock of hours": (_damaged(0, "1.234567890123D-04", "1.234567890123D+04"), 11, "G01: af0_s is -12345.7"),
+    "exponent too long": (_damaged(1, "4.600000000000D-09", "4.60000000000D+109"), 12, "G01: delta_n is 4.6e.109"),
+    "angle of many turns": (_damaged(1, "1.234500000000D+00", "1.234500000000D+02"), 12, "G01: m0 is 123.45"),
     "columns shifted": (_damaged(4, "    ", "     "), 15, "G01: "),
     "GLONASS in the Earth's centre": (
         header() + record("R05", {"x": 0.0, "y": 0.0, "z": 0.0}), 4, "R05: x, y, z is 0 km"),

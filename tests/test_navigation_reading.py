@@ -32,7 +32,7 @@ def after(seconds: float) -> np.datetime64:
 
 def test_every_field_of_a_gps_record_stands_where_it_belongs(tmp_path: Path) -> None:
     names = [n for n in KEPLER if n not in ("week", "flag", "transmitted", "fit", "data_source", "group_delay_2_s")]
-    values = {name: 1e-3 * (k + 1) for k, name in enumerate(names)}
+    values = {name: 1e-8 * (k + 1) for k, name in enumerate(names)}
     values |= {"sqrt_a": 5153.5, "toe_sow_s": 460784.0, "iode": 17.0, "health": 3.0}
     kepler = read(tmp_path, header() + record("G07", {**values, "group_delay_2_s": 529.0})).kepler
     assert kepler.satellite.tolist() == ["G07"]
@@ -252,7 +252,15 @@ def test_blank_fields_and_short_lines(tmp_path: Path) -> None:
     kepler = read(tmp_path, header() + record("G01", blank)).kepler
     assert np.isnan(kepler.accuracy_m[0])
     assert np.isnat(kepler.transmitted[0])
-    assert (kepler.group_delay_1_s[0], kepler.af2[0], kepler.cis[0]) == (0.0, 0.0, 0.0)
+    assert np.isnan(kepler.group_delay_1_s[0]), "what is not known is not nought"
+    assert (kepler.af2[0], kepler.cis[0]) == (0.0, 0.0)
+
+
+def test_group_delay_that_is_unknown(tmp_path: Path) -> None:
+    text = header() + record("E05", {"data_source": 517.0, "group_delay_1_s": 0.9999e9, "group_delay_2_s": None})
+    kepler = read(tmp_path, text).kepler
+    assert np.isnan(kepler.group_delay_1_s[0])
+    assert np.isnan(kepler.group_delay_2_s[0])
 
 
 @pytest.mark.parametrize("said", [0.9999e9, -0.9999e9, None])

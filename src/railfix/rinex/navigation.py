@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from os import PathLike
 from typing import Final, Literal
 
@@ -230,5 +231,5 @@ def _instant(year: int, month: str, day: str, hour: str, minute: str, second: st
     seconds = float(second)
     if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):
         raise ValueError(year, second)
-    minute_start = np.datetime64(f"{year:04d}-{int(month):02d}-{int(day):02d}T{int(hour):02d}:{int(minute):02d}")
-    return minute_start + np.timedelta64(round(seconds * 1e9), "ns")
+    minute_start = datetime(year, int(month), int(day), int(hour), int(minute))
+    return np.datetime64(minute_start, "ns") + np.timedelta64(round(seconds * 1e9), "ns")

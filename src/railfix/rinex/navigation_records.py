@@ -31,17 +31,33 @@ _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
 )
-#: What a number lies between: clocks within a second; orbits between 10 000 and 70 000 km; time in its week.
-_BETWEEN: Final = {
-    "af0_s": (-1.0, 1.0),
-    "clock_bias": (-1.0, 1.0),
+#: What numbers lie between, with room to spare: clocks within a second; orbits between 10 000 and 70 000 km;
+#: angles within a turn; harmonic corrections that are small angles; time in its week.
+_BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
     "sqrt_a": (3.1e3, 8.4e3),
     "eccentricity": (0.0, 0.3),
     "toe_sow_s": (0.0, 604_800.0),
+    **{
+        name: (-limit, limit)
+        for names, limit in (
+            ("af0_s clock_bias", 1.0),
+            ("m0 omega0 i0 omega", 7.0),
+            ("delta_n omega_dot i_dot af1 af2 relative_frequency", 1e-6),
+            ("cuc cus cic cis", 1e-3),
+            ("crc crs", 1e5),
+            ("x_velocity y_velocity z_velocity", 10.0),
+            ("x_acceleration y_acceleration z_acceleration", 1e-6),
+        )
+        for name in names.split()
+    },
 }
+#: Any other number.
+_OTHERS_BETWEEN: Final = (-1e10, 1e10)
 #: Distance of a satellite from the Earth's centre [km]: above its surface.
 _RADIUS_KM: Final = (6_400.0, 70_000.0)
 _BLANK: Final = float("nan")
+#: RINEX writes 0.9999E9 for a number that is not known.
+_UNKNOWN: Final = 0.99e9
 #: Transmission times further than this from toe are no transmission times [s].
 _TRANSMISSION_S: Final = 2 * 86_400.0
 
@@ -59,7 +75,7 @@ class RawRecord:
 
 
 def number(text: str) -> float:
-    """One FORTRAN number; blank is NaN, always the same one, so that equal records compare equal.
+    """One FORTRAN number; blank and 0.9999E9 are NaN, always the same one, so that equal records compare equal.
 
     Raises
     ------
@@ -72,7 +88,7 @@ def number(text: str) -> float:
     value = float(text.replace("D", "E").replace("d", "e"))
     if not np.isfinite(value):
         raise ValueError(f"{text!r} is no number")
-    return value
+    return _BLANK if _UNKNOWN < abs(value) < 1.01e9 else value
 
 
 def first_fault(record: RawRecord) -> tuple[int, str] | None:
@@ -80,7 +96,7 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
     for k, (name, value) in enumerate(zip(FIELDS[record.system], record.numbers, strict=True)):
         if name in _NEEDED and np.isnan(value):
             return k, f"{name} is blank"
-        low, high = _BETWEEN.get(name, (-np.inf, np.inf))
+        low, high = _BETWEEN.get(name, _OTHERS_BETWEEN)
         if value < low or value > high:
             return k, f"{name} is {value:g}, it lies between {low:g} and {high:g}"
     if record.system == "R":
@@ -92,7 +108,10 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
 
 
 def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Records of GPS, QZSS, Galileo and BeiDou; a number that is blank and not needed is 0 (RINEX 3.05, 6.4)."""
+    """Records of GPS, QZSS, Galileo and BeiDou.
+
+    Rates, corrections, health and issues that are blank are 0, as RINEX has it; group delays and accuracies are NaN.
+    """
     table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_KEPLER))
     column = dict(zip(_KEPLER, table.T, strict=True))
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
@@ -120,8 +139,8 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
         health=integers["health"],
         data_source=np.where(system == "E", integers["data_source"], 0),
         accuracy_m=column["accuracy_m"],
-        group_delay_1_s=np.nan_to_num(column["group_delay_1_s"]),
-        group_delay_2_s=np.where(gps_like, np.nan, np.nan_to_num(column["group_delay_2_s"])),
+        group_delay_1_s=column["group_delay_1_s"],
+        group_delay_2_s=np.where(gps_like, np.nan, column["group_delay_2_s"]),
         fit_interval_h=_fit_interval(system, column["fit"]),
         **{
             name: np.nan_to_num(column[name])
