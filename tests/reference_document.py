@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-from railfix import errors
+from railfix import errors, reasons
 from railfix.config import Config
 from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
 
@@ -24,6 +24,10 @@ MODULES: Final = (
     "railfix.vehicle",
     "railfix.config",
     "railfix.pipeline",
+    "railfix.results",
+    "railfix.screens",
+    "railfix.raim",
+    "railfix.cn0_curve",
     "railfix.tables",
     "railfix.run",
     "railfix.evaluate",
@@ -76,6 +80,22 @@ def _exit_codes() -> list[str]:
 def _columns(heading: str, columns: dict[str, str]) -> list[str]:
     lines = ["", f"## {heading}", "", "| column | meaning |", "|---|---|"]
     return lines + [f"| `{name}` | {_cell(text)} |" for name, text in columns.items()]
+
+
+def _members(heading: str, kind: type[reasons.Reason] | type[reasons.Status], head: str) -> list[str]:
+    """Members of an enumeration with the comments above them in the source."""
+    comments: dict[str, str] = {}
+    comment: list[str] = []
+    for line in inspect.getsource(kind).splitlines():
+        text = line.strip()
+        if text.startswith("#:"):
+            comment.append(text.removeprefix("#:").strip())
+        elif found := re.match(r"([A-Z_0-9]+) = ", text):
+            comments[found[1]] = " ".join(comment)
+            comment = []
+    lines = ["", f"## {heading}", "", f"| {head} | name | meaning |", "|---:|---|---|"]
+    rows = [(int(m), str(m.name)) for m in kind if m.name != "USED"]
+    return lines + [f"| {value} | `{name.lower()}` | {_cell(comments[name])} |" for value, name in rows]
 
 
 def _setting_rows(prefix: str, item: Any, docs: dict[str, str]) -> list[str]:
@@ -132,6 +152,8 @@ def document() -> str:
     lines += _exit_codes()
     lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS)
     lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS)
+    lines += _members("Statuses of an epoch", reasons.Status, "number")
+    lines += _members("Reasons of an observation", reasons.Reason, "bit")
     lines += _settings()
     for name in MODULES:
         lines += _module(name)

@@ -313,3 +313,12 @@ def test_positions_are_those_of_the_statuses(whole: RunSummary) -> None:
     words = [status.text for status in POSITIONED]
     has = rows["status"].cast(pl.String).is_in(words)
     assert (rows["chainage_m"].is_not_null() == has).all()
+
+
+def test_positions_that_failed_a_check_do_not_count_when_they_are_dropped(tmp_path: Path) -> None:
+    strict = Config.model_validate({"failed_checks": "drop", "raim": {"false_alarm": 0.2, "max_excluded": 0}})
+    summary = run_files(demo_inputs(), strict, out=tmp_path / "out")
+    rows = pl.read_parquet(summary.files["positions.parquet"]).filter(antenna="front")
+    front = summary.tally.antennas["front"]
+    assert front.status["inconsistent"] > 10
+    assert front.positioned == rows["chainage_m"].count() == 2000 - front.status["inconsistent"]

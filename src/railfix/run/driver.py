@@ -121,6 +121,7 @@ def run_files(
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
+    inputs = replace(inputs, cn0_curve=config.cn0_curve)
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)

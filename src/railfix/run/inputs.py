@@ -26,7 +26,8 @@ class RunInputs:
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
         Track map, joined to a route in this order.
-    vehicle, config : Path or None
+    vehicle, config, cn0_curve : Path or None
+        The curve is named by the settings.
     """
 
     front: tuple[Path, ...]
@@ -36,6 +37,7 @@ class RunInputs:
     sp3: tuple[Path, ...] = ()
     vehicle: Path | None = None
     config: Path | None = None
+    cn0_curve: Path | None = None
 
     def named(self) -> Iterator[tuple[str, Path]]:
         """Each file with the name of what it is."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from railfix.pipeline import AntennaResult, Result
-from railfix.reasons import POSITIONED, Reason, Status, first_reason
+from railfix.reasons import Reason, Status, first_reason
 
 _NOT_A_REFUSAL = Reason.NOT_OBSERVED
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
@@ -63,7 +63,7 @@ class AntennaTally:
         counts = np.bincount(result.status, minlength=len(Status))
         self.epochs += len(result.time)
         self.observed += len(result.time) - int(counts[Status.NO_OBSERVATION])
-        self.positioned += sum(int(counts[s]) for s in POSITIONED)
+        self.positioned += int(np.count_nonzero(np.isfinite(result.chainage_m)))
         self.status.update({s.text: int(counts[s]) for s in Status if counts[s]})
         self._add_reasons(result)
         offset = result.conventional_offset_m
