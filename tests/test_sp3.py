@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from orbits_made import TOE, kepler, navigation
 from railfix.constants import SPEED_OF_LIGHT
@@ -138,6 +140,9 @@ def test_files_are_joined_and_the_first_one_counts(tmp_path: Path) -> None:
         (lambda s: s.replace("PG05", "PGX5", 1), "line 25"),
         (lambda s: s.replace("*  2024  3 13", "*  2024 13 13", 1), "line 23"),
         (lambda s: s.replace("*  2024", "*  0024", 1), "line 23"),
+        (lambda s: s.replace("*  2024  3 13  6", "*  2024  3 13 -1", 1), "line 23"),
+        (lambda s: s.replace(" 0.00000000\nPE14", "        inf\nPE14", 1), "line 23"),
+        (lambda s: s.replace("PG05", "PG-1", 1), "line 25"),
         (lambda s: s[: s.index("-250.")] + "garbage.0000\n", "line 24"),
         (lambda s: "\n".join(x for x in s.splitlines() if not x.startswith("*")), "before the first epoch"),
     ],
@@ -148,6 +153,26 @@ def test_broken_files_are_named_with_their_line(change: Any, message: str, tmp_p
         read_sp3(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damage_anywhere_is_an_error_or_an_ephemeris(tmp_path: Path, data: st.DataObject) -> None:
+    content = text(epochs=12)
+    at = data.draw(st.integers(0, len(content) - 1))
+    put = data.draw(st.text(alphabet="0123456789 .-+*#PGERx\n", max_size=3))
+    length = data.draw(st.sampled_from([0, 1, 1, 30]))
+    path = written(tmp_path, content[:at] + put + content[at + length :])
+    error = None
+    try:
+        found = read_sp3(path)
+    except InputFileError as raised:
+        error = raised
+    if error is not None:
+        assert str(path) in str(error)
+        return
+    assert (np.diff(found.time) > np.timedelta64(0)).all()
+    assert not np.isinf(found.position_ecef_m).any()
 
 
 def test_too_few_epochs_are_refused_when_read_and_when_used(tmp_path: Path) -> None:

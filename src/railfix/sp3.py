@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from os import PathLike
 from typing import Final
 
@@ -105,15 +106,21 @@ def _read_file(path: FilePath, states: _States) -> None:
 
 def _satellite(text: str) -> str:
     """``G01``; SP3-a leaves the letter of GPS out, and blanks stand for zeros."""
-    letter = text[0] if text[0].isalpha() else "G"
-    return f"{letter}{int(text[1:]):02d}"
+    letter = text[0] if text[:1].isalpha() else "G"
+    digits = text[1:].strip()
+    if not digits.isdigit():
+        raise ValueError(text)
+    return f"{letter}{int(digits):02d}"
 
 
 def _numbers(line: str) -> list[float]:
     """Position [km] and clock [us]; a clock left blank is unknown."""
     x, y, z = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(3))
-    clock = line[46:60].strip()
-    return [x, y, z, float(clock) if clock else np.nan]
+    text = line[46:60].strip()
+    clock = float(text) if text else np.nan
+    if np.isinf([x, y, z, clock]).any():
+        raise ValueError(line)
+    return [x, y, z, clock]
 
 
 def _time_system(path: FilePath, lines: list[str]) -> str:
@@ -131,9 +138,10 @@ def _time_system(path: FilePath, lines: list[str]) -> str:
 def _instant(line: str, system: str) -> int:
     """Nanoseconds of GPS time since 1970."""
     year, month, day, hour, minute = (int(line[a:b]) for a, b in ((3, 7), (8, 10), (11, 13), (14, 16), (17, 19)))
-    if not 1980 <= year < 2100:
-        raise ValueError(year)
-    minute_start = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "ns")
-    own = minute_start + np.timedelta64(round(float(line[20:31]) * 1e9), "ns")
+    seconds = float(line[20:31])
+    if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):
+        raise ValueError(line)
+    minute_start = np.datetime64(datetime(year, month, day, hour, minute), "ns")
+    own = minute_start + np.timedelta64(round(seconds * 1e9), "ns")
     to_gpst = _TO_GPST.get(system)
     return int((own if to_gpst is None else to_gpst(own)).astype(np.int64))
