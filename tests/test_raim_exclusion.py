@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import raim_oracle as oracle
 import synthetic
 from railfix.clock_elimination import UNTIED_M, Ranges
-from railfix.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude
+from railfix.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude, reliability
 
 pytestmark = pytest.mark.requirement("B4")
 
@@ -89,6 +89,20 @@ def test_space_equals_trying_every_subset(seed, system, faults, limits):
     model = oracle.point_model(ranges, place)
     if np.isfinite(model.wsse[0]):
         check_against_trying(oracle.problem_in_space(ranges, 0, place[0]), model, limits, 1.0)
+
+
+def test_own_errors_about_the_limit_of_noise():
+    """A second, small fault on a satellite that the others check little: excluded with the first only when over."""
+    limits, scale = RaimLimits(separation_risk=1.0, false_alarm=0.05), 1.0
+    arc = np.array([731.0])
+    outcomes = []
+    for seed in range(150):
+        faults = {1: 80.0, 5: 2.0 + 0.1 * seed}
+        ranges = oracle.made(arc, "GGGGGEEE", seed=seed, faults_m=faults, sigma_m=np.linspace(0.5, 3.0, 8))
+        model = constrained_model(ranges, oracle.LINE, arc)
+        check_against_trying(oracle.problem_on_line(ranges, 0, arc[0]), model, limits, scale)
+        outcomes.append(exclude(model, limits=limits).outcome[0])
+    assert min(outcomes.count(Outcome.EXCLUDED_ONE), outcomes.count(Outcome.EXCLUDED_TWO)) > 10
 
 
 def test_every_outcome_is_reached_by_the_cases():
@@ -306,3 +320,20 @@ def test_forty_satellites_take_a_fraction_of_a_millisecond():
     got = exclude(constrained_model(ranges, oracle.LINE, arc))
     assert (time.perf_counter() - began) / len(arc) < 10.0 / 36_000
     assert (got.outcome == Outcome.EXCLUDED_TWO).mean() > 0.95
+
+
+def test_arrays_of_the_caller_are_left_alone():
+    ranges, arc = mixed_case()
+    model = constrained_model(ranges, oracle.LINE, arc)
+    frozen = {f.name: getattr(model, f.name) for f in fields(model)}
+    before = {name: np.copy(value) for name, value in frozen.items()}
+    for value in frozen.values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+    scale = np.full(len(arc), 1.3)
+    scale.flags.writeable = False
+    for limits in (RaimLimits(faults=2), RaimLimits(mode="fixed")):
+        exclude(model, limits=limits, scale=scale)
+        reliability(model, limits=limits, scale=scale)
+    for name, value in before.items():
+        assert np.array_equal(value, frozen[name], equal_nan=True), name
