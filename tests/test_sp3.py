@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -155,10 +156,15 @@ def test_broken_files_are_named_with_their_line(change: Any, message: str, tmp_p
     assert "\n" not in str(caught.value)
 
 
+@cache
+def short_file() -> str:
+    return text(epochs=14)
+
+
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damage_anywhere_is_an_error_or_an_ephemeris(tmp_path: Path, data: st.DataObject) -> None:
-    content = text(epochs=14)
+    content = short_file()
     at = data.draw(st.integers(0, len(content) - 1))
     put = data.draw(st.text(alphabet="0123456789 .-+*#PGERx\n", max_size=3))
     length = data.draw(st.sampled_from([0, 1, 1, 30]))
