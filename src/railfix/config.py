@@ -3,6 +3,7 @@
 Each room owns its limits; this module only puts them side by side under the names that the
 configuration file uses::
 
+    preset = "default"
     systems = ["G", "J", "E", "C"]
     min_satellites = 3
 
@@ -11,17 +12,29 @@ configuration file uses::
 
     [noise]
     model = "elevation"
+
+A preset names a set of settings; single ones stand over it.
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from railfix.clock_offsets import ClockOffsetLimits
 from railfix.constrained import ConstrainedLimits
@@ -61,12 +74,32 @@ ROOMS: Final = (
     "constrained",
 )
 
+#: Settings by the name of their preset. "p1": table 6 of P1 to the letter, for geodetic receivers at 10 Hz.
+PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "default": {},
+    "p1": {
+        "min_satellites": 3,
+        "failed_checks": "drop",
+        "elevation": {"mask_deg": 20.0},
+        "cn0": {"floor_dbhz": 30.0, "deficit_dbhz": 10.0},
+        "doppler": {"mode": "fixed", "step_m": 1.5, "hold_s": 0.0},
+        "antenna_pair": {"limit_m": 5.0},
+        "raim": {"mode": "fixed", "fixed_limit_m2": 100.0, "max_excluded": 2},
+        "antenna_spacing": {"limit_m": 5.0},
+    },
+}
+
 
 class Config(BaseModel):
     """Settings of the positioning, each with its default and where that comes from.
 
     Attributes
     ----------
+    preset : {"default", "p1"}
+        Settings that all others stand over. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
+        and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m, RAIM with two satellites and
+        100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not say (weights, noise, clock
+        offsets, ambiguous sections, receivers' clocks) is as in "default".
     systems : tuple of str
         Constellations used. GLONASS is left out by default: its channels have code biases of
         metres between them.
@@ -95,6 +128,8 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
+    raim_protection : {"on", "off"}
+        Whether each position gets RAIM's protection level along the line. Off by default for its cost.
     noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
@@ -103,6 +138,7 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
 
+    preset: Literal["default", "p1"] = "default"
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
     screens: tuple[Literal["elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing"], ...] = SCREENS
@@ -124,11 +160,20 @@ class Config(BaseModel):
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
+    raim_protection: Literal["on", "off"] = "off"
     clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
     single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)
     section: SectionLimits = Field(default_factory=SectionLimits)
     constrained: ConstrainedLimits = Field(default_factory=ConstrainedLimits)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_preset(cls, values: Any) -> Any:
+        """The settings given over those of the preset; an unknown preset is left to its own field to refuse."""
+        if not isinstance(values, dict):
+            return values
+        return _over(PRESETS.get(str(values.get("preset", "default")), {}), values)
 
     @field_validator("systems")
     @classmethod
@@ -161,6 +206,16 @@ class Config(BaseModel):
         """Plain values for JSON."""
         plain: dict[str, Any] = TypeAdapter(Config).dump_python(self, mode="json")
         return plain
+
+
+def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings over those of a preset; groups key by key, limits given as an object whole."""
+    both = {**preset, **values}
+    for name, group in preset.items():
+        given = values.get(name)
+        if isinstance(group, Mapping) and isinstance(given, Mapping):
+            both[name] = {**group, **given}
+    return both
 
 
 def parse_config(values: dict[str, Any], *, source: str = "settings") -> Config:

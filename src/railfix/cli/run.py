@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
-if TYPE_CHECKING:
-    from railfix.config import Config
+from railfix.cli.settings import (
+    Choices,
+    ConfigOption,
+    CurveOption,
+    PresetOption,
+    ScreensOption,
+    SettingOption,
+    WithoutOption,
+    settings_of,
+)
 
 Paths = list[Path]
 INPUTS = "Inputs"
@@ -69,19 +77,12 @@ def run(
             "antenna's own path.",
         ),
     ] = None,
-    config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="TOML", rich_help_panel=CHOICES, help="Settings; defaults where not given."),
-    ] = None,
-    setting: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            rich_help_panel=CHOICES,
-            help="One setting, over the file's: --set elevation.mask_deg=15; may be repeated.",
-        ),
-    ] = None,
+    config: ConfigOption = None,
+    preset: PresetOption = None,
+    setting: SettingOption = None,
+    screens: ScreensOption = None,
+    without: WithoutOption = None,
+    cn0_curve: CurveOption = None,
     crs: Annotated[
         str | None,
         typer.Option(metavar="EPSG", rich_help_panel=CHOICES, help="CRS of the track where its file does not say."),
@@ -169,7 +170,16 @@ def run(
     from railfix.cli.console import progress_bar, show_summary
     from railfix.run import RunInputs, RunOptions, TrackReading, run_files
 
-    settings, asked = settings_of(config, setting or [])
+    settings, asked = settings_of(
+        Choices(
+            config=config,
+            preset=preset,
+            setting=tuple(setting or ()),
+            screens=screens,
+            without=tuple(without or ()),
+            cn0_curve=cn0_curve,
+        )
+    )
     inputs = RunInputs(
         front=tuple(front),
         rear=tuple(rear or ()),
@@ -191,55 +201,3 @@ def run(
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
     show_summary(summary)
-
-
-def settings_of(path: Path | None, overrides: list[str]) -> tuple[Config, dict[str, Any]]:
-    """Settings of a file with single ones on top.
-
-    Returns
-    -------
-    Config
-    dict
-        The settings that were asked for, as opposed to defaults.
-
-    Raises
-    ------
-    SettingsError
-        A setting is misspelt, out of range, or not written as KEY=VALUE.
-    InputFileError
-        The file cannot be read.
-    """
-    import tomllib
-
-    from railfix.config import load_config, parse_config
-
-    values: dict[str, Any] = {}
-    config = parse_config(values)
-    if path is not None:
-        config = load_config(path)
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    for text in overrides:
-        _set(values, text)
-    return (parse_config(values, source="--set") if overrides else config), values
-
-
-def _set(values: dict[str, Any], text: str) -> None:
-    """Put one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
-    import tomllib
-
-    from railfix.errors import SettingsError
-
-    key, equals, value = text.partition("=")
-    if not equals or not key.strip():
-        raise SettingsError(f"--set {text}: expected KEY=VALUE, for example elevation.mask_deg=15")
-    try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        parsed = value.strip()
-    *groups, last = (part.strip() for part in key.split("."))
-    place = values
-    for group in groups:
-        place = place.setdefault(group, {})
-        if not isinstance(place, dict):
-            raise SettingsError(f"--set {text}: {group} is a single setting, not a group")
-    place[last] = parsed
