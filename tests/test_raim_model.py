@@ -38,9 +38,9 @@ def test_model_is_the_solvers_own(systems, ties):
     arc = np.linspace(100.0, 1900.0, 30)
     ranges = oracle.made(arc, systems, seed=4, tie_sigma_m=ties)
     got, model = oracle.solved(ranges, arc)
-    assert model.wsse == pytest.approx(got.wsse, rel=1e-5, abs=1e-5)
-    assert np.sqrt(model.covariance_m2[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-9)
-    assert np.sqrt(model.position_covariance_m2(np.ones(30))[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-9)
+    assert model.wsse == pytest.approx(got.wsse, rel=1e-4, abs=1e-4)
+    assert np.sqrt(model.covariance_m2[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-6)
+    assert np.sqrt(model.position_covariance_m2(np.ones(30))[:, 0, 0]) == pytest.approx(got.sigma_m, rel=1e-6)
     assert (model.freedom == ranges.n_used - ranges.n_clocks - 1).all()
 
     point = single_point(ranges, np.broadcast_to(oracle.LINE.ecef_m[0], (30, 3)))
@@ -49,7 +49,7 @@ def test_model_is_the_solvers_own(systems, ties):
     assert solved.all() == (len(systems) > 3 + ranges.n_clocks[0] - 1)
     assert model.wsse[solved] == pytest.approx(point.wsse[solved], rel=1e-4, abs=1e-4)
     trace = np.einsum("tii->t", point.covariance_m2)
-    assert np.einsum("tii->t", model.covariance_m2)[solved] == pytest.approx(trace[solved], rel=1e-6)
+    assert np.einsum("tii->t", model.covariance_m2)[solved] == pytest.approx(trace[solved], rel=1e-5)
 
 
 @given(seed=st.integers(0, 2**32 - 1), case=st.sampled_from(CASES), space=st.booleans())

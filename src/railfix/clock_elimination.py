@@ -121,6 +121,10 @@ class NormalEquations:
         Receiver clock of each group at the place; NaN where the group has no satellite.
     residual_m : ndarray, shape (T, M) [m]
         Code - range - clock; 0 where the weight is 0.
+    clock_slope : ndarray, shape (T, 3, G)
+        What a step from the place takes from `clock_m`, by metre of each axis.
+    design : ndarray, shape (T, 3, M)
+        What a step from the place takes from `residual_m`, by metre of each axis.
     """
 
     matrix: Floats
@@ -128,6 +132,27 @@ class NormalEquations:
     wsse: Floats
     clock_m: Floats
     residual_m: Floats
+    clock_slope: Floats
+    design: Floats
+
+    def after(self, step_m: Floats, epochs: NDArray[np.bool_] | NDArray[np.intp]) -> tuple[Floats, Floats]:
+        """Clocks and residuals of some epochs after a step from their places, to first order.
+
+        A step of 5 m leaves 0.03 mm (the gradient of the Earth's turning, which the design leaves out).
+
+        Parameters
+        ----------
+        step_m : ndarray, shape (n, 3) [m]
+        epochs : ndarray of bool, shape (T,), or of int, shape (n,)
+
+        Returns
+        -------
+        clock_m : ndarray, shape (n, G) [m]
+        residual_m : ndarray, shape (n, M) [m]
+        """
+        step = step_m[:, None, :]
+        clock = self.clock_m[epochs] - np.matmul(step, self.clock_slope[epochs])[:, 0]
+        return clock, self.residual_m[epochs] - np.matmul(step, self.design[epochs])[:, 0]
 
 
 def clock_groups(system: Sequence[str] | NDArray[np.str_]) -> tuple[slice, ...]:
@@ -164,60 +189,62 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     NormalEquations
     """
     distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    weight = ranges.weight
-    # Columns: the design row -u (three) and the residual.
-    rows = np.concatenate([-los, (ranges.code_m - distance)[..., None]], axis=-1)
-    totals = np.empty((len(weight), len(ranges.groups)))
-    means = np.empty((*totals.shape, 4))
-    for g, group in enumerate(ranges.groups):
-        totals[:, g] = weight[:, group].sum(axis=1)
-        safe = np.where(totals[:, g] > 0, totals[:, g], 1.0)
-        means[:, g] = np.matmul(weight[:, None, group], rows[:, group])[:, 0] / safe[:, None]
-        rows[:, group] -= means[:, g, None, :]
-    rows *= (weight > 0)[..., None]
-    system = np.matmul((rows * weight[..., None]).swapaxes(1, 2), rows)
-    clocks, residual = np.where(totals > 0, means[..., 3], np.nan), rows[..., 3]
+    weight, used = ranges.weight, (ranges.weight > 0)[:, None]
+    starts = np.array([group.start for group in ranges.groups], dtype=np.intp)
+    sizes = np.array([group.stop - group.start for group in ranges.groups], dtype=np.intp)
+    # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
+    rows = np.empty((len(weight), 4, weight.shape[1]))
+    np.negative(los.swapaxes(1, 2), out=rows[:, :3])
+    np.subtract(ranges.code_m, distance, out=rows[:, 3])
+    weighted = rows * weight[:, None]
+    totals = np.add.reduceat(weight, starts, axis=1)
+    seen = totals > 0
+    means = np.add.reduceat(weighted, starts, axis=2) / np.where(seen, totals, 1.0)[:, None]
+    rows -= np.repeat(means, sizes, axis=2)
+    rows *= used
+    np.multiply(rows, weight[:, None], out=weighted)
+    system = np.matmul(weighted, rows.swapaxes(1, 2))
     if ranges.ties is not None:
         apart, mass = _between_clocks(means, totals, ranges.ties)
-        system += np.matmul((apart * mass[..., None]).swapaxes(1, 2), apart)
+        system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
         # A clock lies between what its own satellites and what the others say.
-        own = totals * ranges.ties.sigma_m**2
-        shift = apart[..., 3] / (own + 1.0)
-        clocks = clocks - shift
-        for g, group in enumerate(ranges.groups):
-            residual[:, group] += shift[:, g, None] * (weight[:, group] > 0)
+        shift = apart / (totals * ranges.ties.sigma_m**2 + 1.0)[:, None]
+        means -= shift
+        rows += np.repeat(shift, sizes, axis=2) * used
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],
         wsse=system[:, 3, 3],
-        clock_m=clocks,
-        residual_m=residual,
+        clock_m=np.where(seen, means[:, 3], np.nan),
+        residual_m=rows[:, 3],
+        clock_slope=means[:, :3],
+        design=rows[:, :3],
     )
 
 
 def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Floats, Floats]:
-    """Means of the groups (last column: residual) less the common clock, and the weight of each.
+    """Means of the groups (last row: residual) less the common clock, and the weight of each.
 
     Parameters
     ----------
-    means : ndarray, shape (T, G, C)
+    means : ndarray, shape (T, C, G)
     totals : ndarray, shape (T, G) [1/m^2]
         Weight of each mean, 0 where the group has no satellite.
     ties : ClockTies
 
     Returns
     -------
-    apart : ndarray, shape (T, G, C)
+    apart : ndarray, shape (T, C, G)
     mass : ndarray, shape (T, G) [1/m^2]
     """
     apart = means.copy()
-    apart[..., -1] -= ties.offset_m
+    apart[:, -1] -= ties.offset_m
     seen = totals > 0
     mass = np.where(seen, 1.0 / (1.0 / np.where(seen, totals, 1.0) + ties.sigma_m**2), 0.0)
     total = mass.sum(axis=1)
-    common = np.einsum("tg,tgc->tc", mass, apart) / np.where(total > 0, total, 1.0)[:, None]
-    apart -= common[:, None, :]
-    apart *= seen[..., None]
+    common = np.matmul(apart, mass[..., None]) / np.where(total > 0, total, 1.0)[:, None, None]
+    apart -= common
+    apart *= seen[:, None]
     return apart, mass
 
 
@@ -236,8 +263,8 @@ def fit(ranges: Ranges, place_ecef_m: Floats) -> Floats:
         means[:, g] = (weight * residual).sum(axis=1) / np.where(totals[:, g] > 0, totals[:, g], 1.0)
         result += (weight * (residual - means[:, g, None]) ** 2).sum(axis=1)
     if ranges.ties is not None:
-        apart, mass = _between_clocks(means[..., None], totals, ranges.ties)
-        result += (mass * apart[..., 0] ** 2).sum(axis=1)
+        apart, mass = _between_clocks(means[:, None], totals, ranges.ties)
+        result += (mass * apart[:, 0] ** 2).sum(axis=1)
     return result
 
 

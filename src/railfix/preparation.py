@@ -175,13 +175,15 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
     trajectory = index.trajectory
     middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
     point = single_point(ranges, middle, limits=config.single_point)
-    arc, offset = trajectory.nearest(point.ecef_m)
-    beside = offset < BESIDE_THE_LINE_M
-    anchor = np.where(beside[:, None], trajectory.at_arc(arc), point.ecef_m)
+    anchor = point.ecef_m.copy()
+    found = np.flatnonzero(np.isfinite(anchor[:, 0]))
+    distance, vertex = index.tree.query(anchor[found])
+    beside = np.asarray(distance) < BESIDE_THE_LINE_M
+    anchor[found[beside]] = trajectory.ecef_m[np.asarray(vertex)[beside]]
     rest = np.flatnonzero(np.isnan(anchor[:, 0]))
     if len(rest):
-        vertex = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
-        anchor[rest] = np.where((vertex >= 0)[:, None], trajectory.ecef_m[vertex], middle[rest])
+        best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
+        anchor[rest] = np.where((best >= 0)[:, None], trajectory.ecef_m[best], middle[rest])
     return anchor
 
 

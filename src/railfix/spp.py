@@ -23,11 +23,11 @@ class SinglePointLimits:
     Attributes
     ----------
     tolerance_m : float
-        The last step; ranges curve by step^2 / 2e7 m, so 1 mm leaves nothing.
+        The last step: one of 1 m leaves 0.01 mm (`NormalEquations.after`).
     max_iterations : int
     """
 
-    tolerance_m: float = 1e-3
+    tolerance_m: float = 1.0
     max_iterations: int = 12
 
     def __post_init__(self) -> None:
@@ -99,13 +99,11 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
         length = np.sqrt(np.einsum("ti,ti->t", step, step))
         settled = length < limits.tolerance_m
         done = active[settled]
-        # The step belongs to the place it started from; what it would add is below the tolerance squared.
         place[done] = current[settled] + step[settled]
-        clock[done] = equations.clock_m[settled]
+        clock[done], residual[done] = equations.after(step[settled], settled)
         matrix[done] = equations.matrix[settled]
         covariance[done] = inverse[settled]
         wsse[done] = equations.wsse[settled] - np.einsum("ti,ti->t", step, equations.vector)[settled]
-        residual[done] = equations.residual_m[settled]
         going = ~settled & (length < 1e8)
         current = (current + step)[going]
         active = active[going]

@@ -1,0 +1,96 @@
+"""One live epoch of two antennas, handed to the processor one by one as a receiver would.
+
+Prints median, 99th percentile and largest time an epoch, wall and processor time, over the demonstration
+run that comes with railfix, or over another simulated one::
+
+    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--profile]
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.config import Config
+from railfix.epochs import Observations
+from railfix.pipeline import EpochProcessor
+from railfix.rinex import read_navigation, read_observations
+from railfix.simulate.demo_data import demo_files
+from railfix.track_map import read_track
+from railfix.vehicle import antenna_trajectory, read_vehicle
+
+#: Epochs before the clock starts: caches fill, offsets between clocks become known.
+WARM_UP = 50
+#: P1 6: from the receiver's output to the position; and what is aimed at here [ms].
+PAPER_MS, GOAL_MS = 40.0, 4.0
+
+
+def files_of(folder: Path | None) -> dict[str, Path]:
+    """The files of a simulated run, plain or packed; the demonstration's unless a folder is given."""
+    if folder is None:
+        return dict(demo_files())
+    found = {}
+    for name, endings in {"front": ("rnx", "crx.gz"), "rear": ("rnx", "crx.gz"), "nav": ("rnx", "rnx.gz")}.items():
+        found[name] = next(p for e in endings if (p := folder / f"{name}.{e}").exists())
+    return found | {"track": folder / "track.csv", "vehicle": folder / "vehicle.toml"}
+
+
+def prepared(folder: Path | None, epochs: int) -> tuple[EpochProcessor, dict[str, Observations]]:
+    """The processor and the first epochs of both antennas."""
+    files = files_of(folder)
+    track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
+    observations = {name: read_observations(files[name])[:epochs] for name in ("front", "rear")}
+    trajectories = {name: antenna_trajectory(track, vehicle, name) for name in observations}
+    return EpochProcessor(Config(), read_navigation(files["nav"]), trajectories), observations
+
+
+def milliseconds(
+    processor: EpochProcessor, observations: Mapping[str, Observations]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Wall and processor time of each epoch after the warm-up [ms]."""
+    state = None
+    wall, used = [], []
+    for k in range(len(observations["front"])):
+        part = {name: whole[k : k + 1] for name, whole in observations.items()}
+        begin, begin_used = time.perf_counter(), time.process_time()
+        _, state = processor.process(part, state)
+        wall.append(time.perf_counter() - begin)
+        used.append(time.process_time() - begin_used)
+    return 1e3 * np.array(wall[WARM_UP:]), 1e3 * np.array(used[WARM_UP:])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--run", type=Path, help="folder of `python -m railfix.simulate`; the demonstration unless given"
+    )
+    parser.add_argument("--epochs", type=int, default=1500)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--profile", action="store_true", help="print where the time goes, for one more round")
+    options = parser.parse_args()
+    processor, observations = prepared(options.run, options.epochs + WARM_UP)
+    channels = {name: len(whole.satellite) for name, whole in observations.items()}
+    print(f"live epochs of two antennas, {options.epochs} a round, channels {channels}")
+    print(f"P1: {PAPER_MS:g} ms; goal for the 99th percentile: {GOAL_MS:g} ms")
+    for number in range(options.rounds):
+        for name, values in zip(("wall", "processor"), milliseconds(processor, observations), strict=True):
+            p50, p99 = np.percentile(values, [50, 99])
+            head = f"round {number + 1} {name:9s}"
+            print(
+                f"{head} median {p50:6.2f}  p99 {p99:6.2f}  max {values.max():6.2f} ms   p99 / P1 {p99 / PAPER_MS:.3f}"
+            )
+    if options.profile:
+        profile = cProfile.Profile()
+        profile.runcall(milliseconds, processor, observations)
+        pstats.Stats(profile).sort_stats("tottime").print_stats(30)
+
+
+if __name__ == "__main__":
+    main()
