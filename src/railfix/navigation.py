@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -214,6 +215,7 @@ class Navigation:
     sources: tuple[str, ...] = ()
 
 
+@lru_cache(maxsize=8)
 def glonass_channels(navigation: Navigation) -> dict[str, int]:
     """Frequency channel of each GLONASS satellite, as its records say.
 

@@ -15,7 +15,7 @@ from railfix.constants import CLOCK_GROUP
 from railfix.epochs import Observations
 from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.measurement import PLAUSIBLE_CODE_M, channel_order, code_sigma_m, first_available
-from railfix.navigation import Navigation
+from railfix.navigation import Navigation, glonass_channels
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import Reason
 from railfix.screens import Screened
@@ -133,7 +133,7 @@ def prepare(
     clean = code + states.clock_m - states.group_delay_m
     anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
-    frequency = carrier_frequency_hz(satellite, signal, obs.header.glonass_channel)
+    frequency = carrier_frequency_hz(satellite, signal, {**glonass_channels(navigation), **obs.header.glonass_channel})
     latitude, longitude, height = geodetic_from_ecef(anchor)
     if klobuchar is not None:
         clean = clean - klobuchar_delay_m(obs.time, latitude, longitude, elevation, azimuth, klobuchar, frequency)
