@@ -128,8 +128,6 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
-    raim_protection : {"on", "off"}
-        Whether each position gets RAIM's protection level along the line. Off by default for its cost.
     noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
@@ -160,7 +158,6 @@ class Config(BaseModel):
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
-    raim_protection: Literal["on", "off"] = "off"
     clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
     single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)

@@ -27,7 +27,7 @@ from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
 from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
 from railfix.preparation import Prepared, prepare, without
-from railfix.raim import Outcome, constrained_model, detect, exclude
+from railfix.raim import Outcome, constrained_model, detect, exclude, reliability
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.results import AntennaResult, AntennaState, Bits, Floats, Raim, Result, State, patched
 from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
@@ -215,6 +215,8 @@ class EpochProcessor:
         one.refuse(_alone(one, ties), Reason.ALONE_ON_ITS_CLOCK)
         scale, state = self._noise_scale(ranges, place.constrained, state)
         ranges, place, raim = self._fault_free(ranges, index, place, scale)
+        if "raim" in self.config.screens:
+            raim = self._protected(ranges, index.trajectory, place.constrained, raim, scale)
         one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
         status = self._status(one.code_m, ranges, index.trajectory, place, raim)
         found = _Found(point=point, place=place, ties=ties, raim=raim, status=status, noise_scale=scale)
@@ -232,6 +234,7 @@ class EpochProcessor:
             threshold=found.threshold,
             excluded=np.zeros(ranges.code_m.shape, dtype=bool),
             own_error_m=np.full(ranges.code_m.shape, np.nan),
+            protection_level_m=np.full(len(ranges), np.nan),
         )
         failing = np.flatnonzero(found.detected)
         if "raim" not in self.config.screens:
@@ -262,6 +265,15 @@ class EpochProcessor:
                 constrained=patched(place.constrained, again, mended.constrained),
             )
         return ranges, place, raim
+
+    def _protected(
+        self, ranges: Ranges, trajectory: Trajectory, constrained: Constrained, raim: Raim, scale: Floats
+    ) -> Raim:
+        """RAIM with the protection level of what is left, where no fault is left in it."""
+        model = constrained_model(ranges, trajectory, constrained.arc_m, section=constrained.section)
+        level = reliability(model, limits=self.config.raim, scale=scale).protection_level_m
+        faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
+        return replace(raim, protection_level_m=np.where(faulty, np.nan, level))
 
     def _on_the_line(self, ranges: Ranges, index: SearchIndex, point: SinglePoint) -> _Place:
         """Section search and constrained position where there are satellites enough."""
@@ -369,7 +381,7 @@ class EpochProcessor:
             single_point=point,
             section=found.place.section,
             constrained=constrained,
-            raim=found.raim,
+            raim=replace(found.raim, protection_level_m=np.where(has, found.raim.protection_level_m, np.nan)),
             clocks=one.clocks,
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,

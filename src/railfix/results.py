@@ -37,6 +37,9 @@ class Raim:
     excluded : ndarray of bool, shape (T, K)
     own_error_m : ndarray, shape (T, K) [m]
         Error of the channels that stand against the rest; NaN elsewhere.
+    protection_level_m : ndarray, shape (T,) [m]
+        `raim.reliability` of the ranges left; infinite where a fault of one of them would not show, NaN
+        where there is no position, where a fault is left in it, or where the screen is off.
     """
 
     outcome: NDArray[np.int8]
@@ -44,6 +47,7 @@ class Raim:
     threshold: Floats
     excluded: NDArray[np.bool_]
     own_error_m: Floats
+    protection_level_m: Floats
 
 
 @dataclass(frozen=True, kw_only=True)

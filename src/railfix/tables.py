@@ -14,13 +14,17 @@ import polars as pl
 from numpy.typing import NDArray
 
 from railfix.pipeline import AntennaResult, Result
+from railfix.raim import Outcome
 from railfix.reasons import Reason, Status, reason_text
+from railfix.screens import DopplerScreened
 
 if TYPE_CHECKING:
     import xarray as xr
 
 #: Words of the column ``status``.
 STATUS_TYPE: Final = pl.Enum([s.text for s in Status])
+#: Words of the column ``raim_outcome``.
+OUTCOME_TYPE: Final = pl.Enum([o.name.lower() for o in Outcome])
 #: Decimals written to CSV: 0.1 mm, and the same in degrees.
 CSV_DECIMALS_M: Final = 4
 CSV_DECIMALS_DEG: Final = 9
@@ -42,6 +46,13 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "n_used": "satellites used",
     "n_rejected": "satellites with a pseudorange that were not used",
     "noise_scale": "noise of this receiver against what the weights assume, estimated so far",
+    "raim_outcome": "what RAIM made of the ranges: "
+    "`passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
+    "raim_statistic": "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
+    "raim_threshold": "what it is compared with; a fault is detected from there on",
+    "protection_level_m": "along the line: error by a fault that RAIM misses, and by noise; "
+    "infinite where a satellite is unchecked, empty where a fault is left",
+    "metric_antenna_spacing_m": "screen `antenna_spacing`: distance of the two positions less that of the antennas",
     "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
     "conventional_offset_m": "distance of the 3-D single point from that point",
     "conventional_x_m": "3-D single point, ECEF",
@@ -63,6 +74,11 @@ OBSERVATION_COLUMNS: Final[dict[str, str]] = {
     "cn0_dbhz": "carrier-to-noise density",
     "sigma_m": "standard deviation that the weights assume",
     "corrected_code_m": "pseudorange, satellite clock, group delay and atmosphere applied",
+    "metric_cn0_deficit_dbhz": "screen `cn0`: mean at the elevation less C/N0",
+    "metric_doppler_m": "screen `doppler`: change of the pseudorange against its Doppler since the epoch before",
+    "limit_doppler_m": "screen `doppler`: what the size of that is compared with",
+    "metric_antenna_pair_m": "screen `antenna_pair`: pseudorange rear less front, against what their spacing explains",
+    "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty",
 }
 
 #: Results with one value an epoch, and with one an epoch and channel.
@@ -108,11 +124,25 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
     columns["n_used"] = pl.Series(values=result.n_used.astype(np.int16))
     columns["n_rejected"] = pl.Series(values=result.n_rejected.astype(np.int16))
     columns["noise_scale"] = _floats(result.noise_scale)
+    columns |= _raim_columns(result)
     columns["conventional_chainage_m"] = _floats(result.conventional_chainage_m)
     columns["conventional_offset_m"] = _floats(result.conventional_offset_m)
     for axis, column in enumerate(("conventional_x_m", "conventional_y_m", "conventional_z_m")):
         columns[column] = _floats(result.conventional_ecef_m[:, axis])
     return pl.DataFrame(columns)
+
+
+def _raim_columns(result: AntennaResult) -> dict[str, pl.Series]:
+    """Verdicts on the positions: RAIM, and the spacing of the antennas."""
+    words = pl.Series(values=[o.name.lower() for o in Outcome], dtype=OUTCOME_TYPE)
+    spacing = result.screens.get("antenna_spacing")
+    return {
+        "raim_outcome": words.gather(pl.Series(values=result.raim.outcome.astype(np.uint32))),
+        "raim_statistic": _floats(result.raim.statistic),
+        "raim_threshold": _floats(result.raim.threshold),
+        "protection_level_m": _floats(result.raim.protection_level_m),
+        "metric_antenna_spacing_m": _floats(np.full(len(result), np.nan) if spacing is None else spacing.metric),
+    }
 
 
 def positions_table(result: Result) -> pl.DataFrame:
@@ -161,7 +191,40 @@ def antenna_observations(name: str, result: AntennaResult) -> pl.DataFrame:
     }
     for column in ("residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"):
         columns[column] = _floats(getattr(result, column)[epoch, channel])
+    for column, measured in screen_metrics(result).items():
+        columns[column] = _floats(measured[epoch, channel])
     return pl.DataFrame(columns)
+
+
+def screen_metrics(result: AntennaResult) -> dict[str, NDArray[np.float64]]:
+    """What the screens measured of each channel, by column of `OBSERVATION_COLUMNS`.
+
+    Parameters
+    ----------
+    result : AntennaResult
+
+    Returns
+    -------
+    dict of str to ndarray, shape (T, M)
+        NaN where a screen was off or could not judge. Elevation and C/N0 themselves are columns of the result.
+    """
+    doppler = result.screens.get("doppler")
+    measured = {
+        "metric_cn0_deficit_dbhz": _metric(result, "cn0_curve"),
+        "metric_doppler_m": _metric(result, "doppler"),
+        "limit_doppler_m": doppler.limit_m if isinstance(doppler, DopplerScreened) else None,
+        "metric_antenna_pair_m": _metric(result, "antenna_pair"),
+        "raim_own_error_m": result.raim.own_error_m,
+    }
+    whole = {name: np.full(result.reason.shape, np.nan) for name in measured}
+    for name, values in measured.items():
+        if values is not None:
+            whole[name][:, result.columns] = values
+    return whole
+
+
+def _metric(result: AntennaResult, screen: str) -> NDArray[np.float64] | None:
+    return result.screens[screen].metric if screen in result.screens else None
 
 
 def observations_table(result: Result) -> pl.DataFrame:
