@@ -43,7 +43,6 @@ from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
 from railfix.pipeline import AntennaResult, EpochProcessor
 from railfix.rinex import read_navigation, read_observations
-from railfix.section import SearchIndex, search
 from railfix.simulate.demo_data import demo_files
 from railfix.track_map import read_track
 from railfix.vehicle import antenna_trajectory, read_vehicle
@@ -124,9 +123,7 @@ def delays(case: Case, result: AntennaResult) -> tuple[np.ndarray, np.ndarray]:
 
 def solved_on_line(ranges: Ranges, case: Case, result: AntennaResult) -> np.ndarray:
     """Constrained positions of other codes, from the pipeline's sections; its epochs only."""
-    point = result.single_point
-    section = search(ranges, SearchIndex(case.trajectory), point, limits=case.config.section)
-    vertex = np.where(np.isfinite(result.arc_m), section.vertex, -1)
+    vertex = np.where(np.isfinite(result.arc_m), result.section.vertex, -1)
     return constrained_position(ranges, case.trajectory, vertex).arc_m
 
 
@@ -256,9 +253,8 @@ def slip_line(found: Carried) -> str:
 def main(only: Callable[[str], bool] = lambda _: True) -> int:
     data = Path(__file__).resolve().parents[2] / "shared" / "data"
     cases = demo() + (recordings(data) if data.is_dir() else [])
-    print(
-        f"{'log':18s} {'form':6s} {'n':>5s} {'mean m':>7s} {'std m':>7s} {'p50 m':>7s} {'p95 m':>7s} {'max m':>7s}  error/sigma"
-    )
+    names = ("n", "mean m", "std m", "p50 m", "p95 m", "max m")
+    print(f"{'log':18s} {'form':6s} {names[0]:>5s} " + " ".join(f"{n:>7s}" for n in names[1:]) + "  error/sigma")
     for case in cases:
         if not only(case.name):
             continue

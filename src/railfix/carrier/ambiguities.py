@@ -23,12 +23,13 @@ from railfix.carrier.observation_model import (
     PhaseClocks,
     Phases,
     linearise,
+    own_clock,
     own_unknowns,
     reduce,
     shifted,
 )
 from railfix.clock_elimination import Ranges
-from railfix.timescale import GPS_EPOCH
+from railfix.timescale import GPS_EPOCH, seconds
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -36,7 +37,7 @@ ArcIds = NDArray[np.int64]
 Masks = NDArray[np.bool_]
 
 #: Sigma of an ambiguity against its first value [m]: keeps matrices regular, says nothing.
-FREE_AMBIGUITY_M: Final = 1e3
+FREE_AMBIGUITY_M: Final = 1e4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,8 +56,10 @@ class PhaseLimits:
     hop_s : float
         The walk is taken in steps at multiples of this time since the GPS epoch.
     correlation_s : float
-        Epochs nearer to each other than this say the same thing twice of the ambiguities: code
-        errors of a real receiver last for seconds (multipath), of a simulated one not (0).
+        Code errors of a real receiver last for tens of seconds (multipath, delays): epochs nearer
+        to each other than this tell the ambiguities the same thing again. The variance that the
+        ambiguities bring is multiplied by correlation / interval, up to that of codes alone. The
+        positions do not change. 0 for noise that is white, as a simulated one.
     tolerance_m : float
         `phase_run`: last step along the line.
     max_iterations : int
@@ -73,7 +76,7 @@ class PhaseLimits:
     clocks: PhaseClocks = "own"
     drift_m: float = 0.01
     hop_s: float = 10.0
-    correlation_s: float = 0.0
+    correlation_s: float = 20.0
     tolerance_m: float = 1e-4
     max_iterations: int = 8
     passes: int = 2
@@ -98,6 +101,14 @@ def hop_of(time: NDArray[np.datetime64], limits: PhaseLimits) -> NDArray[np.int6
     return np.asarray(nanoseconds // round(limits.hop_s * 1e9), dtype=np.int64)
 
 
+def repeats_of(time: NDArray[np.datetime64], limits: PhaseLimits) -> Floats:
+    """Epochs that tell the same thing as each epoch, shape (T,); 1 for the first."""
+    step = np.append(np.nan, seconds(np.diff(time)))
+    with np.errstate(divide="ignore"):
+        share = limits.correlation_s / step
+    return np.asarray(np.maximum(1.0, np.where(np.isnan(share), 1.0, share)))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ArcAmbiguities:
     """Constants of arcs, A of them (`phase_run` with a drift: of stretches of arcs inside a hop).
@@ -107,7 +118,8 @@ class ArcAmbiguities:
     arc_id : ndarray of int64, shape (A,)
     ambiguity_m : ndarray, shape (A,) [m]
         Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With
-        clocks of the phases' own, known up to a constant common to all.
+        clocks of the phases' own, known up to a constant common to all: zero in the mean of the
+        corrections to their first values, and the covariance is against that mean.
     covariance_m2 : ndarray, shape (A, A) [m^2]
         From noise; a map that is off adds to it.
     """
@@ -180,6 +192,21 @@ def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Flo
     )
     silent = Phases(phase_m=phases.phase_m, weight=np.where(at[:, None], phases.weight, 0.0), arc_id=phases.arc_id)
     return without, silent, np.where(at, np.clip(arc_m, 0.0, trajectory.arc_m[-1]), 0.0)
+
+
+def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
+    """Inverse of normal matrices of ambiguities, shape (..., A, A).
+
+    With a clock of the phases' own nothing tells a constant common to all ambiguities. It is fixed
+    by asking that the `held` ones (1, others 0; shape (..., A)) are zero in the mean: no difference
+    between them changes by that, and no digits are lost.
+    """
+    size = matrix.shape[-1]
+    count = np.maximum(held.sum(axis=-1), 1.0)
+    level = np.einsum("...i,...ii->...", held, matrix) / count**2
+    full = matrix + level[..., None, None] * held[..., :, None] * held[..., None, :]
+    full = full + np.eye(size) * FREE_AMBIGUITY_M**-2.0
+    return np.linalg.inv(full).astype(np.float64, copy=False)
 
 
 def moved(arc_m: Floats, own: OwnUnknowns, trajectory: Trajectory) -> Floats:
@@ -262,7 +289,8 @@ def phase_run(
             base[:count] = lin.phase_m[used][first]
         lin = shifted(lin, base[index])
         value, covariance = _solved(lin, index, walk.links)
-        own = own_unknowns(lin, value[index], covariance[index[:, :, None], index[:, None, :]], trajectory)
+        among = covariance[index[:, :, None], index[:, None, :]]
+        own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
         after = moved(arc, own, trajectory)
         step = float(np.abs(after - arc)[started].max(initial=0.0))
         arc, iteration = after, iteration + 1
@@ -324,6 +352,6 @@ def _solved(lin: Linearised, index: Indices, links: Floats) -> tuple[Floats, Flo
     np.add.at(right, index, part.right)
     matrix[:-1, :-1] += links
     matrix[-1], matrix[:, -1], right[-1] = 0.0, 0.0, 0.0
-    matrix[np.arange(count + 1), np.arange(count + 1)] += FREE_AMBIGUITY_M**-2.0
-    covariance: Floats = np.linalg.inv(matrix).astype(np.float64, copy=False)
+    held = np.append(np.ones(count), 0.0) if own_clock(lin) else np.zeros(count + 1)
+    covariance = inverse_of_arcs(matrix, held)
     return covariance @ right, covariance

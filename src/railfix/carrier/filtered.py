@@ -22,7 +22,9 @@ from railfix.carrier.ambiguities import (
     PhasePositions,
     assembled,
     hop_of,
+    inverse_of_arcs,
     moved,
+    repeats_of,
     startable,
 )
 from railfix.carrier.arcs import channel_of
@@ -30,6 +32,7 @@ from railfix.carrier.observation_model import (
     Linearised,
     Phases,
     linearise,
+    own_clock,
     own_unknowns,
     reduce,
     shifted,
@@ -178,17 +181,18 @@ def _segment(
     base = np.append(memory.first_m, 0.0)
     lin = shifted(lin, base[index])
 
-    matrix, right, kept = _accumulated(lin, index, inputs.time, memory, limits)
-    channel = np.arange(count)
-    matrix[:, channel, channel] += FREE_AMBIGUITY_M**-2.0
+    matrix, right, kept = _accumulated(lin, index, memory)
+    row = np.arange(len(matrix))[:, None]
+    held = np.zeros((len(matrix), count + 1))
+    held[row, index] = own_clock(lin)
     covariance = np.zeros((len(matrix), count + 1, count + 1))
-    covariance[:, :count, :count] = np.linalg.inv(matrix)
+    covariance[:, :count, :count] = inverse_of_arcs(matrix, held[:, :count])
     value = np.zeros((len(matrix), count + 1, 3))
     value[:, :count] = covariance[:, :count, :count] @ right
-    row = np.arange(len(matrix))[:, None]
-    own = own_unknowns(
-        lin, value[row, index], covariance[row[:, None], index[:, :, None], index[:, None, :]], trajectory
-    )
+    among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
+    before = np.asarray([memory.time], dtype="datetime64[ns]")
+    repeats = repeats_of(np.concatenate([before, inputs.time]), limits)[1:]
+    own = own_unknowns(lin, value[row, index], among, trajectory, repeats=repeats)
     arc = moved(inputs.arc_m, own, trajectory)
     seen = memory.seen.copy()
     if len(ids):
@@ -234,28 +238,21 @@ def _with_arcs(memory: Memory, ids: ArcIds, first_m: Floats) -> Memory:
     )
 
 
-def _accumulated(
-    lin: Linearised, index: NDArray[np.intp], time: NDArray[np.datetime64], memory: Memory, limits: PhaseLimits
-) -> tuple[Floats, Floats, Memory]:
-    """Normal equations at each epoch, its own part in full, and the memory after the last one."""
+def _accumulated(lin: Linearised, index: NDArray[np.intp], memory: Memory) -> tuple[Floats, Floats, Memory]:
+    """Normal equations at each epoch, its own part included, and the memory after the last one."""
     part = reduce(lin)
-    epochs, count = len(time), len(memory.arc_id)
+    epochs, count = len(index), len(memory.arc_id)
     row = np.arange(epochs)[:, None]
     # One more row and column takes what has no phase.
     own = np.zeros((epochs, count + 1, count + 4))
     own[row[:, None], index[:, :, None], index[:, None, :]] = part.matrix
     own[row, index, count + 1 :] = part.right
     own = np.delete(own[:, :count], count, axis=2)
-    share = np.ones((epochs, 1, 1))
-    if limits.correlation_s > 0.0:
-        dt = seconds(np.diff(np.concatenate([np.asarray([memory.time], dtype="datetime64[ns]"), time])))
-        share[:, 0, 0] = np.minimum(1.0, np.where(np.isnan(dt), np.inf, dt) / limits.correlation_s)
     carried = np.concatenate([memory.matrix, memory.right], axis=1)
     # cumsum from the carried sums: the same additions in the same order however epochs are cut.
-    sums = np.cumsum(np.concatenate([carried[None], own * share]), axis=0)
-    now = sums[1:] + own * (1.0 - share)
+    sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
     kept = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
-    return now[..., :count], now[..., count:], kept
+    return sums[1:, :, :count], sums[1:, :, count:], kept
 
 
 def _walked(memory: Memory, time: NDArray[np.datetime64], limits: PhaseLimits) -> Memory:

@@ -209,15 +209,19 @@ def _ties(ties: ClockTies) -> tuple[Floats, Floats]:
     return matrix, np.einsum("tgh,th->tg", matrix, ties.offset_m)
 
 
+def own_clock(lin: Linearised) -> bool:
+    """Whether the phases have a clock of their own."""
+    return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
+
+
 def shifted(lin: Linearised, first_m: Floats) -> Linearised:
     """The same with first values of the ambiguities taken off the phases, shape (T, M).
 
     What is left in common (a clock of their own, milliseconds off) is taken off too.
     """
     phase = np.where(lin.phase_weight > 0, lin.phase_m - first_m, 0.0)
-    own = lin.code_design.shape[-1] > PLACE + lin.groups
     clock = np.zeros(len(phase))
-    if own:
+    if own_clock(lin):
         phase, clock = _level(phase, lin.phase_weight)
     moved = np.matmul((lin.phase_weight * (phase - lin.phase_m))[:, None, :], lin.phase_design)[:, 0]
     return replace(lin, phase_m=phase, right=lin.right + moved, phase_clock_m=lin.phase_clock_m + clock)
@@ -284,7 +288,9 @@ class OwnUnknowns:
     phase_residual_m: Floats
 
 
-def own_unknowns(lin: Linearised, ambiguity_m: Floats, covariance_m2: Floats, trajectory: Trajectory) -> OwnUnknowns:
+def own_unknowns(
+    lin: Linearised, ambiguity_m: Floats, covariance_m2: Floats, trajectory: Trajectory, *, repeats: Floats
+) -> OwnUnknowns:
     """Back-substitution of each epoch.
 
     The map is off by the same over a run: that does not average, unlike what the estimator assumes
@@ -299,13 +305,19 @@ def own_unknowns(lin: Linearised, ambiguity_m: Floats, covariance_m2: Floats, tr
         Of each channel, and its response to a map 1 m off across and in height.
     covariance_m2 : ndarray, shape (T, M, M) [m^2]
     trajectory : Trajectory
+    repeats : ndarray, shape (T,)
+        Epochs with the same code errors: the ambiguities' variance is larger by that.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)
     x = np.matmul(lin.inverse, (lin.right - np.matmul(lin.coupling, known[..., :1])[..., 0])[..., None])[..., 0]
     # Response of the distance along the line to the ambiguities, and to the map.
     row = -np.matmul(lin.inverse[:, :1], lin.coupling)[:, 0]
-    from_noise = lin.inverse[:, 0, 0] + np.einsum("ti,tij,tj->t", row, covariance_m2, row)
+    from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
+    from_noise = lin.inverse[:, 0, 0] + from_arcs
+    # With the same errors again and again the phases help no more than not at all.
+    most = np.maximum(_variance_of_codes(lin), from_noise)
+    from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)
     alone = -lin.inverse[:, 0, 1:PLACE] * lin.prior
     together = alone + np.matmul(row[:, None, :], known[..., 1:])[:, 0]
     sigma = np.array([trajectory.sigma_plan_m, trajectory.sigma_height_m])
@@ -321,3 +333,9 @@ def own_unknowns(lin: Linearised, ambiguity_m: Floats, covariance_m2: Floats, tr
         code_residual_m=code,
         phase_residual_m=np.where(used, phase, 0.0),
     )
+
+
+def _variance_of_codes(lin: Linearised) -> Floats:
+    """Variance along the line of each epoch's codes alone, the map's error included, shape (T,) [m^2]."""
+    matrix = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
+    return np.asarray(np.linalg.inv(matrix + lin.known)[:, 0, 0])

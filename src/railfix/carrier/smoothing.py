@@ -9,6 +9,7 @@ drift: with the delay changing at 1 mm/s a window of 100 s leaves up to 0.2 m.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +31,21 @@ class SmoothingLimits:
     window_s : float
         Time constant: each code of an arc counts the same until the arc is this old, from then
         on older ones fade (DO-229D 2.1.4.1.5 takes 100 s, for the ionosphere's drift).
+    clocks : {"own", "shared"}
+        "own": what all codes of an epoch changed against their phases in the mean is a clock, not
+        noise: taken off before and put back after averaging. For telephones, whose codes jump
+        together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m, against 50 m
+        with "shared"); other receivers did not lose by it.
     """
 
     window_s: float = 100.0
+    clocks: Literal["own", "shared"] = "own"
 
     def __post_init__(self) -> None:
         if not self.window_s > 0.0:
             raise ValueError(f"window_s must be positive, got {self.window_s}")
+        if self.clocks not in ("shared", "own"):
+            raise ValueError(f"clocks must be shared or own, got {self.clocks!r}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +65,10 @@ class SmoothingState:
         Of the smoothed code, in units of that of a code.
     count : ndarray of int, shape (M,)
         Codes of the running arc.
+    last_m : ndarray, shape (M,) [m]
+        Last code less phase, for `clocks="own"`.
+    clock_m : float [m]
+        What the codes have moved against the phases in the mean.
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -64,6 +77,8 @@ class SmoothingState:
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
     variance: Floats = field(default_factory=lambda: np.empty(0))
     count: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    last_m: Floats = field(default_factory=lambda: np.empty(0))
+    clock_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,17 +101,18 @@ class Smoothed:
 
 def _rows(
     state: SmoothingState, channels: tuple[tuple[str, str], ...]
-) -> tuple[Floats, Floats, Floats, NDArray[np.int64]]:
+) -> tuple[Floats, Floats, Floats, NDArray[np.int64], Floats]:
     """The state in the order of these channels; nothing runs in new ones."""
     place = {key: i for i, key in enumerate(state.channels)}
     at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
     known = at >= 0
-    base = np.full(len(channels), np.nan)
+    base, last = np.full((2, len(channels)), np.nan)
     offset, variance = np.zeros((2, len(channels)))
     count = np.zeros(len(channels), dtype=np.int64)
     base[known], offset[known] = state.base_m[at[known]], state.offset_m[at[known]]
     variance[known], count[known] = state.variance[at[known]], state.count[at[known]]
-    return base, offset, variance, count
+    last[known] = state.last_m[at[known]]
+    return base, offset, variance, count, last
 
 
 def _held(values: Floats, at: Masks, first: Floats) -> Floats:
@@ -104,6 +120,13 @@ def _held(values: Floats, at: Masks, first: Floats) -> Floats:
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))
+
+
+def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
+    """Mean change of code less phase over the channels that run on, 0 where there is none; shape (T,)."""
+    change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
+    number = np.count_nonzero(np.isfinite(change), axis=1)
+    return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
 
 
 def smooth_codes(
@@ -142,7 +165,7 @@ def smooth_codes(
     """
     limits, state = limits or SmoothingLimits(), state or SmoothingState()
     channels = tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
-    base0, offset0, variance0, count0 = _rows(state, channels)
+    base0, offset0, variance0, count0, last0 = _rows(state, channels)
     if not len(time):
         return Smoothed(code_m=code_m, sigma_factor=np.ones(code_m.shape)), state
     has_phase = np.isfinite(phase_m)
@@ -153,6 +176,10 @@ def smooth_codes(
     before = _held((codes - has).astype(np.float64), begins, -count0.astype(np.float64))
     count = np.where(has_phase, codes - before, 0.0)
     difference = np.where(has, code_m - phase_m, np.nan)
+    apart = np.full(len(time) + 1, state.clock_m)
+    if limits.clocks == "own":
+        apart = np.cumsum(np.r_[state.clock_m, _common_change(difference, begins, last0)])
+    last, difference = difference[-1], difference - apart[1:, None]
     # The arc's first code may come after its first phase.
     base = _held(difference, (has & (count == 1)) | begins, base0)
 
@@ -167,7 +194,7 @@ def smooth_codes(
     variance = linear_recursion(np.concatenate([one, keep**2]), np.concatenate([variance0[None], gain**2]))[1:]
 
     runs = has_phase & (count >= 1)
-    smoothed = np.where(runs, phase_m + (base + offset), code_m)
+    smoothed = np.where(runs, phase_m + (base + offset + apart[1:, None]), code_m)
     smoothed = np.where(has & (gain == 1.0), code_m, smoothed)
     factor = np.where(runs, np.sqrt(variance), np.where(np.isfinite(code_m), 1.0, np.nan))
     after = SmoothingState(
@@ -177,5 +204,7 @@ def smooth_codes(
         offset_m=frozen(np.where(runs[-1], offset[-1], 0.0)),
         variance=frozen(np.where(runs[-1], variance[-1], 0.0)),
         count=frozen(np.where(runs[-1], count[-1], 0.0).astype(np.int64)),
+        last_m=frozen(last),
+        clock_m=float(apart[-1]),
     )
     return Smoothed(code_m=smoothed, sigma_factor=factor), after
