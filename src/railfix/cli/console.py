@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from railfix.reasons import Status
 if TYPE_CHECKING:
     from railfix.run import RunSummary
     from railfix.run.driver import Progress as ProgressCall
+    from railfix.run.tally import AntennaTally
 
 
 @contextmanager
@@ -49,7 +51,7 @@ def show_summary(summary: RunSummary) -> None:
     console = Console(highlight=False)
     names = list(summary.tally.antennas)
     console.print(_positions(summary, names))
-    console.print("Pseudoranges, by the first reason that refused them")
+    console.print("Pseudoranges, by the first reason that refused them, and by it alone")
     console.print(_reasons(summary, names))
     for note in summary.notes:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
@@ -67,15 +69,37 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
         table.add_column(name, justify="right")
     table.add_row("epochs", *(f"{tally[n].epochs:,}" for n in names))
     table.add_row("with observations", *(f"{tally[n].observed:,}" for n in names))
-    table.add_row("with a position", *(f"{tally[n].positioned:,}" for n in names))
+    for head, of_antenna in (
+        ("with coordinates", {n: tally[n].status_positioned for n in names}),
+        ("without coordinates", {n: _without(tally[n]) for n in names}),
+    ):
+        if any(of_antenna[n].total() for n in names):
+            table.add_row(head, *(f"{of_antenna[n].total():,}" for n in names))
+        for status in Status:
+            if any(of_antenna[n][status.text] for n in names):
+                table.add_row(f"  {status.text}", *(f"{of_antenna[n][status.text]:,}" for n in names))
+                if status is Status.TOO_FEW_SATELLITES:
+                    _rows_of_few(table, [tally[n] for n in names])
     table.add_row("positioning rate", *(_percent(tally[n].positioned, tally[n].observed) for n in names))
-    for status in Status:
-        if any(tally[n].status[status.text] for n in names):
-            table.add_row(f"  {status.text}", *(f"{tally[n].status[status.text]:,}" for n in names))
+    table.add_row("rate of ok", *(_percent(tally[n].status[Status.OK.text], tally[n].observed) for n in names))
     for label, field in (("p50", "p50_m"), ("p95", "p95_m"), ("largest", "max_m")):
         cells = [f"{getattr(sigma[n], field):.2f} m" if n in sigma else "-" for n in names]
         table.add_row(f"sigma along the line, {label}", *cells)
     return table
+
+
+def _without(antenna: AntennaTally) -> Counter[str]:
+    """Epochs with observations and without coordinates, by status."""
+    counts = antenna.status - antenna.status_positioned
+    del counts[Status.NO_OBSERVATION.text]
+    return counts
+
+
+def _rows_of_few(table: Table, antennas: list[AntennaTally]) -> None:
+    """Epochs with too few satellites: the reason that left too few, and those that it alone did."""
+    for reason in dict.fromkeys(name for a in antennas for name, count in a.short_first.most_common() if count):
+        cells = [f"{a.short_first[reason]:,} ({a.short_only[reason]:,} alone)" for a in antennas]
+        table.add_row(f"    by {reason}", *cells)
 
 
 def _reasons(summary: RunSummary, names: list[str]) -> Table:
@@ -84,11 +108,13 @@ def _reasons(summary: RunSummary, names: list[str]) -> Table:
     table.add_column("")
     for name in names:
         table.add_column(name, justify="right")
-    table.add_row("observed", *(f"{tally[n].observations:,}" for n in names))
-    table.add_row("used", *(f"{tally[n].used:,}" for n in names))
+        table.add_column("alone", justify="right")
+    table.add_row("observed", *(cell for n in names for cell in (f"{tally[n].observations:,}", "")))
+    table.add_row("used", *(cell for n in names for cell in (f"{tally[n].used:,}", "")))
     reasons = dict.fromkeys(reason for n in names for reason, _ in tally[n].first_reason.most_common())
     for reason in reasons:
-        table.add_row(f"  {reason}", *(f"{tally[n].first_reason[reason]:,}" for n in names))
+        cells = [f"{counts[reason]:,}" for n in names for counts in (tally[n].first_reason, tally[n].only_reason)]
+        table.add_row(f"  {reason}", *cells)
     return table
 
 

@@ -173,7 +173,7 @@ def _position(
     progress: Progress | None,
 ) -> Tally:
     """Chunk by chunk: positions, counts, rows."""
-    tally, state = Tally(), State()
+    tally, state = Tally(min_satellites=processor.config.min_satellites), State()
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
         tally.add(result)

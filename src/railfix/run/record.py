@@ -12,6 +12,7 @@ import polars as pl
 
 from railfix import __version__
 from railfix.navigation import Navigation
+from railfix.reasons import Status
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
 
@@ -95,6 +96,7 @@ def run_record(
         },
         "notes": list(notes),
         "positioning_rate": _overall_rate(tally),
+        "ok_rate": _overall_ok_rate(tally),
         "antennas": {
             name: {**antenna.as_dict(), "along_sigma_m": asdict(sigma[name]) if name in sigma else None}
             for name, antenna in tally.antennas.items()
@@ -106,6 +108,11 @@ def run_record(
 def _overall_rate(tally: Tally) -> float | None:
     observed = sum(a.observed for a in tally.antennas.values())
     return tally.positioned / observed if observed else None
+
+
+def _overall_ok_rate(tally: Tally) -> float | None:
+    observed = sum(a.observed for a in tally.antennas.values())
+    return sum(a.status[Status.OK.text] for a in tally.antennas.values()) / observed if observed else None
 
 
 def _versions() -> dict[str, str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from railfix.pipeline import AntennaResult, Result
 from railfix.reasons import Reason, Status, first_reason
@@ -21,9 +22,17 @@ class AntennaTally:
 
     Attributes
     ----------
+    min_satellites : int
+        Satellites that an epoch needs.
     epochs, observed, positioned : int
-        Epochs; those with at least one pseudorange; those with a position.
+        Epochs; those with at least one pseudorange; those with coordinates.
     status : Counter of str
+    status_positioned : Counter of str
+        Of the epochs with coordinates.
+    short_first, short_only : Counter of str
+        Epochs with too few satellites by the reason that, in the order of the reasons, left too few, and by a
+        reason without which alone there would be enough. `not_observed`: too few were observed; `used`: enough
+        were used, but their clocks left no range for the place.
     first_reason, only_reason : Counter of str
         Refused observations by the first reason that applied, and those that one reason alone refused.
     observations, used : int
@@ -39,12 +48,16 @@ class AntennaTally:
         Least distance of a conventional position from the trajectory; NaN when there was none.
     """
 
+    min_satellites: int = 3
     epochs: int = 0
     observed: int = 0
     positioned: int = 0
     observations: int = 0
     used: int = 0
     status: Counter[str] = field(default_factory=Counter)
+    status_positioned: Counter[str] = field(default_factory=Counter)
+    short_first: Counter[str] = field(default_factory=Counter)
+    short_only: Counter[str] = field(default_factory=Counter)
     first_reason: Counter[str] = field(default_factory=Counter)
     only_reason: Counter[str] = field(default_factory=Counter)
     satellites: Counter[str] = field(default_factory=Counter)
@@ -63,9 +76,13 @@ class AntennaTally:
         counts = np.bincount(result.status, minlength=len(Status))
         self.epochs += len(result.time)
         self.observed += len(result.time) - int(counts[Status.NO_OBSERVATION])
-        self.positioned += int(np.count_nonzero(np.isfinite(result.chainage_m)))
+        has = np.isfinite(result.chainage_m)
+        positioned = np.bincount(result.status[has], minlength=len(Status))
+        self.positioned += int(np.count_nonzero(has))
         self.status.update({s.text: int(counts[s]) for s in Status if counts[s]})
+        self.status_positioned.update({s.text: int(positioned[s]) for s in Status if positioned[s]})
         self._add_reasons(result)
+        self._add_short(result)
         offset = result.conventional_offset_m
         self.conventional += int(np.count_nonzero(np.isfinite(offset)))
         if np.isfinite(offset).any():
@@ -89,6 +106,33 @@ class AntennaTally:
             for channel in np.flatnonzero(of_channel):
                 counter[str(result.satellite[channel])] += int(of_channel[channel])
 
+    def _add_short(self, result: AntennaResult) -> None:
+        """Which reason took the satellites of the epochs that have too few."""
+        short = np.flatnonzero(result.status == Status.TOO_FEW_SATELLITES)
+        if not len(short):
+            return
+        names, which = np.unique(result.satellite, return_inverse=True)
+        member = (which[:, None] == np.arange(len(names))).astype(np.int64)
+        reason = result.reason[short]
+        # The signals that nobody looked at could not have stood in.
+        looked_at = (reason & Reason.OTHER_SIGNAL_TAKEN) == 0
+
+        def enough(without: int) -> NDArray[np.bool_]:
+            left = (looked_at & ((reason & without) == 0)).astype(np.int64) @ member > 0
+            return np.asarray(np.count_nonzero(left, axis=1) >= self.min_satellites)
+
+        so_far, undecided = 0, np.ones(len(short), dtype=bool)
+        whole = sum(Reason)
+        for bit in Reason:
+            name = str(bit.name).lower()
+            so_far |= bit
+            lost = undecided & ~enough(so_far)
+            self.short_first.update({name: int(lost.sum())})
+            undecided &= ~lost
+            if bit != Reason.NOT_OBSERVED:
+                self.short_only.update({name: int((enough(whole & ~bit) & ~enough(whole)).sum())})
+        self.short_first.update({"used": int(undecided.sum())})
+
     @property
     def never_recorded(self) -> dict[str, int]:
         """Satellites seen for which no record was ever usable, with their observations."""
@@ -101,9 +145,14 @@ class AntennaTally:
             "epochs_with_observations": self.observed,
             "epochs_with_position": self.positioned,
             "positioning_rate": self.positioned / self.observed if self.observed else None,
+            "ok_rate": self.status[Status.OK.text] / self.observed if self.observed else None,
             "first_epoch_gpst": None if self.first is None else str(self.first),
             "last_epoch_gpst": None if self.last is None else str(self.last),
             "status": {s.text: self.status[s.text] for s in Status},
+            "epochs_with_position_by_status": _told(self.status_positioned),
+            "epochs_without_position_by_status": _told(self.status - self.status_positioned),
+            "too_few_satellites_by_first_reason": _told(self.short_first),
+            "too_few_satellites_by_one_reason_alone": _told(self.short_only),
             "observations": self.observations,
             "observations_used": self.used,
             "observations_refused_by_first_reason": dict(self.first_reason),
@@ -113,17 +162,31 @@ class AntennaTally:
         }
 
 
+def _told(counts: Counter[str]) -> dict[str, int]:
+    return {name: count for name, count in counts.items() if count}
+
+
 @dataclass(kw_only=True)
 class Tally:
-    """Counts of all antennas of a run."""
+    """Counts of all antennas of a run.
 
+    Attributes
+    ----------
+    min_satellites : int
+        Satellites that an epoch needs.
+    antennas : dict of str to AntennaTally
+    notes : dict of str
+        As keys, in the order in which they came.
+    """
+
+    min_satellites: int = 3
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)
 
     def add(self, result: Result) -> None:
         """Count one more chunk."""
         for name, antenna in result.antennas.items():
-            self.antennas.setdefault(name, AntennaTally()).add(antenna)
+            self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites)).add(antenna)
         self.notes.update(dict.fromkeys(result.notes))
 
     @property
