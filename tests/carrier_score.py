@@ -1,6 +1,7 @@
 """What carrier phase buys: codes alone, Hatch-smoothed codes, float ambiguities; one setting for all.
 
-Run ``python tests/carrier_score.py``; recordings are taken where they are beside the checkout.
+Run ``python tests/carrier_score.py`` (or with a part of a log's name); ``python tests/carrier_score.py slips``
+measures the detection of slips put into the logs. Recordings are taken where they are beside the checkout.
 """
 
 from __future__ import annotations
@@ -127,6 +128,19 @@ def solved_on_line(ranges: Ranges, case: Case, result: AntennaResult) -> np.ndar
     return constrained_position(ranges, case.trajectory, vertex).arc_m
 
 
+def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) -> tuple[np.ndarray, TrackJumps]:
+    """Corrected phases of the used channels, and their jumps against the line."""
+    obs, columns = case.observations, result.columns
+    ionosphere, troposphere = delays(case, result)
+    phase = corrected_phase_m(slips.phase_m[:, columns], result.satellites.clock_m, ionosphere, troposphere)
+    phase = np.where(used, phase, np.nan)
+    jumps, _ = track_jumps(
+        obs.time, obs.satellite[columns], obs.signal[columns], phase, result.satellites.position_ecef_m,
+        slips.slip[:, columns], case.trajectory, result.arc_m,
+    )  # fmt: skip
+    return phase, jumps
+
+
 def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     """All forms on one log, as a pipeline would call them."""
     obs = case.observations
@@ -142,13 +156,7 @@ def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     hatch = ranges_of(result, corrected, weight / np.maximum(smoothed.sigma_factor[:, columns], 0.1) ** 2)
 
     begin = clock.perf_counter()
-    ionosphere, troposphere = delays(case, result)
-    phase = corrected_phase_m(slips.phase_m[:, columns], result.satellites.clock_m, ionosphere, troposphere)
-    phase = np.where(code_ranges.weight > 0, phase, np.nan)
-    jumps, _ = track_jumps(
-        obs.time, *names, phase, result.satellites.position_ecef_m, slips.slip[:, columns], case.trajectory,
-        result.arc_m,
-    )  # fmt: skip
+    phase, jumps = on_track(case, result, slips, code_ranges.weight > 0)
     has = np.isfinite(slips.phase_m[:, columns])
     arcs, _ = number_arcs(slips.slip[:, columns] | jumps.jump, has, *names)
     sine = np.sin(np.radians(np.maximum(result.elevation_deg[:, columns], 5.0)))
@@ -250,9 +258,78 @@ def slip_line(found: Carried) -> str:
     return f"    phases at {100 * has.sum() / max(used.sum(), 1):.0f} % of the codes; begun anew: {text}"
 
 
+@dataclass(frozen=True)
+class Detection:
+    """Slips put into a log: how many were found by the first test, by either, and what was flagged without any."""
+
+    cycles: int
+    injected: int
+    by_receiver_tests: float
+    by_either: float
+
+
+def joined(found: Carried) -> np.ndarray:
+    """Used phases that nothing ended, shape (T, K)."""
+    columns = found.result.columns
+    has = (found.code_ranges.weight > 0) & np.isfinite(found.slips.phase_m[:, columns])
+    fine = has & ~found.slips.slip[:, columns] & ~found.jumps.jump
+    fine[1:] &= has[:-1]
+    fine[0] = False
+    return fine
+
+
+def detections(found: Carried, sizes: tuple[int, ...] = (1, 2, 10, 1000), *, count: int = 150) -> list[Detection]:
+    """Single slips injected into joined phases at random, at most one an epoch and some epochs apart."""
+    case, result = found.case, found.result
+    rng = np.random.default_rng(7)
+    rows, channels = np.nonzero(joined(found))
+    chosen = []
+    for k in rng.permutation(len(rows)):
+        if all(abs(rows[k] - rows[j]) > 1 for j in chosen):
+            chosen.append(k)
+        if len(chosen) == count:
+            break
+    at, channel = rows[chosen], channels[chosen]
+    outcome = []
+    for size in sizes:
+        phase = case.observations.phase_cycles.copy()
+        for t, m in zip(at, result.columns[channel], strict=True):
+            phase[t:, m] += size * rng.choice([-1, 1])
+        slipped = replace(case, observations=replace(case.observations, phase_cycles=phase))
+        slips, _ = find_slips(slipped.observations)
+        _, jumps = on_track(slipped, result, slips, found.code_ranges.weight > 0)
+        first = slips.slip[:, result.columns][at, channel]
+        either = first | jumps.jump[at, channel]
+        outcome.append(Detection(size, len(at), float(first.mean()), float(either.mean())))
+    return outcome
+
+
+def slip_table(cases: list[Case]) -> None:
+    """Detection rates of injected slips, and what the tests flag on the logs as they are."""
+    print(
+        f"{'log':18s} {'judged':>7s} {'flagged %':>9s} {'on track %':>10s}  found % of slips by 1, 2, 10, 1000 cycles"
+    )
+    for case in cases:
+        found = carried(case)
+        columns = found.result.columns
+        has = (found.code_ranges.weight > 0) & np.isfinite(found.slips.phase_m[:, columns])
+        reason = found.slips.reason[:, columns]
+        tests = int(SlipReason.DOPPLER | SlipReason.CODE)
+        judged = has & ((reason & ~tests) == 0)
+        flagged, jumped = judged & (reason != 0), judged & found.jumps.jump
+        rates = " ".join(f"{100 * d.by_receiver_tests:4.0f}/{100 * d.by_either:<4.0f}" for d in detections(found))
+        total = max(int(judged.sum()), 1)
+        print(
+            f"{case.name:18s} {total:7d} {100 * flagged.sum() / total:9.3f} {100 * jumped.sum() / total:10.3f}  {rates}"
+        )
+
+
 def main(only: Callable[[str], bool] = lambda _: True) -> int:
     data = Path(__file__).resolve().parents[2] / "shared" / "data"
     cases = demo() + (recordings(data) if data.is_dir() else [])
+    if sys.argv[1:2] == ["slips"]:
+        slip_table([c for c in cases if c.name.startswith(("demo front", "japan", "urban", "gsdc"))])
+        return 0
     names = ("n", "mean m", "std m", "p50 m", "p95 m", "max m")
     print(f"{'log':18s} {'form':6s} {names[0]:>5s} " + " ".join(f"{n:>7s}" for n in names[1:]) + "  error/sigma")
     for case in cases:

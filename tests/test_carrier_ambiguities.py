@@ -161,9 +161,9 @@ def test_exact_ranges_and_any_whole_cycles_give_the_place(seed, clocks):
     live, _ = phase_positions(time, ranges, phases, LINE, arc + 8.0, limits=limits)
     run = phase_run(time, ranges, phases, LINE, arc + 8.0, limits=limits)
     for found in (live, run):
-        assert np.abs(found.arc_m - arc).max() < 1e-5
-        assert np.nanmax(np.abs(found.phase_residual_m)) < 1e-5
-        assert np.nanmax(np.abs(found.code_residual_m)) < 1e-5
+        assert np.abs(found.arc_m - arc).max() < 1e-4
+        assert np.nanmax(np.abs(found.phase_residual_m)) < 1e-4
+        assert np.nanmax(np.abs(found.code_residual_m)) < 1e-4
     if clocks == "shared":
         names = np.unique(phases.arc_id)
         expected = dict(zip(names.tolist(), carrier_made.WAVELENGTH_M * cycles, strict=False))

@@ -2,7 +2,8 @@
 
 Between two epochs the antenna moved by one unknown distance along a known line and the clock by
 one unknown; every further satellite is a check, good to a centimetre at any rate of the log and
-without Dopplers. The worst channel is taken out until the others agree.
+without Dopplers. Where they do not agree, the worst channel is taken out until the others do, and
+one that then fits comes back.
 """
 
 from __future__ import annotations
@@ -30,10 +31,11 @@ class ContinuityLimits:
     phase_m, drift_mps : float
         Standard deviation of a change of phase: at once, and for each second between the epochs
         (satellite clocks, delays).
-    aside_m, aside_share : float
-        Standard deviation across the line of the change of place: at once (map points), and as
-        share of the way (a position that is 5 m off on a curve of 300 m radius sees it turned by
-        0.017).
+    aside_m : float
+        Standard deviation across the line and in height of the change of place at once (map points).
+    across_share, up_share : float
+        The same as shares of the way: a position that is 5 m off sees the line turned by 0.017 on a
+        curve of 300 m radius, and by 0.0025 on a vertical one of 2000 m.
     sigmas : float
         A channel is out from so many standard deviations of its own residual on.
     refused : int
@@ -45,13 +47,14 @@ class ContinuityLimits:
     phase_m: float = 0.012
     drift_mps: float = 0.008
     aside_m: float = 0.02
-    aside_share: float = 0.02
+    across_share: float = 0.02
+    up_share: float = 0.003
     sigmas: float = 4.5
     refused: int = 8
     max_gap_s: float = 31.0
 
     def __post_init__(self) -> None:
-        for name in ("phase_m", "drift_mps", "aside_m", "aside_share", "sigmas", "max_gap_s"):
+        for name in ("phase_m", "drift_mps", "aside_m", "across_share", "up_share", "sigmas", "max_gap_s"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         if self.refused < 0:
@@ -157,7 +160,8 @@ def track_jumps(
     way = np.diff(arc)
     design = np.concatenate([-np.matmul(los[1:], axes[1:].swapaxes(1, 2)), np.ones((*change.shape, 1))], axis=-1)
     sigma = np.hypot(limits.phase_m, limits.drift_mps * np.where(able, dt, 0.0))
-    aside = np.hypot(limits.aside_m, limits.aside_share * np.where(able, way, 0.0))
+    share = np.array([limits.across_share, limits.up_share])
+    aside = np.hypot(limits.aside_m, share * np.where(able, way, 0.0)[:, None])
     kept, residual, step, variance, decided = _consistent(design, change, judged, sigma, aside, limits)
     jump = judged & ~(kept & decided[:, None])
     known = able & decided & np.isfinite(variance)
@@ -202,32 +206,62 @@ def _consistent(
     change = np.where(judged, change, 0.0)
     prior = np.zeros((len(change), 4, 4))
     prior[:, 0, 0] = prior[:, 3, 3] = 1e-12
-    prior[:, 1, 1] = prior[:, 2, 2] = aside**-2.0
+    prior[:, [1, 2], [1, 2]] = aside**-2.0
+    fit = _fitted(design, change, judged, sigma, prior)
     kept = judged.copy()
-    active = np.flatnonzero(judged.any(axis=1))
-    residual, (step, variance) = np.zeros(change.shape), np.full((2, len(change)), np.nan)
     decided = np.ones(len(change), dtype=bool)
-    for removed in range(limits.refused + 1):
-        if not len(active):
-            break
-        rows, weight = design[active], kept[active] / sigma[active, None] ** 2
-        inverse = np.linalg.inv(np.matmul((rows * weight[..., None]).swapaxes(1, 2), rows) + prior[active])
-        right = np.matmul((weight * change[active])[:, None, :], rows)[:, 0]
-        x = np.matmul(inverse, right[..., None])[..., 0]
-        left = change[active] - np.matmul(rows, x[..., None])[..., 0]
-        # Variance of each residual; channels that nothing checks have none left.
-        checked = sigma[active, None] ** 2 - np.einsum("tmi,tij,tmj->tm", rows, inverse, rows)
-        size = np.where(
-            kept[active] & (checked > 0.02 * sigma[active, None] ** 2),
-            np.abs(left) / np.sqrt(np.maximum(checked, 1e-12)),
-            0.0,
-        )
-        residual[active], step[active], variance[active] = left, x[:, 0], inverse[:, 0, 0]
+    at = np.flatnonzero((fit.size > limits.sigmas).any(axis=1))
+    if len(at):
+        part = design[at], change[at], sigma[at], prior[at]
+        kept[at], decided[at] = _worst_out(*part, judged[at], limits)
+        # One that was taken out for another's sake comes back.
+        back = judged[at] & (_fitted(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
+        kept[at], again = _worst_out(*part, back, limits)
+        decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.refused)
+        fit = _fitted(design, change, kept, sigma, prior)
+    return kept, fit.residual, fit.step, fit.variance, decided
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Residuals of all channels, their size in sigmas (of one kept: its own; of one not: its prediction's)."""
+
+    residual: Floats
+    size: Floats
+    step: Floats
+    variance: Floats
+
+
+def _fitted(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _Fit:
+    """Least squares of the kept channels of each epoch."""
+    weight = kept / sigma[:, None] ** 2
+    inverse = np.linalg.inv(np.matmul((design * weight[..., None]).swapaxes(1, 2), design) + prior)
+    right = np.matmul((weight * change)[:, None, :], design)[:, 0]
+    x = np.matmul(inverse, right[..., None])[..., 0]
+    residual = change - np.matmul(design, x[..., None])[..., 0]
+    spread = np.einsum("tmi,tij,tmj->tm", design, inverse, design)
+    own = sigma[:, None] ** 2
+    # Of a channel that nothing checks no variance is left: it cannot be judged.
+    checked = np.where(kept, own - spread, own + spread)
+    size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
+    return _Fit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
+
+
+def _worst_out(
+    design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
+) -> tuple[Masks, Masks]:
+    """Kept channels after taking out the worst one by one, and where the rest agrees."""
+    kept = kept.copy()
+    active = np.arange(len(kept))
+    for _ in range(limits.refused + 1):
+        fit = _fitted(design[active], change[active], kept[active], sigma[active], prior[active])
+        size = np.where(kept[active], fit.size, 0.0)
         worst = np.argmax(size, axis=1)
         bad = size[np.arange(len(active)), worst] > limits.sigmas
-        if removed == limits.refused:
-            decided[active[bad]] = False
-            break
         kept[active[bad], worst[bad]] = False
         active = active[bad]
-    return kept, residual, step, variance, decided
+        if not len(active):
+            break
+    decided = np.ones(len(kept), dtype=bool)
+    decided[active] = False
+    return kept, decided
