@@ -1,0 +1,261 @@
+"""A made case for every status and every reason of the pipeline."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline_cases import (
+    channel,
+    demo_navigation,
+    demo_observations,
+    demo_trajectories,
+    front_alone,
+    only,
+    processor,
+    with_code,
+)
+from railfix.antenna import Trajectory
+from railfix.epochs import Observations
+from railfix.navigation import Navigation
+from railfix.pipeline import AntennaResult
+from railfix.reasons import Reason, Status
+from railfix.screens.cn0 import Cn0Limits
+from railfix.track_map import Track
+
+pytestmark = pytest.mark.requirement("B7")
+
+MASK_ONLY = {"screens": ["elevation"]}
+#: Epochs of the made cases: the train runs, all satellites are there.
+FRONT = demo_observations()["front"][400:440]
+WHOLE = front_alone(FRONT, MASK_ONLY)
+
+
+def highest(system: str, count: int) -> list[str]:
+    order = np.argsort(-WHOLE.elevation_deg[0])
+    return [s for s in WHOLE.satellite[order].tolist() if s[0] == system][:count]
+
+
+def all_are(found: AntennaResult, status: Status) -> None:
+    assert [Status(s).name for s in np.unique(found.status)] == [status.name]
+
+
+def line(points_ecef_m: np.ndarray) -> dict[str, Trajectory]:
+    return {"front": Trajectory.from_track(Track.from_ecef(points_ecef_m))}
+
+
+@pytest.mark.requirement("A3")
+def test_everything_there_is_ok():
+    all_are(WHOLE, Status.OK)
+
+
+def test_no_observation():
+    gone = with_code(FRONT, np.where(np.arange(40)[:, None] == 7, np.nan, 0.0))
+    found = front_alone(gone, MASK_ONLY)
+    assert np.flatnonzero(found.status == Status.NO_OBSERVATION).tolist() == [7]
+    assert np.isnan(found.arc_m[7])
+    assert found.n_used[7] == found.n_rejected[7] == 0
+
+
+def test_too_few_satellites():
+    found = front_alone(only(FRONT, highest("G", 2)), MASK_ONLY)
+    all_are(found, Status.TOO_FEW_SATELLITES)
+    assert np.isnan(found.arc_m).all()
+    assert np.isnan(found.ecef_m).all()
+
+
+@pytest.mark.requirement("A4")
+def test_two_satellites_are_enough_when_allowed():
+    """One redundant range less than asked for a sure section, so the position is there and says "ambiguous"."""
+    found = front_alone(only(FRONT, highest("G", 2)), MASK_ONLY | {"min_satellites": 2})
+    positioned = np.isfinite(found.arc_m)
+    assert np.isin(found.status[positioned], [Status.AMBIGUOUS, Status.OFF_MAP]).all()
+    assert positioned.mean() > 0.9
+    assert np.all(found.n_used == 2)
+    # On the true section two ranges give the place: the residuals vanish.
+    assert np.nanmax(np.abs(found.residual_m[found.constrained.overshoot_m == 0])) < 1e-3
+
+
+@pytest.mark.requirement("A3")
+def test_ambiguous_with_one_redundant_range():
+    found = front_alone(only(FRONT, highest("G", 3)), MASK_ONLY)
+    all_are(found, Status.AMBIGUOUS)
+    assert np.isfinite(found.arc_m).all()
+    sure = front_alone(only(FRONT, highest("G", 3)), MASK_ONLY | {"section": {"redundancy": 1}})
+    assert (sure.status == Status.OK).any()
+
+
+@pytest.mark.requirement("A3")
+def test_ambiguous_where_the_line_comes_by_twice():
+    """The line and the same line beside it, 3 m away: no range can tell."""
+    there = demo_trajectories()["front"].ecef_m
+    aside = there + 3.0 * np.r_[demo_trajectories()["front"].up[:1], demo_trajectories()["front"].up]
+    found = front_alone(FRONT, MASK_ONLY, trajectories=line(np.concatenate([there, aside[::-1]])))
+    one = front_alone(FRONT, MASK_ONLY, trajectories=line(there))
+    assert (found.status == Status.AMBIGUOUS).mean() > 0.5
+    all_are(one, Status.OK)
+
+
+def test_off_map_beyond_the_end():
+    here = int(np.searchsorted(demo_trajectories()["front"].arc_m, WHOLE.arc_m.min()))
+    found = front_alone(FRONT, MASK_ONLY, trajectories=line(demo_trajectories()["front"].ecef_m[: here - 8]))
+    all_are(found, Status.OFF_MAP)
+    assert (found.constrained.overshoot_m > 5.0).all()
+    assert np.all(found.arc_m == found.arc_m.max())
+
+
+def test_off_map_far_to_the_side():
+    trajectory = demo_trajectories()["front"]
+    aside = trajectory.ecef_m + 5000.0 * trajectory.across[len(trajectory) // 2]
+    all_are(front_alone(FRONT, MASK_ONLY, trajectories=line(aside)), Status.OFF_MAP)
+
+
+def test_unobservable():
+    """A limit that the satellites cannot reach."""
+    found = front_alone(FRONT, MASK_ONLY | {"dilution_limit": 0.2})
+    all_are(found, Status.UNOBSERVABLE)
+    assert np.isnan(found.arc_m).all()
+
+
+def test_no_convergence():
+    """One step allowed: epochs whose nearest point lies ahead of them would have had to walk into its section."""
+    found = front_alone(FRONT, MASK_ONLY | {"constrained": {"max_iterations": 1}})
+    walked = WHOLE.constrained.iterations > 1
+    assert 0 < walked.sum() < len(walked)
+    assert np.array_equal(found.status == Status.NO_CONVERGENCE, walked)
+    assert np.array_equal(np.isnan(found.arc_m), walked)
+
+
+def test_inconsistent():
+    """Half of the satellites are wrong, each otherwise: no exclusion of two mends that."""
+    wrong = np.zeros(len(FRONT.satellite))
+    for i, name in enumerate(highest("G", 4) + highest("E", 2)):
+        wrong[channel(FRONT, name)] = 40.0 * (-1) ** i * (i + 1)
+    found = front_alone(with_code(FRONT, wrong), {"screens": ["elevation", "raim"]})
+    refused = found.status == Status.INCONSISTENT
+    assert refused.mean() > 0.8
+    assert np.isfinite(found.arc_m).all()
+    dropped = front_alone(with_code(FRONT, wrong), {"screens": ["elevation", "raim"], "failed_checks": "drop"})
+    assert np.array_equal(dropped.status, found.status)
+    assert np.array_equal(np.isnan(dropped.arc_m), refused)
+
+
+def test_antennas_disagree():
+    """Each antenna's log given as the other's: 36 m from where they should be."""
+    parts = {name: whole[400:440] for name, whole in demo_observations().items()}
+    swapped = {"front": parts["rear"], "rear": parts["front"]}
+    result, _ = processor({"screens": ["elevation", "antenna_spacing"]}).process(swapped)
+    for found in result.antennas.values():
+        all_are(found, Status.ANTENNAS_DISAGREE)
+
+
+# --- reasons -----------------------------------------------------------------
+
+
+def changed_records(name: str, **values: Any) -> Navigation:
+    """The demonstration's records, some fields of one satellite's changed."""
+    navigation = demo_navigation()
+    mine = navigation.kepler.satellite == name
+    fields = {key: np.where(mine, value, getattr(navigation.kepler, key)) for key, value in values.items()}
+    return replace(navigation, kepler=replace(navigation.kepler, **fields))
+
+
+def second_signal() -> Observations:
+    """The first GPS satellite once more, on P(Y) as received by semi-codeless tracking."""
+    at = channel(FRONT, highest("G", 1)[0])
+    names = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
+    twice = {name: np.concatenate([getattr(FRONT, name), getattr(FRONT, name)[:, [at]]], axis=1) for name in names}
+    satellite = np.append(FRONT.satellite, FRONT.satellite[at])
+    return replace(FRONT, satellite=satellite, signal=np.append(FRONT.signal, "1W"), **twice)
+
+
+TOP = highest("G", 1)[0]
+AT = channel(FRONT, TOP)
+
+
+def one_wrong(change_m: float, *, from_epoch: int = 0) -> Observations:
+    add = np.zeros(FRONT.code_m.shape)
+    add[from_epoch:, AT] = change_m
+    return with_code(FRONT, add)
+
+
+def weak() -> Observations:
+    return replace(FRONT, cn0_dbhz=np.where(np.arange(len(FRONT.satellite)) == AT, 10.0, FRONT.cn0_dbhz))
+
+
+def other_signals() -> dict[str, Any]:
+    """Galileo asked for on E6 only, whose group delay is not broadcast."""
+    return MASK_ONLY | {"signals": {"G": ["1C"], "J": ["1C"], "E": ["6C"]}}
+
+
+def on_e6() -> Observations:
+    return replace(FRONT, signal=np.where(FRONT.system == "E", "6C", FRONT.signal))
+
+
+LONE = highest("E", 1)[0]
+
+CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
+    # Reason: result, channel, epoch at which it must stand alone.
+    Reason.NOT_OBSERVED: lambda: (front_alone(one_wrong(np.nan), MASK_ONLY), AT, 0),
+    Reason.IMPLAUSIBLE_CODE: lambda: (front_alone(one_wrong(-1.8e7), MASK_ONLY), AT, 0),
+    Reason.SYSTEM_NOT_SELECTED: lambda: (front_alone(FRONT, MASK_ONLY | {"systems": ["E"]}), AT, 0),
+    Reason.OTHER_SIGNAL_TAKEN: lambda: (front_alone(second_signal(), MASK_ONLY), len(FRONT.satellite), 0),
+    Reason.NO_EPHEMERIS: lambda: (
+        front_alone(FRONT, MASK_ONLY, navigation=changed_records(TOP, satellite="G31")),
+        AT,
+        0,
+    ),
+    Reason.EPHEMERIS_TOO_OLD: lambda: (front_alone(FRONT, MASK_ONLY | {"max_ephemeris_age_s": 1.0}), AT, 0),
+    Reason.UNHEALTHY: lambda: (front_alone(FRONT, MASK_ONLY, navigation=changed_records(TOP, health=1)), AT, 0),
+    Reason.ELEVATION_MASK: lambda: (front_alone(FRONT, MASK_ONLY | {"elevation": {"mask_deg": 89.0}}), AT, 0),
+    Reason.ALONE_ON_ITS_CLOCK: lambda: (
+        front_alone(only(FRONT, [*highest("G", 5), LONE]), MASK_ONLY),
+        channel(FRONT, LONE),
+        0,
+    ),
+    Reason.NO_CORRECTION: lambda: (front_alone(on_e6(), other_signals()), channel(FRONT, LONE), 0),
+    Reason.CN0_FLOOR: lambda: (
+        front_alone(weak(), {"screens": ["cn0"], "cn0": {"floor_dbhz": Cn0Limits().floor_dbhz}}),
+        AT,
+        0,
+    ),
+    Reason.DOPPLER: lambda: (
+        front_alone(one_wrong(60.0, from_epoch=20), {"screens": ["doppler"]}),
+        AT,
+        20,
+    ),
+    Reason.FAULT_EXCLUDED: lambda: (front_alone(one_wrong(80.0), {"screens": ["elevation", "raim"]}), AT, 0),
+}
+#: Reasons of screens that need more than one log and the settings; tested beside those screens, or below.
+ELSEWHERE = {Reason.CN0_CURVE, Reason.ANTENNA_PAIR, Reason.USED}
+
+
+def test_every_reason_has_a_case():
+    assert set(CASES) | ELSEWHERE == {Reason.USED, *Reason}
+
+
+@pytest.mark.requirement("B0")
+@pytest.mark.parametrize("reason", CASES, ids=lambda r: r.name.lower())
+def test_reason_is_given(reason: Reason):
+    found, at, epoch = CASES[reason]()
+    assert Reason(int(found.reason[epoch, at])) == reason
+    assert np.isnan(found.residual_m[epoch, at])
+
+
+def test_antenna_pair_is_given():
+    parts = {name: whole[400:440] for name, whole in demo_observations().items()}
+    parts["front"] = one_wrong(40.0)
+    result, _ = processor({"screens": ["elevation", "antenna_pair"]}).process(parts)
+    for found in result.antennas.values():
+        assert np.all(found.reason[:, AT] == Reason.ANTENNA_PAIR)
+
+
+def test_reasons_gather():
+    """A satellite can have several: unhealthy and below the mask."""
+    settings = MASK_ONLY | {"elevation": {"mask_deg": 89.0}}
+    found = front_alone(FRONT, settings, navigation=changed_records(TOP, health=1))
+    assert np.all(found.reason[:, AT] == Reason.UNHEALTHY | Reason.ELEVATION_MASK)
