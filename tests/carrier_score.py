@@ -153,7 +153,8 @@ def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     weight = 1.0 / result.sigma_m[:, columns] ** 2
     code_ranges = ranges_of(result, result.corrected_code_m[:, columns], weight)
     corrected = result.corrected_code_m[:, columns] + (smoothed.code_m - obs.code_m)[:, columns]
-    hatch = ranges_of(result, corrected, weight / np.maximum(smoothed.sigma_factor[:, columns], 0.1) ** 2)
+    # The weights stay: what the floor and multipath leave is not averaged as white noise is.
+    hatch = ranges_of(result, corrected, weight)
 
     begin = clock.perf_counter()
     phase, jumps = on_track(case, result, slips, code_ranges.weight > 0)
@@ -242,6 +243,12 @@ def recordings(data: Path) -> list[Case]:
         recorded("gsdc_pixel5_a", phone / "Pixel5_a.21o", phone / "hour1180.21n", recordings_truth.gsdc_truth(phone)),
     ]
     return cases + [geonet(data, s, a) for s in ("0759", "3040") for a in (0.0, 45.0, 90.0, 135.0)]
+
+
+def scaled(found: PhasePositions, noise_scale: np.ndarray) -> np.ndarray:
+    """Sigma along the line with the receiver's noise scale."""
+    noise = found.noise_sigma_m
+    return np.sqrt((noise_scale * noise) ** 2 + (found.sigma_m**2 - noise**2))
 
 
 def slip_line(found: Carried) -> str:
@@ -338,7 +345,8 @@ def main(only: Callable[[str], bool] = lambda _: True) -> int:
         found = carried(case)
         errors = found.errors()
         both = np.all([np.isfinite(e) for e in errors.values()], axis=0)
-        sigmas = {"code": found.result.along_sigma_m, "live": found.live.sigma_m, "runs": found.whole.sigma_m}
+        sigmas = {"code": found.result.along_sigma_m}
+        sigmas |= {n: scaled(p, found.result.noise_scale) for n, p in (("live", found.live), ("runs", found.whole))}
         for name, error in errors.items():
             s = score(error, both)
             ratio = np.sqrt(np.mean((error[both] / sigmas[name][both]) ** 2)) if name in sigmas else np.nan
