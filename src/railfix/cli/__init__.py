@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from railfix import __version__
+from railfix.cli.ablate import ablate as ablate_command
 from railfix.cli.cn0_curve import cn0_curve as cn0_curve_command
 from railfix.cli.demo import demo as demo_command
 from railfix.cli.map import map_app
@@ -87,6 +88,7 @@ def railfix(
 
 app.command("run")(run_command)
 app.command("demo")(demo_command)
+app.command("ablate")(ablate_command)
 app.command("cn0-curve")(cn0_curve_command)
 app.add_typer(map_app)
 

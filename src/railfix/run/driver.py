@@ -125,28 +125,15 @@ def run_files(
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
-        navigation = read_navigation(inputs.nav, on_error="strict" if options.broken_lines == "stop" else "lenient")
-        if inputs.sp3:
-            navigation = replace(navigation, precise=read_sp3(inputs.sp3))
-        line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
+        navigation, line, logs = open_inputs(inputs, options)
         processor = EpochProcessor(config, navigation, line.trajectories)
-        logs = {
-            name: Log(
-                paths=paths,
-                chunk_epochs=options.chunk_epochs,
-                broken_lines=options.broken_lines,
-                start=options.start,
-                end=options.end,
-            )
-            for name, paths in inputs.logs.items()
-        }
         tally = _position(logs, processor, folder, options, progress)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
         check_positions(tally)
         sigma = along_sigma(folder)
-        notes = _notes(line, navigation, tally, logs)
+        notes = notes_of(line, navigation, tally, logs)
         wall = clock.perf_counter() - began
         record = run_record(
             files=collected(fingerprints),
@@ -163,6 +150,43 @@ def run_files(
         folder.write_json("run.json", record)
         files = folder.commit(_footer(record))
     return RunSummary(tally=tally, sigma=sigma, notes=notes, files=files, wall_s=wall)
+
+
+def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Line, dict[Antenna, Log]]:
+    """Navigation and line, read, and the logs, ready to be read.
+
+    Parameters
+    ----------
+    inputs : RunInputs
+    options : RunOptions
+
+    Returns
+    -------
+    Navigation
+    Line
+    dict of str to Log
+        By antenna.
+
+    Raises
+    ------
+    InputFileError, SettingsError, MismatchError
+        A file is not what it should be, or track and vehicle do not fit.
+    """
+    navigation = read_navigation(inputs.nav, on_error="strict" if options.broken_lines == "stop" else "lenient")
+    if inputs.sp3:
+        navigation = replace(navigation, precise=read_sp3(inputs.sp3))
+    line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
+    logs = {
+        name: Log(
+            paths=paths,
+            chunk_epochs=options.chunk_epochs,
+            broken_lines=options.broken_lines,
+            start=options.start,
+            end=options.end,
+        )
+        for name, paths in inputs.logs.items()
+    }
+    return navigation, line, logs
 
 
 def _position(
@@ -189,9 +213,9 @@ def _position(
     return tally
 
 
-def _notes(line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log]) -> tuple[str, ...]:
+def notes_of(line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log]) -> tuple[str, ...]:
     """Everything a reader of the results should know, each once."""
-    said = [*line.notes, *navigation.notes, *_reading_notes(logs), *tally.notes]
+    said = [*line.notes, *navigation.notes, *_broken_notes(logs), *tally.notes]
     for name, antenna in tally.antennas.items():
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
@@ -201,7 +225,7 @@ def _notes(line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Anten
     return tuple(dict.fromkeys(said))
 
 
-def _reading_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
+def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
     for name, log in logs.items():
         yield from log.problems
         if log.passed_over:

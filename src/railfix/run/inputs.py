@@ -26,8 +26,8 @@ class RunInputs:
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
         Track map, joined to a route in this order.
-    vehicle, config, cn0_curve : Path or None
-        The curve is named by the settings.
+    vehicle, config, cn0_curve, truth : Path or None
+        The curve is named by the settings; the truth is asked for by `ablate` alone.
     """
 
     front: tuple[Path, ...]
@@ -38,6 +38,7 @@ class RunInputs:
     vehicle: Path | None = None
     config: Path | None = None
     cn0_curve: Path | None = None
+    truth: Path | None = None
 
     def named(self) -> Iterator[tuple[str, Path]]:
         """Each file with the name of what it is."""
