@@ -33,7 +33,7 @@ def hold(found: Score, *, rate: float, p50_m: float, p95_m: float, wrong_place: 
     ],
 )
 def test_recording_reaches_its_figures(recordings: Path, name, rate, p50_m, p95_m, wrong_place):
-    outcome = recordings_score.RECORDINGS[name](recordings)
+    outcome = recordings_score.RECORDINGS[name](recordings, recordings_score.SETTINGS)
     hold(outcome.constrained, rate=rate, p50_m=p50_m, p95_m=p95_m, wrong_place=wrong_place)
 
 
@@ -56,7 +56,7 @@ def test_station_played_as_a_train_on_straight_lines(recordings: Path):
 @pytest.mark.parametrize("name", ["urbannav_m8t", "smartloc"])
 def test_the_map_gains_most_where_ranges_are_bad(recordings: Path, name):
     """Against the conventional position of the same ranges, nearest point of the line."""
-    outcome = recordings_score.RECORDINGS[name](recordings)
+    outcome = recordings_score.RECORDINGS[name](recordings, recordings_score.SETTINGS)
     assert outcome.constrained.p95_m < 0.75 * outcome.conventional.p95_m
 
 

@@ -19,6 +19,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
     4: (
         "clock_elimination",
         "clock_offsets",
+        "noise_scale",
         "measurement",
         "section",
         "constrained",

@@ -74,10 +74,15 @@ ROOMS: Final = (
     "constrained",
 )
 
-#: Settings by the name of their preset. "p1": table 6 of P1 to the letter, for geodetic receivers at 10 Hz.
+#: Settings by the name of their preset. "strict": certainty before rate. "p1": table 6 of P1 to the
+#: letter, for geodetic receivers at 10 Hz.
 PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
     "default": {},
+    "strict": {"largest_sigma_m": 10.0, "failed_checks": "drop"},
     "p1": {
+        "largest_sigma_m": 1e6,
+        "map_plan_sigma_m": 1e-3,
+        "map_height_sigma_m": 1e-3,
         "min_satellites": 3,
         "failed_checks": "drop",
         "elevation": {"mask_deg": 20.0},
@@ -95,7 +100,7 @@ class Config(BaseModel):
 
     Attributes
     ----------
-    preset : {"default", "p1"}
+    preset : {"default", "strict", "p1"}
         Settings that all others stand over. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
         and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m, RAIM with two satellites and
         100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not say (weights, noise, clock
@@ -112,6 +117,10 @@ class Config(BaseModel):
     failed_checks : {"keep", "drop"}
         Coordinates of positions that a check has failed (`reasons.CHECK_FAILED`): kept beside the
         status that says so, or dropped as P1 does.
+    largest_sigma_m : float
+        The knob between rate and certainty: a position whose own ranges vouch for less than this
+        (`AntennaResult.own_sigma_m`) is called uncertain and counts as a failed check. P4 takes a car
+        length, 20 m, as acceptable; the preset "strict" asks for 10 m and drops failed checks.
     min_satellites : int
         Satellites asked for (P1 3.2: 3; 2 is possible and doubtful on curves).
     dilution_limit : float
@@ -136,12 +145,13 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
 
-    preset: Literal["default", "p1"] = "default"
+    preset: Literal["default", "strict", "p1"] = "default"
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
     screens: tuple[Literal["elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing"], ...] = SCREENS
     cn0_curve: Path | None = None
     failed_checks: Literal["keep", "drop"] = "keep"
+    largest_sigma_m: float = Field(default=20.0, gt=0)
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)
     off_map_m: float = Field(default=200.0, gt=0)
@@ -154,7 +164,7 @@ class Config(BaseModel):
     noise_prior: float = Field(default=100.0, gt=0)
     noise: CodeNoise = Field(default_factory=CodeNoise)
     cn0: Cn0Limits = Field(default_factory=lambda: Cn0Limits(floor_dbhz=None))
-    doppler: DopplerLimits = Field(default_factory=lambda: DopplerLimits(mode="receiver"))
+    doppler: DopplerLimits = Field(default_factory=lambda: DopplerLimits(mode="receiver", prior_epochs=5.0))
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import digamma
 from scipy.stats import chi2
 
 from railfix.antenna import Trajectory
@@ -25,6 +24,7 @@ from railfix.constrained import Constrained, constrained_position
 from railfix.epochs import Observations
 from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
+from railfix.noise_scale import noise_scale, own_sigma_m
 from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
 from railfix.preparation import Prepared, prepare, without
 from railfix.raim import Outcome, constrained_model, detect, exclude, reliability
@@ -213,14 +213,20 @@ class EpochProcessor:
             tied = single_point(ranges, start, limits=self.config.single_point)
         place = self._on_the_line(ranges, index, tied)
         one.refuse(_alone(one, ties), Reason.ALONE_ON_ITS_CLOCK)
-        scale, state = self._noise_scale(ranges, place.constrained, state)
+        sums = (state.log_variance_sum, state.log_variance_weight)
+        wsse = place.constrained.wsse
+        scale, sums = noise_scale(_redundancy(ranges), wsse, sums, prior=self.config.noise_prior)
         ranges, place, raim = self._fault_free(ranges, index, place, scale)
         if "raim" in self.config.screens:
             raim = self._protected(ranges, index.trajectory, place.constrained, raim, scale)
         one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
-        status = self._status(one.code_m, ranges, index.trajectory, place, raim)
-        found = _Found(point=point, place=place, ties=ties, raim=raim, status=status, noise_scale=scale)
-        return found, replace(state, offsets=offsets)
+        one_map = place.constrained
+        own_sigma = own_sigma_m(_redundancy(ranges), one_map.wsse, one_map.exact_map_sigma_m, scale)
+        status = self._status(one.code_m, ranges, index.trajectory, place, raim, own_sigma)
+        found = _Found(
+            point=point, place=place, ties=ties, raim=raim, status=status, noise_scale=scale, own_sigma_m=own_sigma
+        )
+        return found, replace(state, offsets=offsets, log_variance_sum=sums[0], log_variance_weight=sums[1])
 
     def _fault_free(
         self, ranges: Ranges, index: SearchIndex, place: _Place, scale: Floats
@@ -292,7 +298,7 @@ class EpochProcessor:
         return tie_clocks(time, one.clocks, reference, ranges, free, state.offsets, limits=self.config.clock_offsets)
 
     def _status(
-        self, code: Floats, ranges: Ranges, trajectory: Trajectory, place: _Place, raim: Raim
+        self, code: Floats, ranges: Ranges, trajectory: Trajectory, place: _Place, raim: Raim, own_sigma: Floats
     ) -> NDArray[np.int8]:
         """The status of each epoch, shape (T,), decided once, from numbers, the gravest first."""
         config, redundancy = self.config, _redundancy(ranges)
@@ -309,28 +315,10 @@ class EpochProcessor:
             (~np.isfinite(constrained.arc_m), Status.NO_CONVERGENCE),
             (lost | beyond, Status.OFF_MAP),
             (np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE]), Status.INCONSISTENT),
+            (own_sigma > config.largest_sigma_m, Status.UNCERTAIN),
             ((section.excess <= config.section.threshold) | (redundancy < config.section.redundancy), Status.AMBIGUOUS),
         ]
         return np.select([c for c, _ in conditions], [s.value for _, s in conditions], Status.OK).astype(np.int8)
-
-    def _noise_scale(
-        self, ranges: Ranges, constrained: Constrained, state: AntennaState
-    ) -> tuple[Floats, AntennaState]:
-        """Standard deviation of this receiver's ranges against the weights', from the epochs before.
-
-        The mean of the logarithm of wsse / degrees of freedom, each weighted by its degrees of
-        freedom, less what the logarithm of a chi-square variable is lower by.
-        """
-        freedom = _redundancy(ranges).astype(np.float64)
-        usable = (freedom > 0) & (constrained.wsse > 0)
-        safe = np.where(usable, freedom, 1.0)
-        level = np.log(np.where(usable, constrained.wsse, 1.0) / safe) - (digamma(safe / 2) - np.log(safe / 2))
-        weight = np.where(usable, freedom, 0.0)
-        # cumsum from the carried sums: the same additions in the same order however epochs are cut.
-        sums = np.cumsum(np.r_[state.log_variance_sum, weight * level])
-        weights = np.cumsum(np.r_[state.log_variance_weight, weight])
-        scale = np.exp(0.5 * sums[:-1] / (weights[:-1] + self.config.noise_prior))
-        return scale, replace(state, log_variance_sum=float(sums[-1]), log_variance_weight=float(weights[-1]))
 
     def _result(self, one: Prepared, trajectory: Trajectory, found: _Found) -> AntennaResult:
         """Everything side by side, coordinates only where the status has them."""
@@ -357,6 +345,7 @@ class EpochProcessor:
             kilometrage_m=trajectory.kilometrage_at(arc),
             arc_m=arc,
             along_sigma_m=np.where(has, np.sqrt(scale**2 * exact + (total - exact)), np.nan),
+            own_sigma_m=found.own_sigma_m,
             noise_scale=scale,
             ecef_m=ecef,
             latitude_deg=latitude,
@@ -417,6 +406,7 @@ class _Found:
     raim: Raim
     status: NDArray[np.int8]
     noise_scale: Floats
+    own_sigma_m: Floats
 
 
 def _redundancy(ranges: Ranges) -> NDArray[np.int64]:

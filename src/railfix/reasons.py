@@ -70,6 +70,8 @@ class Status(IntEnum):
     INCONSISTENT = 7
     #: A position, but the two antennas' positions are not as far apart as the antennas.
     ANTENNAS_DISAGREE = 8
+    #: A position, but what its own ranges can vouch for is too wide (`Config.largest_sigma_m`).
+    UNCERTAIN = 9
 
     @property
     def text(self) -> str:
@@ -78,7 +80,7 @@ class Status(IntEnum):
 
 
 #: Positions that a check has failed: with coordinates or without, as `Config.failed_checks` says.
-CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE)
+CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN)
 #: Statuses that come with coordinates (those of `CHECK_FAILED` unless they are dropped).
 POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, *CHECK_FAILED)
 

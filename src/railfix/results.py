@@ -93,6 +93,10 @@ class AntennaResult:
         antenna's trajectory. NaN where the status has no position.
     along_sigma_m : ndarray, shape (T,) [m]
         Standard deviation along the line, the receiver's noise scale and the map error included.
+    own_sigma_m : ndarray, shape (T,) [m]
+        What the ranges of the epoch itself vouch for: standard deviation along the line by the larger
+        of the receiver's noise and what these ranges show, widened as Student's t is where few of them
+        are redundant. Also where the position is dropped.
     noise_scale : ndarray, shape (T,)
         Standard deviation of this receiver's ranges against the one the weights assume, as
         estimated from the epochs before.
@@ -136,6 +140,7 @@ class AntennaResult:
     kilometrage_m: Floats
     arc_m: Floats
     along_sigma_m: Floats
+    own_sigma_m: Floats
     noise_scale: Floats
     ecef_m: Floats
     latitude_deg: Floats

@@ -37,6 +37,7 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "chainage_m": "distance along the line from the first point of the track",
     "kilometrage_m": "the line's own marking, where the track has one",
     "along_sigma_m": "standard deviation along the line",
+    "own_sigma_m": "standard deviation that the ranges of the epoch itself vouch for; `uncertain` over its limit",
     "latitude_deg": "antenna, WGS 84",
     "longitude_deg": "antenna, WGS 84",
     "height_m": "antenna, above the ellipsoid",
@@ -83,7 +84,16 @@ OBSERVATION_COLUMNS: Final[dict[str, str]] = {
 
 #: Results with one value an epoch, and with one an epoch and channel.
 _OF_EPOCH: Final = (
-    *("chainage_m", "kilometrage_m", "arc_m", "along_sigma_m", "latitude_deg", "longitude_deg", "height_m"),
+    *(
+        "chainage_m",
+        "kilometrage_m",
+        "arc_m",
+        "along_sigma_m",
+        "own_sigma_m",
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+    ),
     *("n_used", "n_rejected", "noise_scale", "conventional_chainage_m", "conventional_offset_m"),
 )
 _OF_CHANNEL: Final = (
@@ -117,7 +127,15 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
         "antenna": pl.Series(values=[name], dtype=pl.String).new_from_index(0, epochs),
         "status": words.gather(pl.Series(values=result.status.astype(np.uint32))),
     }
-    for column in ("chainage_m", "kilometrage_m", "along_sigma_m", "latitude_deg", "longitude_deg", "height_m"):
+    for column in (
+        "chainage_m",
+        "kilometrage_m",
+        "along_sigma_m",
+        "own_sigma_m",
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+    ):
         columns[column] = _floats(getattr(result, column))
     for axis, column in enumerate(("x_m", "y_m", "z_m")):
         columns[column] = _floats(result.ecef_m[:, axis])
