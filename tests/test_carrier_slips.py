@@ -183,6 +183,15 @@ def test_channels_may_change_between_chunks():
     assert np.flatnonzero(slips.slip[0]).tolist() == [3]
 
 
+def test_a_carrier_of_unknown_frequency_has_no_phase():
+    obs = carrier_made.log(5, channels=4)
+    frequency = np.full(4, 1_575.42e6)
+    frequency[1] = np.nan
+    slips, _ = find_slips(obs, frequency_hz=frequency)
+    assert (slips.reason[:, 1] == SlipReason.NO_PHASE).all()
+    assert np.isfinite(slips.phase_m[:, [0, 2, 3]]).all()
+
+
 def test_arcs_have_names_of_their_own():
     slip = np.zeros((4, 2), dtype=bool)
     slip[0], slip[2, 0] = True, True

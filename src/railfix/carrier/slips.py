@@ -190,7 +190,11 @@ def _last_row(state: SlipState, channels: tuple[tuple[str, str], ...]) -> dict[s
 
 
 def find_slips(
-    observations: Observations, state: SlipState | None = None, *, limits: SlipLimits | None = None
+    observations: Observations,
+    state: SlipState | None = None,
+    *,
+    frequency_hz: Floats | None = None,
+    limits: SlipLimits | None = None,
 ) -> tuple[Slips, SlipState]:
     """Cycle slips of every channel of a chunk.
 
@@ -203,6 +207,9 @@ def find_slips(
         T epochs, M channels.
     state : SlipState, optional
         Left by the chunk before; None at the start of a log.
+    frequency_hz : ndarray, shape (M,), optional [Hz]
+        Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
+        channels.
     limits : SlipLimits, optional
 
     Returns
@@ -214,9 +221,11 @@ def find_slips(
     limits, state = limits or SlipLimits(), state or SlipState()
     channels = tuple(zip(observations.satellite.tolist(), observations.signal.tolist(), strict=True))
     last = _last_row(state, channels)
-    wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(
-        observations.satellite, observations.signal, observations.header.glonass_channel
-    )
+    if frequency_hz is None:
+        frequency_hz = carrier_frequency_hz(
+            observations.satellite, observations.signal, observations.header.glonass_channel
+        )
+    wavelength = SPEED_OF_LIGHT / frequency_hz
     phase, doppler = observations.phase_cycles * wavelength, observations.doppler_hz * wavelength
     times = np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), observations.time])
     changes = _Changes(
