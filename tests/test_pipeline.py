@@ -30,7 +30,7 @@ from pipeline_cases import (
 from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.epochs import Observations
 from railfix.pipeline import EpochProcessor
-from railfix.reasons import Reason, Status
+from railfix.reasons import POSITIONED, Reason, Status
 from railfix.rinex import read_navigation, read_observations
 from railfix.timescale import timedelta
 
@@ -250,8 +250,7 @@ def test_reasons_and_statuses_add_up():
             assert found.n_used[t] == len(used)
             assert found.n_used[t] + found.n_rejected[t] == len(with_code_) <= len(names)
         positioned = np.isfinite(found.chainage_m)
-        has = np.isin(found.status, [Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, 8])
-        assert np.array_equal(positioned, has)
+        assert np.array_equal(positioned, np.isin(found.status, POSITIONED))
 
 
 @pytest.mark.requirement("B7")
