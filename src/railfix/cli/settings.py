@@ -21,7 +21,8 @@ PresetOption = Annotated[
         "--preset",
         metavar="NAME",
         rich_help_panel=_PANEL,
-        help="Named set of settings that all others stand over: default, or p1 (P1 table 6 to the letter).",
+        help="Settings that all others stand over: default, strict (certainty before rate), or p1 (P1 table 6 to the "
+        "letter).",
     ),
 ]
 ConfigOption = Annotated[
