@@ -1,0 +1,147 @@
+"""`railfix run` against RTKLIB's single point (`rnx2rtkp`) on the same two logs of an hour at 10 Hz.
+
+The two 86 MB logs are simulated first (or taken from ``--run``). Both programs are whole processes,
+started in turn; medians of the rounds, and their ratio, are printed::
+
+    python tests/benchmarks/bench_run.py [--run FOLDER] [--rounds 3] [--screens all|mask] [--profile]
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+#: RTKLIB with the same models; it has no screens beyond the mask.
+RTKLIB_SETTINGS = """pos1-posmode=single
+pos1-frequency=l1
+pos1-elmask=20
+pos1-ionoopt=brdc
+pos1-tropopt=saas
+pos1-sateph=brdc
+pos1-navsys=57
+out-solformat=llh
+out-timesys=gpst
+"""
+MASK_ONLY = 'screens = ["elevation"]\n'
+
+
+@dataclass(frozen=True)
+class Spent:
+    """One run of a program."""
+
+    wall_s: float
+    used_s: float
+    peak_mb: float
+
+
+def run(command: list[str]) -> Spent:
+    """Run a program to its end; its own processor time and memory."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    begin = time.perf_counter()
+    watched = "import resource, subprocess, sys\nr = subprocess.run(sys.argv[1:], stdout=-3, stderr=-3).returncode\n"
+    watched += "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\nsys.exit(r)"
+    done = subprocess.run([sys.executable, "-c", watched, *command], stdout=subprocess.PIPE, check=True, text=True)
+    wall = time.perf_counter() - begin
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return Spent(wall, used, float(done.stdout) / 1024.0)
+
+
+def simulate(folder: Path) -> None:
+    """An hour of a train on 20 km of line, 18 satellites on two signals, two antennas."""
+    options = "--seconds 3600 --line-km 20 --systems GJEC --satellites 18 --signals 2 --plain"
+    command = [sys.executable, "-m", "railfix.simulate", str(folder), *options.split()]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+def railfix_command(folder: Path, out: Path, config: Path | None) -> list[str]:
+    command = [sys.executable, "-m", "railfix", "run", "--front", f"{folder}/front.rnx", "--rear", f"{folder}/rear.rnx"]
+    command += ["--nav", f"{folder}/nav.rnx", "--track", f"{folder}/track.csv", "--vehicle", f"{folder}/vehicle.toml"]
+    return [*command, "--out", str(out), *(["--config", str(config)] if config else [])]
+
+
+def line(name: str, rounds: list[Spent]) -> float:
+    wall, used, peak = (float(np.median([getattr(r, k) for r in rounds])) for k in ("wall_s", "used_s", "peak_mb"))
+    spread = f"{min(r.wall_s for r in rounds):.2f} to {max(r.wall_s for r in rounds):.2f}"
+    print(f"{name:28s} wall {wall:6.2f} s ({spread})   processor {used:6.2f} s   peak memory {peak:5.0f} MB")
+    return wall
+
+
+def compare(folder: Path, scratch: Path, *, rounds: int, config: Path | None) -> None:
+    own: list[Spent] = []
+    other: list[Spent] = []
+    conf = scratch / "single.conf"
+    conf.write_text(RTKLIB_SETTINGS)
+    for number in range(rounds):
+        own.append(run(railfix_command(folder, scratch / f"out{number}", config)))
+        shutil.rmtree(scratch / f"out{number}")
+        if shutil.which("rnx2rtkp"):
+            spent = [
+                run(["rnx2rtkp", "-k", str(conf), "-o", f"{scratch}/{a}.pos", f"{folder}/{a}.rnx", f"{folder}/nav.rnx"])
+                for a in ("front", "rear")
+            ]
+            total = Spent(sum(s.wall_s for s in spent), sum(s.used_s for s in spent), max(s.peak_mb for s in spent))
+            other.append(total)
+    wall = line("railfix run, two antennas", own)
+    print(f"{'':28s} {72_000 / wall:8.0f} positions a second")
+    if other:
+        theirs = line("rnx2rtkp, one log, then the other", other)
+        ratio = float(np.median([b.wall_s / a.wall_s for a, b in zip(own, other, strict=True)]))
+        print(f"{'':28s} {72_000 / theirs:8.0f} positions a second")
+        print(f"railfix is {ratio:.2f} times as fast (wanted: 1; goal: 10)")
+
+
+def profiled(folder: Path, scratch: Path, config: Path | None) -> None:
+    from railfix.cli import main as railfix_main
+
+    def once() -> None:
+        sys.argv = ["railfix", *railfix_command(folder, scratch / "profiled", config)[3:]]
+        try:
+            railfix_main()
+        except SystemExit as left:
+            if left.code:
+                raise
+
+    profile = cProfile.Profile()
+    action: Callable[[], None] = once
+    profile.runcall(action)
+    pstats.Stats(profile).sort_stats("tottime").print_stats(25)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, help="folder of a simulated run, made with --plain")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: as RTKLIB, elevation only")
+    parser.add_argument("--profile", action="store_true", help="print where the time of one more run goes")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="railfix-bench-") as name:
+        scratch = Path(name)
+        folder = options.run or scratch / "hour"
+        if options.run is None:
+            simulate(folder)
+        config = None
+        if options.screens == "mask":
+            config = scratch / "mask.toml"
+            config.write_text(MASK_ONLY)
+        size = sum((folder / f"{a}.rnx").stat().st_size for a in ("front", "rear")) / 1e6
+        print(f"two logs of an hour at 10 Hz, {size:.0f} MB in all, screens: {options.screens}")
+        compare(folder, scratch, rounds=options.rounds, config=config)
+        if options.profile:
+            profiled(folder, scratch, config)
+
+
+if __name__ == "__main__":
+    main()

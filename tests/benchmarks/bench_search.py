@@ -1,0 +1,80 @@
+"""Time of the section search per epoch on a line of 1 km and on one of 200 km, and what it looks at.
+
+A train runs at 72 km/h, 10 Hz, noise of a metre; the search itself knows nothing of the epoch before.
+With eight satellites there is a 3-D position to start from; with three the search goes coarse to fine.
+The two lines take turns, and the ratio is the median of the rounds::
+
+    python tests/benchmarks/bench_search.py [--epochs 2000] [--rounds 9]
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import synthetic
+from railfix.antenna import Trajectory
+from railfix.clock_elimination import Ranges
+from railfix.section import SearchIndex, search
+from railfix.spp import SinglePoint, single_point
+
+LENGTHS_M = (1_000.0, 200_000.0)
+#: Wanted with a 3-D position.
+RATIO = 1.5
+
+
+def case(line: Trajectory, epochs: int, satellites: int) -> tuple[Ranges, SinglePoint]:
+    """A train at 72 km/h and 10 Hz from the middle of a line, turning at its ends, and 3-D positions of its ranges."""
+    free = line.arc_m[-1] - 10.0
+    where = 5.0 + np.abs((free / 2.0 + 2.0 * np.arange(epochs) + free) % (2.0 * free) - free)
+    ranges = synthetic.ranges(line, where)
+    if satellites < ranges.weight.shape[1]:
+        ranges = replace(ranges, weight=np.where(np.arange(ranges.weight.shape[1]) < satellites, ranges.weight, 0.0))
+    return ranges, single_point(ranges, np.broadcast_to(line.ecef_m.mean(axis=0), (epochs, 3)))
+
+
+def microseconds(ranges: Ranges, index: SearchIndex, point: SinglePoint) -> float:
+    """Time an epoch of one call over all epochs [us]."""
+    begin = time.perf_counter()
+    search(ranges, index, point)
+    return 1e6 * (time.perf_counter() - begin) / len(ranges)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--epochs", type=int, default=2000)
+    parser.add_argument("--rounds", type=int, default=9)
+    options = parser.parse_args()
+    lines = [synthetic.line(length) for length in LENGTHS_M]
+    indices = [SearchIndex(line) for line in lines]
+    for satellites, epochs in ((8, options.epochs), (3, max(options.epochs // 10, 1))):
+        cases = [case(line, epochs, satellites) for line in lines]
+        looked = [
+            float(search(ranges, index, point).evaluations.mean())
+            for index, (ranges, point) in zip(indices, cases, strict=True)
+        ]
+        times = np.array(
+            [
+                [microseconds(ranges, index, point) for index, (ranges, point) in zip(indices, cases, strict=True)]
+                for _ in range(options.rounds)
+            ]
+        )
+        ratio = float(np.median(times[:, 1] / times[:, 0]))
+        print(
+            f"{satellites} satellites, {epochs} epochs a call, {'3-D position' if satellites > 3 else 'coarse to fine'}"
+        )
+        for length, line, spent, points in zip(LENGTHS_M, lines, np.median(times, axis=0), looked, strict=True):
+            head = f"  {length / 1e3:5.0f} km, {len(line):6d} points"
+            print(f"{head}: {spent:8.2f} us an epoch, {points:7.1f} points looked at")
+        print(f"  200 km / 1 km: {ratio:.2f}" + (f" (wanted: under {RATIO})" if satellites > 3 else ""))
+
+
+if __name__ == "__main__":
+    main()
