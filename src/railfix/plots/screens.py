@@ -91,7 +91,7 @@ def draw_screen(
 
 def _draw_metric(axes: Axes, picture: ScreenPicture, along: NDArray[Any]) -> None:
     where = np.broadcast_to(along[:, None], picture.metric.shape)
-    for mask, colour, name in ((~picture.reject, _KEPT, "used"), (picture.reject, _REJECTED, "refused")):
+    for mask, colour, name in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "refused")):
         axes.plot(where[mask], picture.metric[mask], ".", ms=2, color=colour, label=name, rasterized=True)
     limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
     finite = np.isfinite(limit).any(axis=1)
