@@ -36,6 +36,7 @@ from pydantic import (
     model_validator,
 )
 
+from railfix.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
 from railfix.clock_offsets import ClockOffsetLimits
 from railfix.constrained import ConstrainedLimits
 from railfix.errors import InputFileError, SettingsError
@@ -72,6 +73,10 @@ ROOMS: Final = (
     "single_point",
     "section",
     "constrained",
+    "slips",
+    "smoothing",
+    "continuity",
+    "phase",
 )
 
 #: Settings by the name of their preset. "strict": certainty before rate. "p1": table 6 of P1 to the
@@ -141,6 +146,14 @@ class Config(BaseModel):
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
         Limits of the rooms of these names.
+    carrier : {"off", "smoothed", "float"}
+        Use of the carrier phase (A5): none; codes smoothed by it; or code and phase together with float
+        ambiguities, from this and earlier epochs. On recordings smoothing helps most on a phone, float
+        ambiguities under open sky; in towns, where arcs last seconds, neither takes off large errors.
+    phase_sigma_m : float
+        Standard deviation of a phase at the zenith, what multipath does to it included.
+    slips, smoothing, continuity, phase
+        Limits of the rooms of the carrier phase.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
@@ -168,6 +181,12 @@ class Config(BaseModel):
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
+    carrier: Literal["off", "smoothed", "float"] = "off"
+    phase_sigma_m: float = Field(default=0.01, gt=0)
+    slips: SlipLimits = Field(default_factory=SlipLimits)
+    smoothing: SmoothingLimits = Field(default_factory=SmoothingLimits)
+    continuity: ContinuityLimits = Field(default_factory=ContinuityLimits)
+    phase: PhaseLimits = Field(default_factory=PhaseLimits)
     clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
     single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)

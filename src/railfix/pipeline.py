@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from railfix.antenna import Trajectory
-from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges
+from railfix.carrier import PhasePositions
+from railfix.carrying import CarrierState, carried, slips_of, smoothed
+from railfix.clock_elimination import ClockTies, Ranges
 from railfix.clock_offsets import OffsetState, tie_clocks
 from railfix.cn0_curve import read_cn0_curve
 from railfix.config import Config
@@ -29,7 +31,8 @@ from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
 from railfix.preparation import Prepared, prepare, without
 from railfix.raim import Outcome, constrained_model, detect, exclude, reliability
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
-from railfix.results import AntennaResult, AntennaState, Bits, Floats, Raim, Result, State, patched
+from railfix.refusals import alone_on_their_clocks, satellites_refused, whole_reason
+from railfix.results import AntennaResult, AntennaState, Floats, Raim, Result, State, patched
 from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
 from railfix.section import SearchIndex, Section, search
 from railfix.spp import SinglePoint, single_point
@@ -167,6 +170,11 @@ class EpochProcessor:
             )
             one.screened("doppler", changes, Reason.DOPPLER)
             state = replace(state, doppler=doppler)
+        if self.config.carrier != "off":
+            slips, carrier = slips_of(one, self.navigation, self.config, state.carrier or CarrierState())
+            if self.config.carrier == "smoothed":
+                one, carrier = smoothed(one, slips, self.config, carrier)
+            one, state = replace(one, slips=slips), replace(state, carrier=carrier)
         return one, state
 
     def _pair(self, prepared: Mapping[str, Prepared]) -> AntennaPair | None:
@@ -212,7 +220,7 @@ class EpochProcessor:
             start = np.where(np.isnan(point.ecef_m), one.anchor_ecef_m, point.ecef_m)
             tied = single_point(ranges, start, limits=self.config.single_point)
         place = self._on_the_line(ranges, index, tied)
-        one.refuse(_alone(one, ties), Reason.ALONE_ON_ITS_CLOCK)
+        one.refuse(alone_on_their_clocks(one, ties), Reason.ALONE_ON_ITS_CLOCK)
         sums = (state.log_variance_sum, state.log_variance_weight)
         wsse = place.constrained.wsse
         scale, sums = noise_scale(_redundancy(ranges), wsse, sums, prior=self.config.noise_prior)
@@ -223,8 +231,25 @@ class EpochProcessor:
         one_map = place.constrained
         own_sigma = own_sigma_m(_redundancy(ranges), one_map.wsse, one_map.exact_map_sigma_m, scale)
         status = self._status(one.code_m, ranges, index.trajectory, place, raim, own_sigma)
+        arc = one_map.arc_m
+        exact, total = one_map.exact_map_sigma_m, one_map.sigma_m
+        phase = None
+        if self.config.carrier == "float" and one.slips is not None:
+            before = state.carrier or CarrierState()
+            phase, after = carried(one, one.slips, ranges, index.trajectory, arc, self.config, before)
+            arc, exact, total = phase.arc_m, phase.noise_sigma_m, phase.sigma_m
+            state = replace(state, carrier=after)
         found = _Found(
-            point=point, place=place, ties=ties, raim=raim, status=status, noise_scale=scale, own_sigma_m=own_sigma
+            point=point,
+            place=place,
+            ties=ties,
+            raim=raim,
+            status=status,
+            noise_scale=scale,
+            own_sigma_m=own_sigma,
+            arc_m=arc,
+            along_sigma_m=np.sqrt((scale * exact) ** 2 + (total**2 - exact**2)),
+            phase=phase,
         )
         return found, replace(state, offsets=offsets, log_variance_sum=sums[0], log_variance_weight=sums[1])
 
@@ -324,12 +349,11 @@ class EpochProcessor:
         """Everything side by side, coordinates only where the status has them."""
         obs, point, constrained, scale = one.observations, found.point, found.place.constrained, found.noise_scale
         has = np.isin(found.status, self._with_coordinates)
-        arc = np.where(has, constrained.arc_m, np.nan)
+        arc = np.where(has, found.arc_m, np.nan)
         ecef = trajectory.at_arc(arc)
         latitude, longitude, height = geodetic_from_ecef(ecef)
         nearest, offset = trajectory.nearest(point.ecef_m)
-        exact, total = constrained.exact_map_sigma_m**2, constrained.sigma_m**2
-        reason = self._whole_reason(one)
+        reason = whole_reason(one, self.config.systems)
 
         def whole(values: Floats) -> Floats:
             full = np.full(obs.code_m.shape, np.nan)
@@ -344,7 +368,7 @@ class EpochProcessor:
             chainage_m=trajectory.chainage_at(arc),
             kilometrage_m=trajectory.kilometrage_at(arc),
             arc_m=arc,
-            along_sigma_m=np.where(has, np.sqrt(scale**2 * exact + (total - exact)), np.nan),
+            along_sigma_m=np.where(has, found.along_sigma_m, np.nan),
             own_sigma_m=found.own_sigma_m,
             noise_scale=scale,
             ecef_m=ecef,
@@ -352,7 +376,7 @@ class EpochProcessor:
             longitude_deg=longitude,
             height_m=height,
             n_used=np.count_nonzero(one.reason == 0, axis=1),
-            n_rejected=_satellites_refused(obs.satellite, reason),
+            n_rejected=satellites_refused(obs.satellite, reason),
             conventional_ecef_m=point.ecef_m,
             conventional_arc_m=nearest,
             conventional_chainage_m=trajectory.chainage_at(nearest),
@@ -370,21 +394,12 @@ class EpochProcessor:
             single_point=point,
             section=found.place.section,
             constrained=constrained,
+            phase=found.phase,
             raim=replace(found.raim, protection_level_m=np.where(has, found.raim.protection_level_m, np.nan)),
             clocks=one.clocks,
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,
         )
-
-    def _whole_reason(self, one: Prepared) -> Bits:
-        """Reasons of all channels, those that settings leave out included, shape (T, M)."""
-        obs = one.observations
-        reason = np.where(np.isfinite(obs.code_m), 0, int(Reason.NOT_OBSERVED))
-        selected = np.isin(obs.system, self.config.systems)
-        reason[:, ~selected] |= Reason.SYSTEM_NOT_SELECTED
-        reason[:, np.setdiff1d(np.flatnonzero(selected), one.columns)] |= Reason.OTHER_SIGNAL_TAKEN
-        reason[:, one.columns] = one.reason
-        return reason
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,27 +422,11 @@ class _Found:
     status: NDArray[np.int8]
     noise_scale: Floats
     own_sigma_m: Floats
+    arc_m: Floats
+    along_sigma_m: Floats
+    phase: PhasePositions | None
 
 
 def _redundancy(ranges: Ranges) -> NDArray[np.int64]:
     """Ranges beyond the clocks and the distance along the line, shape (T,)."""
     return np.asarray(ranges.n_used - ranges.n_clocks - 1, dtype=np.int64)
-
-
-def _alone(one: Prepared, ties: ClockTies) -> NDArray[np.bool_]:
-    """Satellites that determine their own clock and nothing else, shape (T, K)."""
-    alone = np.zeros(one.reason.shape, dtype=bool)
-    for g, group in enumerate(one.groups):
-        used = one.reason[:, group] == 0
-        lone = (np.count_nonzero(used, axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
-        alone[:, group] = used & lone[:, None]
-    return alone
-
-
-def _satellites_refused(satellite: NDArray[np.str_], reason: Bits) -> NDArray[np.int64]:
-    """Satellites with a code of which no signal was used, shape (T,)."""
-    names, which = np.unique(satellite, return_inverse=True)
-    member = (which[:, None] == np.arange(len(names))).astype(np.int64)
-    seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.int64) @ member > 0
-    used = (reason == 0).astype(np.int64) @ member > 0
-    return np.asarray(np.count_nonzero(seen & ~used, axis=1), dtype=np.int64)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
+from railfix.carrier import Slips
 from railfix.clock_elimination import Ranges, clock_groups
 from railfix.config import Config
 from railfix.constants import CLOCK_GROUP
@@ -53,11 +54,15 @@ class Prepared:
     anchor_ecef_m : ndarray, shape (T, 3) [m]
         Where the satellites are seen from.
     elevation_deg, azimuth_deg : ndarray, shape (T, K)
+    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
+        Delays taken off the codes; 0 where the model is off.
     corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
     reason : ndarray of int64, shape (T, K)
         Written to by `refuse` alone.
     screens : dict of str to Screened
         What each screen measured and said.
+    slips : Slips or None
+        Of all channels of the observations, where the carrier phase is used.
     """
 
     observations: Observations
@@ -73,10 +78,13 @@ class Prepared:
     anchor_ecef_m: Floats
     elevation_deg: Floats
     azimuth_deg: Floats
+    ionosphere_m: Floats
+    troposphere_m: Floats
     corrected_code_m: Floats
     sigma_m: Floats
     reason: Bits
     screens: dict[str, Screened] = field(default_factory=dict)
+    slips: Slips | None = None
 
     @property
     def clocks(self) -> tuple[str, ...]:
@@ -135,10 +143,12 @@ def prepare(
     elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
     frequency = carrier_frequency_hz(satellite, signal, {**glonass_channels(navigation), **obs.header.glonass_channel})
     latitude, longitude, height = geodetic_from_ecef(anchor)
+    ionosphere, troposphere = np.zeros((2, *code.shape))
     if klobuchar is not None:
-        clean = clean - klobuchar_delay_m(obs.time, latitude, longitude, elevation, azimuth, klobuchar, frequency)
+        ionosphere = klobuchar_delay_m(obs.time, latitude, longitude, elevation, azimuth, klobuchar, frequency)
     if config.troposphere == "saastamoinen":
-        clean = clean - saastamoinen_delay_m(latitude, height, elevation)
+        troposphere = saastamoinen_delay_m(latitude, height, elevation)
+    clean = clean - ionosphere - troposphere
     sigma = code_sigma_m(cn0, elevation, noise=config.noise)
     reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
     return Prepared(
@@ -155,6 +165,8 @@ def prepare(
         anchor_ecef_m=anchor,
         elevation_deg=elevation,
         azimuth_deg=azimuth,
+        ionosphere_m=ionosphere,
+        troposphere_m=troposphere,
         corrected_code_m=clean,
         sigma_m=sigma,
         reason=reason,

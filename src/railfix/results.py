@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from railfix.carrier import PhasePositions
+from railfix.carrying import CarrierState
 from railfix.clock_offsets import OffsetState
 from railfix.constrained import Constrained
 from railfix.orbits import SatelliteStates
@@ -63,12 +65,15 @@ class AntennaState:
         What is known of the offsets between the clocks of the constellations.
     doppler : DopplerState or None
         The last epoch that the Doppler screen has seen.
+    carrier : CarrierState or None
+        What the carrier phase has left, where it is used.
     """
 
     log_variance_sum: float = 0.0
     log_variance_weight: float = 0.0
     offsets: OffsetState = field(default_factory=OffsetState)
     doppler: DopplerState | None = None
+    carrier: CarrierState | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,6 +129,8 @@ class AntennaResult:
         The conventional position: every constellation with a clock of its own.
     section : Section
     constrained : Constrained
+    phase : PhasePositions or None
+        Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
     raim : Raim
         Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
     clocks : tuple of str
@@ -165,6 +172,7 @@ class AntennaResult:
     single_point: SinglePoint
     section: Section
     constrained: Constrained
+    phase: PhasePositions | None
     raim: Raim
     clocks: tuple[str, ...]
     clock_offset_m: Floats

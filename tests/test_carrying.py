@@ -1,0 +1,71 @@
+"""The carrier phase in the pipeline: how epochs are cut does not matter, and the noise goes down."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import polars as pl
+import pytest
+
+from railfix.config import parse_config
+from railfix.evaluate import along_track_error
+from railfix.pipeline import EpochProcessor
+from railfix.rinex import read_navigation, read_observations
+from railfix.simulate import demo_files
+from railfix.track_map import read_track
+from railfix.vehicle import antenna_trajectory, read_vehicle
+
+EPOCHS = 150
+
+
+@cache
+def demo():
+    files = demo_files()
+    track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
+    truth = pl.read_csv(files["truth"]).filter(pl.col("antenna") == "front").select("x_m", "y_m", "z_m").to_numpy()
+    return (
+        read_observations(files["front"])[:EPOCHS],
+        read_navigation(files["nav"]),
+        antenna_trajectory(track, vehicle, "front"),
+        truth[:EPOCHS],
+    )
+
+
+def run(carrier: str, cuts: int):
+    observations, navigation, trajectory, _ = demo()
+    processor = EpochProcessor(parse_config({"carrier": carrier}), navigation, {"front": trajectory})
+    state, parts = None, []
+    for first in range(0, EPOCHS, cuts):
+        result, state = processor.process({"front": observations[first : first + cuts]}, state)
+        parts.append(result.antennas["front"])
+    return parts
+
+
+@pytest.mark.requirement("A5")
+@pytest.mark.parametrize("carrier", ["smoothed", "float"])
+@pytest.mark.parametrize("cuts", [1, 7])
+def test_cutting_changes_nothing(carrier: str, cuts: int):
+    whole = run(carrier, EPOCHS)[0]
+    arc = np.concatenate([part.arc_m for part in run(carrier, cuts)])
+    sigma = np.concatenate([part.along_sigma_m for part in run(carrier, cuts)])
+    assert np.abs(arc - whole.arc_m).max() < 1e-6
+    assert np.abs(sigma - whole.along_sigma_m).max() < 1e-6
+
+
+@pytest.mark.requirement("A5")
+def test_phase_takes_the_noise_off():
+    """Standing and running, 10 Hz: after five seconds the phases carry the position."""
+    *_, trajectory, truth = demo()
+    spread = {}
+    for carrier in ("off", "smoothed", "float"):
+        error = along_track_error(run(carrier, EPOCHS)[0].arc_m, truth, trajectory)
+        spread[carrier] = float(np.std(error[50:]))
+    assert spread["smoothed"] < 0.4 * spread["off"]
+    assert spread["float"] < 0.4 * spread["off"]
+
+
+def test_off_leaves_the_phase_alone():
+    whole = run("off", EPOCHS)[0]
+    assert whole.phase is None
+    assert run("float", EPOCHS)[0].phase is not None
