@@ -17,6 +17,7 @@ from scipy.stats import chi2
 from railfix.antenna import Trajectory
 from railfix.carrier import PhasePositions
 from railfix.carrying import CarrierState, carried, slips_of, smoothed
+from railfix.channels import ChannelBook
 from railfix.clock_elimination import ClockTies, Ranges
 from railfix.clock_offsets import OffsetState, tie_clocks
 from railfix.cn0_curve import read_cn0_curve
@@ -65,12 +66,14 @@ class EpochProcessor:
             )
             for name, trajectory in trajectories.items()
         }
+        self._channels = ChannelBook(config, navigation)
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._cn0_curve = None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve)
         self._klobuchar, notes = self._ionosphere()
         self.notes = (*notes, *self._what_screens_lack())
         dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
-        self._with_coordinates = [status.value for status in POSITIONED if status not in dropped]
+        #: By status: whether coordinates come with it.
+        self._has_coordinates = np.array([status in POSITIONED and status not in dropped for status in sorted(Status)])
         self._off_map_excess = float(chi2.isf(config.off_map_risk, 2))
 
     def _ionosphere(self) -> tuple[Floats | None, tuple[str, ...]]:
@@ -140,7 +143,8 @@ class EpochProcessor:
 
     def _screened(self, name: str, obs: Observations, state: AntennaState) -> tuple[Prepared, AntennaState]:
         """Corrected ranges of one antenna, and what the screens of one antenna refuse."""
-        one = prepare(obs, self.config, self.navigation, self._index[name], self._klobuchar)
+        channels = self._channels.of(obs)
+        one = prepare(obs, channels, self.config, self.navigation, self._index[name], self._klobuchar)
         if "elevation" in self.config.screens:
             verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
             one.screened("elevation", verdict, Reason.ELEVATION_MASK)
@@ -204,7 +208,7 @@ class EpochProcessor:
             metric[epochs] = verdict.metric
             reject = np.zeros(len(metric), dtype=bool)
             reject[epochs] = verdict.reject
-            doubtful = reject & np.isin(one.status, self._with_coordinates)
+            doubtful = reject & self._has_coordinates[one.status]
             status = np.where(doubtful, Status.ANTENNAS_DISAGREE, one.status).astype(np.int8)
             pair.prepared[name].screens["antenna_spacing"] = Screened(metric=metric, reject=reject)
             found[name] = replace(one, status=status)
@@ -339,7 +343,7 @@ class EpochProcessor:
             (constrained.dilution > config.dilution_limit, Status.UNOBSERVABLE),
             (~np.isfinite(constrained.arc_m), Status.NO_CONVERGENCE),
             (lost | beyond, Status.OFF_MAP),
-            (np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE]), Status.INCONSISTENT),
+            ((raim.outcome == Outcome.UNRESOLVED) | (raim.outcome == Outcome.INSEPARABLE), Status.INCONSISTENT),
             (own_sigma > config.largest_sigma_m, Status.UNCERTAIN),
             ((section.excess <= config.section.threshold) | (redundancy < config.section.redundancy), Status.AMBIGUOUS),
         ]
@@ -348,12 +352,12 @@ class EpochProcessor:
     def _result(self, one: Prepared, trajectory: Trajectory, found: _Found) -> AntennaResult:
         """Everything side by side, coordinates only where the status has them."""
         obs, point, constrained, scale = one.observations, found.point, found.place.constrained, found.noise_scale
-        has = np.isin(found.status, self._with_coordinates)
+        has = self._has_coordinates[found.status]
         arc = np.where(has, found.arc_m, np.nan)
         ecef = trajectory.at_arc(arc)
         latitude, longitude, height = geodetic_from_ecef(ecef)
         nearest, offset = trajectory.nearest(point.ecef_m)
-        reason = whole_reason(one, self.config.systems)
+        reason = whole_reason(one)
 
         def whole(values: Floats) -> Floats:
             full = np.full(obs.code_m.shape, np.nan)
@@ -376,7 +380,7 @@ class EpochProcessor:
             longitude_deg=longitude,
             height_m=height,
             n_used=np.count_nonzero(one.reason == 0, axis=1),
-            n_rejected=satellites_refused(obs.satellite, reason),
+            n_rejected=satellites_refused(one.channels.member, reason),
             conventional_ecef_m=point.ecef_m,
             conventional_arc_m=nearest,
             conventional_chainage_m=trajectory.chainage_at(nearest),

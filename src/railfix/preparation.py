@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 
 from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.carrier import Slips
-from railfix.clock_elimination import Ranges, clock_groups
+from railfix.channels import Channels
+from railfix.clock_elimination import Ranges
 from railfix.config import Config
-from railfix.constants import CLOCK_GROUP
 from railfix.epochs import Observations
 from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.measurement import PLAUSIBLE_CODE_M, channel_order, code_sigma_m, first_available
-from railfix.navigation import Navigation, glonass_channels
+from railfix.measurement import PLAUSIBLE_CODE_M, code_sigma_m, first_available
+from railfix.navigation import Navigation
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import Reason
 from railfix.screens import Screened
 from railfix.section import SearchIndex, search
-from railfix.signals import carrier_frequency_hz
 from railfix.spp import single_point
 
 Floats = NDArray[np.float64]
@@ -43,13 +42,8 @@ class Prepared:
     Attributes
     ----------
     observations : Observations
-    columns : ndarray of int, shape (K,)
-        Where the channels stand in the observations.
-    satellite, signal : ndarray of str, shape (K,)
-    groups : tuple of slice
-        Channels of one receiver clock.
+    channels : Channels
     code_m, doppler_hz, cn0_dbhz : ndarray, shape (T, K)
-    frequency_hz : ndarray, shape (K,)
     satellites : SatelliteStates
     anchor_ecef_m : ndarray, shape (T, 3) [m]
         Where the satellites are seen from.
@@ -66,14 +60,10 @@ class Prepared:
     """
 
     observations: Observations
-    columns: NDArray[np.intp]
-    satellite: NDArray[np.str_]
-    signal: NDArray[np.str_]
-    groups: tuple[slice, ...]
+    channels: Channels
     code_m: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
-    frequency_hz: Floats
     satellites: SatelliteStates
     anchor_ecef_m: Floats
     elevation_deg: Floats
@@ -87,9 +77,34 @@ class Prepared:
     slips: Slips | None = None
 
     @property
+    def columns(self) -> NDArray[np.intp]:
+        """Where the channels stand in the observations, shape (K,)."""
+        return self.channels.columns
+
+    @property
+    def satellite(self) -> NDArray[np.str_]:
+        """Satellite of each channel, shape (K,)."""
+        return self.channels.satellite
+
+    @property
+    def signal(self) -> NDArray[np.str_]:
+        """Signal of each channel, shape (K,)."""
+        return self.channels.signal
+
+    @property
+    def groups(self) -> tuple[slice, ...]:
+        """Channels of one receiver clock."""
+        return self.channels.groups
+
+    @property
     def clocks(self) -> tuple[str, ...]:
         """Letter of each receiver clock."""
-        return tuple(CLOCK_GROUP[str(self.satellite[group.start])[0]] for group in self.groups)
+        return self.channels.clocks
+
+    @property
+    def frequency_hz(self) -> Floats:
+        """Carrier of each channel, shape (K,) [Hz]."""
+        return self.channels.frequency_hz
 
     def refuse(self, mask: Masks, reason: Reason) -> None:
         """Add a reason to observed channels; nothing ever takes one away."""
@@ -106,13 +121,20 @@ class Prepared:
 
 
 def prepare(
-    obs: Observations, config: Config, navigation: Navigation, index: SearchIndex, klobuchar: Floats | None
+    obs: Observations,
+    channels: Channels,
+    config: Config,
+    navigation: Navigation,
+    index: SearchIndex,
+    klobuchar: Floats | None,
 ) -> Prepared:
-    """Choose channels, find their satellites, correct their codes, weigh them.
+    """Find the satellites of the channels, correct their codes, weigh them.
 
     Parameters
     ----------
     obs : Observations
+    channels : Channels
+        Of these observations.
     config : Config
     navigation : Navigation
     index : SearchIndex
@@ -125,9 +147,7 @@ def prepare(
     Prepared
         With the reasons of codes, satellites and corrections; the screens come after.
     """
-    columns = channel_order(obs.satellite, obs.signal, systems=config.systems, signals=config.signals)
-    satellite, signal = obs.satellite[columns], obs.signal[columns]
-    groups = clock_groups(satellite.astype("<U1"))
+    columns, satellite, signal, groups = channels.columns, channels.satellite, channels.signal, channels.groups
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
     reason = _reasons_of_codes(satellite, code)
     states = satellite_states(obs.time, satellite, signal, code, navigation, max_age_s=config.max_ephemeris_age_s)
@@ -141,11 +161,12 @@ def prepare(
     clean = code + states.clock_m - states.group_delay_m
     anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
-    frequency = carrier_frequency_hz(satellite, signal, {**glonass_channels(navigation), **obs.header.glonass_channel})
     latitude, longitude, height = geodetic_from_ecef(anchor)
     ionosphere, troposphere = np.zeros((2, *code.shape))
     if klobuchar is not None:
-        ionosphere = klobuchar_delay_m(obs.time, latitude, longitude, elevation, azimuth, klobuchar, frequency)
+        ionosphere = klobuchar_delay_m(
+            obs.time, latitude, longitude, elevation, azimuth, klobuchar, channels.frequency_hz
+        )
     if config.troposphere == "saastamoinen":
         troposphere = saastamoinen_delay_m(latitude, height, elevation)
     clean = clean - ionosphere - troposphere
@@ -153,14 +174,10 @@ def prepare(
     reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
     return Prepared(
         observations=obs,
-        columns=columns,
-        satellite=satellite,
-        signal=signal,
-        groups=groups,
+        channels=channels,
         code_m=code,
         doppler_hz=obs.doppler_hz[:, columns],
         cn0_dbhz=cn0,
-        frequency_hz=frequency,
         satellites=states,
         anchor_ecef_m=anchor,
         elevation_deg=elevation,

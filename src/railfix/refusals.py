@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,13 +12,10 @@ from railfix.reasons import Reason
 Bits = NDArray[np.int64]
 
 
-def whole_reason(one: Prepared, systems: Sequence[str]) -> Bits:
+def whole_reason(one: Prepared) -> Bits:
     """Reasons of all channels of the observations, those that settings leave out included, shape (T, M)."""
-    obs = one.observations
-    reason = np.where(np.isfinite(obs.code_m), 0, int(Reason.NOT_OBSERVED))
-    selected = np.isin(obs.system, systems)
-    reason[:, ~selected] |= Reason.SYSTEM_NOT_SELECTED
-    reason[:, np.setdiff1d(np.flatnonzero(selected), one.columns)] |= Reason.OTHER_SIGNAL_TAKEN
+    not_observed = ~np.isfinite(one.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
+    reason = np.asarray(not_observed | one.channels.left_out)
     reason[:, one.columns] = one.reason
     return reason
 
@@ -35,10 +30,15 @@ def alone_on_their_clocks(one: Prepared, ties: ClockTies) -> NDArray[np.bool_]:
     return alone
 
 
-def satellites_refused(satellite: NDArray[np.str_], reason: Bits) -> NDArray[np.int64]:
-    """Satellites with a code of which no signal was used, shape (T,)."""
-    names, which = np.unique(satellite, return_inverse=True)
-    member = (which[:, None] == np.arange(len(names))).astype(np.int64)
+def satellites_refused(member: NDArray[np.int64], reason: Bits) -> NDArray[np.int64]:
+    """Satellites with a code of which no signal was used, shape (T,).
+
+    Parameters
+    ----------
+    member : ndarray of int64, shape (M, S)
+        `Channels.member`.
+    reason : ndarray of int64, shape (T, M)
+    """
     seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.int64) @ member > 0
     used = (reason == 0).astype(np.int64) @ member > 0
     return np.asarray(np.count_nonzero(seen & ~used, axis=1), dtype=np.int64)
