@@ -1,19 +1,26 @@
-"""What each screen buys and costs on the real recordings: the commands, and the tables they print.
+"""What each screen buys and costs: the commands, and the tables they print, for ``docs/screens.md``.
 
 ``python tests/recordings_ablate.py FOLDER`` with the recordings beside the checkout writes references, maps and
-results to the folder and prints what ``docs/screens.md`` shows.
+results to the folder, and the tables into the document.
 """
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Final
 
 from typer.testing import CliRunner
 
+import multipath_run
 import recordings_truth
+from conftest import ROOT
 from railfix.cli import app
+from railfix.files import read_bytes
+
+DOCUMENT: Final = ROOT / "docs" / "screens.md"
+BLOCK: Final = re.compile(r"(<!-- tables -->\n).*?(<!-- end of tables -->\n)", re.DOTALL)
 
 #: Recording: log, navigation, reference.
 RECORDINGS: Final = {
@@ -31,7 +38,19 @@ RECORDINGS: Final = {
     ),
 }
 #: Settings by the name of their table.
-SETTINGS: Final = {"default": ["--set", "elevation.mask_deg=15"], "p1": ["--preset", "p1"]}
+SETTINGS: Final = {
+    "default": ["--set", "elevation.mask_deg=15"],
+    "strict": ["--preset", "strict", "--set", "elevation.mask_deg=15"],
+    "p1": ["--preset", "p1"],
+}
+#: Recordings by their heading.
+HEADINGS: Final = {
+    "urbannav_f9p": "UrbanNav TST, u-blox F9P (G E C J), 1 Hz, urban",
+    "urbannav_m8t": "UrbanNav TST, u-blox M8T (G C), 1 Hz, urban",
+    "gsdc": "GSDC, Pixel 5 (G), 1 Hz, phone in a car",
+    "japan": "Japan, mosaic-X5 (G E J), 1 Hz, open sky",
+    "walls": "Made-up run with walls, two antennas, 10 Hz (`tests/multipath_run.py`)",
+}
 
 
 def prepared(data: Path, folder: Path) -> dict[str, Path]:
@@ -59,34 +78,61 @@ def printed(arguments: list[str]) -> str:
     return result.stdout
 
 
-def ablation(data: Path, folder: Path, recording: str, settings: str) -> str:
-    """The table of one recording with one choice of settings, its command above it."""
+def options_of(data: Path, folder: Path, recording: str) -> dict[str, Path]:
+    """The files of a recording by the option that takes them."""
+    if recording == "walls":
+        files = multipath_run.write_walls(folder / "walls")
+        names = {"--front": "front", "--rear": "rear", "--nav": "nav", "--track": "track", "--vehicle": "vehicle"}
+        options = {option: files[name] for option, name in names.items()}
+        truth = folder / "walls" / "truth.csv"
+        truth.write_bytes(read_bytes(files["truth"]))
+        return options | {"--truth": truth}
     log, navigation, reference = RECORDINGS[recording]
-    options = {
-        "--front": str(data / "kinematic" / log),
-        "--nav": str(data / "kinematic" / navigation),
-        "--track": str(folder / f"{reference}_line.csv"),
-        "--truth": str(folder / f"{reference}_truth.csv"),
-        "--out": str(folder / f"{recording}_{settings}"),
+    return {
+        "--front": data / "kinematic" / log,
+        "--nav": data / "kinematic" / navigation,
+        "--track": folder / f"{reference}_line.csv",
+        "--truth": folder / f"{reference}_truth.csv",
     }
-    words = ["ablate", *(word for pair in options.items() for word in pair), *SETTINGS[settings]]
-    shown = [f"{option} {Path(value).name}" for option, value in options.items()]
-    output = "\n".join(line.rstrip() for line in printed([*words, "--overwrite"]).splitlines() if "wrote" not in line)
-    return f"$ railfix ablate {' '.join(shown)} {' '.join(SETTINGS[settings])}\n{output}"
+
+
+def ablation(options: dict[str, Path], folder: Path, settings: str) -> str:
+    """The table of one recording with one choice of settings, its command above it."""
+    words = ["ablate", *(word for option, path in options.items() for word in (option, str(path)))]
+    output = printed([*words, "--out", str(folder), *SETTINGS[settings], "--overwrite"])
+    shown = " ".join(f"{option} {path.name}" for option, path in options.items())
+    command = f"$ railfix ablate {shown} \\\n    {' '.join(SETTINGS[settings])} --out {folder.name}\n"
+    kept = [line.rstrip() for line in output.splitlines() if not line.startswith(("wrote", "note: screen", "note: no"))]
+    return command + "\n".join(kept)
+
+
+def tables(data: Path, folder: Path) -> str:
+    """All tables as Markdown."""
+    prepared(data, folder)
+    parts = []
+    for recording, heading in HEADINGS.items():
+        parts.append(f"### {heading}\n")
+        options = options_of(data, folder, recording)
+        for settings in SETTINGS:
+            text = ablation(options, folder / f"{recording}_{settings}", settings)
+            if settings == "strict":
+                # the screens are those of the default; what it drops shows in the first lines
+                text = "\n".join(line for line in text.splitlines() if not line.startswith(("only", "without")))
+            parts.append(f"```console\n{text}\n```\n")
+    return "\n".join(parts)
 
 
 def main() -> int:
-    """Print all tables."""
-    data = Path(__file__).resolve().parents[2] / "shared" / "data"
+    """Write the tables."""
+    data = ROOT.parent / "shared" / "data"
     if len(sys.argv) != 2 or not data.is_dir():
         print(f"give a folder to write to; the recordings are expected at {data}", file=sys.stderr)
         return 1
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
-    prepared(data, folder)
-    for recording in RECORDINGS:
-        for settings in SETTINGS:
-            print(f"### {recording}, {settings}\n\n```console\n{ablation(data, folder, recording, settings)}\n```\n")
+    made = tables(data, folder)
+    text = DOCUMENT.read_text(encoding="utf-8")
+    DOCUMENT.write_text(BLOCK.sub(lambda m: f"{m[1]}\n{made}\n{m[2]}", text), encoding="utf-8")
     return 0
 
 

@@ -16,7 +16,17 @@ from railfix import __version__, errors
 from railfix.cli import app
 
 RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
-COMMANDS = [[], ["run"], ["demo"], ["map"], ["map", "check"], ["map", "from-positions"]]
+COMMANDS = [
+    [],
+    ["run"],
+    ["demo"],
+    ["ablate"],
+    ["cn0-curve"],
+    ["plot-screens"],
+    ["map"],
+    ["map", "check"],
+    ["map", "from-positions"],
+]
 
 
 def text_of(result: Any) -> str:

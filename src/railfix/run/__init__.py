@@ -1,7 +1,17 @@
 """The batch: logs, navigation and a track map in, tables of positions out."""
 
+from railfix.run.ablation import Ablation, Effect, ablate_files
 from railfix.run.driver import RunOptions, RunSummary, run_files
 from railfix.run.inputs import RunInputs
 from railfix.run.sources import TrackReading
 
-__all__ = ["RunInputs", "RunOptions", "RunSummary", "TrackReading", "run_files"]
+__all__ = [
+    "Ablation",
+    "Effect",
+    "RunInputs",
+    "RunOptions",
+    "RunSummary",
+    "TrackReading",
+    "ablate_files",
+    "run_files",
+]
