@@ -94,11 +94,14 @@ class Ranges:
         return np.asarray(np.count_nonzero(self.weight, axis=1), dtype=np.int64)
 
     @cached_property
+    def starts(self) -> NDArray[np.intp]:
+        """First channel of each group."""
+        return np.array([group.start for group in self.groups], dtype=np.intp)
+
+    @cached_property
     def n_clocks(self) -> NDArray[np.int64]:
         """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
-        seen = np.zeros((len(self), len(self.groups)), dtype=bool)
-        for g, group in enumerate(self.groups):
-            seen[:, g] = np.any(self.weight[:, group] > 0, axis=1)
+        seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
         if self.ties is None:
             return np.asarray(np.count_nonzero(seen, axis=1), dtype=np.int64)
         tied = self.ties.sigma_m < UNTIED_M
@@ -190,7 +193,7 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     """
     distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
     weight, used = ranges.weight, (ranges.weight > 0)[:, None]
-    starts = np.array([group.start for group in ranges.groups], dtype=np.intp)
+    starts = ranges.starts
     sizes = np.array([group.stop - group.start for group in ranges.groups], dtype=np.intp)
     # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
     rows = np.empty((len(weight), 4, weight.shape[1]))

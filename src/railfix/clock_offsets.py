@@ -98,7 +98,7 @@ def tie_clocks(
     epochs = len(time)
     offset, sigma = np.zeros((epochs, len(clocks))), np.full((epochs, len(clocks)), UNTIED_M)
     information, moment = dict(state.information), dict(state.moment)
-    step = seconds(np.diff(np.r_[np.asarray([state.last], dtype="datetime64[ns]"), time]))
+    step = seconds(np.diff(np.concatenate([np.asarray([state.last], dtype="datetime64[ns]"), time])))
     fresh = np.clip(np.nan_to_num(step, nan=0.0) / limits.correlation_s, 0.0, 1.0)
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
@@ -118,8 +118,8 @@ def tie_clocks(
             weight = np.where(usable, fresh / np.where(usable, variance, 1.0), 0.0)
             difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)
         # Sums up to and without each epoch: the same additions however epochs are cut.
-        known = np.cumsum(np.r_[information.get(letter, 0.0), weight])
-        moments = np.cumsum(np.r_[moment.get(letter, 0.0), weight * difference])
+        known = np.cumsum(np.concatenate([[information.get(letter, 0.0)], weight]))
+        moments = np.cumsum(np.concatenate([[moment.get(letter, 0.0)], weight * difference]))
         has = known[:-1] > 0.0
         safe = np.where(has, known[:-1], 1.0)
         offset[:, g] = np.where(has, moments[:-1] / safe, 0.0)

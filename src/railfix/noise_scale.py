@@ -45,8 +45,8 @@ def noise_scale(
     level = np.log(np.where(usable, wsse, 1.0) / safe) - (digamma(safe / 2) - np.log(safe / 2))
     weight = np.where(usable, freedom, 0.0)
     # cumsum from the carried sums: the same additions in the same order however epochs are cut.
-    total = np.cumsum(np.r_[sums[0], weight * level])
-    weights = np.cumsum(np.r_[sums[1], weight])
+    total = np.cumsum(np.concatenate([[sums[0]], weight * level]))
+    weights = np.cumsum(np.concatenate([[sums[1]], weight]))
     scale = np.exp(0.5 * total[:-1] / (weights[:-1] + prior))
     return scale, (float(total[-1]), float(weights[-1]))
 

@@ -29,6 +29,8 @@ Bits = NDArray[np.int64]
 
 #: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
 ANCHOR_SIGMA_M: Final = 10.0
+#: A last step of this length leaves 25 m of a range, which turns no satellite by more than 2e-6 rad [m].
+ANCHOR_TOLERANCE_M: Final = 1000.0
 #: Further from the line than this a raw 3-D position is no train on it, however bad the ranges [m].
 BESIDE_THE_LINE_M: Final = 1e5
 #: Stands for the satellite of a range without weight [m].
@@ -203,7 +205,8 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
     """
     trajectory = index.trajectory
     middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
-    point = single_point(ranges, middle, limits=config.single_point)
+    rough = replace(config.single_point, tolerance_m=max(ANCHOR_TOLERANCE_M, config.single_point.tolerance_m))
+    point = single_point(ranges, middle, limits=rough)
     anchor = point.ecef_m.copy()
     found = np.flatnonzero(np.isfinite(anchor[:, 0]))
     distance, vertex = index.tree.query(anchor[found])

@@ -329,8 +329,8 @@ def _decide(
     other = np.full(epochs, -1, dtype=np.intp)
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
     for found in parts:
-        starts = np.flatnonzero(np.r_[True, found.epoch[1:] != found.epoch[:-1]])
-        count = np.diff(np.r_[starts, len(found.epoch)])
+        starts = np.flatnonzero(np.concatenate([[True], found.epoch[1:] != found.epoch[:-1]]))
+        count = np.diff(np.concatenate([starts, [len(found.epoch)]]))
         at = found.epoch[starts]
         least = np.minimum.reduceat(found.q, starts)
         # First of equals, as argmin picks.
@@ -339,8 +339,8 @@ def _decide(
         vertex[at], q[at] = found.vertex[best], least
 
         joined = (found.epoch[1:] == found.epoch[:-1]) & (found.vertex[1:] == found.vertex[:-1] + 1)
-        before = np.r_[np.inf, np.where(joined, found.q[:-1], np.inf)]
-        after = np.r_[np.where(joined, found.q[1:], np.inf), np.inf]
+        before = np.concatenate([[np.inf], np.where(joined, found.q[:-1], np.inf)])
+        after = np.concatenate([np.where(joined, found.q[1:], np.inf), [np.inf]])
         apart = np.abs(trajectory.arc_m[found.vertex] - np.repeat(trajectory.arc_m[found.vertex[best]], count))
         minimum = np.flatnonzero((found.q <= before) & (found.q <= after) & (apart > limits.separation_m))
         if not len(minimum):
