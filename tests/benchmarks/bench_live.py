@@ -3,7 +3,7 @@
 Prints median, 99th percentile and largest time an epoch, wall and processor time, over the demonstration
 run that comes with railfix, or over another simulated one::
 
-    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--profile]
+    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask] [--profile]
 """
 
 from __future__ import annotations
@@ -42,13 +42,15 @@ def files_of(folder: Path | None) -> dict[str, Path]:
     return found | {"track": folder / "track.csv", "vehicle": folder / "vehicle.toml"}
 
 
-def prepared(folder: Path | None, epochs: int) -> tuple[EpochProcessor, dict[str, Observations]]:
+def prepared(
+    folder: Path | None, epochs: int, config: Config | None = None
+) -> tuple[EpochProcessor, dict[str, Observations]]:
     """The processor and the first epochs of both antennas."""
     files = files_of(folder)
     track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
     observations = {name: read_observations(files[name])[:epochs] for name in ("front", "rear")}
     trajectories = {name: antenna_trajectory(track, vehicle, name) for name in observations}
-    return EpochProcessor(Config(), read_navigation(files["nav"]), trajectories), observations
+    return EpochProcessor(config or Config(), read_navigation(files["nav"]), trajectories), observations
 
 
 def milliseconds(
@@ -73,11 +75,13 @@ def main() -> None:
     )
     parser.add_argument("--epochs", type=int, default=1500)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: elevation only")
     parser.add_argument("--profile", action="store_true", help="print where the time goes, for one more round")
     options = parser.parse_args()
-    processor, observations = prepared(options.run, options.epochs + WARM_UP)
+    config = Config(screens=("elevation",)) if options.screens == "mask" else Config()
+    processor, observations = prepared(options.run, options.epochs + WARM_UP, config)
     channels = {name: len(whole.satellite) for name, whole in observations.items()}
-    print(f"live epochs of two antennas, {options.epochs} a round, channels {channels}")
+    print(f"live epochs of two antennas, {options.epochs} a round, channels {channels}, screens: {options.screens}")
     print(f"P1: {PAPER_MS:g} ms; goal for the 99th percentile: {GOAL_MS:g} ms")
     for number in range(options.rounds):
         for name, values in zip(("wall", "processor"), milliseconds(processor, observations), strict=True):
