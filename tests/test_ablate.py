@@ -13,6 +13,7 @@ import polars as pl
 import pytest
 from typer.testing import CliRunner
 
+import recordings_ablate
 from railfix.cli import app
 from railfix.config import parse_config
 from railfix.demonstration import demo_inputs
@@ -210,3 +211,24 @@ def test_only_fixed_positions_are_truth(truth: Path, tmp_path: Path) -> None:
     found = read_truth(path, ["front"])["front"]
     assert len(found.time) == 6
     assert (np.diff(found.time) > np.timedelta64(0)).all()
+
+
+@pytest.mark.slow
+def test_the_document_shows_what_the_recordings_give(recordings: Path, tmp_path: Path) -> None:
+    """Figures of docs/screens.md, to the last digit or two; `python tests/recordings_ablate.py` writes them."""
+    document = recordings_ablate.DOCUMENT.read_text(encoding="utf-8")
+    recordings_ablate.prepared(recordings, tmp_path)
+    for recording in ("urbannav_f9p", "gsdc"):
+        options = recordings_ablate.options_of(recordings, tmp_path, recording)
+        made = recordings_ablate.ablation(options, tmp_path / f"{recording}_default", "default").splitlines()
+        assert made[0] in document
+        start = document.index("\n".join(made[:2]))
+        shown = document[start:].splitlines()[: len(made)]
+        for one, other in zip(made[7:], shown[7:], strict=True):
+            if one.startswith("note"):
+                assert one == other
+                continue
+            mine, told = one.split(), other.split()
+            assert len(mine) == len(told)
+            for a, b in zip(mine, told, strict=True):
+                assert a == b or float(a) == pytest.approx(float(b), abs=0.06, rel=0.02)

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from railfix.cli.options import (
+    INPUTS,
+    CrsOption,
+    DatumOption,
+    EndOption,
+    FrontOption,
+    GeoidOption,
+    LenientOption,
+    NavOption,
+    OutOption,
+    OverwriteOption,
+    RearOption,
+    Sp3Option,
+    StartOption,
+    TrackOption,
+    VehicleOption,
+)
 from railfix.cli.settings import (
     Choices,
     ConfigOption,
@@ -27,42 +43,23 @@ if TYPE_CHECKING:
 
 #: Columns of text that the table needs.
 _WIDTH = 110
-_INPUTS = "Inputs"
-_CHOICES = "Choices"
-_TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d"]
 
 
 def ablate(
     *,
-    front: Annotated[
-        list[Path],
-        typer.Option(
-            "--front", metavar="OBS", rich_help_panel=_INPUTS, help="RINEX observation file of the front antenna."
-        ),
-    ],
-    nav: Annotated[
-        list[Path],
-        typer.Option("--nav", metavar="FILE", rich_help_panel=_INPUTS, help="RINEX navigation file; may be repeated."),
-    ],
-    track: Annotated[
-        list[Path],
-        typer.Option("--track", metavar="TRACK", rich_help_panel=_INPUTS, help="Track map; may be repeated."),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; it is made.")],
-    rear: Annotated[
-        list[Path] | None,
-        typer.Option("--rear", metavar="OBS", rich_help_panel=_INPUTS, help="The same of the rear antenna."),
-    ] = None,
-    vehicle: Annotated[
-        Path | None,
-        typer.Option("--vehicle", metavar="TOML", rich_help_panel=_INPUTS, help="Vehicle, as in railfix run."),
-    ] = None,
+    front: FrontOption,
+    nav: NavOption,
+    track: TrackOption,
+    out: OutOption,
+    rear: RearOption = None,
+    sp3: Sp3Option = None,
+    vehicle: VehicleOption = None,
     truth: Annotated[
         Path | None,
         typer.Option(
             "--truth",
             metavar="POSITIONS",
-            rich_help_panel=_INPUTS,
+            rich_help_panel=INPUTS,
             help="Where the antenna really was: CSV with named columns (antenna says whose, where there are two) or "
             "RTKLIB .pos; of quality 1 where it tells one.",
         ),
@@ -73,24 +70,13 @@ def ablate(
     screens: ScreensOption = None,
     without: WithoutOption = None,
     cn0_curve: CurveOption = None,
-    start: Annotated[
-        datetime | None,
-        typer.Option(metavar="TIME", formats=_TIMES, rich_help_panel=_CHOICES, help="Epochs from this on, GPS time."),
-    ] = None,
-    end: Annotated[
-        datetime | None,
-        typer.Option(metavar="TIME", formats=_TIMES, rich_help_panel=_CHOICES, help="Epochs before this, GPS time."),
-    ] = None,
-    lenient: Annotated[
-        bool,
-        typer.Option(
-            "--lenient", rich_help_panel=_CHOICES, help="Count broken lines of the logs and go on, instead of stopping."
-        ),
-    ] = False,
-    overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", rich_help_panel=_CHOICES, help="Replace results that are already in DIR."),
-    ] = False,
+    crs: CrsOption = None,
+    height_datum: DatumOption = None,
+    geoid: GeoidOption = None,
+    start: StartOption = None,
+    end: EndOption = None,
+    lenient: LenientOption = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     r"""What each screen buys and costs on a log: all screens, none, each alone, all but each.
 
@@ -112,8 +98,7 @@ def ablate(
     written; 1 a defect of railfix.
     """
     from railfix.cli.console import progress_bar
-    from railfix.run import RunInputs, RunOptions
-    from railfix.run.ablation import ablate_files
+    from railfix.run import RunInputs, RunOptions, TrackReading, ablate_files
 
     chosen = Choices(
         config=config,
@@ -128,6 +113,7 @@ def ablate(
         front=tuple(front),
         rear=tuple(rear or ()),
         nav=tuple(nav),
+        sp3=tuple(sp3 or ()),
         track=tuple(track),
         vehicle=vehicle,
         config=config,
@@ -138,6 +124,7 @@ def ablate(
         overwrite="replace" if overwrite else "refuse",
         start=start,
         end=end,
+        track=TrackReading(crs=crs, height_datum=height_datum, geoid=geoid),
     )
     with progress_bar() as progress:
         ablation = ablate_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)

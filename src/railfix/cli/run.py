@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
-from datetime import datetime
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from railfix.cli.options import (
+    CHOICES,
+    CrsOption,
+    DatumOption,
+    EndOption,
+    FrontOption,
+    GeoidOption,
+    LenientOption,
+    NavOption,
+    OutOption,
+    OverwriteOption,
+    RearOption,
+    Sp3Option,
+    StartOption,
+    TrackOption,
+    VehicleOption,
+)
 from railfix.cli.settings import (
     Choices,
     ConfigOption,
@@ -19,88 +34,25 @@ from railfix.cli.settings import (
     settings_of,
 )
 
-Paths = list[Path]
-INPUTS = "Inputs"
-CHOICES = "Choices"
-TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%d"]
-
 
 def run(
     *,
-    front: Annotated[
-        Paths,
-        typer.Option(
-            "--front",
-            metavar="OBS",
-            rich_help_panel=INPUTS,
-            help="RINEX observation file of the front (or only) antenna; repeat it for a log in several files.",
-        ),
-    ],
-    nav: Annotated[
-        Paths,
-        typer.Option(
-            "--nav", metavar="FILE", rich_help_panel=INPUTS, help="RINEX navigation file; repeat it for several."
-        ),
-    ],
-    track: Annotated[
-        Paths,
-        typer.Option(
-            "--track",
-            metavar="TRACK",
-            rich_help_panel=INPUTS,
-            help="Track map, CSV or GeoJSON; several are joined to a route in the order given.",
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results; it is made.")],
-    rear: Annotated[
-        Paths | None,
-        typer.Option(
-            "--rear", metavar="OBS", rich_help_panel=INPUTS, help="The same of the rear antenna, where there is one."
-        ),
-    ] = None,
-    sp3: Annotated[
-        Paths | None,
-        typer.Option(
-            "--sp3",
-            metavar="FILE",
-            rich_help_panel=INPUTS,
-            help="Precise orbits and clocks, used in place of the broadcast ones.",
-        ),
-    ] = None,
-    vehicle: Annotated[
-        Path | None,
-        typer.Option(
-            "--vehicle",
-            metavar="TOML",
-            rich_help_panel=INPUTS,
-            help="Vehicle: bogie distance, gauge, places of the antennas. Without it the track is taken as the "
-            "antenna's own path.",
-        ),
-    ] = None,
+    front: FrontOption,
+    nav: NavOption,
+    track: TrackOption,
+    out: OutOption,
+    rear: RearOption = None,
+    sp3: Sp3Option = None,
+    vehicle: VehicleOption = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
     setting: SettingOption = None,
     screens: ScreensOption = None,
     without: WithoutOption = None,
     cn0_curve: CurveOption = None,
-    crs: Annotated[
-        str | None,
-        typer.Option(metavar="EPSG", rich_help_panel=CHOICES, help="CRS of the track where its file does not say."),
-    ] = None,
-    height_datum: Annotated[
-        str | None,
-        typer.Option(
-            metavar="DATUM", rich_help_panel=CHOICES, help="Heights of the track: ellipsoidal or orthometric."
-        ),
-    ] = None,
-    geoid: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODEL",
-            rich_help_panel=CHOICES,
-            help="Geoid of orthometric heights: japan, gsigeo2011, or a grid or CRS known to PROJ.",
-        ),
-    ] = None,
+    crs: CrsOption = None,
+    height_datum: DatumOption = None,
+    geoid: GeoidOption = None,
     reference: Annotated[
         Literal["antenna", "centre", "front_bogie", "rear_bogie"],
         typer.Option(
@@ -108,14 +60,8 @@ def run(
             help="The point of the vehicle whose chainage is given; for each antenna its own place by default.",
         ),
     ] = "antenna",
-    start: Annotated[
-        datetime | None,
-        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="Epochs from this on, GPS time."),
-    ] = None,
-    end: Annotated[
-        datetime | None,
-        typer.Option(metavar="TIME", formats=TIMES, rich_help_panel=CHOICES, help="Epochs before this, GPS time."),
-    ] = None,
+    start: StartOption = None,
+    end: EndOption = None,
     observations: Annotated[
         bool,
         typer.Option(
@@ -124,16 +70,8 @@ def run(
             help="Also write observations.parquet: one row an epoch, satellite and signal, with its reason.",
         ),
     ] = False,
-    lenient: Annotated[
-        bool,
-        typer.Option(
-            "--lenient", rich_help_panel=CHOICES, help="Count broken lines of the logs and go on, instead of stopping."
-        ),
-    ] = False,
-    overwrite: Annotated[
-        bool,
-        typer.Option("--overwrite", rich_help_panel=CHOICES, help="Replace results that are already in DIR."),
-    ] = False,
+    lenient: LenientOption = False,
+    overwrite: OverwriteOption = False,
     chunk: Annotated[
         int,
         typer.Option(

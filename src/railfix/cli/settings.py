@@ -21,8 +21,8 @@ PresetOption = Annotated[
         "--preset",
         metavar="NAME",
         rich_help_panel=_PANEL,
-        help="Settings that all others stand over: default, strict (certainty before rate), or p1 (P1 table 6 to the "
-        "letter).",
+        help="Settings that all others stand over: default; strict, certainty before rate; p1, the limits of the "
+        "paper that the screens are from, for geodetic receivers at 10 Hz.",
     ),
 ]
 ConfigOption = Annotated[
