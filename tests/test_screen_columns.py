@@ -82,6 +82,13 @@ def test_dropped_positions_have_no_level() -> None:
         assert np.isnan(antenna.chainage_m[failed]).all()
 
 
+def test_the_protection_level_can_be_left_out(result: Result) -> None:
+    off = result_of({**TIGHT, "raim_protection": "off"})
+    for name, antenna in off.antennas.items():
+        assert np.isnan(antenna.raim.protection_level_m).all()
+        np.testing.assert_array_equal(antenna.chainage_m, result.antennas[name].chainage_m)
+
+
 def test_without_raim_nothing_is_said() -> None:
     off = result_of({"screens": ["elevation"]})
     positions, observations = positions_table(off), observations_table(off)

@@ -142,6 +142,9 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
+    raim_protection : {"on", "off"}
+        Whether positions get RAIM's protection level along the line: 5 us an epoch in a batch, 0.3 ms for an
+        epoch by itself.
     noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
@@ -181,6 +184,7 @@ class Config(BaseModel):
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
+    raim_protection: Literal["on", "off"] = "on"
     carrier: Literal["off", "smoothed", "float"] = "off"
     phase_sigma_m: float = Field(default=0.01, gt=0)
     slips: SlipLimits = Field(default_factory=SlipLimits)

@@ -229,7 +229,7 @@ class EpochProcessor:
         wsse = place.constrained.wsse
         scale, sums = noise_scale(_redundancy(ranges), wsse, sums, prior=self.config.noise_prior)
         ranges, place, raim = self._fault_free(ranges, index, place, scale)
-        if "raim" in self.config.screens:
+        if "raim" in self.config.screens and self.config.raim_protection == "on":
             raim = self._protected(ranges, index.trajectory, place.constrained, raim, scale)
         one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
         one_map = place.constrained

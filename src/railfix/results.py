@@ -41,7 +41,7 @@ class Raim:
         Error of the channels that stand against the rest; NaN elsewhere.
     protection_level_m : ndarray, shape (T,) [m]
         `raim.reliability` of the ranges left; infinite where a fault of one of them would not show, NaN
-        where there is no position, where a fault is left in it, or where the screen is off.
+        where there is no position, where a fault is left in it, or where that or the screen is off.
     """
 
     outcome: NDArray[np.int8]
