@@ -171,7 +171,12 @@ def ablate_files(
         navigation, line, logs = open_inputs(inputs, options)
         screens, left_out = judging_screens(config, line.trajectories)
         processors = {
-            name: EpochProcessor(config.model_copy(update={"screens": chosen}), navigation, line.trajectories)
+            name: EpochProcessor(
+                # Nobody asks for a protection level here.
+                config.model_copy(update={"screens": chosen, "raim_protection": "off"}),
+                navigation,
+                line.trajectories,
+            )
             for name, chosen in choices(screens).items()
         }
         states = dict.fromkeys(processors, State())
