@@ -1,0 +1,64 @@
+"""P4's experiment prints what its document shows, and its picture is drawn; injected faults likewise."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fault_injection
+import p4_experiment
+from conftest import ROOT
+from railfix.geodesy import enu_axes, geodetic_from_ecef
+
+pytestmark = pytest.mark.requirement("B6")
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
+
+
+def shown(document: str) -> list[str]:
+    (block,) = re.findall(r"^```text\n(.*?)^```$", (ROOT / "docs" / document).read_text(), re.MULTILINE | re.DOTALL)
+    return block.rstrip().splitlines()
+
+
+def assert_same(printed: list[str], document: list[str]) -> None:
+    """The same words, and numbers to a unit of their last digit."""
+    assert [NUMBER.sub("#", line).split() for line in printed] == [NUMBER.sub("#", line).split() for line in document]
+    for one, two in zip(printed, document, strict=True):
+        for a, b in zip(NUMBER.findall(one), NUMBER.findall(two), strict=True):
+            unit = 10.0 ** -len(b.partition(".")[2])
+            assert abs(float(a) - float(b)) <= 1.01 * unit, (one, two)
+
+
+def test_the_station_is_where_p4_has_it() -> None:
+    place = np.array([3582105.0, 532589.0, 5232754.0])
+    for beside in (0.0, 2.7):
+        first, last = p4_experiment.two_points(place, beside)
+        trajectory = p4_experiment.line_between(first, last)
+        arc, offset = trajectory.nearest(place[None])
+        assert arc[0] == pytest.approx(1433.0, abs=0.01)
+        assert offset[0] == pytest.approx(beside, abs=0.02)
+        assert trajectory.arc_m[-1] == pytest.approx(2500.0, abs=0.01)
+    latitude, longitude, _ = geodetic_from_ecef(first)
+    east, north, _ = enu_axes(latitude, longitude) @ (last - first)
+    assert np.degrees(np.arctan2(east, north)) == pytest.approx(60.0, abs=0.1)
+
+
+def test_the_document_shows_what_is_measured(recordings: Path, tmp_path: Path) -> None:
+    station, document = p4_experiment.STATIONS[0], shown("p4-experiment.md")
+    day = p4_experiment.play(recordings, station, *p4_experiment.LINES[0])
+    assert_same([f"{station.name:12s} {0.0:6.1f} {0.3:7.1f} {p4_experiment.row(day)}"], document[2:3])
+    p4_experiment.draw(day, tmp_path / "p4.png")
+    assert (tmp_path / "p4.png").stat().st_size > 20_000
+
+
+@pytest.mark.slow
+def test_the_whole_document_shows_what_is_measured(recordings: Path) -> None:
+    assert_same(list(p4_experiment.report(recordings)), shown("p4-experiment.md"))
+
+
+@pytest.mark.slow
+@pytest.mark.requirement("B4")
+def test_the_tables_of_faults_are_what_is_measured(recordings: Path) -> None:
+    assert_same("\n".join(fault_injection.tables(recordings)).rstrip().splitlines(), shown("fault-injection.md"))
