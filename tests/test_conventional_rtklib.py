@@ -233,7 +233,10 @@ def test_single_point_with_the_same_choices(logs: dict[str, Log], tmp_path: Path
     ],
 )
 def test_single_point_as_it_comes(logs: dict[str, Log], tmp_path: Path, name: str, p50_m: float, p95_m: float):
-    """Each with its own weights and records: as far apart as these choices may carry, and no worse to the truth."""
+    """Each with its own choices: further apart than 0.5 m, as far as these carry, and about as near to the truth.
+
+    At the two stations without C/N0 the nearest toe is better, by a fifth at the median; in Japan railfix is.
+    """
     log = logs[name]
     time, place, _ = rtklib(log, tmp_path)
     found, trajectory, _ = positions(log, lambda navigation: navigation)

@@ -1,6 +1,7 @@
 """Time of the section search per epoch on a line of 1 km and on one of 200 km, and what it looks at.
 
-A train runs at 72 km/h, 10 Hz, noise of a metre; the search itself knows nothing of the epoch before.
+Two layouts: a train running at 72 km/h, 10 Hz, and epochs at random places of the whole line, where the
+processor's cache holds little of a long line. The search itself knows nothing of the epoch before.
 With eight satellites there is a 3-D position to start from; with three the search goes coarse to fine.
 The two lines take turns, and the ratio is the median of the rounds::
 
@@ -30,11 +31,17 @@ LENGTHS_M = (1_000.0, 200_000.0)
 RATIO = 1.5
 
 
-def case(line: Trajectory, epochs: int, satellites: int) -> tuple[Ranges, SinglePoint]:
-    """A train at 72 km/h and 10 Hz from the middle of a line, turning at its ends, and 3-D positions of its ranges."""
+def places(line: Trajectory, epochs: int, layout: str) -> np.ndarray:
+    """Arc lengths of the epochs: "train" at 72 km/h and 10 Hz from the middle, turning at the ends; or "random"."""
+    if layout == "random":
+        return np.random.default_rng(3).uniform(5.0, line.arc_m[-1] - 5.0, epochs)
     free = line.arc_m[-1] - 10.0
-    where = 5.0 + np.abs((free / 2.0 + 2.0 * np.arange(epochs) + free) % (2.0 * free) - free)
-    ranges = synthetic.ranges(line, where)
+    return 5.0 + np.abs((free / 2.0 + 2.0 * np.arange(epochs) + free) % (2.0 * free) - free)
+
+
+def case(line: Trajectory, epochs: int, satellites: int, layout: str) -> tuple[Ranges, SinglePoint]:
+    """Ranges with noise of a metre, and their 3-D positions."""
+    ranges = synthetic.ranges(line, places(line, epochs, layout))
     if satellites < ranges.weight.shape[1]:
         ranges = replace(ranges, weight=np.where(np.arange(ranges.weight.shape[1]) < satellites, ranges.weight, 0.0))
     return ranges, single_point(ranges, np.broadcast_to(line.ecef_m.mean(axis=0), (epochs, 3)))
@@ -54,8 +61,14 @@ def main() -> None:
     options = parser.parse_args()
     lines = [synthetic.line(length) for length in LENGTHS_M]
     indices = [SearchIndex(line) for line in lines]
-    for satellites, epochs in ((8, options.epochs), (3, max(options.epochs // 10, 1))):
-        cases = [case(line, epochs, satellites) for line in lines]
+    few = max(options.epochs // 10, 1)
+    for layout, satellites, epochs in (
+        ("train", 8, options.epochs),
+        ("random", 8, options.epochs),
+        ("train", 3, few),
+        ("random", 3, few),
+    ):
+        cases = [case(line, epochs, satellites, layout) for line in lines]
         looked = [
             float(search(ranges, index, point).evaluations.mean())
             for index, (ranges, point) in zip(indices, cases, strict=True)
@@ -67,9 +80,8 @@ def main() -> None:
             ]
         )
         ratio = float(np.median(times[:, 1] / times[:, 0]))
-        print(
-            f"{satellites} satellites, {epochs} epochs a call, {'3-D position' if satellites > 3 else 'coarse to fine'}"
-        )
+        how = "3-D position" if satellites > 3 else "coarse to fine"
+        print(f"{layout}: {satellites} satellites, {epochs} epochs a call, {how}")
         for length, line, spent, points in zip(LENGTHS_M, lines, np.median(times, axis=0), looked, strict=True):
             head = f"  {length / 1e3:5.0f} km, {len(line):6d} points"
             print(f"{head}: {spent:8.2f} us an epoch, {points:7.1f} points looked at")
