@@ -171,3 +171,32 @@ def test_against_the_single_point_with_exclusion_of_rtklib(
     print(f"{name}: rate {rates[0]:.3f} against {rates[1]:.3f}")
     assert mine <= ratio * other
     assert rates[0] >= rates[1] + rate_gain
+
+
+@pytest.mark.requirement("B4")
+@pytest.mark.parametrize("size_m", [20.0, 50.0, 200.0])
+def test_short_faults_on_a_curved_course_are_excluded(recordings: Path, size_m: float):
+    """Each satellite in turn wrong for single epochs: a large fault moves the position to where the line turns."""
+    folder = next((recordings / "kinematic").glob("japan_mosaic*"))
+    observations = read_observations(folder / "SEPT265G.21O")
+    trajectory = recordings_score.trajectory_of(*recordings_score.recordings_truth.japan_truth(recordings))
+    navigation = recordings_score.read_navigation([folder / "SEPT2650.21P"])
+    config = recordings_score.parse_config({"screens": ["elevation", "raim"]})
+    processor = recordings_score.EpochProcessor(config, navigation, {"front": trajectory})
+    clean = processor.process({"front": observations})[0].antennas["front"]
+    epochs = np.arange(60, 360, 20)
+    right = wrong = tried = 0
+    for k, channel in enumerate(clean.columns):
+        here = epochs[clean.reason[epochs, channel] == 0]
+        if not len(here):
+            continue
+        code = observations.code_m.copy()
+        code[here, channel] += size_m
+        result = processor.process({"front": replace(observations, code_m=code)})[0].antennas["front"]
+        excluded = result.raim.excluded[here]
+        right += int((excluded[:, k] & (excluded.sum(axis=1) == 1)).sum())
+        wrong += int((excluded.any(axis=1) & ~excluded[:, k]).sum())
+        tried += len(here)
+    print(f"{size_m:g} m: {right} of {tried} excluded rightly, {wrong} wrongly")
+    assert right >= 0.95 * tried
+    assert wrong <= 0.01 * tried

@@ -29,7 +29,18 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "carrier",
         "cn0_curve",
     ),
-    5: ("config", "results", "channels", "preparation", "refusals", "pairing", "carrying", "pipeline"),
+    5: (
+        "config",
+        "results",
+        "channels",
+        "preparation",
+        "refusals",
+        "pairing",
+        "carrying",
+        "placing",
+        "fault_free",
+        "pipeline",
+    ),
     6: ("simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),
 }
 FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}

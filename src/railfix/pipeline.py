@@ -23,19 +23,20 @@ from railfix.clock_offsets import OffsetState, tie_clocks
 from railfix.cn0_curve import read_cn0_curve
 from railfix.config import Config
 from railfix.constants import CLOCK_GROUP
-from railfix.constrained import Constrained, constrained_position
 from railfix.epochs import Observations
+from railfix.fault_free import fault_free, protected
 from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
 from railfix.noise_scale import noise_scale, own_sigma_m
 from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
-from railfix.preparation import Prepared, prepare, without
-from railfix.raim import Outcome, constrained_model, detect, exclude, reliability
+from railfix.placing import Place, place_on_line, redundancy_of
+from railfix.preparation import Prepared, prepare
+from railfix.raim import Outcome
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.refusals import alone_on_their_clocks, satellites_refused, whole_reason
-from railfix.results import AntennaResult, AntennaState, Floats, Raim, Result, State, patched
+from railfix.results import AntennaResult, AntennaState, Floats, Raim, Result, State
 from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
-from railfix.section import SearchIndex, Section, search
+from railfix.section import SearchIndex
 from railfix.spp import SinglePoint, single_point
 
 __all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "State"]
@@ -223,17 +224,17 @@ class EpochProcessor:
             ranges = replace(ranges, ties=ties)
             start = np.where(np.isnan(point.ecef_m), one.anchor_ecef_m, point.ecef_m)
             tied = single_point(ranges, start, limits=self.config.single_point)
-        place = self._on_the_line(ranges, index, tied)
+        place = place_on_line(ranges, index, tied, self.config)
         one.refuse(alone_on_their_clocks(one, ties), Reason.ALONE_ON_ITS_CLOCK)
         sums = (state.log_variance_sum, state.log_variance_weight)
         wsse = place.constrained.wsse
-        scale, sums = noise_scale(_redundancy(ranges), wsse, sums, prior=self.config.noise_prior)
-        ranges, place, raim = self._fault_free(ranges, index, place, scale)
+        scale, sums = noise_scale(redundancy_of(ranges), wsse, sums, prior=self.config.noise_prior)
+        ranges, place, raim = fault_free(ranges, index, place, scale, self.config)
         if "raim" in self.config.screens and self.config.raim_protection == "on":
-            raim = self._protected(ranges, index.trajectory, place.constrained, raim, scale)
+            raim = protected(ranges, index.trajectory, place.constrained, raim, scale, self.config)
         one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
         one_map = place.constrained
-        own_sigma = own_sigma_m(_redundancy(ranges), one_map.wsse, one_map.exact_map_sigma_m, scale)
+        own_sigma = own_sigma_m(redundancy_of(ranges), one_map.wsse, one_map.exact_map_sigma_m, scale)
         status = self._status(one.code_m, ranges, index.trajectory, place, raim, own_sigma)
         arc = one_map.arc_m
         exact, total = one_map.exact_map_sigma_m, one_map.sigma_m
@@ -257,67 +258,6 @@ class EpochProcessor:
         )
         return found, replace(state, offsets=offsets, log_variance_sum=sums[0], log_variance_weight=sums[1])
 
-    def _fault_free(
-        self, ranges: Ranges, index: SearchIndex, place: _Place, scale: Floats
-    ) -> tuple[Ranges, _Place, Raim]:
-        """RAIM: where a fault is detected and its satellites are found, the position without them."""
-        limits, constrained = self.config.raim, place.constrained
-        found = detect(constrained.wsse, constrained.residual_m, _redundancy(ranges), limits=limits, scale=scale)
-        raim = Raim(
-            outcome=np.where(found.testable, Outcome.PASSED, Outcome.UNTESTABLE).astype(np.int8),
-            statistic=found.statistic,
-            threshold=found.threshold,
-            excluded=np.zeros(ranges.code_m.shape, dtype=bool),
-            own_error_m=np.full(ranges.code_m.shape, np.nan),
-            protection_level_m=np.full(len(ranges), np.nan),
-        )
-        failing = np.flatnonzero(found.detected)
-        if "raim" not in self.config.screens:
-            raim.outcome[:] = Outcome.UNTESTABLE
-            return ranges, place, raim
-        if not len(failing):
-            return ranges, place, raim
-        arc, section = constrained.arc_m[failing], constrained.section[failing]
-        model = constrained_model(ranges.take(failing), index.trajectory, arc, section=section)
-        exclusion = exclude(model, limits=limits, scale=scale[failing])
-        raim.outcome[failing] = exclusion.outcome
-        raim.excluded[failing], raim.own_error_m[failing] = exclusion.excluded, exclusion.own_error_m
-        again = failing[exclusion.excluded.any(axis=1)]
-        if len(again):
-            ranges = without(ranges, raim.excluded)
-            part = ranges.take(again)
-            rest = single_point(part, place.point.ecef_m[again], limits=self.config.single_point)
-            mended = self._on_the_line(part, index, rest)
-            constrained = mended.constrained
-            # Without the fault the best section can be another one: is the rest of one mind there too?
-            once_more = detect(
-                constrained.wsse, constrained.residual_m, _redundancy(part), limits=limits, scale=scale[again]
-            )
-            raim.outcome[again[once_more.detected]] = Outcome.UNRESOLVED
-            place = _Place(
-                point=patched(place.point, again, mended.point),
-                section=patched(place.section, again, mended.section),
-                constrained=patched(place.constrained, again, mended.constrained),
-            )
-        return ranges, place, raim
-
-    def _protected(
-        self, ranges: Ranges, trajectory: Trajectory, constrained: Constrained, raim: Raim, scale: Floats
-    ) -> Raim:
-        """RAIM with the protection level of what is left, where no fault is left in it."""
-        model = constrained_model(ranges, trajectory, constrained.arc_m, section=constrained.section)
-        level = reliability(model, limits=self.config.raim, scale=scale).protection_level_m
-        faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
-        return replace(raim, protection_level_m=np.where(faulty, np.nan, level))
-
-    def _on_the_line(self, ranges: Ranges, index: SearchIndex, point: SinglePoint) -> _Place:
-        """Section search and constrained position where there are satellites enough."""
-        section = search(ranges, index, point, limits=self.config.section)
-        enough = ranges.n_used >= self.config.min_satellites
-        vertex = np.where(enough, section.vertex, -1)
-        constrained = constrained_position(ranges, index.trajectory, vertex, limits=self.config.constrained)
-        return _Place(point=point, section=section, constrained=constrained)
-
     def _ties(
         self, one: Prepared, ranges: Ranges, free: SinglePoint, state: AntennaState
     ) -> tuple[ClockTies, OffsetState]:
@@ -327,10 +267,10 @@ class EpochProcessor:
         return tie_clocks(time, one.clocks, reference, ranges, free, state.offsets, limits=self.config.clock_offsets)
 
     def _status(
-        self, code: Floats, ranges: Ranges, trajectory: Trajectory, place: _Place, raim: Raim, own_sigma: Floats
+        self, code: Floats, ranges: Ranges, trajectory: Trajectory, place: Place, raim: Raim, own_sigma: Floats
     ) -> NDArray[np.int8]:
         """The status of each epoch, shape (T,), decided once, from numbers, the gravest first."""
-        config, redundancy = self.config, _redundancy(ranges)
+        config, redundancy = self.config, redundancy_of(ranges)
         point, section, constrained = place.point, place.section, place.constrained
         position = trajectory.at_arc(constrained.arc_m)
         away = np.linalg.norm(position - point.ecef_m, axis=1)
@@ -407,20 +347,11 @@ class EpochProcessor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Place:
-    """Where one set of ranges puts an antenna: in space, at a point of the line, on the line."""
-
-    point: SinglePoint
-    section: Section
-    constrained: Constrained
-
-
-@dataclass(frozen=True, kw_only=True)
 class _Found:
     """Where one antenna is: conventionally, and on the line, with what was decided on the way."""
 
     point: SinglePoint
-    place: _Place
+    place: Place
     ties: ClockTies
     raim: Raim
     status: NDArray[np.int8]
@@ -429,8 +360,3 @@ class _Found:
     arc_m: Floats
     along_sigma_m: Floats
     phase: PhasePositions | None
-
-
-def _redundancy(ranges: Ranges) -> NDArray[np.int64]:
-    """Ranges beyond the clocks and the distance along the line, shape (T,)."""
-    return np.asarray(ranges.n_used - ranges.n_clocks - 1, dtype=np.int64)

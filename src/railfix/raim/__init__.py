@@ -14,7 +14,7 @@ balance between ranges and map error, stays that of the weights.
 """
 
 from railfix.raim.detection import Detection, RaimLimits, detect, threshold
-from railfix.raim.exclusion import Exclusion, Outcome, exclude
+from railfix.raim.exclusion import Exclusion, Outcome, exclude, worst_channel
 from railfix.raim.model import LinearModel, constrained_model, point_model
 from railfix.raim.reliability import Reliability, noncentrality, reliability
 
@@ -32,4 +32,5 @@ __all__ = [
     "point_model",
     "reliability",
     "threshold",
+    "worst_channel",
 ]

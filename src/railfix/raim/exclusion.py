@@ -279,3 +279,11 @@ def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
     for k, own in enumerate(trial.own):
         moves -= parts.gain_m[rows][:, trial.members[:, k]] * own[rows][..., None]
     return moves
+
+
+def worst_channel(model: LinearModel) -> Indices:
+    """Channel whose removal lowers the weighted sum of squared residuals most, shape (T,); 0 where none is checked."""
+    share = model.redundancy
+    checked = model.used & (share > LEAST_REDUNDANCY)
+    drop = np.where(checked, model.residual**2 / np.where(checked, share, 1.0), 0.0)
+    return np.asarray(np.argmax(drop, axis=1), dtype=np.intp)
