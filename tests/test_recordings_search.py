@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 import recordings_score
 import synthetic
 from pipeline_cases import demo_observations, processor
-from railfix import constrained, pipeline, preparation, section
+from railfix import constrained, placing, preparation, section
 from railfix.antenna import Trajectory
 from railfix.clock_elimination import UNTIED_M, Ranges
 from railfix.constrained import Constrained
@@ -49,9 +49,9 @@ def calls(monkeypatch) -> Calls:
         found.positions.append((ranges, trajectory, result))
         return result
 
-    for module in (pipeline, preparation, recordings_score):
+    for module in (placing, preparation, recordings_score):
         monkeypatch.setattr(module, "search", search)
-    for module in (pipeline, recordings_score):
+    for module in (placing, recordings_score):
         monkeypatch.setattr(module, "constrained_position", position)
     return found
 
