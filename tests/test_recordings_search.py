@@ -7,7 +7,7 @@ epochs in the usual run; all with ``-m slow`` (``-s`` prints the counts).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +68,7 @@ def run_demo_with_three(_: Path) -> None:
         mean = np.nanmean(whole.cn0_dbhz, axis=0)
         keep = np.zeros(len(whole.satellite), dtype=bool)
         keep[[i for i in np.argsort(-mean) if whole.satellite[i][0] == "G"][:3]] = True
-        few[name] = pipeline.replace(whole, code_m=np.where(keep, whole.code_m, np.nan))
+        few[name] = replace(whole, code_m=np.where(keep, whole.code_m, np.nan))
     processor().process(few)
 
 
