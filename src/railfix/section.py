@@ -183,10 +183,10 @@ def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: Se
     candidates: list[_Candidates] = []
     evaluations = np.zeros(epochs, dtype=np.int64)
 
-    radius, nearest = _ball(index, point, weight_norm, freedom, limits)
+    radius = _ball(index, point, weight_norm, freedom, limits)
     in_ball = np.flatnonzero(np.isfinite(radius))
     if len(in_ball):
-        found = _in_ball(ranges, index, point, weight_norm, in_ball, radius[in_ball], nearest[in_ball])
+        found = _in_ball(ranges, index, point, weight_norm, in_ball, radius[in_ball])
         candidates.append(found)
     coarse = np.flatnonzero(~np.isfinite(radius) & _searchable(ranges))
     if len(coarse):
@@ -200,13 +200,12 @@ def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: Se
 
 def _ball(
     index: SearchIndex, point: SinglePoint, weight_norm: Floats, freedom: NDArray[np.int64], limits: SectionLimits
-) -> tuple[Floats, Indices]:
+) -> Floats:
     """Radius around the 3-D position that holds every point worth looking at; NaN where unknown."""
     radius = np.full(len(point.ecef_m), np.nan)
-    nearest = np.full(len(point.ecef_m), -1, dtype=np.intp)
     at = np.flatnonzero(np.isfinite(point.ecef_m[:, 0]))
     if not len(at):
-        return radius, nearest
+        return radius
     found, vertex = index.tree.query(point.ecef_m[at])
     distance = np.asarray(found, dtype=np.float64)
     delta = index.trajectory.ecef_m[vertex] - point.ecef_m[at]
@@ -223,8 +222,7 @@ def _ball(
     # The bound holds where curvature stays small against growth; otherwise the search goes coarse to fine.
     holds = weight_norm[at] * _bend(2.0 * size) < 0.5 * np.sqrt(growth) * size
     radius[at] = np.where(holds, 1.001 * size + 1e-3, np.nan)
-    nearest[at] = vertex
-    return radius, nearest
+    return radius
 
 
 def _bend(distance_m: Floats) -> Floats:
@@ -239,14 +237,13 @@ def _in_ball(
     weight_norm: Floats,
     epochs: Indices,
     radius: Floats,
-    nearest: Indices,
 ) -> _Candidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
     lists = index.tree.query_ball_point(point.ecef_m[epochs], radius, return_sorted=True)
     count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
     vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
     if not np.all(count):
-        raise AssertionError(f"an empty ball around {nearest[count == 0]}: the radius is below the nearest point")
+        raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
     epoch = np.repeat(epochs, count)
     delta = index.trajectory.ecef_m[vertex] - point.ecef_m[epoch]
     matrix = point.matrix[epoch]
