@@ -19,11 +19,11 @@ from railfix.config import parse_config
 from railfix.demonstration import demo_inputs
 from railfix.epochs import Observations
 from railfix.errors import InputFileError
+from railfix.reference_log import read_reference
 from railfix.rinex import scan_observations
 from railfix.run import RunInputs, run_files
 from railfix.run import sources as run_sources
 from railfix.run.ablation import Ablation, ablate_files, choices
-from railfix.run.truth import read_truth
 
 pytestmark = [pytest.mark.requirement("B7"), pytest.mark.requirement("D2")]
 
@@ -187,19 +187,19 @@ def test_a_truth_of_another_day_does_not_belong_to_the_log(truth: Path, tmp_path
 
 
 def test_the_truth_of_two_antennas_says_whose_it_is(truth: Path, tmp_path: Path) -> None:
-    both = read_truth(truth, ["front", "rear"])
+    both = read_reference(truth, ["front", "rear"])
     apart = np.linalg.norm(both["front"].ecef_m - both["rear"].ecef_m, axis=1)
     np.testing.assert_allclose(apart, 18.2, atol=0.01)
     table = pl.read_csv(truth)
     bare = tmp_path / "bare.csv"
     table.filter(pl.col("antenna") == "rear").drop("antenna").write_csv(bare)
     with pytest.raises(InputFileError, match="column antenna"):
-        read_truth(bare, ["front", "rear"])
-    np.testing.assert_array_equal(read_truth(bare, ["front"])["front"].ecef_m, both["rear"].ecef_m)
+        read_reference(bare, ["front", "rear"])
+    np.testing.assert_array_equal(read_reference(bare, ["front"])["front"].ecef_m, both["rear"].ecef_m)
     one = tmp_path / "one.csv"
     table.filter(pl.col("antenna") == "rear").write_csv(one)
     with pytest.raises(InputFileError, match="for the antenna front"):
-        read_truth(one, ["front", "rear"])
+        read_reference(one, ["front", "rear"])
 
 
 def test_only_fixed_positions_are_truth(truth: Path, tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_only_fixed_positions_are_truth(truth: Path, tmp_path: Path) -> None:
     quality = pl.Series("quality", [1, 2, 1, 5, 1, 1, 2, 2, 1, 1])
     # in any order, each instant once
     pl.concat([table.with_columns(quality)] * 2).reverse().write_csv(path)
-    found = read_truth(path, ["front"])["front"]
+    found = read_reference(path, ["front"])["front"]
     assert len(found.time) == 6
     assert (np.diff(found.time) > np.timedelta64(0)).all()
 

@@ -135,12 +135,17 @@ def read_named_columns(path: str | PathLike[str]) -> NamedColumns:
     InputFileError
         No text, no header, a column name twice, a row with another number of cells.
     """
+    return parse_named_columns(read_text(path), path)
+
+
+def parse_named_columns(text: str, path: str | PathLike[str]) -> NamedColumns:
+    """The same from the text of the file; `path` is for the messages."""
     metadata: dict[str, str] = {}
     header: list[str] = []
     header_line = 0
     rows: list[list[str]] = []
     numbers: list[int] = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
             continue
         if line.startswith("#"):

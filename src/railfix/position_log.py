@@ -95,7 +95,12 @@ def _read_csv(path: str | PathLike[str], columns: dict[str, str]) -> PositionLog
     unknown = sorted(set(columns) - set(CSV_COLUMNS))
     if unknown:
         raise SettingsError(f"{path}: column {unknown[0]!r} is unknown; expected one of {', '.join(CSV_COLUMNS)}")
-    table = _renamed(read_named_columns(path), columns)
+    return positions_of_table(_renamed(read_named_columns(path), columns))
+
+
+def positions_of_table(table: NamedColumns) -> PositionLog:
+    """Positions of a table that has been read already; see `read_positions`."""
+    path = table.path
     close = misspelt(table.cells, CSV_COLUMNS)
     absent = {right: wrong for wrong, right in close.items() if right not in table}
     geodetic, cartesian = (all(name in table for name in names) for names in (_GEODETIC, _CARTESIAN))

@@ -20,6 +20,7 @@ from railfix.errors import MismatchError
 from railfix.evaluate import Score, along_track_error, interpolate_reference, score
 from railfix.pipeline import AntennaResult, EpochProcessor, State
 from railfix.reasons import Status
+from railfix.reference_log import AntennaReference, read_reference
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
 from railfix.run.driver import Progress, RunOptions, notes_of, open_inputs
@@ -27,7 +28,6 @@ from railfix.run.inputs import RunInputs, collected
 from railfix.run.output import OutputFolder
 from railfix.run.record import run_record
 from railfix.run.tally import Tally
-from railfix.run.truth import Truth, read_truth
 
 Floats = NDArray[np.float64]
 
@@ -167,7 +167,7 @@ def ablate_files(
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
-        truth = None if inputs.truth is None else read_truth(inputs.truth, tuple(inputs.logs))
+        truth = None if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs))
         navigation, line, logs = open_inputs(inputs, options)
         screens, left_out = judging_screens(config, line.trajectories)
         processors = {
@@ -226,7 +226,7 @@ def ablate_files(
 class _Kept:
     """What is kept of each epoch, by choice and antenna, chunk by chunk."""
 
-    truth: Mapping[str, Truth] | None
+    truth: Mapping[str, AntennaReference] | None
     trajectories: Mapping[str, Trajectory]
     parts: dict[tuple[str, str], list[dict[str, Floats]]] = field(default_factory=dict)
 
