@@ -28,6 +28,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "raim",
         "carrier",
         "cn0_curve",
+        "error_model",
     ),
     5: (
         "config",
