@@ -1,0 +1,21 @@
+"""Errors of corrected pseudoranges along a railway, by direction and C/N0: fit, file, use (P1 7)."""
+
+from railfix.error_model.file import read_error_model, write_error_model
+from railfix.error_model.fit import ErrorModelFit, ErrorSamples, fit_bins
+from railfix.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource
+from railfix.error_model.overbound import Overbound, gaussian_overbound
+
+__all__ = [
+    "POOLED",
+    "BinStatistics",
+    "ErrorBins",
+    "ErrorModel",
+    "ErrorModelFit",
+    "ErrorModelSource",
+    "ErrorSamples",
+    "Overbound",
+    "fit_bins",
+    "gaussian_overbound",
+    "read_error_model",
+    "write_error_model",
+]

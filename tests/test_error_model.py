@@ -1,0 +1,190 @@
+"""Bins, pooling, overbounds and the file of the error model."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from railfix.error_model import (
+    POOLED,
+    BinStatistics,
+    ErrorBins,
+    ErrorModel,
+    ErrorModelFit,
+    ErrorModelSource,
+    ErrorSamples,
+    fit_bins,
+    gaussian_overbound,
+    read_error_model,
+    write_error_model,
+)
+from railfix.errors import InputFileError
+
+pytestmark = pytest.mark.requirement("C3")
+
+
+def samples_of(error: np.ndarray, elevation: float, azimuth: float, cn0: float, *, block: int = 0) -> ErrorSamples:
+    n = len(error)
+    return ErrorSamples(
+        error_m=error,
+        elevation_deg=np.full(n, elevation),
+        relative_azimuth_deg=np.full(n, azimuth),
+        cn0_dbhz=np.full(n, cn0),
+        block=block + np.arange(n) // 10,
+        used=np.ones(n, dtype=bool),
+    )
+
+
+def joined(*parts: ErrorSamples) -> ErrorSamples:
+    return ErrorSamples(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ErrorSamples)})
+
+
+def test_the_bound_of_a_normal_sample_is_the_sample_s_own_distribution() -> None:
+    error = np.random.default_rng(1).normal(0.5, 2.0, 200_000)
+    bound = gaussian_overbound(error)
+    assert bound.bias_m == pytest.approx(0.5, abs=0.2)
+    assert 2.0 <= bound.sigma_m < 2.25
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_quantile_of_the_sample_lies_beyond_the_bound(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    error = np.where(rng.random(5000) < 0.1, rng.exponential(15.0, 5000), rng.normal(0.3, 1.5, 5000))
+    bound = gaussian_overbound(error)
+    for probability in np.linspace(0.5, 1.0 - 1.0 / 5001, 500):
+        score = norm.ppf(probability)
+        upper = np.quantile(error, probability, method="weibull")
+        lower = np.quantile(error, 1.0 - probability, method="weibull")
+        assert upper <= bound.bias_m + bound.sigma_m * score + 1e-9
+        assert -lower <= bound.bias_m + bound.sigma_m * score + 1e-9
+
+
+def test_the_bound_is_no_wider_than_its_worst_sample_asks_for() -> None:
+    error = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.0])
+    score = norm.ppf(0.9)
+    bound = gaussian_overbound(error)
+    assert bound.sigma_m == pytest.approx(9.0 / score)
+    assert bound.bias_m == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("error", [np.array([1.0, 2.0]), np.array([1.0, np.nan, 2.0])])
+def test_a_bound_needs_finite_samples(error: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="at least three samples"):
+        gaussian_overbound(error)
+
+
+def test_bins_by_hand() -> None:
+    bins = ErrorBins(elevation_deg=(0.0, 30.0, 90.0), sectors=4, cn0_dbhz=(0.0, 40.0, 60.0))
+    cases = [
+        (10.0, 0.0, 35.0, (0, 0, 0)),
+        (10.0, 350.0, 35.0, (0, 0, 0)),
+        (10.0, 44.9, 45.0, (0, 0, 1)),
+        (30.0, 45.1, 45.0, (1, 1, 1)),
+        (89.0, 180.0, 99.0, (1, 2, 1)),
+        (5.0, -90.0, np.nan, (0, 3, 0)),
+    ]
+    for elevation, azimuth, cn0, where in cases:
+        assert bins.index(elevation, azimuth, cn0) == np.ravel_multi_index(where, bins.shape)
+    assert bins.index(np.nan, 0.0, 40.0) == -1
+
+
+def test_thin_bins_take_the_next_wider_set() -> None:
+    rng = np.random.default_rng(3)
+    bins = ErrorBins(elevation_deg=(0.0, 30.0, 90.0), sectors=2, cn0_dbhz=(0.0, 40.0, 60.0))
+    fit = ErrorModelFit(bins=bins, least_blocks=20)
+    plenty = samples_of(rng.normal(0.0, 1.0, 1000), 10.0, 0.0, 45.0)
+    thin = samples_of(rng.normal(0.0, 5.0, 50), 10.0, 180.0, 45.0, block=1000)
+    samples = joined(plenty, thin)
+    found = fit_bins(samples, samples.used, fit)
+    assert found.count[0, 0, 1] == 1000
+    assert found.blocks[0, 0, 1] == 100
+    assert found.count[0, 1, 1] == 50
+    assert POOLED[found.pooled[0, 0, 1]] == "own"
+    assert found.sigma_m[0, 0, 1] == pytest.approx(np.std(plenty.error_m, ddof=1))
+    assert POOLED[found.pooled[0, 1, 1]] == "all azimuths"
+    assert found.sigma_m[0, 1, 1] == pytest.approx(np.std(samples.error_m, ddof=1))
+    assert POOLED[found.pooled[0, 1, 0]] == "all azimuths and C/N0"
+    assert POOLED[found.pooled[1, 0, 1]] == "all azimuths and elevations"
+    assert POOLED[found.pooled[1, 0, 0]] == "all"
+
+
+def test_samples_that_are_not_asked_for_do_not_count() -> None:
+    samples = samples_of(np.random.default_rng(5).normal(size=100), 10.0, 0.0, 45.0)
+    found = fit_bins(samples, np.zeros(100, dtype=bool), ErrorModelFit())
+    assert found.count.sum() == 0
+    assert np.isnan(found.bound_sigma_m).all()
+
+
+def made_model() -> ErrorModel:
+    rng = np.random.default_rng(9)
+    n = 20_000
+    samples = ErrorSamples(
+        error_m=rng.normal(0.2, 2.0, n),
+        elevation_deg=rng.uniform(0, 90, n),
+        relative_azimuth_deg=rng.uniform(0, 360, n),
+        cn0_dbhz=rng.uniform(20, 55, n),
+        block=np.arange(n) // 5,
+        used=rng.random(n) < 0.7,
+    )
+    fit = ErrorModelFit()
+    return ErrorModel(
+        bins=fit.bins,
+        before=fit_bins(samples, np.ones(n, dtype=bool), fit),
+        after=fit_bins(samples, samples.used, fit),
+        covers="local",
+        source=ErrorModelSource(runs=('a "run"',), base="3034", epochs=7, files=(("x.obs", "00ff"),)),
+    )
+
+
+def test_the_file_gives_the_model_back(tmp_path: Path) -> None:
+    model = made_model()
+    write_error_model(model, tmp_path / "model.toml")
+    again = read_error_model(tmp_path / "model.toml")
+    assert again.bins == model.bins
+    assert again.covers == model.covers
+    assert again.source == model.source
+    for part in ("before", "after"):
+        for item in fields(BinStatistics):
+            np.testing.assert_allclose(
+                getattr(getattr(again, part), item.name), getattr(getattr(model, part), item.name), atol=5e-4
+            )
+    sigma, bias = model.at([10.0, np.nan], [0.0, 0.0], [42.0, 42.0])
+    assert sigma[0] == model.after.bound_sigma_m[0, 0, 3]
+    assert bias[0] == model.after.bound_bias_m[0, 0, 3]
+    assert np.isnan(sigma[1])
+
+
+def test_what_no_bin_knows_is_nan() -> None:
+    model = made_model()
+    empty = replace(model.after, bound_sigma_m=np.full(model.bins.shape, np.nan))
+    assert np.isnan(replace(model, after=empty).at(10.0, 0.0, 42.0)[0])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("railfix error model 1", "something else", "is no error model"),
+        ('covers = "local"', 'covers = "all"', "covers is 'all'"),
+        ("sectors = 4", "sectors = 3", "must have 75 rows"),
+        ("sectors = 4", 'sectors = "x"', r"\[bins\]"),
+        ("[before]", "[early]", "must have exactly the entries"),
+        ('["count", ', '["number", ', "must have columns"),
+        ("rows = [\n  [", "rows = [\n  [-", "must not be negative"),
+        ("rows = [\n  [", "rows = [\n  [true, ", "must be 7 numbers"),
+    ],
+)
+def test_a_broken_file_is_refused_with_the_place(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "model.toml"
+    write_error_model(made_model(), path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputFileError, match=said):
+        read_error_model(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputFileError, match=r"no\.toml"):
+        read_error_model(tmp_path / "no.toml")
