@@ -6,7 +6,7 @@ import sys
 import time as clock
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -63,6 +63,11 @@ class RunOptions:
     def __post_init__(self) -> None:
         if self.start is not None and self.end is not None and self.start >= self.end:
             raise SettingsError(f"--start {self.start} is not before --end {self.end}; give an earlier start")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        plain = asdict(self)
+        return plain | {name: None if plain[name] is None else plain[name].isoformat() for name in ("start", "end")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,6 +145,7 @@ def run_files(
             command=sys.argv,
             asked=asked or {},
             used=config.as_dict(),
+            options=options.as_dict(),
             line=line.facts,
             navigation=navigation,
             tally=tally,
@@ -199,7 +205,9 @@ def _position(
     """Chunk by chunk: positions, counts, rows."""
     tally, state = Tally(min_satellites=processor.config.min_satellites), State()
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+        began = clock.perf_counter()
         result, state = processor.process(chunk, state)
+        tally.took(result, clock.perf_counter() - began)
         tally.add(result)
         check_same_day(processor.navigation, tally)
         check_same_place(tally, antennas="all")

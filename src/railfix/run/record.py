@@ -52,6 +52,7 @@ def run_record(
     command: Sequence[str],
     asked: Mapping[str, Any],
     used: Mapping[str, Any],
+    options: Mapping[str, Any],
     line: Mapping[str, Any],
     navigation: Navigation,
     tally: Tally,
@@ -68,6 +69,8 @@ def run_record(
     command : sequence of str
     asked, used : mapping
         Settings as given, and all settings that were in force.
+    options : mapping
+        Choices of the run that are no settings of the positions.
     line : mapping
         Facts of the track map, the vehicle and the trajectories.
     navigation : Navigation
@@ -87,6 +90,7 @@ def run_record(
         "inputs": list(files),
         "settings_asked": dict(asked),
         "settings_used": dict(used),
+        "options": dict(options),
         "line": dict(line),
         "navigation": {
             "records": len(navigation.kepler) + len(navigation.glonass),
@@ -102,6 +106,11 @@ def run_record(
             for name, antenna in tally.antennas.items()
         },
         "wall_s": round(wall_s, 3),
+        "chunks": {
+            "first_epoch_gpst": [str(first) for first, _, _ in tally.chunks],
+            "epochs": [epochs for _, epochs, _ in tally.chunks],
+            "positioning_s": [round(spent, 6) for _, _, spent in tally.chunks],
+        },
     }
 
 

@@ -177,17 +177,26 @@ class Tally:
     antennas : dict of str to AntennaTally
     notes : dict of str
         As keys, in the order in which they came.
+    chunks : list of (datetime64[ns], int, float)
+        First epoch of each chunk, its epochs of all antennas, and the time that positioning it took [s].
     """
 
     min_satellites: int = 3
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)
+    chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
 
     def add(self, result: Result) -> None:
         """Count one more chunk."""
         for name, antenna in result.antennas.items():
             self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites)).add(antenna)
         self.notes.update(dict.fromkeys(result.notes))
+
+    def took(self, result: Result, spent_s: float) -> None:
+        """Note how long the positions of one more chunk took."""
+        times = [antenna.time for antenna in result.antennas.values() if len(antenna.time)]
+        if times:
+            self.chunks.append((min(time[0] for time in times), sum(map(len, times)), spent_s))
 
     @property
     def epochs(self) -> int:
