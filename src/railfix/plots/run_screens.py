@@ -78,13 +78,52 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{out}: the folder cannot be made ({error.strerror})") from None
-    drawn = []
+    return [
+        draw_screen(out / f"{screen.antenna}_{screen.name}.png", screen.picture, screen.time, screen.chainage_m)
+        for screen in screens_of(config, positions, observations)
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunScreen:
+    """One screen of a run over one antenna.
+
+    Attributes
+    ----------
+    antenna, name : str
+        ``front``, ``doppler``.
+    picture : ScreenPicture
+    time : ndarray of datetime64[ns], shape (T,)
+    chainage_m : ndarray, shape (T,) [m]
+        Of the positions; NaN where there is none.
+    """
+
+    antenna: str
+    name: str
+    picture: ScreenPicture
+    time: NDArray[np.datetime64]
+    chainage_m: Floats
+
+
+def screens_of(config: Config, positions: pl.DataFrame, observations: pl.DataFrame) -> Iterator[RunScreen]:
+    """Every screen of a run that judged anything, antenna by antenna.
+
+    Parameters
+    ----------
+    config : Config
+        Settings that were in force.
+    positions, observations : polars.DataFrame
+        Tables of the run, columns of `railfix.tables`.
+
+    Yields
+    ------
+    RunScreen
+    """
     for antenna in positions["antenna"].unique(maintain_order=True).to_list():
         grid = _grid(positions.filter(pl.col("antenna") == antenna), observations.filter(pl.col("antenna") == antenna))
         for name, picture in _pictures(antenna, grid, config):
             if np.isfinite(picture.metric).any():
-                drawn.append(draw_screen(out / f"{antenna}_{name}.png", picture, grid.time, grid.chainage_m))
-    return drawn
+                yield RunScreen(antenna=antenna, name=name, picture=picture, time=grid.time, chainage_m=grid.chainage_m)
 
 
 def _read(run: Path) -> tuple[Config, pl.DataFrame, pl.DataFrame]:

@@ -13,7 +13,11 @@ from numpy.typing import NDArray
 
 from railfix.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
 from railfix.errors import OutputError
+from railfix.plots.chart import Chart, Layer, Line, Points
+from railfix.plots.draw import draw_chart
+from railfix.plots.thinning import extremes, told
 from railfix.screens import Cn0Limits
+from railfix.timescale import seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,7 +26,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 #: Colours that stay apart for the colour-blind (Okabe and Ito).
-_MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#56b4e9"
+_MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#2f86b8"
 _COLUMNS: Final = 4
 
 
@@ -75,40 +79,84 @@ def draw_screen(
     """
     from matplotlib.figure import Figure
 
-    places: list[tuple[str, NDArray[Any]]] = [("GPS time", time)]
+    charts = [screen_over_time(picture, time)]
     if chainage_m is not None:
-        places.append(("chainage [m]", chainage_m))
-    figure = Figure(figsize=(12, 4.2 * len(places)), layout="constrained")
-    judged = int(np.count_nonzero(np.isfinite(picture.metric)))
-    refused = int(np.count_nonzero(picture.reject))
-    share = f"{100 * refused / judged:.2f} %" if judged else "none"
-    figure.suptitle(f"{picture.title}: {judged:,} judged, {refused:,} refused ({share})")
-    for axes, (name, along) in zip(np.ravel(figure.subplots(len(places), 1)), places, strict=True):
-        _draw_metric(axes, picture, along)
-        axes.set_xlabel(name)
+        charts.append(screen_over_chainage(picture, chainage_m))
+    figure = Figure(figsize=(12, 4.2 * len(charts)), layout="constrained")
+    for axes, chart in zip(np.ravel(figure.subplots(len(charts), 1)), charts, strict=True):
+        draw_chart(chart, axes)
     return _save(figure, path)
 
 
-def _draw_metric(axes: Axes, picture: ScreenPicture, along: NDArray[Any]) -> None:
-    where = np.broadcast_to(along[:, None], picture.metric.shape)
-    for mask, colour, name in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "refused")):
-        axes.plot(where[mask], picture.metric[mask], ".", ms=2, color=colour, label=name, rasterized=True)
+def screen_over_time(picture: ScreenPicture, time: NDArray[np.datetime64]) -> Chart:
+    """Chart of a metric against its limit over time.
+
+    Parameters
+    ----------
+    picture : ScreenPicture
+    time : ndarray of datetime64[ns], shape (T,)
+
+    Returns
+    -------
+    Chart
+    """
+    start = time.min() if len(time) else np.datetime64(0, "ns")
+    return _screen(picture, seconds(time - start), name="time", x_label="GPS time", start=start)
+
+
+def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats) -> Chart:
+    """Chart of a metric against its limit over the place.
+
+    Parameters
+    ----------
+    picture : ScreenPicture
+    chainage_m : ndarray, shape (T,) [m]
+
+    Returns
+    -------
+    Chart
+    """
+    return _screen(picture, chainage_m, name="chainage", x_label="chainage [m]", start=None)
+
+
+def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start: np.datetime64 | None) -> Chart:
+    judged = int(np.count_nonzero(np.isfinite(picture.metric)))
+    refused = int(np.count_nonzero(picture.reject))
+    share = f"{100 * refused / judged:.2f} %" if judged else "none"
+    where = np.broadcast_to(x[:, None], picture.metric.shape)
+    layers: list[Layer] = []
+    shown = whole = 0
+    for mask, colour, label in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "refused")):
+        along, metric = where[mask], picture.metric[mask]
+        rows = extremes(along, metric)
+        shown, whole = shown + len(rows), whole + int(np.count_nonzero(np.isfinite(along + metric)))
+        layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
     limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
     finite = np.isfinite(limit).any(axis=1)
     # one line for all channels: the tightest limit of each epoch, where channels differ
     least = np.full(len(limit), np.nan)
     least[finite] = np.nanmin(limit[finite], axis=1)
-    order = np.argsort(along, kind="stable")
+    rows = extremes(x, least)
+    rows = rows[np.argsort(x[rows], kind="stable")]
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
-        axes.plot(along[order], sign * least[order], "-", lw=0.8, color=_FLOOR, label="limit" if sign > 0 else None)
-    if finite.any():
+        label = "limit" if sign > 0 else ""
+        layers.append(Line(label=label, colour=_FLOOR, x=x[rows], y=sign * least[rows], width=1.0))
+    scale: dict[str, Any] = {}
+    values = np.abs(picture.metric[np.isfinite(picture.metric)])
+    if finite.any() and picture.sides != "below" and len(values):
         top = 6.0 * float(np.nanmedian(least))
-        values = picture.metric[np.isfinite(picture.metric)]
-        if picture.sides != "below" and len(values) and np.abs(values).max() > top:
-            axes.set_yscale("symlog", linthresh=top / 2.0)
-    axes.set_ylabel(picture.label)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize="small", markerscale=4, loc="upper right")
+        if top > 0.0 and values.max() > top:
+            scale = {"y_scale": "symlog", "y_linear": top / 2.0}
+    return Chart(
+        name=name,
+        title=f"{picture.title}: {judged:,} judged, {refused:,} refused ({share})",
+        caption=told(shown, whole).strip(),
+        x_label=x_label,
+        y_label=picture.label,
+        layers=tuple(layers),
+        start=start,
+        **scale,
+    )
 
 
 def draw_cn0_curve(

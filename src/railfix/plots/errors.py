@@ -1,0 +1,245 @@
+"""Charts of the error along the line (P1 figures 7, 8, 10, 11) and of the levels that bound it.
+
+The tables have one row an epoch of one antenna: ``time_gpst``, ``reference_chainage_m`` (where the
+antenna was), ``error_m`` and ``conventional_error_m`` (+ toward the end of the line), and, as far as
+there is any, ``along_sigma_m`` and ``protection_level_m``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import ArrayLike, NDArray
+
+from railfix.plots.chart import (
+    BLACK,
+    CONSTRAINED,
+    CONVENTIONAL,
+    GREY,
+    PURPLE,
+    Band,
+    Cells,
+    Chart,
+    Layer,
+    Line,
+    Points,
+    Ranges,
+)
+from railfix.plots.columns import floats, since, start_of
+from railfix.plots.thinning import extremes, told
+
+Floats = NDArray[np.float64]
+
+_ERROR_LABEL: Final = "error along the line [m]"
+_SIGN: Final = "+ is toward the end of the line."
+#: Pieces of the line over which the greatest sigma and level are drawn.
+_PIECES: Final = 600
+_SERIES: Final = (
+    ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
+    ("on the map", "error_m", CONSTRAINED, "dot"),
+)
+
+
+def error_over_time(errors: pl.DataFrame, *, title: str = "Error along the line over time") -> Chart:
+    """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
+
+    Parameters
+    ----------
+    errors : polars.DataFrame
+        Of one antenna, in order of time.
+    title : str
+
+    Returns
+    -------
+    Chart
+    """
+    start = start_of(errors)
+    x = since(errors, start)
+    return _errors(errors, x, name="error-time", title=title, x_label="GPS time", start=start)
+
+
+def error_over_chainage(errors: pl.DataFrame, *, title: str = "Error along the line over chainage") -> Chart:
+    """The same over the place where the antenna was (P1 figure 8).
+
+    Parameters
+    ----------
+    errors : polars.DataFrame
+        Of one antenna.
+    title : str
+
+    Returns
+    -------
+    Chart
+    """
+    x = floats(errors, "reference_chainage_m")
+    return _errors(errors, x, name="error-chainage", title=title, x_label="chainage of the reference [m]", start=None)
+
+
+def _errors(
+    errors: pl.DataFrame, x: Floats, *, name: str, title: str, x_label: str, start: np.datetime64 | None
+) -> Chart:
+    layers: list[Layer] = []
+    caption = [_SIGN]
+    at, sigma = _greatest(x, floats(errors, "along_sigma_m"))
+    if len(at):
+        layers.append(Band(label="± sigma stated", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
+        caption.append("The band is the standard deviation that railfix states, the greatest of each short piece.")
+    level = floats(errors, "protection_level_m")
+    at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
+    if len(at):
+        for sign, label in ((1.0, "± protection level"), (-1.0, "")):
+            layers.append(Line(label=label, colour=PURPLE, x=at, y=sign * most, width=1.0, dash="dashed"))
+        share = np.isfinite(level).mean()
+        caption.append(f"Protection levels are finite at {100 * share:.1f} % of the epochs.")
+    epoch = since(errors, start_of(errors))
+    shown = whole = 0
+    for label, column, colour, shape in _SERIES:
+        y = floats(errors, column)
+        rows = extremes(x, y)
+        shown, whole = shown + len(rows), whole + int(np.isfinite(x + y).sum())
+        layers.append(
+            Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows], epoch_s=epoch[rows])  # type: ignore[arg-type]
+        )
+    scale = error_scale(np.concatenate([floats(errors, column) for _, column, _, _ in _SERIES]))
+    if scale["y_scale"] == "symlog":
+        caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
+    return Chart(
+        name=name,
+        title=title,
+        caption=" ".join(caption) + told(shown, whole),
+        x_label=x_label,
+        y_label=_ERROR_LABEL,
+        layers=tuple(layers),
+        start=start,
+        **scale,
+    )
+
+
+def error_scale(error_m: Floats) -> dict[str, Any]:
+    """Scale of an axis of errors: logarithmic outside where few are far larger than the rest."""
+    size = np.abs(error_m[np.isfinite(error_m)])
+    if not len(size):
+        return {"y_scale": "linear"}
+    usual, largest = float(np.percentile(size, 98)), float(size.max())
+    if largest <= 8.0 * max(usual, 0.5):
+        return {"y_scale": "linear"}
+    return {"y_scale": "symlog", "y_linear": float(np.ceil(max(usual, 1.0)))}
+
+
+def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """The greatest y of each piece of x, NaN between pieces far apart."""
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not len(rows):
+        return np.empty(0), np.empty(0)
+    low, high = float(x[rows].min()), float(x[rows].max())
+    width = ((high - low) or 1.0) / _PIECES
+    piece = np.minimum(((x[rows] - low) / width).astype(np.intp), _PIECES - 1)
+    most = np.full(_PIECES, np.nan)
+    np.fmax.at(most, piece, y[rows])
+    here = np.isfinite(most)
+    # a few empty pieces are only the spacing of the epochs
+    inside = np.flatnonzero(here)
+    spacing = np.percentile(np.diff(inside), 98) if len(inside) > 1 else 1.0
+    gap = np.flatnonzero(np.diff(inside) > 3 * spacing)
+    middle = low + (inside + 0.5) * width
+    return np.insert(middle, gap + 1, np.nan), np.insert(most[inside], gap + 1, np.nan)
+
+
+def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the errors") -> Chart:
+    """Least, mean and greatest error of each run, on the map and conventional (P1 figure 11).
+
+    Parameters
+    ----------
+    runs : mapping of str to polars.DataFrame
+        Errors by the name of the run.
+    title : str
+
+    Returns
+    -------
+    Chart
+    """
+    names: list[str] = []
+    values: list[Floats] = []
+    for run, errors in runs.items():
+        for label, column, _, _ in reversed(_SERIES):
+            names.append(f"{run}, {label}")
+            error = floats(errors, column)
+            values.append(error[np.isfinite(error)])
+    layers = []
+    for label, _, colour, _ in reversed(_SERIES):
+        mine = [v if name.endswith(f", {label}") else np.empty(0) for name, v in zip(names, values, strict=True)]
+        layers.append(
+            Ranges(
+                label=label,
+                colour=colour,
+                names=tuple(names),
+                low=np.array([v.min() if len(v) else np.nan for v in mine]),
+                mid=np.array([v.mean() if len(v) else np.nan for v in mine]),
+                high=np.array([v.max() if len(v) else np.nan for v in mine]),
+            )
+        )
+    return Chart(
+        name="error-ranges",
+        title=title,
+        caption=f"From the least to the greatest signed error; the mark is the mean. {_SIGN}",
+        x_label=_ERROR_LABEL,
+        y_label="",
+        layers=tuple(layers),
+    )
+
+
+def stanford(error_m: ArrayLike, level_m: ArrayLike, alarm_limit_m: float, *, title: str = "Stanford diagram") -> Chart:
+    """Protection level over the size of the error, counted in cells.
+
+    Parameters
+    ----------
+    error_m, level_m : array_like, shape (T,) [m]
+        Signed error along the line and the level meant to bound it; epochs without either are left out.
+    alarm_limit_m : float [m]
+    title : str
+
+    Returns
+    -------
+    Chart
+        The axes end at three times the alarm limit; what is beyond counts in the last cells.
+    """
+    error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
+    known = np.isfinite(error) & ~np.isnan(level)
+    error, level = error[known], level[known]
+    top = 3.0 * alarm_limit_m
+    edges = np.linspace(0.0, top, 121)
+    inside = np.nextafter(top, 0.0)
+    counts, _, _ = np.histogram2d(np.minimum(error, inside), np.minimum(level, inside), bins=(edges, edges))
+    usable = level <= alarm_limit_m
+    missed = error > level
+    hazard = usable & (error > alarm_limit_m)
+    whole = max(len(error), 1)
+    parts = (
+        ("available", usable),
+        ("level over the alarm limit", ~usable),
+        ("misleading: error over the level", missed),
+        ("hazardous: error over the alarm limit, level under it", hazard),
+    )
+    said = "; ".join(f"{name} {int(mask.sum()):,} ({100 * mask.sum() / whole:.3f} %)" for name, mask in parts)
+    line = np.array([0.0, top])
+    limit = np.array([alarm_limit_m, alarm_limit_m])
+    return Chart(
+        name="stanford",
+        title=title,
+        caption=f"{len(error):,} epochs with a level: {said}. Below the diagonal the error was larger than the level. "
+        f"Values beyond {top:g} m, infinite levels among them, stand in the last cells.",
+        x_label="size of the error along the line [m]",
+        y_label="protection level [m]",
+        layers=(
+            Cells(label="epochs", colour=BLACK, x_edges=edges, y_edges=edges, counts=counts.astype(np.int64)),
+            Line(label="error = level", colour=GREY, x=line, y=line),
+            Line(label="alarm limit", colour=CONVENTIONAL, x=line, y=limit, dash="dashed"),
+            Line(label="", colour=CONVENTIONAL, x=limit, y=line, dash="dashed"),
+        ),
+        x_range=(0.0, top),
+        y_range=(0.0, top),
+        width="half",
+    )
