@@ -42,7 +42,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "fault_free",
         "pipeline",
     ),
-    6: ("simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),
+    6: ("range_errors", "simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),
 }
 FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 

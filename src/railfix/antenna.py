@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -56,6 +57,8 @@ class Trajectory:
     body_chainage_m : ndarray, shape (V,), or None [m]
         Chainage of the middle between the bogies when the antenna is at the point, strictly rising: where
         one antenna is, it tells where the other one of the same vehicle is. None without a vehicle.
+    facing : {"rising", "falling"}
+        Which way along the line the vehicle's front points; "rising" is taken where no vehicle tells.
     sigma_plan_m, sigma_height_m : float [m]
         Standard deviations of the map, carried into the solution.
     notes : tuple of str
@@ -70,6 +73,7 @@ class Trajectory:
     roll_deg: Floats
     reference: str = "antenna"
     body_chainage_m: Floats | None = None
+    facing: Literal["rising", "falling"] = "rising"
     sigma_plan_m: float = SIGMA_PLAN_M
     sigma_height_m: float = SIGMA_HEIGHT_M
     notes: tuple[str, ...] = ()
@@ -152,6 +156,11 @@ class Trajectory:
         """Climb of each segment in rising chainage, shape (V - 1,)."""
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
         return frozen(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
+
+    def body_azimuth_deg(self, arc_m: ArrayLike) -> Floats:
+        """Azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""
+        heading = self.heading_deg[self.segment_at(arc_m)[0]] + (0.0 if self.facing == "rising" else 180.0)
+        return np.where(np.isfinite(np.asarray(arc_m, dtype=np.float64)), heading % 360.0, np.nan)
 
     @cached_property
     def _nearest(self) -> NearestOnPolyline:

@@ -390,6 +390,7 @@ def antenna_trajectory(
         roll_deg=np.degrees(body.roll_rad),
         reference=reference,
         body_chainage_m=middle,
+        facing=vehicle.facing,
         sigma_plan_m=track.sigma_plan_m,
         sigma_height_m=track.sigma_height_m,
         notes=(*line.notes, *track.provenance.notes),

@@ -208,6 +208,7 @@ def ablate_files(
             command=sys.argv,
             asked=asked or {},
             used=config.model_copy(update={"screens": screens}).as_dict(),
+            options=options.as_dict(),
             line=line.facts,
             navigation=navigation,
             tally=tallies[ALL],

@@ -77,7 +77,7 @@ class RunInputs:
 
     def fingerprints(self, pool: Executor) -> list[tuple[str, Path, Future[str]]]:
         """SHA-256 of every file, worked out beside the run."""
-        return [(name, path, pool.submit(_sha256, path)) for name, path in self.named()]
+        return [(name, path, pool.submit(file_sha256, path)) for name, path in self.named()]
 
 
 def collected(fingerprints: list[tuple[str, Path, Future[str]]]) -> list[dict[str, Any]]:
@@ -101,7 +101,8 @@ def _check_file(name: str, path: Path) -> None:
         raise InputFileError(path, f"cannot be read ({error.strerror}); check what --{name} names") from error
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, as hexadecimal digits."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
