@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from railfix.simulate.setting_checks import (
     require_not_negative,
@@ -11,6 +16,8 @@ from railfix.simulate.setting_checks import (
     require_positive,
     require_share,
 )
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,3 +74,122 @@ class TrackingSettings:
         if self.threshold_dbhz is not None:
             require_not_negative(self, "threshold_dbhz")
         require_one_of(self, "slips", ("none", "after_loss"))
+
+
+class CarriedNoise:
+    """Correlated noise of a receiver's channels, piece by piece; any cutting gives the same numbers.
+
+    Parameters
+    ----------
+    settings : NoiseSettings
+    key : sequence of int
+        Seed, another one for each receiver.
+    channels : int
+    interval_s : float
+        Of the epochs.
+    """
+
+    def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
+        self._settings = settings
+        self._code = _FirstOrder((*key, 0), channels, interval_s / settings.code_correlation_time_s)
+        self._cn0 = _FirstOrder((*key, 1), channels, interval_s / settings.cn0_wander_time_s)
+
+    def code(self, white: Floats) -> Floats:
+        """Code noise of standard deviation 1, shape (T, M), from white noise of that shape."""
+        share = self._settings.code_correlated_share
+        if share == 0.0:
+            return white
+        return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
+
+    def cn0_db(self, epochs: int) -> Floats | float:
+        """Wander of C/N0 [dB], shape (T, M), of the next epochs; 0 where there is none."""
+        sigma = self._settings.cn0_wander_sigma_db
+        return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
+
+
+class _FirstOrder:
+    """Autoregressive series of order 1 and standard deviation 1: ``x[k] = rho x[k-1] + sqrt(1 - rho^2) w[k]``."""
+
+    def __init__(self, key: Sequence[int], channels: int, steps_a_time: float) -> None:
+        self._rng = np.random.default_rng(list(key))
+        self._rho = float(np.exp(-steps_a_time))
+        self._state = self._rho * self._rng.standard_normal((1, channels))
+
+    def next(self, epochs: int) -> Floats:
+        white = np.sqrt(1.0 - self._rho**2) * self._rng.standard_normal((epochs, self._state.shape[1]))
+        series, self._state = lfilter([1.0], [1.0, -self._rho], white, axis=0, zi=self._state)
+        return np.asarray(series)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked:
+    """What a receiver makes of its signals.
+
+    Attributes
+    ----------
+    lost : ndarray of bool, shape (T, M)
+        Absent.
+    slip_cycles : ndarray, shape (T, M), or 0.0
+        Whole cycles that the phase has moved since the start.
+    loss_of_lock : ndarray of uint8, shape (T, M)
+        Bit 0 at the first epoch after a loss.
+    """
+
+    lost: NDArray[np.bool_]
+    slip_cycles: Floats | float
+    loss_of_lock: NDArray[np.uint8]
+
+
+class Tracking:
+    """Loss and re-acquisition of a receiver's channels; the state goes on from piece to piece.
+
+    Parameters
+    ----------
+    settings : TrackingSettings
+    key : sequence of int
+        Seed of the slips, another one for each receiver.
+    channels : int
+    interval_s : float
+        Of the epochs.
+    """
+
+    def __init__(self, settings: TrackingSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
+        self._settings = settings
+        self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
+        self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
+        # Epochs since the signal was last too bad to be tracked, as if it had been good for ever.
+        self._since = np.full(channels, self._wait + 1, dtype=np.int64)
+        self._seen = np.zeros(channels, dtype=np.bool_)
+        self._present = np.zeros(channels, dtype=np.bool_)
+        self._losses = np.zeros(channels, dtype=np.uint64)
+
+    def too_weak(self, cn0_dbhz: Floats) -> NDArray[np.bool_]:
+        """Signals below the threshold."""
+        threshold = self._settings.threshold_dbhz
+        return np.zeros(cn0_dbhz.shape, dtype=np.bool_) if threshold is None else np.asarray(cn0_dbhz < threshold)
+
+    def follow(self, bad: NDArray[np.bool_]) -> Tracked:
+        """What becomes of signals that cannot be tracked where `bad`, shape (T, M), the epochs that follow."""
+        epoch = np.arange(1, len(bad) + 1, dtype=np.int64)[:, None]
+        last_bad = np.maximum.accumulate(np.where(bad, epoch, -self._since), axis=0)
+        since = epoch - last_bad
+        lost = bad | (since <= self._wait)
+        here = np.concatenate([self._present[None], ~lost])
+        seen = np.maximum.accumulate(np.concatenate([self._seen[None], ~lost]), axis=0)
+        back = here[1:] & ~here[:-1] & seen[:-1]
+        losses = self._losses + np.cumsum(back, axis=0, dtype=np.uint64)
+        self._since = np.minimum(since[-1], self._wait + 1)
+        self._present, self._seen, self._losses = here[-1], seen[-1], losses[-1]
+        if self._settings.slips == "none":
+            return Tracked(lost=lost, slip_cycles=0.0, loss_of_lock=np.zeros(bad.shape, dtype=np.uint8))
+        return Tracked(lost=lost, slip_cycles=_cycles(self._salt, losses), loss_of_lock=back.astype(np.uint8))
+
+
+def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
+    """Whole cycles in +-2e6 for each channel and number of losses, 0 for none (mixed by splitmix64)."""
+    mixed = salt + losses * np.uint64(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    mixed ^= mixed >> np.uint64(31)
+    cycles = (mixed % np.uint64(4_000_001)).astype(np.float64) - 2_000_000.0
+    return np.where(losses == 0, 0.0, cycles)

@@ -15,6 +15,8 @@ import numpy as np
 
 from railfix.errors import SettingsError
 from railfix.simulate.disturbance import Disturbances
+from railfix.simulate.errors.settings import ErrorSettings
+from railfix.simulate.sensors.settings import SensorSettings
 
 #: Antennas of the vehicle, in the order in which they are written.
 ANTENNAS: Final = ("front", "rear")
@@ -214,6 +216,10 @@ class Scenario:
         Number of epochs is their product; the interval must be a whole number of 100 ns.
     multipath : sequence of Disturbances
         What is added to the clean signals; none yet by default.
+    errors : ErrorSettings
+        What satellites, atmosphere and receivers are off by beyond the noise of `receiver`; nothing by default.
+    sensors : SensorSettings or None
+        Sensors on board besides the receivers.
     """
 
     seed: int = 20_240_305
@@ -226,6 +232,8 @@ class Scenario:
     sky: SkySettings = field(default_factory=SkySettings)
     receiver: ReceiverSettings = field(default_factory=ReceiverSettings)
     multipath: tuple[Disturbances, ...] = ()
+    errors: ErrorSettings = field(default_factory=ErrorSettings)
+    sensors: SensorSettings | None = None
 
     def __post_init__(self) -> None:
         _not_negative(self, "seed")
@@ -259,7 +267,13 @@ class Scenario:
         flat: dict[str, Any] = {}
         for item in fields(self):
             value = getattr(self, item.name)
-            if hasattr(value, "__dataclass_fields__"):
+            if item.name in ("errors", "sensors"):
+                # Only what is not at its default of no error.
+                usual = {"errors": ErrorSettings, "sensors": SensorSettings}[item.name]()
+                for inner in fields(value) if value is not None else ():
+                    if item.name == "sensors" or getattr(value, inner.name) != getattr(usual, inner.name):
+                        flat[f"{item.name}.{inner.name}"] = getattr(value, inner.name)
+            elif hasattr(value, "__dataclass_fields__"):
                 flat |= {f"{item.name}.{inner.name}": getattr(value, inner.name) for inner in fields(value)}
             elif item.name != "multipath":
                 flat[item.name] = str(value) if item.name == "start" else value
