@@ -15,7 +15,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
     0: ("constants", "errors", "timescale", "geodesy", "polyline", "signals"),
     1: ("epochs", "navigation", "reasons", "named_columns"),
     2: ("files", "rinex", "sp3", "position_log", "reference_log", "orbits", "atmosphere"),
-    3: ("track_map", "antenna", "vehicle"),
+    3: ("track_map", "antenna", "vehicle", "sbas"),
     4: (
         "clock_elimination",
         "clock_offsets",
@@ -28,6 +28,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "raim",
         "carrier",
         "cn0_curve",
+        "doppler_speed",
         "error_model",
     ),
     5: (
