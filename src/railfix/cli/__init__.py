@@ -14,6 +14,7 @@ from railfix import __version__
 from railfix.cli.ablate import ablate as ablate_command
 from railfix.cli.cn0_curve import cn0_curve as cn0_curve_command
 from railfix.cli.demo import demo as demo_command
+from railfix.cli.error_model import error_model as error_model_command
 from railfix.cli.map import map_app
 from railfix.cli.plot_screens import plot_screens as plot_screens_command
 from railfix.cli.run import run as run_command
@@ -91,6 +92,7 @@ app.command("run")(run_command)
 app.command("demo")(demo_command)
 app.command("ablate")(ablate_command)
 app.command("cn0-curve")(cn0_curve_command)
+app.command("error-model")(error_model_command)
 app.command("plot-screens")(plot_screens_command)
 app.add_typer(map_app)
 

@@ -59,7 +59,7 @@ def cn0_curve(
         fit = CurveFit(bin_deg=bin_deg)
     except ValueError as error:
         raise SettingsError(f"--bin: {error}") from None
-    place = None if position is None else _position(position)
+    place = None if position is None else place_of(position, "--position")
     for path in (out, plot):
         if path is not None and not path.parent.is_dir():
             raise OutputError(f"{path}: the folder {path.parent} does not exist")
@@ -77,15 +77,16 @@ def cn0_curve(
             typer.echo(f"wrote {path}")
 
 
-def _position(text: str) -> NDArray[np.float64]:
+def place_of(text: str, option: str) -> NDArray[np.float64]:
+    """A place given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
     from railfix.geodesy import ecef_from_geodetic
 
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
     except ValueError:
-        raise SettingsError(f"--position {text!r}: expected LAT,LON,HEIGHT, for example 35.63,139.74,60") from None
+        raise SettingsError(f"{option} {text!r}: expected LAT,LON,HEIGHT, for example 35.63,139.74,60") from None
     if not (-90.0 <= latitude <= 90.0 and -180.0 <= longitude <= 360.0 and -1e4 < height < 1e5):
-        raise SettingsError(f"--position {text!r}: latitude, longitude in degrees and height in metres were expected")
+        raise SettingsError(f"{option} {text!r}: latitude, longitude in degrees and height in metres were expected")
     return ecef_from_geodetic(latitude, longitude, height)
 
 

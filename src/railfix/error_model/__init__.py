@@ -2,6 +2,7 @@
 
 from railfix.error_model.file import read_error_model, write_error_model
 from railfix.error_model.fit import ErrorModelFit, ErrorSamples, fit_bins
+from railfix.error_model.marginal import SummaryRow, summary
 from railfix.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource
 from railfix.error_model.overbound import Overbound, gaussian_overbound
 
@@ -14,8 +15,10 @@ __all__ = [
     "ErrorModelSource",
     "ErrorSamples",
     "Overbound",
+    "SummaryRow",
     "fit_bins",
     "gaussian_overbound",
     "read_error_model",
+    "summary",
     "write_error_model",
 ]

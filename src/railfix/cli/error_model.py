@@ -1,0 +1,114 @@
+"""``railfix error-model``: errors of the pseudoranges along a line, from runs with references."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from railfix.errors import OutputError, SettingsError
+
+if TYPE_CHECKING:
+    from railfix.error_model import ErrorModel
+
+
+def error_model(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `railfix run` wrote.")],
+    *,
+    reference: Annotated[
+        list[Path],
+        typer.Option("--reference", metavar="FILE", help="Where the antennas were, one for each RUN in their order."),
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="MODEL.toml", help="Error model to write.")],
+    base: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--base",
+            metavar="OBS",
+            help="RINEX observations of a nearby reference station during all RUNs; repeat it for several files.",
+        ),
+    ] = None,
+    base_position: Annotated[
+        str | None,
+        typer.Option(metavar="LAT,LON,HEIGHT", help="Place of the station; else what its header says."),
+    ] = None,
+    elevations: Annotated[
+        str, typer.Option(metavar="DEG,...", help="Edges of the bins of elevation.")
+    ] = "0,15,30,45,60,90",
+    sectors: Annotated[
+        int, typer.Option(metavar="N", help="Sectors of azimuth, the first centred ahead of the car.")
+    ] = 4,
+    cn0: Annotated[
+        str, typer.Option("--cn0", metavar="DBHZ,...", help="Edges of the bins of C/N0; 0,60 puts all into one.")
+    ] = "0,30,35,40,45,60",
+    least_blocks: Annotated[
+        int,
+        typer.Option(metavar="N", help="Passes of a satellite (30 s blocks) below which wider bins stand for a bin."),
+    ] = 30,
+) -> None:
+    """Model the errors of corrected pseudoranges: multipath of the line and receiver noise.
+
+    Each RUN is positioned once more with its own settings. The error of a pseudorange is what is left of it
+    after the distance to the reference and the receiver clock are taken away, and with `--base` also what a
+    nearby reference station sees of the same satellite. Without `--base` errors of orbits, clocks and
+    atmosphere stay in, as they were on those days: the model is then wider, and holds for such days.
+
+    The file has bias, standard deviation and a Gaussian overbound for every bin of elevation, azimuth from the
+    car's front and C/N0, before the screens and after. `railfix run --set error_model=MODEL.toml` weighs
+    the ranges by it and derives the protection level from it.
+
+    Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
+
+    Exit codes as `railfix --help` says; 5 where run, reference and station do not belong together.
+    """
+    import numpy as np
+
+    from railfix.cli.cn0_curve import place_of
+    from railfix.error_model import ErrorBins, ErrorModelFit, write_error_model
+    from railfix.range_errors import ModelInputs, error_model_from_runs
+
+    if len(reference) != len(runs):
+        raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")
+    if not out.parent.is_dir():
+        raise OutputError(f"{out}: the folder {out.parent} does not exist")
+    try:
+        bins = ErrorBins(elevation_deg=_edges(elevations), sectors=sectors, cn0_dbhz=_edges(cn0))
+        fit = ErrorModelFit(bins=bins, least_blocks=least_blocks)
+    except ValueError as error:
+        raise SettingsError(f"bins of the model: {error}") from None
+    place = None if base_position is None else np.asarray(place_of(base_position, "--base-position"))
+    inputs = [
+        ModelInputs(run=run, reference=file, base=tuple(base or ()), base_position_ecef_m=place)
+        for run, file in zip(runs, reference, strict=True)
+    ]
+    model, samples = error_model_from_runs(inputs, fit=fit)
+    write_error_model(model, out)
+    _print_model(model, len(samples.error_m))
+    typer.echo(f"wrote {out}")
+
+
+def _edges(text: str) -> tuple[float, ...]:
+    return tuple(float(part) for part in text.split(","))
+
+
+def _print_model(model: ErrorModel, samples: int) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from railfix.error_model import summary
+
+    console = Console(highlight=False)
+    base = model.source.base or "none: errors of satellites and atmosphere are in the model"
+    console.print(
+        f"{samples:,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres",
+        markup=False,
+    )
+    table = Table(show_edge=False, pad_edge=False)
+    table.add_column("before and\nafter screens", no_wrap=True)
+    for when in ("before", "after"):
+        for name in ("count", "bias", "sigma", "bound"):
+            table.add_column(f"{when}\n{name}" if name == "count" else f"\n{name}", justify="right", no_wrap=True)
+    for row in summary(model):
+        table.add_row(row.name, *row.cells)
+    console.print(table)

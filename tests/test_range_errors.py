@@ -1,0 +1,234 @@
+"""Errors of single pseudoranges: clocks, reference station, past runs, the command."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import recordings_truth
+from railfix.antenna import Trajectory
+from railfix.cli import app
+from railfix.config import Config, parse_config
+from railfix.demonstration import demo_inputs
+from railfix.epochs import Observations
+from railfix.error_model import ErrorModelFit, read_error_model
+from railfix.errors import InputFileError, MismatchError
+from railfix.pipeline import EpochProcessor
+from railfix.range_errors import (
+    BaseStation,
+    ModelInputs,
+    base_station_from_files,
+    error_model_from_runs,
+    range_errors,
+    robust_clock,
+)
+from railfix.reference_log import AntennaReference, read_reference
+from railfix.rinex import read_navigation, read_observations
+from railfix.run import RunOptions, past_run, run_files
+from railfix.run.driver import open_inputs
+from railfix.simulate import demo_files
+from railfix.track_map import from_positions
+
+pytestmark = pytest.mark.requirement("C3")
+EPOCH = np.datetime64("2024-03-05T00:00:00", "ns")
+
+
+def test_the_clock_is_the_mean_of_clean_ranges_and_one_bad_one_hardly_moves_it() -> None:
+    rng = np.random.default_rng(4)
+    clean = 1000.0 + rng.normal(0.0, 1.0, (500, 9))
+    sigma = np.ones_like(clean)
+    groups = (slice(0, 5), slice(5, 9))
+    found = robust_clock(clean, sigma, groups)
+    assert np.abs(found.clock_m[:, 0] - clean[:, :5].mean(axis=1)).max() < 0.6
+    assert found.clock_m[:, 0].std() == pytest.approx(1.0 / np.sqrt(5), rel=0.15)
+    np.testing.assert_allclose(found.share[:, :5].sum(axis=1), 1.0)
+    dirty = clean.copy()
+    dirty[:, 2] += 100.0
+    moved = robust_clock(dirty, sigma, groups).clock_m - found.clock_m
+    assert np.abs(moved[:, 0]).max() < 1.5
+    assert (moved[:, 1] == 0.0).all()
+
+
+def test_too_few_ranges_have_no_clock() -> None:
+    residual = np.full((1, 5), 7.0)
+    residual[0, 3:] = np.nan
+    assert np.isnan(robust_clock(residual, np.ones((1, 5)), (slice(0, 5),)).clock_m).all()
+    assert robust_clock(residual, np.ones((1, 5)), (slice(0, 5),), least_ranges=3).clock_m[0, 0] == 7.0
+
+
+def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
+    station = BaseStation(
+        name="x",
+        time=EPOCH + np.array([0, 30, 90]) * np.timedelta64(1, "s"),
+        satellite=np.array(["E01", "G01"]),
+        error_m=np.array([[1.0, 4.0], [3.0, np.nan], [5.0, 8.0]]),
+        smoothed=True,
+    )
+    at = EPOCH + np.array([-1, 0, 15, 30, 60, 91]) * np.timedelta64(1, "s")
+    found = station.at(at, np.array(["E01", "R01"]), largest_gap_s=35.0)
+    np.testing.assert_allclose(found[:, 0], [np.nan, 1.0, 2.0, np.nan, np.nan, np.nan])
+    assert np.isnan(found[:, 1]).all()
+    assert np.isnan(station.at(at, np.array(["G01"]), largest_gap_s=100.0)[2, 0])
+
+
+def _demo(config: Config, part: slice = slice(0, 600)) -> tuple[EpochProcessor, Observations, AntennaReference]:
+    inputs = demo_inputs()
+    navigation, line, logs = open_inputs(inputs, RunOptions())
+    processor = EpochProcessor(config, navigation, line.trajectories)
+    reference = read_reference(demo_files()["truth"], ("front", "rear"))["front"]
+    return processor, next(logs["front"].parts())[part], reference
+
+
+def test_an_error_put_into_a_code_comes_back_and_touches_no_other_satellite() -> None:
+    config = parse_config({"screens": ["elevation"], "systems": ["G"]})
+    processor, obs, reference = _demo(config, slice(0, 50))
+    found, _ = processor.process({"front": obs})
+    used = np.flatnonzero(np.char.startswith(obs.satellite, "G") & (found.antennas["front"].reason == 0).all(axis=0))
+    one = int(used[0])
+    code = obs.code_m.copy()
+    code[:, one] += 60.0
+    spoilt, _ = processor.process({"front": replace(obs, code_m=code)})
+    path = processor.trajectories["front"]
+    before = range_errors(found.antennas["front"], path, reference)
+    after = range_errors(spoilt.antennas["front"], path, reference)
+    np.testing.assert_array_equal(before.satellite, after.satellite)
+    changed = after.samples.error_m - before.samples.error_m
+    itself = before.satellite == obs.satellite[one]
+    # Huber's weight holds a sixtyfold outlier down to a share of a few per cent of the clock.
+    assert np.median(changed[itself]) == pytest.approx(60.0, abs=4.0)
+    assert np.abs(np.median(changed[~itself])) < 1.0
+
+
+def test_the_errors_of_the_simulated_run_have_the_noise_that_was_put_in() -> None:
+    config = parse_config({"screens": ["elevation"]})
+    processor, obs, reference = _demo(config)
+    result, _ = processor.process({"front": obs})
+    antenna = result.antennas["front"]
+    errors = range_errors(antenna, processor.trajectories["front"], reference)
+    sample = errors.samples
+    expected = 0.5 * 10.0 ** ((45.0 - np.minimum(sample.cn0_dbhz, 50.0)) / 20.0)
+    expected /= np.sin(np.radians(sample.elevation_deg))
+    score = sample.error_m[sample.used] / expected[sample.used]
+    assert errors.epochs == len(obs)
+    assert score.std() == pytest.approx(1.0, abs=0.05)
+    assert abs(score.mean()) < 0.05
+
+
+def test_the_car_s_own_front_counts_not_north() -> None:
+    processor, obs, reference = _demo(parse_config({"screens": ["elevation"]}), slice(0, 2))
+    result, _ = processor.process({"front": obs})
+    path = processor.trajectories["front"]
+    errors = range_errors(result.antennas["front"], path, reference)
+    turned = range_errors(result.antennas["front"], replace(path, facing="falling"), reference)
+    away = (errors.samples.relative_azimuth_deg - turned.samples.relative_azimuth_deg) % 360.0
+    np.testing.assert_allclose(away, 180.0)
+    column = int(np.flatnonzero(obs.satellite == errors.satellite[0])[0])
+    heading = path.body_azimuth_deg(path.nearest(reference.ecef_m[:1])[0])[0]
+    expected = (result.antennas["front"].azimuth_deg[0, column] - heading) % 360.0
+    assert errors.samples.relative_azimuth_deg[0] == pytest.approx(expected, abs=0.1)
+
+
+def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
+    folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
+    time, ecef = recordings_truth.japan_truth(folder)
+    navigation = read_navigation([folder / "SEPT2650.21P"])
+    path = Trajectory.from_track(from_positions(time, ecef, spacing_m=5.0))
+    config = parse_config({"ionosphere": "off", "troposphere": "off"})
+    result, _ = EpochProcessor(config, navigation, {"front": path}).process(
+        {"front": read_observations(folder / "SEPT265G.21O")}
+    )
+    blank = np.full(len(time), np.nan)
+    words = np.full(len(time), "")
+    reference = AntennaReference(
+        time=time, ecef_m=ecef, chainage_m=blank, speed_mps=blank, sigma_m=blank, source=words, environment=words
+    )
+    station = base_station_from_files([folder / "3034265G.21O"], navigation, config)
+    assert station.smoothed
+    antenna = result.antennas["front"]
+    alone = range_errors(antenna, path, reference)
+    with_station = range_errors(antenna, path, reference, station)
+
+    def spread(errors: object) -> float:
+        size = np.abs(errors.samples.error_m[errors.samples.used])  # type: ignore[attr-defined]
+        return float(np.percentile(size, 68))
+
+    # Without any model of the atmosphere the errors are of metres; both receivers have the same ones.
+    assert spread(alone) > 2.0
+    assert spread(with_station) < 0.7 * spread(alone)
+
+
+@pytest.fixture(scope="module")
+def done_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    run_files(demo_inputs(), parse_config({"min_satellites": 4}), out=folder / "run")
+    return folder / "run"
+
+
+def test_a_past_run_knows_how_it_was_done(done_run: Path) -> None:
+    past = past_run(done_run)
+    assert past.config.min_satellites == 4
+    assert past.inputs == demo_inputs()
+    assert past.options == RunOptions()
+    past.check_inputs()
+
+
+def test_a_past_run_whose_input_has_changed_is_refused(done_run: Path, tmp_path: Path) -> None:
+    record = json.loads((done_run / "run.json").read_text())
+    record["inputs"][0]["sha256"] = "0" * 64
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    with pytest.raises(MismatchError, match="has changed since the run"):
+        past_run(tmp_path).check_inputs()
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [("{", "is no JSON"), ("{}", "lacks inputs, options, settings_used"), ("[]", "everything")]
+)
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, content: str, said: str) -> None:
+    (tmp_path / "run.json").write_text(content)
+    with pytest.raises(InputFileError, match=said):
+        past_run(tmp_path)
+    with pytest.raises(InputFileError, match="name a folder that railfix run wrote"):
+        past_run(tmp_path / "nothing")
+
+
+def test_the_command_writes_a_model_and_says_what_it_lacks(done_run: Path, tmp_path: Path) -> None:
+    truth, out = str(demo_files()["truth"]), tmp_path / "model.toml"
+    done = CliRunner().invoke(
+        app, ["error-model", str(done_run), "--reference", truth, "--out", str(out), "--cn0", "0,60"]
+    )
+    assert done.exit_code == 0, done.output
+    assert "errors of satellites and atmosphere are in the model" in " ".join(done.output.split())
+    model = read_error_model(out)
+    assert model.covers == "satellite_and_atmosphere"
+    assert model.bins.shape == (5, 4, 1)
+    assert model.source.epochs == 4000
+    assert (model.before.count >= model.after.count).all()
+    again, samples = error_model_from_runs(
+        [ModelInputs(run=done_run, reference=demo_files()["truth"])], fit=ErrorModelFit(bins=model.bins)
+    )
+    np.testing.assert_allclose(again.after.bound_sigma_m, model.after.bound_sigma_m, atol=5e-4)
+    assert again.after.count.sum() == samples.used.sum()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--out", "nodir/m.toml"], 8, "the folder nodir does not exist"),
+        (["--out", "m.toml", "--elevations", "0,90,45"], 4, "rising edges"),
+        (["--out", "m.toml", "--cn0", "x"], 4, "bins of the model"),
+        (["--out", "m.toml", "--reference", "b"], 4, "1 runs and 2 references"),
+        (["--out", "m.toml", "--base-position", "1,2"], 4, "--base-position '1,2'"),
+    ],
+)
+def test_what_cannot_be_is_said_before_the_work(
+    done_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], code: int, said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["error-model", str(done_run), "--reference", "a", *arguments])
+    assert done.exit_code == code
+    assert said in done.output
