@@ -14,7 +14,7 @@ SOURCE: Final = ROOT / "src" / "railfix"
 FLOORS: Final[dict[int, tuple[str, ...]]] = {
     0: ("constants", "errors", "timescale", "geodesy", "polyline", "signals"),
     1: ("epochs", "navigation", "reasons", "named_columns"),
-    2: ("files", "rinex", "sp3", "position_log", "reference_log", "orbits", "atmosphere"),
+    2: ("files", "rinex", "sp3", "position_log", "nmea", "reference_log", "orbits", "atmosphere"),
     3: ("track_map", "antenna", "vehicle", "sbas"),
     4: (
         "clock_elimination",
@@ -26,6 +26,8 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "spp",
         "screens",
         "raim",
+        "protection",
+        "stanford",
         "carrier",
         "cn0_curve",
         "doppler_speed",

@@ -22,7 +22,7 @@ Datetimes = NDArray[np.datetime64]
 #: RTKLIB's solution quality (RTKLIB manual 2.4.2, B.1).
 QUALITY_NAMES: Final = {1: "fix", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 #: Columns of a CSV log; coordinates are geodetic or ECEF.
-CSV_COLUMNS: Final = ("time_gpst", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality")
+CSV_COLUMNS: Final = ("time_gpst", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality", "ratio")
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
@@ -45,6 +45,8 @@ class PositionLog:
     line : ndarray of int, shape (n,)
         Line number of each row in the file.
     notes : tuple of str
+    ratio : ndarray, shape (n,), or None
+        Ratio of the ambiguities' test, where the log has it.
     """
 
     path: str
@@ -54,6 +56,7 @@ class PositionLog:
     sigma_m: Floats
     line: NDArray[np.int64]
     notes: tuple[str, ...] = ()
+    ratio: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -128,6 +131,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
         quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
         sigma_m=np.full((len(table), 3), np.nan),
         line=table.line,
+        ratio=table.numbers("ratio", blank=np.nan) if "ratio" in table else None,
     )
 
 
@@ -212,6 +216,7 @@ def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
         sigma_m=_rtklib_sigma(rest, names),
         line=number,
         notes=() if scale == "GPST" else (f"{path}: times converted from {scale} to GPS time",),
+        ratio=_rtklib_ratio(rest, names),
     )
 
 
@@ -298,6 +303,12 @@ def _rtklib_sigma(rest: Floats, names: list[str]) -> Floats:
     if not {"sdn", "sde", "sdu"} <= set(after[: rest.shape[1]]):
         return np.full((len(rest), 3), np.nan)
     return rest[:, [after.index(name) for name in ("sdn", "sde", "sdu")]]
+
+
+def _rtklib_ratio(rest: Floats, names: list[str]) -> Floats | None:
+    """The column ``ratio``, where the file has it."""
+    after = [name.split("(")[0] for name in names[3:]]
+    return rest[:, after.index("ratio")] if "ratio" in after[: rest.shape[1]] else None
 
 
 def write_positions_csv(path: str | PathLike[str], time: Datetimes, ecef_m: Floats) -> None:

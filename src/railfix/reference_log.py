@@ -14,7 +14,7 @@ environment where the train is: ``open``, ``cutting``, or whatever words the fil
 =========== ===============================================================================
 
 Only time and place are needed (geodetic coordinates will do). The simulator's ``truth.csv`` is
-such a file without a source, and so are the logs that `railfix.position_log` reads.
+such a file without a source, and so are logs of positions (RTKLIB, CSV, NMEA).
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from railfix.epochs import frozen
 from railfix.errors import InputFileError, OutputError
 from railfix.files import read_bytes
 from railfix.named_columns import NamedColumns, parse_named_columns, read_named_columns
-from railfix.position_log import PositionLog, positions_of_table, read_positions
+from railfix.nmea import read_any_positions
+from railfix.position_log import PositionLog, positions_of_table
 
 Floats = NDArray[np.float64]
 Datetimes = NDArray[np.datetime64]
@@ -106,7 +107,7 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
     ----------
     path : path
         A reference file or the simulator's truth (``.csv``, ``.csv.gz``), or a log of positions that
-        `railfix.position_log.read_positions` reads. Where quality is told, 1 (fix) alone counts.
+        `railfix.nmea.read_any_positions` reads. Where quality is told, 1 (fix) alone counts.
     antennas : sequence of str
         Those that are wanted. A file without the column ``antenna`` is about the only one.
 
@@ -122,7 +123,7 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
         No reference, no times, an unknown source, or nothing that says which antenna's they are.
     """
     table = _table(Path(path))
-    log = read_positions(path) if table is None else positions_of_table(table)
+    log = read_any_positions(path) if table is None else positions_of_table(table)
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
         usable &= log.quality == _FIX
