@@ -234,6 +234,8 @@ class CorrelatorSettings:
         Weaker signals are lost.
     cn0_horizon_dbhz, cn0_rise_dbhz : float
         C/N0 of a clear signal, horizon + rise sin(elevation): against these the loss is judged.
+    code_loop_hz, carrier_loop_hz : float
+        Bandwidths of the loops: multipath that turns faster is averaged.
     backward_db : float
         By which the antenna on its roof receives from below the horizon weaker.
     """
@@ -243,11 +245,13 @@ class CorrelatorSettings:
     tracking_cn0_dbhz: float = 20.0
     cn0_horizon_dbhz: float = 34.0
     cn0_rise_dbhz: float = 16.0
+    code_loop_hz: float = 1.0
+    carrier_loop_hz: float = 10.0
     backward_db: float = 15.0
     __pydantic_config__: ClassVar[Any] = _STRICT
 
     def __post_init__(self) -> None:
-        _positive(self, "chip_m", "spacing_chips")
+        _positive(self, "chip_m", "spacing_chips", "code_loop_hz", "carrier_loop_hz")
         if self.spacing_chips > 1.0:
             _refuse(self, "spacing_chips", "be at most 1")
 
@@ -275,7 +279,7 @@ class EnvironmentSettings:
 
     electrification: ElectrificationSettings | None = None
     sections: tuple[SectionSettings, ...] = ()
-    shares: dict[str, float] = field(default_factory=dict)
+    shares: dict[Kind, float] = field(default_factory=dict)
     section_length_m: Between = (150.0, 800.0)
     antenna_height_m: float = 4.0
     ground_reflection: float = 0.5

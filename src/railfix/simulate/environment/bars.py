@@ -1,0 +1,167 @@
+"""Masts, beams and wires: straight bars that take a strip out of the wave, and throw some of it about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.simulate.environment.faces import Rays
+from railfix.simulate.environment.settings import ElectrificationSettings
+from railfix.simulate.environment.waves import edge_amplitude, per_metre, strip_field
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bar:
+    """One bar for each of N rays.
+
+    Attributes
+    ----------
+    p, q : ndarray, shape (N,) [m]
+        Its axis in the plane square to it, from the antenna.
+    ray_p, ray_q, ray_axis : ndarray, shape (N,)
+        Direction to the satellite in that plane, and along the bar.
+    low_m, high_m : ndarray or float [m]
+        Ends along the axis, from the antenna.
+    width_m : float
+    """
+
+    p: Floats
+    q: Floats
+    ray_p: Floats
+    ray_q: Floats
+    ray_axis: Floats
+    low_m: Floats | float
+    high_m: Floats | float
+    width_m: float
+
+    def taken(self, wavelength_m: Floats) -> Complexes:
+        """What a bar ahead takes from the direct wave (0: nothing), shape (N,).
+
+        The strip's field times the share of its length, and the cosine of the angle to the bar: none from the side.
+        """
+        plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
+        away = np.hypot(self.p, self.q)
+        toward = (self.p * self.ray_p + self.q * self.ray_q) / plane
+        beside = (self.q * self.ray_p - self.p * self.ray_q) / plane
+        far = toward / plane
+        scale = per_metre(far, wavelength_m)
+        ahead = np.maximum(toward, 0.0) / away
+        strip = strip_field(beside * scale, self.width_m * scale)
+        return np.asarray(strip * ahead * self._share(far * self.ray_axis, scale * plane))
+
+    def thrown(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Amplitude, extra path [m], and direction (p, q) of what a bar behind throws to the antenna.
+
+        A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
+        bistatic angle b; extra path rho c (1 - cos(phi)), c the part of the ray square to the bar and phi its
+        angle to the bar. Half the power is of the antenna's polarisation.
+        """
+        plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
+        away = np.hypot(self.p, self.q)
+        cosine = (self.p * self.ray_p + self.q * self.ray_q) / (plane * away)
+        scale = per_metre(away, wavelength_m)
+        share = self._share(away / plane * self.ray_axis, scale * plane)
+        # sin(phi / 2) is cos(b / 2).
+        half = np.sqrt(np.maximum(0.5 * (1.0 - cosine), 0.0))
+        amplitude = np.sqrt(0.5) * np.sqrt(0.25 * self.width_m * half / away) * share
+        behind = np.where(cosine < 0.0, np.minimum(1.0, -4.0 * cosine), 0.0)
+        return amplitude * behind, away * plane * (1.0 - cosine), plane * self.p / away, plane * self.q / away
+
+    def _share(self, at_m: Floats, scale: Floats) -> Floats:
+        """1 between the bar's ends, 0 beyond."""
+        inside = np.minimum(at_m - self.low_m, self.high_m - at_m) * scale
+        return 1.0 - edge_amplitude(inside)
+
+
+class Electrification:
+    """The bars of an electrified line.
+
+    Parameters
+    ----------
+    settings : ElectrificationSettings
+    """
+
+    def __init__(self, settings: ElectrificationSettings) -> None:
+        self.settings = settings
+
+    def _numbered(self, chainage_m: Floats, every: int) -> Floats:
+        """Chainage of the nearest mast, of every so-manieth."""
+        spacing = self.settings.spacing_m * every
+        return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
+
+    def _mast(self, rays: Rays, sign: Floats, near_m: Floats) -> Bar:
+        s = self.settings
+        return Bar(
+            p=self._numbered(near_m, 1) - rays.chainage_m,
+            q=sign * s.lateral_m,
+            ray_p=rays.x,
+            ray_q=rays.y,
+            ray_axis=rays.z,
+            low_m=-rays.height_m,
+            high_m=s.height_m - rays.height_m,
+            width_m=s.width_m,
+        )
+
+    def _beam(self, rays: Rays, near_m: Floats) -> Bar:
+        s = self.settings
+        return Bar(
+            p=self._numbered(near_m, s.beam_every) - rays.chainage_m,
+            q=np.full(len(near_m), s.beam_height_m - rays.height_m),
+            ray_p=rays.x,
+            ray_q=rays.z,
+            ray_axis=rays.y,
+            low_m=-s.lateral_m,
+            high_m=s.lateral_m,
+            width_m=s.beam_depth_m,
+        )
+
+    def _stands(self, sign: Floats) -> Floats:
+        """1 where the side has masts, else 0."""
+        side = {"both": sign, "right": 1.0, "left": -1.0}[self.settings.sides]
+        return np.where(sign == side, 1.0, 0.0)
+
+    def left_over(self, rays: Rays) -> Complexes:
+        """Direct field behind the bars ahead: 1 where nothing is in the way, shape (N,)."""
+        s = self.settings
+        sign = np.where(rays.y > 0.0, 1.0, -1.0)
+        lateral = np.maximum(np.abs(rays.y), 1e-3)
+        mast = self._mast(rays, sign, rays.chainage_m + s.lateral_m * rays.x / lateral)
+        field = 1.0 - mast.taken(rays.wavelength_m) * self._stands(sign)
+        if s.beam_every:
+            over = s.beam_height_m - rays.height_m
+            beam = self._beam(rays, rays.chainage_m + over * rays.x / np.maximum(rays.z, 0.02))
+            field = field * (1.0 - beam.taken(rays.wavelength_m))
+        for height in (s.wire_height_m, s.messenger_height_m):
+            field = field * (1.0 - self._wire(rays, height).taken(rays.wavelength_m))
+        return np.asarray(field)
+
+    def _wire(self, rays: Rays, height_m: float) -> Bar:
+        n = len(rays.x)
+        return Bar(
+            p=np.zeros(n),
+            q=np.full(n, height_m - rays.height_m),
+            ray_p=rays.y,
+            ray_q=rays.z,
+            ray_axis=rays.x,
+            low_m=-1e6,
+            high_m=1e6,
+            width_m=self.settings.wire_width_m,
+        )
+
+    def thrown(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
+        """Amplitude, extra path and its growth [m/m] of what mast and beam behind throw, each of shape (N,)."""
+        sign = np.where(rays.y > 0.0, -1.0, 1.0)
+        bars = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
+        if self.settings.beam_every:
+            half = 0.5 * self.settings.spacing_m * self.settings.beam_every
+            bars.append((self._beam(rays, rays.chainage_m - np.sign(rays.x) * half * 0.999), np.ones(len(rays.x))))
+        found = []
+        for bar, stands in bars:
+            amplitude, extra, toward_x, _ = bar.thrown(rays.wavelength_m)
+            found.append((amplitude * stands, extra, rays.x - toward_x))
+        return found

@@ -1,0 +1,133 @@
+"""What an early-late receiver measures where several paths arrive at once: closed forms, no memory.
+
+The loop is the coherent one on a phase lock to the sum: its code error is the zero of
+``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths in the early, late and prompt
+correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14), with the
+triangle of unlimited bandwidth. On the stretches where the triangle is straight that zero is a
+quotient, so a few repetitions find it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+#: Repetitions; the stretch on which each path's triangle lies settles in two or three.
+_ROUNDS: Final = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked:
+    """What is tracked, shapes (N,).
+
+    Attributes
+    ----------
+    code_m, phase_m : ndarray [m]
+        Later than the clear direct signal.
+    rate_mps : ndarray [m/s]
+        Of the phase, the paths' strengths held.
+    gain_db : ndarray [dB]
+        Of the prompt correlator over the clear direct signal.
+    main : ndarray of int
+        Path that is locked to.
+    """
+
+    code_m: Floats
+    phase_m: Floats
+    rate_mps: Floats
+    gain_db: Floats
+    main: NDArray[np.intp]
+
+
+def tracked(
+    field: Complexes,
+    extra_m: Floats,
+    rate_mps: Floats,
+    *,
+    wavelength_m: Floats,
+    chip_m: Floats,
+    spacing_chips: float,
+    code_loop_hz: float,
+    carrier_loop_hz: float,
+) -> Tracked:
+    """Code, phase, rate and strength of the sum of P paths, for N signals.
+
+    The strongest path is locked to; the code's error about it stays within half the spacing.
+    What turns against it faster than a loop follows is averaged: its part that swings is weakened as
+    a loop of first order does, by ``1 / sqrt(1 + (f / loop_hz)^2)``; of its power nothing is lost.
+
+    Parameters
+    ----------
+    field : ndarray of complex, shape (P, N)
+        Amplitude over the clear direct signal's, and the phase that is not the path's length.
+    extra_m : ndarray, shape (P, N) [m]
+        By which the path is longer.
+    rate_mps : ndarray, shape (P, N) [m/s]
+        By which it grows.
+    wavelength_m, chip_m : ndarray, shape (N,)
+    spacing_chips : float
+        Early to late.
+    code_loop_hz, carrier_loop_hz : float
+        Bandwidths. C/N0 is averaged as the code is.
+
+    Returns
+    -------
+    Tracked
+    """
+    strength = np.abs(field)
+    main = np.argmax(strength, axis=0)
+    column = np.arange(field.shape[1])
+    first, first_rate, anchor = extra_m[main, column], rate_mps[main, column], field[main, column]
+    delay, rate = extra_m - first, rate_mps - first_rate
+    safe = np.where(np.abs(anchor) > 1e-9, anchor, 1.0)
+    c = field / safe * np.exp(-2.0j * np.pi * delay / wavelength_m)
+    turning_hz = rate / wavelength_m
+    follow = 1.0 / np.sqrt(1.0 + (turning_hz / code_loop_hz) ** 2)
+    late = delay / chip_m
+    error = _zero(c, late, follow, spacing_chips)
+    weight = c * _triangle(error - late)
+    power = np.abs((weight * follow).sum(axis=0)) ** 2 + ((1.0 - follow**2) * np.abs(weight) ** 2).sum(axis=0)
+    heard = weight / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
+    carrier = heard.sum(axis=0)
+    carrier = np.where(np.abs(carrier) > 1e-9, carrier, 1e-9)
+    turned = np.angle(carrier * safe / np.abs(safe))
+    pulled = np.real((heard * rate).sum(axis=0) / carrier)
+    limit = np.abs(rate * (strength > 0.05 * strength.max(axis=0))).max(axis=0)
+    return Tracked(
+        code_m=first + error * chip_m,
+        phase_m=first - turned * wavelength_m / (2.0 * np.pi),
+        rate_mps=first_rate + np.clip(pulled, -limit, limit),
+        gain_db=20.0 * np.log10(np.maximum(np.sqrt(power) * np.abs(anchor), 1e-9)),
+        main=main,
+    )
+
+
+def _triangle(x: Floats) -> Floats:
+    return np.maximum(1.0 - np.abs(x), 0.0)
+
+
+def _zero(c: Complexes, late: Floats, follow: Floats, spacing: float) -> Floats:
+    """Zero of the discriminator, in chips from the main path (whose c is 1 and `late` 0)."""
+    half = 0.5 * spacing
+    error = np.zeros(c.shape[1])
+    own = np.abs(c) ** 2
+    for _ in range(_ROUNDS):
+        x = error - late
+        triangle = _triangle(x)
+        prompt = (c * triangle).sum(axis=0)
+        # Part of each path in phase with the sum: its own square stands, the rest swings.
+        steady = own * triangle
+        in_phase = follow * (np.real(np.conj(prompt) * c) - steady) + steady
+        near = np.abs(x) < half
+        # Early less late of a path at x: -2 x when near, else a plateau that falls to 0 past a chip.
+        far = np.sign(-x) * np.minimum(spacing, np.maximum(1.0 + half - np.abs(x), 0.0))
+        push = np.where(near, 2.0 * late, far) * in_phase
+        slope = 2.0 * (near * in_phase).sum(axis=0)
+        error = np.clip(push.sum(axis=0) / np.where(slope > 1e-3, slope, 1e-3), -half, half)
+    return error

@@ -1,0 +1,205 @@
+"""The environment as one source of disturbances, a function of the geometry alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railfix.constants import SPEED_OF_LIGHT
+from railfix.signals import carrier_frequency_hz
+from railfix.simulate.disturbance import Disturbance, Geometry
+from railfix.simulate.environment.bars import Electrification
+from railfix.simulate.environment.correlator import tracked
+from railfix.simulate.environment.faces import FREE_V, Rays, mirrored, roof_amplitude, shadow
+from railfix.simulate.environment.kinds import drawn_sections
+from railfix.simulate.environment.place import built
+from railfix.simulate.environment.settings import EnvironmentSettings
+from railfix.simulate.environment.waves import edge_amplitude, roughness_loss
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+#: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
+CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
+#: Weaker fields count as none.
+_NO_FIELD: Final = 0.01
+#: The platforms of a station stand so high over the rails [m].
+PLATFORM_M: Final = 1.1
+#: Below this elevation nothing is worked out: no receiver tracks there [deg].
+_LEAST_ELEVATION_DEG: Final = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paths:
+    """Paths of N signals, the direct one first, shapes (P, N).
+
+    Attributes
+    ----------
+    field : ndarray of complex
+        Over the clear direct signal, without the phase of the extra path.
+    extra_m : ndarray [m]
+    growth : ndarray [m/m]
+        Of the extra path with the antenna's way along the line.
+    """
+
+    field: Complexes
+    extra_m: Floats
+    growth: Floats
+
+
+class Environment:
+    """Multipath and blockage along a line.
+
+    Parameters
+    ----------
+    settings : EnvironmentSettings
+    line_length_m : float
+    seed : int
+        The same seed gives the same place; another one other buildings and, where they are drawn,
+        other sections.
+
+    Attributes
+    ----------
+    settings : EnvironmentSettings
+    sections : tuple of SectionSettings
+        As given, or as drawn.
+    place : Place
+    """
+
+    def __init__(self, settings: EnvironmentSettings, *, line_length_m: float, seed: int) -> None:
+        self.settings = settings
+        self.sections = settings.sections
+        if settings.shares:
+            self.sections = drawn_sections(
+                settings.shares, line_length_m, section_length_m=settings.section_length_m, seed=seed
+            )
+        self.place = built(self.sections, line_length_m, seed)
+        self._bars = None if settings.electrification is None else Electrification(settings.electrification)
+
+    def label_at(self, chainage_m: ArrayLike) -> NDArray[np.str_]:
+        """Kind of section at chainages; "open" outside all sections."""
+        return self.place.kind_at(np.asarray(chainage_m, dtype=np.float64))
+
+    def __call__(self, geometry: Geometry) -> Disturbance:
+        """Disturbance of every channel and epoch, shapes (T, M)."""
+        shape = geometry.elevation_deg.shape
+        code, phase, doppler, cn0 = np.zeros((4, *shape))
+        if self.settings.empty:
+            return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
+        label = self.label_at(geometry.chainage_m)
+        inside = label == "tunnel"
+        code[inside], cn0[inside] = np.nan, -99.0
+        epoch, channel = np.nonzero((geometry.elevation_deg > _LEAST_ELEVATION_DEG) & ~inside[:, None])
+        if len(epoch):
+            wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(geometry.satellite, geometry.signal)
+            rays = _rays(geometry, epoch, channel, wavelength, self.settings.antenna_height_m)
+            paths = self._paths(rays, label[epoch] == "station")
+            receiver = self.settings.receiver
+            ratio = [
+                CHIP_RATIO.get(f"{n[0]}{g[:1]}", 1.0) for n, g in zip(geometry.satellite, geometry.signal, strict=True)
+            ]
+            got = tracked(
+                paths.field,
+                paths.extra_m,
+                paths.growth * geometry.speed_mps[epoch],
+                wavelength_m=rays.wavelength_m,
+                chip_m=receiver.chip_m * np.array(ratio)[channel],
+                spacing_chips=receiver.spacing_chips,
+                code_loop_hz=receiver.code_loop_hz,
+                carrier_loop_hz=receiver.carrier_loop_hz,
+            )
+            clear = receiver.cn0_horizon_dbhz + receiver.cn0_rise_dbhz * rays.z
+            lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
+            code[epoch, channel] = np.where(lost, np.nan, got.code_m)
+            phase[epoch, channel] = got.phase_m
+            doppler[epoch, channel] = -got.rate_mps / rays.wavelength_m
+            cn0[epoch, channel] = got.gain_db
+        return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
+
+    def _paths(self, rays: Rays, platform: NDArray[np.bool_]) -> Paths:
+        """Direct path, ground, what bars throw, and one reflection a row of faces."""
+        field, delay = self._direct(rays)
+        nothing = np.zeros(len(rays.x))
+        rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
+        if self.settings.ground_reflection > 0.0:
+            rows.append((-self._ground(rays), 2.0 * (rays.height_m - PLATFORM_M * platform) * rays.z, nothing))
+        if self._bars is not None:
+            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._bars.thrown(rays)]
+        rows += [self._reflection(r, rays) for r in range(len(self.place.faces))]
+        return Paths(
+            field=np.stack([row[0].astype(np.complex128) for row in rows]),
+            extra_m=np.stack([row[1] for row in rows]),
+            growth=np.stack([row[2] for row in rows]),
+        )
+
+    def _direct(self, rays: Rays) -> tuple[Complexes, Floats]:
+        """Direct field, and by how much the way round the edge is longer.
+
+        Of several faces one behind the other the one deepest in the way counts.
+        """
+        v = np.full(len(rays.x), FREE_V)
+        for row in self.place.faces:
+            v = np.maximum(v, shadow(row, rays))
+        amplitude = edge_amplitude(v)
+        for roofs in self.place.roofs:
+            amplitude = amplitude * roof_amplitude(roofs, rays)
+        field = amplitude.astype(np.complex128)
+        if self._bars is not None:
+            field *= self._bars.left_over(rays)
+        # h^2 / (2 D) of a clearance h at distance D.
+        return field, 0.25 * rays.wavelength_m * np.clip(v, 0.0, 30.0) ** 2
+
+    def _ground(self, rays: Rays) -> Floats:
+        strength = self.settings.ground_reflection * 10.0 ** (-self.settings.receiver.backward_db / 20.0)
+        rough = np.full(len(rays.x), self.settings.ground_roughness_m)
+        return np.asarray(strength * roughness_loss(rough, rays.z, rays.wavelength_m))
+
+    def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
+        """Amplitude (turned by half a wave), extra path and growth of the reflection in row r.
+
+        The way in passes over the rows of the satellite's side, seen from the antenna's mirror image;
+        the way back over the other rows of the reflecting side.
+        """
+        image = mirrored(self.place.faces[r], rays)
+        amplitude = image.amplitude.copy()
+        kept = np.flatnonzero(amplitude > _NO_FIELD)
+        if len(kept):
+            some = rays.take(kept)
+            v = np.full(len(kept), FREE_V)
+            for row in self.place.faces:
+                v = np.maximum(v, shadow(row, some, x0=image.x_m[kept], y0=image.y_m[kept]))
+            back = Rays(
+                chainage_m=some.chainage_m,
+                height_m=some.height_m,
+                x=image.back_x[kept],
+                y=image.back_y[kept],
+                z=some.z,
+                wavelength_m=some.wavelength_m,
+            )
+            for q, row in enumerate(self.place.faces):
+                if q < r:
+                    v = np.maximum(v, shadow(row, back))
+            open_above = np.ones(len(kept))
+            for roofs in self.place.roofs:
+                open_above = open_above * roof_amplitude(roofs, back)
+            amplitude[kept] *= edge_amplitude(v) * open_above
+        return -amplitude, image.extra_m, image.rate
+
+
+def _rays(
+    geometry: Geometry, epoch: NDArray[np.intp], channel: NDArray[np.intp], wavelength_m: Floats, height_m: float
+) -> Rays:
+    elevation = np.radians(geometry.elevation_deg[epoch, channel])
+    relative = np.radians(geometry.azimuth_deg[epoch, channel] - geometry.heading_deg[epoch])
+    level = np.cos(elevation)
+    return Rays(
+        chainage_m=geometry.chainage_m[epoch],
+        height_m=height_m,
+        x=level * np.cos(relative),
+        y=level * np.sin(relative),
+        z=np.sin(elevation),
+        wavelength_m=wavelength_m[channel],
+    )

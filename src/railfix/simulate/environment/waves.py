@@ -1,0 +1,67 @@
+"""Edges and strips in the way of a plane wave (ITU-R P.526-15, section 4; Born & Wolf, 8.3 and 8.7)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fresnel
+
+Floats = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+#: Below this the loss of an edge is 0 by ITU-R P.526-15, equation (31).
+CLEAR_V: Final = -0.78
+
+
+def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
+    """Fresnel parameter of a clearance of 1 m, the source infinitely far (P.526-15, equation (26)).
+
+    Parameters
+    ----------
+    distance_m : ndarray [m]
+        From the antenna to the edge.
+    wavelength_m : ndarray [m]
+
+    Returns
+    -------
+    ndarray [1/m]
+    """
+    return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
+
+
+def edge_amplitude(v: Floats) -> Floats:
+    """Amplitude behind a knife edge of Fresnel parameter v, positive in the shadow (P.526-15, equation (31)).
+
+    ``J(v) = 6.9 + 20 log10(sqrt((v - 0.1)^2 + 1) + v - 0.1)`` dB above v = -0.78, else none.
+    """
+    w = v - 0.1
+    loss = 10.0 ** (-6.9 / 20.0) / (np.sqrt(w * w + 1.0) + w)
+    return np.where(v > CLEAR_V, np.minimum(loss, 1.0), 1.0)
+
+
+def strip_field(v: Floats, width_v: Floats) -> Complexes:
+    """What a strip takes from a wave of amplitude 1, by Kirchhoff and Babinet.
+
+    Behind the strip the field is 1 less this: ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip.
+
+    Parameters
+    ----------
+    v : ndarray
+        Fresnel parameter of the strip's middle.
+    width_v : ndarray
+        Its width in the same measure.
+    """
+    sine_1, cosine_1 = fresnel(v - 0.5 * width_v)
+    sine_2, cosine_2 = fresnel(v + 0.5 * width_v)
+    return np.asarray(0.5 * (1.0 + 1.0j) * ((cosine_2 - cosine_1) - 1.0j * (sine_2 - sine_1)))
+
+
+def roughness_loss(roughness_m: Floats, cosine: Floats, wavelength_m: Floats) -> Floats:
+    """Amplitude of the mirrored wave left by an uneven face: exp(-g^2/2), g = 4 pi sigma cos(incidence)/lambda.
+
+    ITU-R P.526-15 has it for the ground (Ament 1953).
+    """
+    g = 4.0 * np.pi * roughness_m * cosine / wavelength_m
+    return np.exp(-0.5 * g * g)
