@@ -1,0 +1,81 @@
+"""A simulated receiver: its channels, their constants, and the noise and locks that go on from piece to piece."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.navigation import KeplerRecords
+from railfix.simulate.errors.settings import InterSystemSettings
+from railfix.simulate.noise import CarriedNoise, Tracking
+from railfix.simulate.satellites import newest_record
+from railfix.simulate.scenario import ANTENNAS
+
+if TYPE_CHECKING:
+    from railfix.simulate.signals import Simulation
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.datetime64]
+
+#: Signals of each constellation, the first one first.
+SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
+#: Streams of random numbers: white noise, noise that goes on, cycle slips.
+_WHITE, _CARRIED, _SLIPS = 2, 3, 4
+
+
+class Receiver:
+    """One receiver's channels, and all of it that goes on from piece to piece."""
+
+    def __init__(self, simulation: Simulation, antenna: str) -> None:
+        scenario, errors, channels = simulation.scenario, simulation.scenario.errors, simulation.channels
+        number = ANTENNAS.index(antenna)
+        self.antenna = antenna
+        self.header = simulation.header(antenna)
+        self.names, self.signals = (np.array(part) for part in zip(*channels, strict=True))
+        self.column = np.searchsorted(simulation.satellites, self.names)
+        frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in channels])
+        self.wavelength_m = SPEED_OF_LIGHT / frequency
+        #: Ionosphere in parts of that on L1.
+        self.scale = (FREQUENCY_L1 / frequency) ** 2
+        self.second = np.array([g != SIGNALS[n[0]][0] for n, g in channels])
+        self.group_delay_error_m = simulation.common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
+        offsets = [errors.intersystem.get(name[0], InterSystemSettings()) for name, _ in channels]
+        self.offset_m = np.array([o.offset_m + (o.rear_difference_m if number else 0.0) for o in offsets])
+        self.offset_drift_mps = np.array([o.drift_mps for o in offsets])
+        self._rng = np.random.default_rng([scenario.seed, _WHITE, number])
+        # Whole cycles that the phases are off, one number a channel.
+        self.ambiguity = self._rng.integers(-2_000_000, 2_000_000, len(channels)).astype(np.float64)
+        self.carried = CarriedNoise(
+            errors.noise,
+            key=(scenario.seed, _CARRIED, number),
+            channels=len(channels),
+            interval_s=simulation.interval_s,
+        )
+        self.tracking = Tracking(
+            errors.tracking,
+            key=(scenario.seed, _SLIPS, number),
+            channels=len(channels),
+            interval_s=simulation.interval_s,
+        )
+
+    def white(self, epochs: int) -> Floats:
+        """White noise of code, phase, Doppler and C/N0 for the next epochs, shape (T, M, 4)."""
+        return self._rng.standard_normal((epochs, len(self.names), 4))
+
+
+def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Times) -> Floats:
+    """What a signal's code is late by against the broadcast clock, shape (T,) [s].
+
+    GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2). Galileo I/NAV: BGD E5b/E1
+    likewise (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I, which the clock refers to.
+    """
+    row = newest_record(records, satellite, time)
+    letter = satellite[0]
+    frequency = CARRIER_FREQUENCY[letter]
+    if letter == "C":
+        return np.where(signal[0] == "2", records.group_delay_1_s[row], 0.0)
+    delay = records.group_delay_2_s if letter == "E" else records.group_delay_1_s
+    return np.asarray(delay[row] * (frequency["1"] / frequency[signal[0]]) ** 2)
