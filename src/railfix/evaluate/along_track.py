@@ -1,4 +1,4 @@
-"""How good were the positions: the error along the line against a reference.
+"""The error along the line against a reference.
 
 The error is the distance along the map between the answer and the reference's own point on it,
 positive toward the end of the line (P1 3.3).
@@ -6,7 +6,6 @@ positive toward the end of the line (P1 3.3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -14,43 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from railfix.antenna import Trajectory
-from railfix.timescale import seconds
+from railfix.evaluate.bracket import LARGEST_GAP_S, bracket
 
 Floats = NDArray[np.float64]
-
-#: Distance on the map from which on an answer is in the wrong place [m].
-WRONG_PLACE_M = 50.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Score:
-    """Figures of merit of a run.
-
-    Attributes
-    ----------
-    epochs : int
-        Epochs with observations inside the time of the reference.
-    positions : int
-        Those with coordinates.
-    rate : float
-        positions / epochs.
-    mean_m, std_m : float [m]
-        Of the signed error.
-    p50_m, p95_m, max_m : float [m]
-        Of the absolute error.
-    wrong_place : float
-        Share of the positions more than `WRONG_PLACE_M` from the reference.
-    """
-
-    epochs: int
-    positions: int
-    rate: float
-    mean_m: float
-    std_m: float
-    p50_m: float
-    p95_m: float
-    max_m: float
-    wrong_place: float
 
 
 def interpolate_reference(
@@ -58,7 +23,7 @@ def interpolate_reference(
     reference_time: NDArray[np.datetime64],
     reference_ecef_m: Floats,
     *,
-    largest_gap_s: float = 2.5,
+    largest_gap_s: float = LARGEST_GAP_S,
 ) -> Floats:
     """Reference positions at other times, linearly; NaN outside and in gaps.
 
@@ -75,17 +40,7 @@ def interpolate_reference(
     -------
     ndarray, shape (T, 3) [m]
     """
-    after = np.searchsorted(reference_time, time, side="left")
-    exact = (after < len(reference_time)) & (reference_time[np.minimum(after, len(reference_time) - 1)] == time)
-    inside = (after > 0) & (after < len(reference_time))
-    right = np.clip(after, 1, len(reference_time) - 1)
-    left = right - 1
-    step = seconds(reference_time[right] - reference_time[left])
-    part = seconds(time - reference_time[left]) / step
-    between = reference_ecef_m[left] + part[:, None] * (reference_ecef_m[right] - reference_ecef_m[left])
-    between[~(inside & (step <= largest_gap_s))] = np.nan
-    between[exact] = reference_ecef_m[after[exact]]
-    return between
+    return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
 
 def along_track_error(
@@ -142,35 +97,3 @@ def along_track_error(
     straight = np.linalg.norm(trajectory.at_arc(arc_m[at]) - trajectory.at_arc(nearest_arc), axis=1)
     error[at] = np.copysign(np.minimum(np.abs(error[at]), straight), error[at])
     return error
-
-
-def score(error_m: Floats, observed: NDArray[np.bool_]) -> Score:
-    """Figures of merit from signed errors.
-
-    Parameters
-    ----------
-    error_m : ndarray, shape (T,) [m]
-        NaN where there is no position.
-    observed : ndarray of bool, shape (T,)
-        Epochs with observations inside the time of the reference.
-
-    Raises
-    ------
-    ValueError
-        No epoch is observed.
-    """
-    if not observed.any():
-        raise ValueError("no epoch with observations lies inside the time of the reference")
-    values = error_m[observed & np.isfinite(error_m)]
-    size = np.abs(values) if len(values) else np.array([np.nan])
-    return Score(
-        epochs=int(observed.sum()),
-        positions=len(values),
-        rate=len(values) / int(observed.sum()),
-        mean_m=float(values.mean()) if len(values) else float("nan"),
-        std_m=float(values.std()) if len(values) else float("nan"),
-        p50_m=float(np.median(size)),
-        p95_m=float(np.percentile(size, 95)),
-        max_m=float(size.max()),
-        wrong_place=float(np.mean(size > WRONG_PLACE_M)),
-    )

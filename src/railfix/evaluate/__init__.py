@@ -1,0 +1,36 @@
+"""How good the positions were: errors along the line against a reference, and the figures made of them.
+
+The error is the distance along the map between the answer and the reference's own point on it,
+positive toward the end of the line whichever way the train runs (P1 3.3, 5).
+"""
+
+from railfix.evaluate.along_track import along_track_error, interpolate_reference
+from railfix.evaluate.epochs import EPOCH_COLUMNS
+from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_run, evaluate_runs
+from railfix.evaluate.figures import FIGURE_COLUMNS
+from railfix.evaluate.intervals import INTERVAL_COLUMNS
+from railfix.evaluate.levels import LEVEL_COLUMNS
+from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.output import write_evaluation
+from railfix.evaluate.place import TrackFiles
+from railfix.evaluate.scores import WRONG_PLACE_M, Score, score
+
+__all__ = [
+    "EPOCH_COLUMNS",
+    "FIGURE_COLUMNS",
+    "INTERVAL_COLUMNS",
+    "LEVEL_COLUMNS",
+    "WRONG_PLACE_M",
+    "EvaluatedRun",
+    "Evaluation",
+    "EvaluationOptions",
+    "RunAndReference",
+    "Score",
+    "TrackFiles",
+    "along_track_error",
+    "evaluate_run",
+    "evaluate_runs",
+    "interpolate_reference",
+    "score",
+    "write_evaluation",
+]

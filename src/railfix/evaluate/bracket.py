@@ -1,0 +1,78 @@
+"""Instants of a series between those of a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Longest step of a reference that is bridged [s].
+LARGEST_GAP_S = 2.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bracket:
+    """Between which two instants of the reference each time lies, T times.
+
+    Attributes
+    ----------
+    left, right : ndarray of int, shape (T,)
+        The same where a time is one of the reference.
+    share : ndarray, shape (T,)
+        0 at left, 1 at right.
+    inside : ndarray of bool, shape (T,)
+        Neither outside the reference nor in one of its gaps.
+    """
+
+    left: Indices
+    right: Indices
+    share: Floats
+    inside: NDArray[np.bool_]
+
+    def of(self, values: Floats) -> Floats:
+        """Values of the reference, shape (R,) or (R, n), at the times, linearly; NaN where not inside."""
+        share = self.share.reshape(-1, *(1,) * (values.ndim - 1))
+        between = values[self.left] + share * (values[self.right] - values[self.left])
+        between[~self.inside] = np.nan
+        return np.asarray(between, dtype=np.float64)
+
+    @property
+    def nearest(self) -> Indices:
+        """The nearer of the two instants, shape (T,)."""
+        return np.where(self.share <= 0.5, self.left, self.right)
+
+
+def bracket(
+    time: NDArray[np.datetime64], reference_time: NDArray[np.datetime64], *, largest_gap_s: float = LARGEST_GAP_S
+) -> Bracket:
+    """Where each time lies in a reference.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    reference_time : ndarray of datetime64[ns], shape (R,)
+        Rising, at least two.
+    largest_gap_s : float [s]
+        Longest step of the reference that is bridged.
+    """
+    last = len(reference_time) - 1
+    after = np.searchsorted(reference_time, time, side="left")
+    exact = (after <= last) & (reference_time[np.minimum(after, last)] == time)
+    right = np.clip(after, 1, last)
+    left = right - 1
+    step = seconds(reference_time[right] - reference_time[left])
+    share = seconds(time - reference_time[left]) / step
+    inside = (after > 0) & (after <= last) & (step <= largest_gap_s)
+    at = np.minimum(after, last)
+    return Bracket(
+        left=np.where(exact, at, left),
+        right=np.where(exact, at, right),
+        share=np.where(exact, 0.0, share),
+        inside=inside | exact,
+    )

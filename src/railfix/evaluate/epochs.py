@@ -1,0 +1,270 @@
+"""One row an epoch and antenna: what the run answered, where the train was, how far apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from railfix.errors import MismatchError
+from railfix.evaluate.bracket import bracket
+from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.place import Answers, Errors, TrackFiles, errors_of
+from railfix.evaluate.run_folder import RunFolder, floats
+from railfix.evaluate.sections import Sections
+from railfix.reasons import Status
+from railfix.reference_log import AntennaReference
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Datetimes = NDArray[np.datetime64]
+
+#: Status of an epoch that the log does not have though the epochs around it are there.
+NOT_LOGGED: Final = "not_logged"
+#: Environment where nothing tells it.
+UNKNOWN: Final = "unknown"
+
+#: Columns of the table of epochs, with their unit and meaning.
+EPOCH_COLUMNS: Final[dict[str, str]] = {
+    "run": "name of the run",
+    "configuration": "settings of the run, see `settings` in evaluation.json",
+    "line": "name of the track",
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "status": "what became of the epoch; `not_logged` where the log has none between two it has",
+    "observed": "the antenna has observations",
+    "in_reference": "the reference tells where the antenna was",
+    "reference_good": "its standard deviation is within the limit, or not stated",
+    "chainage_m": "of the reference: where the antenna was",
+    "speed_mps": "of the reference, without sign; from its places where it tells none",
+    "moved_m": "distance that the train has run since the first epoch in the reference",
+    "environment": "of the reference or the sections; `unknown` where neither tells",
+    "reference_sigma_m": "standard deviation of the reference along the track",
+    "reference_source": "where the reference has its place from",
+    "n_used": "satellites used",
+    "error_m": "on the map, + toward the end of the line",
+    "conventional_error_m": "3-D single point at its nearest point of the trajectory, + toward the end",
+    "along_sigma_m": "standard deviation that the run gave",
+    "interval_m": "distance that the train has run since the position before",
+    "gap_s": "time since the position before",
+    "conventional_interval_m": "the same of the conventional positions",
+    "conventional_gap_s": "the same of the conventional positions",
+    "block": "stretch of time within the run, for the confidence",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaEpochs:
+    """Rows of one antenna and what is to be said of them.
+
+    Attributes
+    ----------
+    table : polars.DataFrame
+        `EPOCH_COLUMNS` without run, configuration and line, and the run's protection levels.
+    errors : Errors
+    speed_from : {"reference", "places"}
+    outside : int
+        Epochs of the log outside the reference.
+    step_s : float [s]
+        Step of the log.
+    """
+
+    table: pl.DataFrame
+    errors: Errors
+    speed_from: str
+    outside: int
+    step_s: float
+
+
+def level_columns(table: pl.DataFrame) -> list[str]:
+    """Protection levels among the columns."""
+    return [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
+
+
+def with_missing(time: Datetimes) -> tuple[Datetimes, NDArray[np.bool_], float]:
+    """Epochs with those put in that a log skips.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+        Rising.
+
+    Returns
+    -------
+    time : ndarray of datetime64[ns], shape (N,)
+        With instants at the step of the log (the median of its steps) in every gap of more than 1.5 steps.
+    logged : ndarray of bool, shape (N,)
+        Those of the log.
+    step_s : float [s]
+        NaN with fewer than two epochs.
+    """
+    if len(time) < 2:
+        return time, np.ones(len(time), dtype=np.bool_), float("nan")
+    gap = seconds(np.diff(time))
+    step = float(np.median(gap))
+    more = np.where(gap > 1.5 * step, np.round(gap / step).astype(np.int64) - 1, 0)
+    parts = np.repeat(more + 1, more)
+    first = np.repeat(np.cumsum(more) - more, more)
+    share = (np.arange(len(parts)) - first + 1) / parts
+    left = np.repeat(np.arange(len(gap)), more)
+    put_in = time[left] + (share * (time[left + 1] - time[left]).astype(np.float64)).astype("timedelta64[ns]")
+    whole = np.concatenate([time, put_in])
+    order = np.argsort(whole, kind="stable")
+    return whole[order], (np.arange(len(whole)) < len(time))[order], step
+
+
+def travelled(
+    time: Datetimes, step_m: Floats, known: NDArray[np.bool_], speed_mps: Floats, *, options: EvaluationOptions
+) -> Floats:
+    """Distance run since the first epoch whose place is known.
+
+    A step counts where the train moved: by the mean of the speeds told at its ends, or by the step's
+    own where they are not told or the step is longer than the reference bridges.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    step_m : ndarray, shape (K - 1,) [m]
+        Size of the steps between the K epochs whose place is known.
+    known : ndarray of bool, shape (T,)
+    speed_mps : ndarray, shape (T,) [m/s]
+        As told; NaN where it is not.
+    options : EvaluationOptions
+
+    Returns
+    -------
+    ndarray, shape (T,) [m]
+        Between known places shared out by time; NaN before the first and after the last.
+    """
+    at = np.flatnonzero(known)
+    moved = np.full(len(time), np.nan)
+    if not len(at):
+        return moved
+    duration = seconds(np.diff(time[at]))
+    told = np.abs(speed_mps[at])
+    mean = (told[1:] + told[:-1]) / 2.0
+    speed = np.where(np.isfinite(mean) & (duration <= options.reference_gap_s), mean, step_m / duration)
+    total = np.concatenate([[0.0], np.cumsum(np.where(speed >= options.standing_mps, step_m, 0.0))])
+    clock = seconds(time - time[at[0]])
+    return np.asarray(np.interp(clock, clock[at], total, left=np.nan, right=np.nan), dtype=np.float64)
+
+
+def since_last(values: Floats, has: NDArray[np.bool_]) -> Floats:
+    """Growth of a rising quantity since the row before that `has`, at those rows, shape (T,); NaN elsewhere."""
+    grown = np.full(len(values), np.nan)
+    at = np.flatnonzero(has & np.isfinite(values))
+    grown[at[1:]] = np.diff(values[at])
+    return grown
+
+
+def antenna_epochs(
+    run: RunFolder,
+    antenna: str,
+    reference: AntennaReference,
+    *,
+    sections: Sections | None,
+    files: TrackFiles,
+    options: EvaluationOptions,
+) -> AntennaEpochs:
+    """Rows of one antenna of a run.
+
+    Raises
+    ------
+    MismatchError
+        Reference and run have no time in common, or the errors cannot be worked out as asked.
+    InputFileError
+        A file of the line cannot be read.
+    """
+    mine = run.positions.filter(pl.col("antenna") == antenna)
+    time, logged, step_s = with_missing(mine["time_gpst"].to_numpy())
+    rows = np.where(logged, np.cumsum(logged) - 1, len(mine))
+    at = bracket(time, reference.time, largest_gap_s=options.reference_gap_s)
+    place, chainage = at.of(reference.ecef_m), at.of(reference.chainage_m)
+    if not (at.inside & logged).any():
+        span, own = (f"{t[0]} to {t[-1]}" for t in (reference.time, time))
+        raise MismatchError(
+            f"{run.path}: the {antenna} antenna's epochs ({own}) and its reference ({span}, GPS time) have no time in "
+            "common; give the reference of this run"
+        )
+
+    def column(name: str) -> Floats:
+        return np.append(floats(mine, name), np.nan)[rows]
+
+    answers = Answers(
+        chainage_m=column("chainage_m"),
+        conventional_chainage_m=column("conventional_chainage_m"),
+        ecef_m=np.stack([column(name) for name in ("x_m", "y_m", "z_m")], axis=1),
+        reference_chainage_m=chainage,
+        reference_ecef_m=place,
+    )
+    errors = errors_of(run, antenna, answers, method=options.method, files=files)
+    known = at.inside & (np.isfinite(chainage) if errors.method == "chainage" else np.isfinite(place[:, 0]))
+    along = _steps(chainage if np.isfinite(chainage[known]).all() else place, known)
+    told = at.of(reference.speed_mps)
+    moved = travelled(time, along, known, told, options=options)
+    speed = np.where(np.isfinite(told), np.abs(told), _own_speed(time, along, known))
+    sigma = at.of(reference.sigma_m)
+    status = np.append(mine["status"].to_numpy().astype(str), NOT_LOGGED)[rows]
+    clock = seconds(time - time[0])
+    columns: dict[str, Any] = {
+        "time_gpst": time,
+        "antenna": np.full(len(time), antenna),
+        "status": status,
+        "observed": logged & (status != Status.NO_OBSERVATION.text),
+        "in_reference": known,
+        "reference_good": known & ~(sigma > options.reference_sigma_m),
+        "chainage_m": errors.reference_chainage_m,
+        "speed_mps": np.where(known, speed, np.nan),
+        "moved_m": moved,
+        "environment": _environment(reference.environment[at.nearest], known, sections, errors.reference_chainage_m),
+        "reference_sigma_m": sigma,
+        "reference_source": np.where(known, reference.source[at.nearest], ""),
+        "n_used": column("n_used"),
+        "error_m": errors.error_m,
+        "conventional_error_m": errors.conventional_error_m,
+        "along_sigma_m": column("along_sigma_m"),
+    }
+    for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
+        columns[f"{prefix}interval_m"] = since_last(moved, np.isfinite(answered))
+        columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
+    columns["block"] = (clock // options.block_s).astype(np.int64)
+    columns |= {name: column(name) for name in level_columns(mine)}
+    table = pl.DataFrame(columns, nan_to_null=True).with_columns(pl.col("n_used").cast(pl.Int64))
+    return AntennaEpochs(
+        table=table,
+        errors=errors,
+        speed_from="reference" if np.isfinite(told[known]).all() else "places",
+        outside=int((logged & ~known).sum()),
+        step_s=step_s,
+    )
+
+
+def _steps(values: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Size of the steps between known places: differences of chainage, or straight distances."""
+    step = np.diff(values[known], axis=0)
+    return np.abs(step) if step.ndim == 1 else np.asarray(np.linalg.norm(step, axis=1))
+
+
+def _own_speed(time: Datetimes, step_m: Floats, known: NDArray[np.bool_]) -> Floats:
+    """Speed over the steps before and after each known place, shape (T,) [m/s]; NaN elsewhere."""
+    speed = np.full(len(time), np.nan)
+    at = np.flatnonzero(known)
+    if len(at) < 2:
+        return speed
+    duration = seconds(np.diff(time[at]))
+    run, took = (np.concatenate([[0.0], values]) + np.concatenate([values, [0.0]]) for values in (step_m, duration))
+    speed[at] = run / took
+    return speed
+
+
+def _environment(
+    told: NDArray[np.str_], known: NDArray[np.bool_], sections: Sections | None, chainage_m: Floats
+) -> NDArray[np.str_]:
+    """What the reference tells, else what the sections tell."""
+    words = np.where(known, told, "")
+    if sections is not None:
+        words = np.where(words == "", sections.at(chainage_m), words)
+    return np.where(words == "", UNKNOWN, words)

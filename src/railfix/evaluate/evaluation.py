@@ -1,0 +1,356 @@
+"""Runs against their references: one, or a campaign of several."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import polars as pl
+
+from railfix.errors import InputFileError, SettingsError
+from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, level_columns
+from railfix.evaluate.figures import ALL, KEYS, classed, figures_by
+from railfix.evaluate.intervals import interval_table
+from railfix.evaluate.levels import level_table
+from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.place import TrackFiles
+from railfix.evaluate.run_folder import RunFolder, fingerprint, read_run
+from railfix.evaluate.sections import read_sections
+from railfix.reference_log import AntennaReference, read_reference
+
+#: Names of a reference that is looked for beside the log of a run.
+BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
+#: Blocks of one run are numbered apart from those of the next.
+_BLOCKS_APART: Final = 10**9
+
+Reference = Path | Mapping[str, AntennaReference] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunAndReference:
+    """A run and what it is measured against.
+
+    Attributes
+    ----------
+    run : Path
+        Folder of `railfix run`.
+    reference : Path or mapping of str to AntennaReference or None
+        A file, or references by antenna; None: the file of `BESIDE_THE_LOG` beside the run's log.
+    configuration : str or None
+        Name of its settings; made from those that differ between the runs where None.
+    """
+
+    run: Path
+    reference: Reference = None
+    configuration: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluatedRun:
+    """How one run was evaluated.
+
+    Attributes
+    ----------
+    name, configuration, line : str
+        As in the tables.
+    path : Path
+    reference : str
+        The file, or "given" for arrays.
+    method, speed_from : mapping of str to str
+        By antenna: "chainage" or "trajectory"; "reference" or "places".
+    outside : mapping of str to int
+        Epochs of the log outside the reference, by antenna.
+    step_s : mapping of str to float
+        Step of the log, by antenna.
+    settings : mapping
+    inputs : tuple of mapping
+        Files that were read, with size and hash.
+    notes : tuple of str
+    """
+
+    name: str
+    configuration: str
+    line: str
+    path: Path
+    reference: str
+    method: Mapping[str, str]
+    speed_from: Mapping[str, str]
+    outside: Mapping[str, int]
+    step_s: Mapping[str, float]
+    settings: Mapping[str, Any]
+    inputs: tuple[Mapping[str, Any], ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Runs against their references.
+
+    Attributes
+    ----------
+    runs : tuple of EvaluatedRun
+    epochs : polars.DataFrame
+        One row an epoch, antenna and run: `railfix.evaluate.EPOCH_COLUMNS`, then protection levels.
+    figures : polars.DataFrame
+        Figures of every grouping: `railfix.evaluate.FIGURE_COLUMNS`.
+    intervals : polars.DataFrame
+        `railfix.evaluate.INTERVAL_COLUMNS`.
+    levels : polars.DataFrame or None
+        `railfix.evaluate.LEVEL_COLUMNS`; None where no run has a protection level.
+    options : EvaluationOptions
+    inputs : tuple of mapping
+        Files of all runs, with size and hash.
+    """
+
+    runs: tuple[EvaluatedRun, ...]
+    epochs: pl.DataFrame
+    figures: pl.DataFrame
+    intervals: pl.DataFrame
+    levels: pl.DataFrame | None
+    options: EvaluationOptions
+    inputs: tuple[Mapping[str, Any], ...] = ()
+
+    def figure(self, name: str, **where: str) -> Any:
+        """One figure of the table of figures.
+
+        Parameters
+        ----------
+        name : str
+            A column of it.
+        **where : str
+            Values of its other columns; without them the grouping "all", own epochs, constrained.
+
+        Raises
+        ------
+        LookupError
+            Not exactly one row is meant.
+        """
+        chosen = {"grouping": ALL, "epochs_of": "own", "position": "constrained"} | where
+        rows = self.figures.filter(*(pl.col(key) == value for key, value in chosen.items()))
+        if len(rows) != 1:
+            raise LookupError(f"{len(rows)} rows of the figures have {chosen}; name one")
+        return rows[name].item()
+
+
+@dataclass(kw_only=True)
+class _Part:
+    """One run, read and set against its reference."""
+
+    folder: RunFolder
+    reference: str
+    configuration: str | None
+    antennas: dict[str, AntennaEpochs]
+    inputs: list[dict[str, Any]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def evaluate_run(
+    run: Path,
+    reference: Reference = None,
+    *,
+    sections: Path | None = None,
+    files: TrackFiles | None = None,
+    options: EvaluationOptions | None = None,
+) -> Evaluation:
+    """Set one run against its reference; see `evaluate_runs`."""
+    one = RunAndReference(run=run, reference=reference)
+    return evaluate_runs([one], sections=sections, files=files, options=options)
+
+
+def evaluate_runs(
+    runs: Sequence[RunAndReference],
+    *,
+    sections: Path | None = None,
+    files: TrackFiles | None = None,
+    options: EvaluationOptions | None = None,
+) -> Evaluation:
+    """Set runs against their references.
+
+    Parameters
+    ----------
+    runs : sequence of RunAndReference
+    sections : Path, optional
+        Environment by chainage (``from_m,to_m,environment``) where a reference does not tell it.
+    files : TrackFiles, optional
+        In place of the track and the vehicle that ``run.json`` names.
+    options : EvaluationOptions, optional
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    InputFileError
+        A file is missing, or not what it should be.
+    MismatchError
+        A run and its reference have no time in common, or the errors cannot be worked out as asked.
+    SettingsError
+        The same run twice, or none.
+    """
+    options, files = options or EvaluationOptions(), files or TrackFiles()
+    if not runs:
+        raise SettingsError("no run to evaluate; name the folders that railfix run wrote")
+    twice = [path for path, count in Counter(item.run.resolve() for item in runs).items() if count > 1]
+    if twice:
+        raise SettingsError(f"{twice[0]}: the run is given twice; give each run once")
+    parts = [_part(item, sections=sections, files=files, options=options) for item in runs]
+    names = _names([part.folder.path for part in parts])
+    labels = configurations([part.folder.settings for part in parts], [part.configuration for part in parts])
+    tables = []
+    for number, (part, name, label) in enumerate(zip(parts, names, labels, strict=True)):
+        whole = pl.concat([antenna.table for antenna in part.antennas.values()], how="diagonal").with_columns(
+            run=pl.lit(name),
+            configuration=pl.lit(label),
+            line=pl.lit(part.folder.line_name),
+            block=pl.col("block") + number * _BLOCKS_APART,
+        )
+        tables.append(whole)
+    epochs = pl.concat(tables, how="diagonal")
+    epochs = epochs.select(*EPOCH_COLUMNS, *level_columns(epochs))
+    evaluated = tuple(_evaluated(*item) for item in zip(parts, names, labels, strict=True))
+    return Evaluation(
+        runs=evaluated,
+        epochs=epochs,
+        figures=_figures(epochs, options),
+        intervals=_intervals(epochs),
+        levels=level_table(epochs, list(KEYS), options),
+        options=options,
+        inputs=tuple({entry["path"]: entry for run in evaluated for entry in run.inputs}.values()),
+    )
+
+
+def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, options: EvaluationOptions) -> _Part:
+    folder = read_run(item.run)
+    inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
+    notes = []
+    if isinstance(item.reference, Mapping):
+        references, told = item.reference, "given"
+    else:
+        path = item.reference or reference_beside(folder)
+        if item.reference is None:
+            notes.append(f"the reference was found beside the log: {path}")
+        references, told = read_reference(path, folder.antennas), str(path)
+        inputs.append(fingerprint("reference", path))
+    stretches = None
+    if sections is not None:
+        stretches = read_sections(sections)
+        inputs.append(fingerprint("sections", sections))
+    antennas = {
+        name: antenna_epochs(folder, name, references[name], sections=stretches, files=files, options=options)
+        for name in folder.antennas
+    }
+    read = dict.fromkeys(pair for antenna in antennas.values() for pair in antenna.errors.files)
+    entries = [fingerprint(kind, path) for kind, path in read]
+    recorded = {entry["sha256"] for entry in folder.record.get("inputs", ())}
+    notes += [
+        f"{entry['path']}: is not byte for byte the {entry['input']} of the run, but gives the same positions"
+        for entry in entries
+        if entry["sha256"] not in recorded
+    ]
+    said = [note for antenna in antennas.values() for note in antenna.errors.notes]
+    return _Part(
+        folder=folder,
+        reference=told,
+        configuration=item.configuration,
+        antennas=antennas,
+        inputs=inputs + entries,
+        notes=list(dict.fromkeys([*notes, *said])),
+    )
+
+
+def reference_beside(run: RunFolder) -> Path:
+    """The reference beside the log of the front antenna.
+
+    Raises
+    ------
+    InputFileError
+        There is none, or more than one.
+    """
+    logs = run.located("front")
+    if not logs:
+        raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
+    folder = logs[0].parent
+    found = [folder / name for name in BESIDE_THE_LOG if (folder / name).is_file()]
+    if not found:
+        raise InputFileError(
+            folder, f"holds no reference ({', '.join(BESIDE_THE_LOG)}) beside the log of {run.path}; name the file"
+        )
+    if len(found) > 1:
+        told = " and ".join(path.name for path in found)
+        raise InputFileError(folder, f"holds {told} beside the log of {run.path}; name the one that counts")
+    return found[0]
+
+
+def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | None]) -> list[str]:
+    """A name for the settings of each run: its preset, then what is not the same in all runs."""
+    keys = dict.fromkeys(key for one in settings for key in one)
+    differ = [key for key in keys if key != "preset" and len({str(one.get(key)) for one in settings}) > 1]
+    if len(settings) == 1:
+        differ = ["screens"]
+    names = []
+    for one, label in zip(settings, given, strict=True):
+        told = [f"{key}: {one[key] if one.get(key) not in (None, '') else 'none'}" for key in differ]
+        names.append(label or "; ".join([str(one.get("preset", "unknown preset")), *told]))
+    return names
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of the folders, with as many of those above them as it takes to tell them apart."""
+    whole = [path.resolve().parts for path in paths]
+    depth = 1
+    while len({parts[-depth:] for parts in whole}) < len(whole):
+        depth += 1
+    return ["/".join(parts[-depth:]) for parts in whole]
+
+
+def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
+    return EvaluatedRun(
+        name=name,
+        configuration=label,
+        line=part.folder.line_name,
+        path=part.folder.path,
+        reference=part.reference,
+        method={antenna: found.errors.method for antenna, found in part.antennas.items()},
+        speed_from={antenna: found.speed_from for antenna, found in part.antennas.items()},
+        outside={antenna: found.outside for antenna, found in part.antennas.items()},
+        step_s={antenna: found.step_s for antenna, found in part.antennas.items()},
+        settings=part.folder.settings,
+        inputs=tuple(part.inputs),
+        notes=tuple(part.notes),
+    )
+
+
+def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
+    """Every grouping of every run, and of all runs together where there are several."""
+    ready = classed(epochs, options)
+    both = _with_all(ready)
+    groupings = ("all", "section", "environment", "speed", "satellites", "status")
+    tables = [figures_by(both, grouping, options) for grouping in groupings]
+    if epochs["run"].n_unique() > 1:
+        for grouping in ("configuration", "line"):
+            together = {key: pl.lit(ALL) for key in ("run", "configuration", "line") if key != grouping}
+            named = both.with_columns(pl.col(grouping).alias(f"{grouping}_group"), pl.lit(0).alias(f"{grouping}_rank"))
+            tables.append(figures_by(named.with_columns(**together), grouping, options))
+        whole = both.with_columns(pl.lit(ALL).alias(key) for key in ("run", "configuration", "line"))
+        tables += [figures_by(whole, grouping, options) for grouping in ("all", "environment", "speed")]
+    return pl.concat(tables)
+
+
+def _with_all(epochs: pl.DataFrame) -> pl.DataFrame:
+    """The rows, and once more with both antennas as one, where there are two."""
+    if epochs["antenna"].n_unique() < 2:
+        return epochs
+    return pl.concat([epochs, epochs.with_columns(antenna=pl.lit(ALL))])
+
+
+def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:
+    """Of every run and antenna, and of every configuration where there are several runs."""
+    found = interval_table(epochs, list(KEYS))
+    if epochs["run"].n_unique() < 2:
+        return found
+    pooled = interval_table(epochs, ["configuration", "antenna"])
+    return pl.concat([found, pooled.with_columns(run=pl.lit(ALL), line=pl.lit(ALL)).select(found.columns)])

@@ -1,0 +1,249 @@
+"""Figures of merit by groups of epochs, constrained beside conventional."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from railfix.evaluate.blocks import block_limits
+from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.run_folder import floats
+from railfix.evaluate.scores import WRONG_PLACE_M
+from railfix.reasons import Status
+
+#: Which positions: on the map, those of status ok alone, the 3-D ones at their nearest point.
+POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
+#: What names a row of every table.
+KEYS: Final = ("run", "configuration", "line", "antenna")
+#: Groupings that are told with limits of confidence.
+WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
+#: In place of a name: everything together.
+ALL: Final = "all"
+
+#: Columns of the table of figures, with their unit and meaning.
+FIGURE_COLUMNS: Final[dict[str, str]] = {
+    "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `status`; of several runs also "
+    "`configuration` and `line`",
+    "group": "which of them",
+    "run": "name of the run; `all` of several together",
+    "configuration": "settings of the run",
+    "line": "name of the track",
+    "antenna": "`front` or `rear`; `all` of both together",
+    "position": "`constrained` on the map, `constrained_ok` those of status ok alone, `conventional`",
+    "epochs_of": "`own` every epoch, `common` those where constrained and conventional both have a position",
+    "epochs": "of the run inside the reference, those put in where the log has a gap included",
+    "observed": "of them with observations",
+    "positions": "of them with a position",
+    "left_out": "positions without an error: the reference is worse than the limit",
+    "errors": "positions with an error",
+    "rate": "positions / observed",
+    "rate_of_run": "positions / epochs",
+    "mean_m": "error",
+    "std_m": "error, population",
+    "rms_m": "error",
+    "p50_m": "size of error",
+    "p95_m": "size of error",
+    "p99_m": "size of error",
+    "max_m": "size of error",
+    "lowest_m": "error furthest toward the start of the line",
+    "highest_m": "error furthest toward its end",
+    "max_at_time": "when the largest was, GPS time",
+    "max_at_chainage_m": "where the train was then",
+    "over_5_m": "share of the errors over this size (sizes are an option)",
+    "wrong_places": "errors over 50 m",
+    "reference_sigma_p50_m": "median standard deviation of the reference, where it states one",
+    "along_sigma_p50_m": "median standard deviation that the run gave",
+    "normalised_mean": "error / along_sigma",
+    "normalised_rms": "error / along_sigma",
+    "over_1_sigma": "share of the errors over along_sigma",
+    "over_2_sigma": "over twice",
+    "over_3_sigma": "over three times",
+    "blocks": "blocks of time for the limits below",
+    "mean_low_m": "limit of confidence",
+    "mean_high_m": "limit of confidence",
+    "rate_low": "limit of confidence",
+    "rate_high": "limit of confidence",
+    "p95_low_m": "limit of confidence",
+    "p95_high_m": "limit of confidence",
+}
+_LIMITS: Final = ("mean_low_m", "mean_high_m", "rate_low", "rate_high", "p95_low_m", "p95_high_m")
+_USED: Final = (
+    "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
+    "reference_sigma_m", "n_used", "error_m", "conventional_error_m", "along_sigma_m", "block",
+)  # fmt: skip
+
+
+def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
+    """Epochs inside the reference, with a class and its rank (``section``, ``section_rank``) for every grouping."""
+    section = (pl.col("chainage_m") / options.section_m).floor().cast(pl.Int64)
+    speed = pl.col("speed_mps") * 3.6
+    edges = np.array(options.speed_edges_kmh)
+    speed_rank = pl.when(pl.col("speed_mps") < options.standing_mps).then(0).otherwise(_rank(speed, edges) + 1)
+    sats = np.array(options.satellite_edges, dtype=np.float64)
+    ranks = {
+        "all": pl.lit(0),
+        "section": section,
+        "environment": pl.lit(0),
+        "speed": pl.when(pl.col("speed_mps").is_null()).then(len(edges) + 2).otherwise(speed_rank),
+        "satellites": pl.when(pl.col("n_used").is_null()).then(-1).otherwise(_rank(pl.col("n_used"), sats)),
+        "status": pl.col("status").replace_strict({s.text: int(s) for s in Status}, default=len(Status)),
+    }
+    begins = section * options.section_m
+    names = {
+        "all": pl.lit(ALL),
+        "section": pl.format("{} to {} m", *(_plain(x) for x in (begins, begins + options.section_m))),
+        "environment": pl.col("environment"),
+        "speed": pl.col("speed_rank").replace_strict(dict(enumerate(_speed_names(options)))),
+        "satellites": pl.col("satellites_rank").replace_strict(dict(enumerate(_satellite_names(options), start=-1))),
+        "status": pl.col("status"),
+    }
+    inside = epochs.filter("in_reference").select(*KEYS, *_USED)
+    ranked = inside.with_columns(rank.cast(pl.Int64).alias(f"{name}_rank") for name, rank in ranks.items())
+    return ranked.with_columns(expression.cast(pl.String).alias(f"{name}_group") for name, expression in names.items())
+
+
+def _rank(value: pl.Expr, edges: np.ndarray[Any, np.dtype[np.float64]]) -> pl.Expr:
+    """How many of the edges a value has reached."""
+    return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
+
+
+def _plain(value: pl.Expr) -> pl.Expr:
+    """A whole number without its decimals."""
+    return pl.when(value == value.round()).then(value.cast(pl.Int64).cast(pl.String)).otherwise(value.cast(pl.String))
+
+
+def _speed_names(options: EvaluationOptions) -> list[str]:
+    edges = options.speed_edges_kmh
+    between = [f"{low:g} to {high:g} km/h" for low, high in pairwise(edges)]
+    return ["standing", f"under {edges[0]:g} km/h", *between, f"over {edges[-1]:g} km/h", "unknown"]
+
+
+def _satellite_names(options: EvaluationOptions) -> list[str]:
+    edges = options.satellite_edges
+    between = [f"{low}" if high == low + 1 else f"{low} to {high - 1}" for low, high in pairwise(edges)]
+    return ["unknown", f"under {edges[0]}", *between, f"{edges[-1]} and more"]
+
+
+def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
+    """Epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
+    column = "conventional_error_m" if position == "conventional" else "error_m"
+    has = pl.col(column).is_not_null()
+    if position == "constrained_ok":
+        has &= pl.col("status") == Status.OK.text
+    if epochs_of == "common":
+        has &= pl.col("error_m").is_not_null() & pl.col("conventional_error_m").is_not_null()
+    sigma = pl.lit(None, pl.Float64) if position == "conventional" else pl.col("along_sigma_m")
+    return (
+        epochs.with_columns(has=has, error=pl.when(has & pl.col("reference_good")).then(pl.col(column)), sigma=sigma)
+        .with_columns(size=pl.col("error").abs(), normalised=pl.col("error") / pl.col("sigma"))
+        .with_columns(position=pl.lit(position), epochs_of=pl.lit(epochs_of))
+    )
+
+
+def figures_by(
+    epochs: pl.DataFrame, grouping: str, options: EvaluationOptions, *, name: str | None = None
+) -> pl.DataFrame:
+    """Figures of one grouping, a row for every group, antenna, kind of position and choice of epochs.
+
+    Parameters
+    ----------
+    epochs : polars.DataFrame
+        From `classed`; its columns of `KEYS` are kept apart.
+    grouping : str
+        Which classes: ``f"{grouping}_group"``.
+    options : EvaluationOptions
+    name : str, optional
+        Written into the column ``grouping``.
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `FIGURE_COLUMNS`.
+    """
+    rank, group = f"{grouping}_rank", f"{grouping}_group"
+    by = [*KEYS, rank, group]
+    kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
+    tables = []
+    for position, epochs_of in kinds:
+        part = series(epochs, position, epochs_of)
+        table = part.group_by(by, maintain_order=True).agg(_figures(options))
+        limited = epochs_of == "own" and (name or grouping) in WITH_LIMITS
+        tables.append(_with_limits(table, part if limited else None, by, options))
+    found = pl.concat(tables).sort(rank, group, maintain_order=True)
+    return found.select(
+        pl.lit(name or grouping).alias("grouping"),
+        pl.col(group).alias("group"),
+        pl.exclude("grouping", rank, group),
+    )
+
+
+def largest_first(column: str, by: str) -> pl.Expr:
+    """A column in falling order of another, the first of equals first, nulls at the end."""
+    return pl.col(column).sort_by(by, descending=True, nulls_last=True, maintain_order=True)
+
+
+def _figures(options: EvaluationOptions) -> list[pl.Expr]:
+    """Every figure of a group of rows of `series`."""
+    error, size, has = pl.col("error"), pl.col("size"), pl.col("has")
+    good = error.is_not_null()
+    observed, positions = pl.col("observed").sum(), has.sum()
+    sigmas = pl.col("normalised").abs()
+    return [
+        pl.col("position").first(),
+        pl.col("epochs_of").first(),
+        pl.len().cast(pl.Int64).alias("epochs"),
+        observed.cast(pl.Int64).alias("observed"),
+        positions.cast(pl.Int64).alias("positions"),
+        (has & ~pl.col("reference_good")).sum().cast(pl.Int64).alias("left_out"),
+        error.count().cast(pl.Int64).alias("errors"),
+        pl.when(observed > 0).then(positions / observed).alias("rate"),
+        (positions / pl.len()).alias("rate_of_run"),
+        error.mean().alias("mean_m"),
+        error.std(ddof=0).alias("std_m"),
+        (error**2).mean().sqrt().alias("rms_m"),
+        *(size.quantile(q / 100, "linear").alias(f"p{q}_m") for q in (50, 95, 99)),
+        size.max().alias("max_m"),
+        error.min().alias("lowest_m"),
+        error.max().alias("highest_m"),
+        *(
+            pl.when(good.any()).then(largest_first(column, "size").first()).alias(f"max_at_{what}")
+            for column, what in (("time_gpst", "time"), ("chainage_m", "chainage_m"))
+        ),
+        *((size > limit).mean().alias(f"over_{limit:g}_m") for limit in options.over_m),
+        (size > WRONG_PLACE_M).sum().cast(pl.Int64).alias("wrong_places"),
+        pl.col("reference_sigma_m").filter(good).median().alias("reference_sigma_p50_m"),
+        pl.col("sigma").filter(good).median().alias("along_sigma_p50_m"),
+        pl.col("normalised").mean().alias("normalised_mean"),
+        (pl.col("normalised") ** 2).mean().sqrt().alias("normalised_rms"),
+        *((sigmas > n).mean().alias(f"over_{n}_sigma") for n in (1, 2, 3)),
+    ]
+
+
+def _with_limits(
+    table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
+) -> pl.DataFrame:
+    """The table with the limits of confidence, null where none are told."""
+    groups = {} if part is None else part.partition_by(by, as_dict=True, maintain_order=True)
+    rows: list[dict[str, Any]] = []
+    for key in table.select(by).iter_rows():
+        if key not in groups:
+            rows.append({"blocks": None, **dict.fromkeys(_LIMITS)})
+            continue
+        group = groups[key]
+        found = block_limits(
+            floats(group, "error"),
+            group["observed"].to_numpy(),
+            group["has"].to_numpy(),
+            group["block"].to_numpy(),
+            replicates=options.replicates,
+            seed=options.seed,
+            confidence=options.confidence,
+        )
+        values = (*found.mean_m, *found.rate, *found.p95_m)
+        rows.append({"blocks": found.blocks, **dict(zip(_LIMITS, values, strict=True))})
+    schema = {"blocks": pl.Int64} | dict.fromkeys(_LIMITS, pl.Float64)
+    return table.hstack(pl.DataFrame(rows, schema=schema).with_columns(pl.col(_LIMITS).fill_nan(None)))

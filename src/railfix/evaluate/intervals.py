@@ -1,0 +1,95 @@
+"""How far the train runs, and how long it takes, from one position to the next (P1 5, figure 12)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import polars as pl
+
+from railfix.evaluate.figures import POSITIONS, largest_first
+from railfix.reasons import Status
+
+#: Columns of the table of intervals beside its keys, with their unit and meaning.
+INTERVAL_COLUMNS: Final[dict[str, str]] = {
+    "position": "`constrained`, `constrained_ok` or `conventional`",
+    "intervals": "pairs of positions that follow each other while the train ran",
+    "standing": "pairs while it stood, which count for the gaps of time alone",
+    "interval_mean_m": "distance that the train ran between two positions",
+    "interval_p50_m": "the same",
+    "interval_p95_m": "the same",
+    "interval_p99_m": "the same",
+    "interval_max_m": "the same",
+    "interval_max_from": "time of the position before the largest, GPS time",
+    "interval_max_chainage_m": "where the train was at it",
+    "gap_p50_s": "time between two positions",
+    "gap_p95_s": "the same",
+    "gap_max_s": "the same",
+    "gap_max_from": "time of the position before the longest, GPS time",
+    "before_first_s": "from the first epoch in the reference to the first position",
+    "after_last_s": "from the last position to the last epoch in the reference",
+}
+_OF: Final = ("run", "antenna")
+
+
+def interval_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame:
+    """Distribution of the intervals of each kind of position.
+
+    Parameters
+    ----------
+    epochs : polars.DataFrame
+        `railfix.evaluate.epochs.EPOCH_COLUMNS`; an interval lies within one run and antenna.
+    by : list of str
+        Columns whose values are kept apart.
+
+    Returns
+    -------
+    polars.DataFrame
+        `by` and `INTERVAL_COLUMNS`; before_first_s and after_last_s are the largest of the runs.
+    """
+    return pl.concat([_of_position(epochs, position, by) for position in POSITIONS])
+
+
+def _of_position(epochs: pl.DataFrame, position: str, by: list[str]) -> pl.DataFrame:
+    has = pl.col("conventional_error_m" if position == "conventional" else "error_m").is_not_null()
+    if position == "constrained_ok":
+        has &= pl.col("status") == Status.OK.text
+    keys = list(dict.fromkeys([*by, *_OF]))
+    spanned = epochs.filter("in_reference").select(*keys, "time_gpst", "chainage_m", "moved_m", has=has)
+    edges = (
+        spanned.group_by(keys, maintain_order=True)
+        .agg(
+            before=_seconds(pl.col("time_gpst").filter("has").first() - pl.col("time_gpst").first()),
+            after=_seconds(pl.col("time_gpst").last() - pl.col("time_gpst").filter("has").last()),
+        )
+        .group_by(by, maintain_order=True)
+        .agg(before_first_s=pl.col("before").max(), after_last_s=pl.col("after").max())
+    )
+    apart = spanned.filter("has").with_columns(
+        interval=pl.col("moved_m").diff().over(keys),
+        gap=_seconds(pl.col("time_gpst").diff().over(keys)),
+        start=pl.col("time_gpst").shift().over(keys),
+        place=pl.col("chainage_m").shift().over(keys),
+    )
+    ran = pl.col("interval").filter(pl.col("interval") > 0)
+    found = apart.group_by(by, maintain_order=True).agg(
+        intervals=ran.count().cast(pl.Int64),
+        standing=(pl.col("interval") == 0).sum().cast(pl.Int64),
+        interval_mean_m=ran.mean(),
+        interval_p50_m=ran.quantile(0.5, "linear"),
+        interval_p95_m=ran.quantile(0.95, "linear"),
+        interval_p99_m=ran.quantile(0.99, "linear"),
+        interval_max_m=ran.max(),
+        interval_max_from=pl.when(ran.count() > 0).then(largest_first("start", "interval").first()),
+        interval_max_chainage_m=pl.when(ran.count() > 0).then(largest_first("place", "interval").first()),
+        gap_p50_s=pl.col("gap").quantile(0.5, "linear"),
+        gap_p95_s=pl.col("gap").quantile(0.95, "linear"),
+        gap_max_s=pl.col("gap").max(),
+        gap_max_from=largest_first("start", "gap").first(),
+    )
+    whole = edges.join(found, on=by, how="left", maintain_order="left")
+    counts = pl.col("intervals", "standing").fill_null(0)
+    return whole.with_columns(counts, position=pl.lit(position)).select(*by, *INTERVAL_COLUMNS)
+
+
+def _seconds(duration: pl.Expr) -> pl.Expr:
+    return duration.dt.total_nanoseconds() / 1e9

@@ -1,0 +1,83 @@
+"""What became of the protection levels of a run: how often there is one, how often an error exceeds it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import polars as pl
+
+from railfix.evaluate.epochs import level_columns
+from railfix.evaluate.options import EvaluationOptions
+from railfix.reasons import Status
+
+#: Columns of the table of levels beside its keys, with their unit and meaning.
+LEVEL_COLUMNS: Final[dict[str, str]] = {
+    "level": "column of the run",
+    "position": "`constrained` or `constrained_ok`",
+    "observed": "epochs with observations inside the reference",
+    "positions": "epochs with a position",
+    "infinite": "of the positions with an infinite level",
+    "with_level": "of the positions with a finite level",
+    "available": "of the positions with a finite level, within the alarm limit where one is given",
+    "availability": "available / observed",
+    "level_p50_m": "finite levels",
+    "level_p95_m": "finite levels",
+    "errors": "finite levels with an error: the reference is good",
+    "over_level": "errors over their level",
+    "over_level_share": "over_level / errors",
+}
+
+
+def level_table(epochs: pl.DataFrame, by: list[str], options: EvaluationOptions) -> pl.DataFrame | None:
+    """Counts of every protection level; None where a run has none.
+
+    Parameters
+    ----------
+    epochs : polars.DataFrame
+        `railfix.evaluate.epochs.EPOCH_COLUMNS` and the levels.
+    by : list of str
+        Columns whose values are kept apart.
+    options : EvaluationOptions
+    """
+    spanned = epochs.filter("in_reference")
+    tables = []
+    for level in level_columns(epochs):
+        if epochs[level].null_count() == len(epochs):
+            continue
+        for position in ("constrained", "constrained_ok"):
+            has = pl.col("error_m").is_not_null()
+            if position == "constrained_ok":
+                has &= pl.col("status") == Status.OK.text
+            tables.append(
+                spanned.with_columns(has=has, finite=has & pl.col(level).is_finite().fill_null(value=False))
+                .group_by(by, maintain_order=True)
+                .agg(_counts(level, options))
+                .with_columns(
+                    level=pl.lit(level),
+                    position=pl.lit(position),
+                    availability=pl.when(pl.col("observed") > 0).then(pl.col("available") / pl.col("observed")),
+                    over_level_share=pl.when(pl.col("errors") > 0).then(pl.col("over_level") / pl.col("errors")),
+                )
+                .select(*by, *LEVEL_COLUMNS)
+            )
+    return pl.concat(tables) if tables else None
+
+
+def _counts(level: str, options: EvaluationOptions) -> list[pl.Expr]:
+    value, has, finite = pl.col(level), pl.col("has"), pl.col("finite")
+    within = finite if options.alarm_limit_m is None else finite & (value <= options.alarm_limit_m)
+    judged = finite & pl.col("reference_good")
+    counts = {
+        "observed": pl.col("observed"),
+        "positions": has,
+        "infinite": has & value.is_infinite(),
+        "with_level": finite,
+        "available": within,
+        "errors": judged,
+        "over_level": judged & (pl.col("error_m").abs() > value),
+    }
+    return [
+        *(expression.sum().cast(pl.Int64).alias(name) for name, expression in counts.items()),
+        value.filter(finite).median().alias("level_p50_m"),
+        value.filter(finite).quantile(0.95, "linear").alias("level_p95_m"),
+    ]

@@ -1,0 +1,232 @@
+"""Errors along the line of one antenna: by chainage, or along the trajectory from the reference's place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.antenna import Trajectory
+from railfix.errors import InputFileError, MismatchError, RailfixError
+from railfix.evaluate.along_track import along_track_error
+from railfix.evaluate.options import Method
+from railfix.evaluate.run_folder import RunFolder
+from railfix.track_map import Track, read_track
+from railfix.vehicle import antenna_trajectory, read_vehicle
+
+Floats = NDArray[np.float64]
+
+#: Chainages of the reference and of the run that differ from their places by more than this, at the median, are
+#: not of one map [m].
+SAME_MAP_M: Final = 1.0
+#: Answers further than this from the trajectory at their chainage show that it is not that of the run [m].
+SAME_TRAJECTORY_M: Final = 0.01
+#: Chainages may lie beyond the ends by their rounding [m].
+_ROUNDING_M: Final = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackFiles:
+    """Files that stand in for those that ``run.json`` names, and how to read the track.
+
+    Attributes
+    ----------
+    track : tuple of Path
+        Empty: those of the run.
+    vehicle : Path or None
+    crs, height_datum, geoid : str or None
+        See `railfix.track_map.read_track`.
+    """
+
+    track: tuple[Path, ...] = ()
+    vehicle: Path | None = None
+    crs: str | None = None
+    height_datum: str | None = None
+    geoid: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answers:
+    """Answers of one antenna and the reference at their times, T epochs.
+
+    Attributes
+    ----------
+    chainage_m, conventional_chainage_m : ndarray, shape (T,) [m]
+        NaN where there is none.
+    ecef_m : ndarray, shape (T, 3) [m]
+    reference_chainage_m : ndarray, shape (T,) [m]
+    reference_ecef_m : ndarray, shape (T, 3) [m]
+        NaN outside the reference.
+    """
+
+    chainage_m: Floats
+    conventional_chainage_m: Floats
+    ecef_m: Floats
+    reference_chainage_m: Floats
+    reference_ecef_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Errors:
+    """Signed errors of one antenna, T epochs.
+
+    Attributes
+    ----------
+    method : {"chainage", "trajectory"}
+    error_m, conventional_error_m : ndarray, shape (T,) [m]
+        + toward the end of the line.
+    reference_chainage_m : ndarray, shape (T,) [m]
+        Of the reference, for places; from the map where the reference has none.
+    files : tuple of Path
+        Track and vehicle, where they were read.
+    notes : tuple of str
+    """
+
+    method: Method
+    error_m: Floats
+    conventional_error_m: Floats
+    reference_chainage_m: Floats
+    files: tuple[tuple[str, Path], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def errors_of(
+    run: RunFolder,
+    antenna: str,
+    answers: Answers,
+    *,
+    method: Literal["auto", "chainage", "trajectory"],
+    files: TrackFiles,
+) -> Errors:
+    """Errors of one antenna of a run.
+
+    By chainage where the reference has it at every epoch, the run's is that of the antenna, and both
+    agree with the distance of the places to `SAME_MAP_M` at the median; otherwise along the trajectory.
+
+    Raises
+    ------
+    MismatchError
+        `method` is "chainage" and it cannot be taken, or the track is not that of the run.
+    InputFileError
+        The track or the vehicle cannot be read.
+    """
+    if method != "trajectory":
+        against = _against_chainage(run, antenna, answers)
+        if against is None:
+            return Errors(
+                method="chainage",
+                error_m=answers.chainage_m - answers.reference_chainage_m,
+                conventional_error_m=answers.conventional_chainage_m - answers.reference_chainage_m,
+                reference_chainage_m=answers.reference_chainage_m,
+            )
+        if method == "chainage":
+            raise MismatchError(f"{run.path}: {against}; take the trajectory instead (--method trajectory)")
+        notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory: {against}",)
+    else:
+        notes = (f"{antenna}: errors are along the trajectory, as asked",)
+    trajectory, used, said = find_trajectory(run, antenna, answers, files)
+    arc, other = (_arc(trajectory, c) for c in (answers.chainage_m, answers.conventional_chainage_m))
+    place = answers.reference_chainage_m
+    if not np.isfinite(place).any():
+        place = trajectory.chainage_at(trajectory.nearest(answers.reference_ecef_m)[0])
+    return Errors(
+        method="trajectory",
+        error_m=along_track_error(arc, answers.reference_ecef_m, trajectory),
+        conventional_error_m=along_track_error(other, answers.reference_ecef_m, trajectory),
+        reference_chainage_m=place,
+        files=used,
+        notes=(*notes, *said),
+    )
+
+
+def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> str | None:
+    """Why differences of chainage cannot be taken; None where they can."""
+    known = np.isfinite(answers.reference_ecef_m[:, 0])
+    with_chainage = np.isfinite(answers.reference_chainage_m)
+    if not with_chainage.any():
+        return "the reference has no chainage"
+    if (known & ~with_chainage).any():
+        count = int((known & ~with_chainage).sum())
+        return f"the reference has no chainage at {count} of {int(known.sum())} epochs"
+    point = run.chainage_of.get(antenna, "antenna")
+    if point != "antenna":
+        return f"the run's chainage is that of the {point}, the reference's that of the antenna"
+    difference = np.abs(answers.chainage_m - answers.reference_chainage_m)
+    apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
+    both = np.isfinite(difference) & np.isfinite(apart)
+    if both.any() and (off := float(np.median(np.abs(difference - apart)[both]))) > SAME_MAP_M:
+        return f"the chainages of run and reference are not of one map (off by {off:.1f} m at the median)"
+    return None
+
+
+def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
+    """Arcs at chainages that may lie beyond the ends by their rounding."""
+    first, last = trajectory.chainage_m[0], trajectory.chainage_m[-1]
+    near = (chainage_m > first - _ROUNDING_M) & (chainage_m < last + _ROUNDING_M)
+    return trajectory.arc_at_chainage(np.where(near, np.clip(chainage_m, first, last), chainage_m))
+
+
+def find_trajectory(
+    run: RunFolder, antenna: str, answers: Answers, files: TrackFiles
+) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
+    """The trajectory that the run had, from its track and vehicle; with the files and what is to be said.
+
+    Raises
+    ------
+    MismatchError
+        The answers do not lie on it: another track, vehicle, or reading of them.
+    InputFileError
+        The files cannot be read.
+    """
+    tracks = list(files.track) or run.located("track")
+    vehicles = [files.vehicle] if files.vehicle is not None else run.located("vehicle")
+    if not tracks:
+        raise InputFileError(run.path / "run.json", "names no track; give it with --track")
+    used = (*(("track", path) for path in tracks), *(("vehicle", path) for path in vehicles))
+    for kind, path in used:
+        if not path.is_file():
+            raise InputFileError(path, f"the {kind} of the run is no longer there; give it with --{kind}")
+    farthest: list[float] = []
+    faults: list[RailfixError] = []
+    for crs, datum, geoid in _readings(run, files):
+        try:
+            track = read_track(tracks, crs=crs, height_datum=datum, geoid=geoid)
+            trajectory = _trajectory(run, antenna, track, vehicles)
+        except RailfixError as error:
+            faults.append(error)
+            continue
+        arc = _arc(trajectory, answers.chainage_m)
+        off = np.linalg.norm(trajectory.at_arc(arc) - answers.ecef_m, axis=1)
+        off = np.where(np.isfinite(answers.chainage_m), np.nan_to_num(off, nan=np.inf), 0.0)
+        if off.max(initial=0.0) <= SAME_TRAJECTORY_M:
+            return trajectory, used, trajectory.notes
+        farthest.append(float(off.max()))
+    if not farthest:
+        raise faults[0]
+    told = f"{min(farthest):.2f} m" if np.isfinite(min(farthest)) else "the line's whole length"
+    raise MismatchError(
+        f"{tracks[0]}: is not the track of {run.path}, whose positions of the {antenna} antenna lie up to {told} from "
+        "it; give the run's own --track and --vehicle, and its --crs, --height-datum and --geoid where it had them"
+    )
+
+
+def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
+    """Ways to read the track: as told; else as the file says, then as the run's record says."""
+    told = (files.crs, files.height_datum, files.geoid)
+    if any(told):
+        return [told]
+    facts = run.track_facts
+    recorded = tuple(facts.get(name) or None for name in ("crs", "height_datum_asked", "geoid"))
+    return [told, (recorded[0], recorded[1], recorded[2])]
+
+
+def _trajectory(run: RunFolder, antenna: str, track: Track, vehicles: Sequence[Path]) -> Trajectory:
+    if not vehicles:
+        return Trajectory.from_track(track)
+    point = run.chainage_of.get(antenna, "antenna")
+    name: Literal["front", "rear"] = "rear" if antenna == "rear" else "front"
+    return antenna_trajectory(track, read_vehicle(vehicles[0]), name, reference=point)  # type: ignore[arg-type]
