@@ -13,15 +13,25 @@ from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.constellation import made_navigation
 from railfix.simulate.demo_data import DEMO_FILES, demo_files, demo_folder
 from railfix.simulate.disturbance import Disturbance, Disturbances, Geometry
-from railfix.simulate.motion import Motion, shuttle
+from railfix.simulate.line_settings import (
+    Element,
+    GeneratedLine,
+    Gradient,
+    LineFile,
+    LineSettings,
+    MapError,
+    Terrain,
+)
+from railfix.simulate.motion import Motion, made_motion, run_curve, shuttle
 from railfix.simulate.run import truth_table, write_run
 from railfix.simulate.scenario import (
     ANTENNAS,
-    LineSettings,
     ReceiverSettings,
     RunSettings,
     Scenario,
     SkySettings,
+    SpeedLimit,
+    Station,
     VehicleSettings,
 )
 from railfix.simulate.signals import Piece, Simulation
@@ -33,8 +43,13 @@ __all__ = [
     "AntennaTruth",
     "Disturbance",
     "Disturbances",
+    "Element",
+    "GeneratedLine",
     "Geometry",
+    "Gradient",
+    "LineFile",
     "LineSettings",
+    "MapError",
     "Motion",
     "Piece",
     "ReceiverSettings",
@@ -42,12 +57,17 @@ __all__ = [
     "Scenario",
     "Simulation",
     "SkySettings",
+    "SpeedLimit",
+    "Station",
+    "Terrain",
     "VehicleSettings",
     "antenna_truth",
     "demo_files",
     "demo_folder",
     "made_alignment",
+    "made_motion",
     "made_navigation",
+    "run_curve",
     "shuttle",
     "truth_table",
     "write_run",

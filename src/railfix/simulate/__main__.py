@@ -11,8 +11,9 @@ import sys
 from collections.abc import Sequence
 
 from railfix.errors import RailfixError
+from railfix.simulate.line_settings import LineSettings
 from railfix.simulate.run import write_run
-from railfix.simulate.scenario import LineSettings, ReceiverSettings, RunSettings, Scenario, SkySettings
+from railfix.simulate.scenario import ReceiverSettings, RunSettings, Scenario, SkySettings
 
 _EPILOG = """\
 exit codes: 0 done; 2 the command line was misused; 4 a setting is out of range; 8 the output cannot be written.

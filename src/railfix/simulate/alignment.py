@@ -1,14 +1,15 @@
 """The continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
 
-The truth is this curve; the track map is its sampling. Chainage is the arc length in three
-dimensions. Curvature changes linearly in transitions (clothoids), and with it the cant (ramps); the
-gradient changes linearly in vertical curves. The curve is laid on the ellipsoid, so that a line of
-200 km stays at its height and its curves stay curves.
+The truth is this curve; the track map is its sampling, off by `MapError` where that is asked for.
+Chainage is the arc length in three dimensions. Curvature changes linearly in transitions (clothoids),
+and with it the cant (ramps); the gradient changes linearly in vertical curves. The curve is laid on
+the ellipsoid, so that a line of 200 km stays at its height and its curves stay curves. A line of a
+track file is the curve of `railfix.simulate.line_file` instead.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -16,9 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.simulate.scenario import LineSettings
-from railfix.track_map import Track
+from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.simulate.line_elements import Knots, generated_knots, knots_of_elements
+from railfix.simulate.line_file import FileLine, line_of_file
+from railfix.simulate.line_settings import PATTERN_LENGTH_M, LineSettings
+from railfix.simulate.waves import Waves
+from railfix.track_map import Track, interpolate_kilometrage
+from railfix.track_map.track import frozen
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +47,6 @@ PATTERN: Final = (
     (35.0, np.inf, 0.0),
     (226.0, np.inf, 0.0),
 )
-PATTERN_LENGTH_M: Final = sum(length for length, _, _ in PATTERN)
 #: Gradient at places of the pattern: place [m], gradient [permille]; linear between.
 GRADIENT: Final = (
     (0.0, 0.0), (60.0, 0.0), (100.0, -4.0), (180.0, -4.0), (240.0, 10.0), (380.0, 10.0), (450.0, 2.5),
@@ -65,6 +69,8 @@ class Alignment:
         Cant, positive where the vehicle leans to the right, linear between knots.
     grade_knot_m, grade : ndarray, shape (G,)
         Chainage [m] and gradient [m/m, climb over plan length], linear between.
+    file : FileLine or None
+        The curve through the points of a track file, in place of the integrated one.
     """
 
     settings: LineSettings
@@ -73,11 +79,12 @@ class Alignment:
     lean_m: Floats
     grade_knot_m: Floats
     grade: Floats
+    file: FileLine | None = None
 
     @property
     def length_m(self) -> float:
         """Chainage of the end."""
-        return self.settings.length_m
+        return float(self.knot_m[-1])
 
     def curvature_at(self, chainage_m: ArrayLike) -> Floats:
         """Curvature in plan [1/m], positive to the right."""
@@ -93,10 +100,14 @@ class Alignment:
 
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
         """The line's own marking [m]."""
+        if self.file is not None:
+            return interpolate_kilometrage(chainage_m, self.file.point_m, self.file.track.kilometrage_m)
         return np.asarray(np.asarray(chainage_m, dtype=np.float64) + self.settings.kilometrage_start_m)
 
     @cached_property
     def _curve(self) -> CubicHermiteSpline[np.float64]:
+        if self.file is not None:
+            return self.file.curve
         place, tangent = _integrate(self)
         chainage = np.linspace(0.0, self.length_m, len(place))
         return CubicHermiteSpline(chainage, place, tangent, axis=0)
@@ -110,7 +121,9 @@ class Alignment:
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
 
     def sampled_chainage_m(self) -> Floats:
-        """Chainage of the map's points: the elements' ends, and evenly between at no more than the spacing."""
+        """Chainage of the map's points: the elements' ends, and evenly between within the spacing; a file's own."""
+        if self.file is not None:
+            return self.file.point_m
         points = [np.zeros(1)]
         for first, last, *bend in zip(
             self.knot_m[:-1], self.knot_m[1:], self.curvature[:-1], self.curvature[1:], strict=True
@@ -120,17 +133,33 @@ class Alignment:
             points.append(np.linspace(first, last, pieces + 1)[1:])
         return np.concatenate(points)
 
+    def map_error_m(self, chainage_m: ArrayLike) -> Floats:
+        """How far the map lies from the line, to the east, to the north and up, shape (..., 3) [m]."""
+        error = self.settings.map_error
+        rng = np.random.default_rng([error.seed, 12])
+        sigmas = (error.plan_sigma_m, error.plan_sigma_m, error.height_sigma_m)
+        waves = [Waves.smooth(rng, sigma=sigma, correlation=error.correlation_m) for sigma in sigmas]
+        return np.stack([wave.at(chainage_m) for wave in waves], axis=-1)
+
     def track(self) -> Track:
-        """The track map: the curve at `sampled_chainage_m`, with its attributes."""
+        """The track map: the curve at `sampled_chainage_m`, with its attributes, off by the map's error."""
         chainage = self.sampled_chainage_m()
+        ecef = self.at(chainage)
+        exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
+        if self.file is not None and exact:
+            return self.file.track
+        if not exact:
+            there = geodetic_from_ecef(ecef)
+            ecef = ecef + np.einsum("ni,nij->nj", self.map_error_m(chainage), enu_axes(there[0], there[1]))
+        place = geodetic_from_ecef(ecef)
+        if self.file is not None:
+            latitude, longitude, height = (frozen(part) for part in place)
+            return replace(self.file.track, latitude_deg=latitude, longitude_deg=longitude, height_m=height)
         curvature = self.curvature_at(chainage)
         with np.errstate(divide="ignore"):
             radius = np.where(curvature == 0.0, np.inf, 1.0 / curvature)
-        from_ecef = Track.from_ecef(self.at(chainage))
         return Track.from_geodetic(
-            from_ecef.latitude_deg,
-            from_ecef.longitude_deg,
-            from_ecef.height_m,
+            *place,
             name=self.settings.name,
             kilometrage_m=self.kilometrage_at(chainage),
             cant_m=np.abs(self.lean_at(chainage)),
@@ -140,8 +169,41 @@ class Alignment:
 
 
 def made_alignment(settings: LineSettings) -> Alignment:
+    """The line of a scenario, of any of the four kinds.
+
+    Raises
+    ------
+    SettingsError
+        The elements do not make a line.
+    InputFileError
+        The track file cannot be read, or is too rough for a line.
+    """
+    if settings.kind == "file":
+        assert settings.file is not None
+        line = line_of_file(settings.file)
+        return _of_knots(settings, line.knots, line)
+    if settings.kind == "elements":
+        return _of_knots(settings, knots_of_elements(settings.elements, settings.gradients))
+    if settings.kind == "generated":
+        return _of_knots(settings, generated_knots(settings))
+    return _of_knots(settings, _pattern_knots(settings.length_m))
+
+
+def _of_knots(settings: LineSettings, knots: Knots, file: FileLine | None = None) -> Alignment:
+    return Alignment(
+        settings=settings,
+        knot_m=knots.knot_m,
+        curvature=knots.curvature,
+        lean_m=knots.lean_m,
+        grade_knot_m=knots.grade_knot_m,
+        grade=knots.grade,
+        file=file,
+    )
+
+
+def _pattern_knots(length_m: float) -> Knots:
     """The pattern of the made test line, repeated and every second time mirrored, to the length asked for."""
-    repeats = int(np.ceil(settings.length_m / PATTERN_LENGTH_M - 1e-12))
+    repeats = int(np.ceil(length_m / PATTERN_LENGTH_M - 1e-12))
     lengths, radii, cants = (np.array(column) for column in zip(*PATTERN, strict=True))
     side = np.repeat(np.where(np.arange(repeats) % 2 == 0, 1.0, -1.0), len(lengths))
     knot = np.concatenate([[0.0], np.cumsum(np.tile(lengths, repeats))])
@@ -151,10 +213,9 @@ def made_alignment(settings: LineSettings) -> Alignment:
     turn = np.where(np.arange(repeats) % 2 == 0, 1e-3, -1e-3)[:, None]
     grade_knot = (place[:-1] + PATTERN_LENGTH_M * np.arange(repeats)[:, None]).ravel()
     grade = (permille[:-1] * turn).ravel()
-    inside = knot < settings.length_m
-    end = np.array([settings.length_m])
-    return Alignment(
-        settings=settings,
+    inside = knot < length_m
+    end = np.array([length_m])
+    return Knots(
         knot_m=np.concatenate([knot[inside], end]),
         curvature=np.concatenate([curvature[inside], np.interp(end, knot, curvature)]),
         lean_m=np.concatenate([lean[inside], np.interp(end, knot, lean)]),

@@ -40,7 +40,11 @@ class AntennaTruth:
 
 
 def antenna_truth(
-    line: Alignment, vehicle: VehicleSettings, offset_m: tuple[float, float, float], middle_m: Floats
+    line: Alignment,
+    vehicle: VehicleSettings,
+    offset_m: tuple[float, float, float],
+    middle_m: Floats,
+    sway_rad: Floats | float = 0.0,
 ) -> AntennaTruth:
     """True place of an antenna.
 
@@ -52,6 +56,8 @@ def antenna_truth(
         Along, across to the right, above the rail tops [m].
     middle_m : ndarray, shape (n,) [m]
         Chainage midway between the bogies' chainages.
+    sway_rad : ndarray, shape (n,), or float [rad]
+        Lean to the right beyond that of the cant.
 
     Returns
     -------
@@ -74,6 +80,7 @@ def antenna_truth(
     upright /= np.linalg.norm(upright, axis=-1, keepdims=True)
     contact = vehicle.gauge_m + _RAIL_HEAD_M
     lean = 0.5 * (np.arcsin(line.lean_at(middle - half) / contact) + np.arcsin(line.lean_at(middle + half) / contact))
+    lean = lean + sway_rad
     along, across, up = offset_m
     arm = across * np.cross(forward, upright) + up * upright
     # A lean to the right turns the body about its forward axis.

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.constants import BDT_MINUS_GPST_S
-from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.navigation import KeplerRecords, Navigation
 from railfix.simulate.satellites import EARTH, FRAME_ROTATION
 from railfix.simulate.scenario import Scenario
+from railfix.simulate.sky_file import no_glonass, sky_of_file
 from railfix.timescale import gpst_minus_utc, to_week
 
 Floats = NDArray[np.float64]
@@ -50,8 +51,15 @@ def made_navigation(scenario: Scenario) -> Navigation:
     """Broadcast records for the whole of a run, as `railfix.rinex.write.write_navigation` writes them.
 
     All values are already rounded to the digits of the file, so that the file and the arrays are the
-    same satellites.
+    same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.sky_file`).
+
+    Raises
+    ------
+    InputFileError, MismatchError
+        The navigation file cannot be read, or does not serve the scenario's time.
     """
+    if scenario.sky.nav is not None:
+        return sky_of_file(scenario, scenario.sky.nav)
     rng = np.random.default_rng([scenario.seed, 1])
     rows: list[dict[str, Any]] = []
     for system in scenario.sky.systems:
@@ -62,22 +70,11 @@ def made_navigation(scenario: Scenario) -> Navigation:
     table["satellite"] = table["satellite"].astype("<U3")
     return Navigation(
         kepler=KeplerRecords(**table),
-        glonass=_no_glonass(),
+        glonass=no_glonass(),
         klobuchar={"G": np.array(KLOBUCHAR)},
         leap_seconds=int(gpst_minus_utc(scenario.start)),
         sources=("simulated",),
     )
-
-
-def _no_glonass() -> GlonassRecords:
-    none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
-    vectors = np.empty((0, 3))
-    whole = np.empty(0, dtype=np.int64)
-    return GlonassRecords(
-        satellite=np.empty(0, dtype="<U3"), toe=times, transmitted=times, clock_bias_s=none, relative_frequency=none,
-        position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=whole,
-        frequency_channel=whole, age_days=none,
-    )  # fmt: skip
 
 
 def _orbits(system: str, scenario: Scenario, rng: np.random.Generator) -> list[_Orbit]:

@@ -1,15 +1,31 @@
-"""Chainage and speed of the train over time: pieces of even acceleration."""
+"""Chainage and speed of the train over time: pieces of even acceleration.
+
+A shuttle between two places, or a run curve: as fast as the line, its curves and the train allow,
+stopping at stations.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from railfix.simulate.scenario import RunSettings
+from railfix.simulate.alignment import Alignment
+from railfix.simulate.scenario import RunSettings, Scenario, Station
+from railfix.simulate.waves import Waves
 
 Floats = NDArray[np.float64]
+
+#: Spacing of the places at which a run curve looks at the limits [m].
+_STEP_M: Final = 2.0
+_GRAVITY: Final = 9.806_65
+#: Contact points of the wheels lie further apart than the gauge [m].
+_RAIL_HEAD_M: Final = 0.070
+#: Speed from which on the body sways fully [m/s].
+_FULL_SWAY_MPS: Final = 20.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +52,67 @@ class Motion:
         since = np.maximum(time - self.time_s[piece], 0.0)
         speed = self.speed_mps[piece] + self.acceleration_mps2[piece] * since
         return self.chainage_m[piece] + (self.speed_mps[piece] + speed) / 2.0 * since, speed
+
+    def acceleration_at(self, time_s: ArrayLike) -> Floats:
+        """Acceleration along the line [m/s^2] at times; before 0 none."""
+        time = np.asarray(time_s, dtype=np.float64)
+        piece = np.searchsorted(self.time_s, time, side="right") - 1
+        return np.where(piece < 0, 0.0, self.acceleration_mps2[np.maximum(piece, 0)])
+
+
+def made_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
+    """Motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or the like are given.
+
+    Parameters
+    ----------
+    line : Alignment
+    scenario : Scenario
+    duration_s : float, optional
+        Without it the scenario's; 0: one way, to the last stop and its stand.
+
+    Returns
+    -------
+    Motion
+
+    Raises
+    ------
+    SettingsError
+        The train has no room on the line.
+    """
+    settings = scenario.run
+    scenario.check_room(line.length_m)
+    lasting = scenario.duration_s if duration_s is None else duration_s
+    margin = settings.end_margin_m
+    usual = RunSettings()
+    plain = ("stations", "limits", "cant_deficiency_m", "direction", "at_end")
+    if all(getattr(settings, name) == getattr(usual, name) for name in plain):
+        return shuttle(margin, line.length_m - margin, lasting, settings)
+    return run_curve(line, settings, lasting, contact_m=scenario.vehicle.gauge_m + _RAIL_HEAD_M)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sway:
+    """Swaying of the body about its forward axis, beyond the lean of the cant.
+
+    Attributes
+    ----------
+    waves : Waves
+    """
+
+    waves: Waves
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Sway:
+        """Sway of a scenario's vehicle; its seed decides."""
+        vehicle = scenario.vehicle
+        rng = np.random.default_rng([scenario.seed, 13])
+        return cls(
+            waves=Waves.narrow(rng, sigma=float(np.radians(vehicle.sway_sigma_deg)), period=vehicle.sway_period_s)
+        )
+
+    def roll_rad(self, time_s: Floats, speed_mps: Floats) -> Floats:
+        """Lean to the right [rad] at times and speeds; none while the train stands."""
+        return self.waves.at(time_s) * np.minimum(np.abs(speed_mps) / _FULL_SWAY_MPS, 1.0)
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
@@ -70,3 +147,89 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
         speed_mps=np.concatenate([[0.0], (sign * speeds).ravel()]),
         acceleration_mps2=np.concatenate([[0.0], (sign * accelerations).ravel()]),
     )
+
+
+def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, contact_m: float) -> Motion:
+    """A train that runs from stop to stop as fast as it may, for at least a duration.
+
+    Parameters
+    ----------
+    line : Alignment
+    settings : RunSettings
+    duration_s : float [s]
+        The train goes to its last stop at least.
+    contact_m : float [m]
+        Distance of the wheels' contact points, for the speed in canted curves.
+
+    Returns
+    -------
+    Motion
+    """
+    margin = settings.end_margin_m
+    ends = (
+        Station(at_m=margin, dwell_s=settings.stand_s),
+        Station(at_m=line.length_m - margin, dwell_s=settings.stand_s),
+    )
+    stops = settings.stations or ends
+    if settings.direction == "falling":
+        stops = stops[::-1]
+    time, pieces = settings.first_stand_s, [np.array([[0.0], [stops[0].at_m], [0.0], [0.0]])]
+    while True:
+        for start, stop in pairwise(stops):
+            leg = _leg(line, settings, start.at_m, stop.at_m, contact_m)
+            leg[0] += time
+            time = float(leg[0, -1]) + stop.dwell_s
+            pieces.append(leg)
+        if time >= duration_s or settings.at_end == "stand":
+            break
+        stops = stops[::-1]
+    table = np.concatenate(pieces, axis=1)
+    return Motion(time_s=table[0], chainage_m=table[1], speed_mps=table[2], acceleration_mps2=table[3])
+
+
+def _leg(line: Alignment, settings: RunSettings, first_m: float, last_m: float, contact_m: float) -> Floats:
+    """From standing to standing: rows of time from the start, chainage, speed and acceleration, shape (4, P).
+
+    The square of the speed that can be reached from the limits behind is the least of their squares
+    plus ``2 a`` times the distance to each; from the limits ahead likewise.
+    """
+    cells = max(2, int(np.ceil(abs(last_m - first_m) / _STEP_M)))
+    way = np.linspace(0.0, abs(last_m - first_m), cells + 1)
+    sign = 1.0 if last_m > first_m else -1.0
+    square = _limits(line, settings, first_m + sign * way, contact_m) ** 2
+    # A limit holds in the cells on both sides of its place.
+    square = np.minimum(square, np.minimum(np.append(square[1:], np.inf), np.append(np.inf, square[:-1])))
+    square[[0, -1]] = 0.0
+    up, down = 2.0 * settings.acceleration_mps2 * way, 2.0 * settings.deceleration_mps2 * way
+    square = np.minimum(square, np.minimum.accumulate(square - up) + up)
+    square = np.maximum(np.minimum(square, np.minimum.accumulate((square + down)[::-1])[::-1] - down), 0.0)
+    square[[0, -1]] = 0.0
+    # Cells of one acceleration are one piece.
+    acceleration = np.diff(square) / (2.0 * np.diff(way))
+    change = np.flatnonzero(np.abs(np.diff(acceleration)) > 1e-6) + 1
+    corner = np.concatenate([[0], change, [cells]])
+    way, speed = way[corner], np.sqrt(square[corner])
+    acceleration = np.diff(square[corner]) / (2.0 * np.diff(way))
+    lasting = 2.0 * np.diff(way) / (speed[:-1] + speed[1:])
+    return np.stack(
+        [
+            np.concatenate([[0.0], np.cumsum(lasting)]),
+            np.append(first_m + sign * way[:-1], last_m),
+            sign * speed,
+            np.append(sign * acceleration, 0.0),
+        ]
+    )
+
+
+def _limits(line: Alignment, settings: RunSettings, chainage_m: Floats, contact_m: float) -> Floats:
+    """Highest speed at places [m/s]: cruising, limits of the line, and curves."""
+    limit = np.full(chainage_m.shape, settings.cruise_mps)
+    for part in settings.limits:
+        inside = (chainage_m >= part.from_m) & (chainage_m <= part.to_m)
+        limit[inside] = np.minimum(limit[inside], part.limit_mps)
+    if settings.cant_deficiency_m is not None:
+        bend = np.abs(line.curvature_at(chainage_m))
+        cant = np.abs(line.lean_at(chainage_m)) + settings.cant_deficiency_m
+        # Equilibrium: v^2 curvature / g = cant / distance of the contact points.
+        limit = np.minimum(limit, np.sqrt(_GRAVITY * cant / (contact_m * np.maximum(bend, 1e-9))))
+    return limit

@@ -173,8 +173,8 @@ class SatelliteTable:
         self, records: KeplerRecords, satellites: Sequence[str], first: np.datetime64, last: np.datetime64
     ) -> None:
         self.satellites = tuple(satellites)
-        self._start = np.datetime64(first, "ns")
-        span = float(seconds(np.datetime64(last, "ns") - self._start))
+        self._start = first.astype("datetime64[ns]")
+        span = float(seconds(last.astype("datetime64[ns]") - self._start))
         sent = records.transmitted[np.isin(records.satellite, self.satellites)]
         changes = seconds(sent[~np.isnat(sent)] - self._start)
         grid = np.arange(0.0, span, _PIECE_S)

@@ -1,0 +1,119 @@
+"""Satellites of a real navigation file: the records that a run needs.
+
+The simulated signals follow the file's records as a receiver takes them, the newest transmitted, so
+that a change of records is a small step in the ranges (decimetres), which a receiver that changes
+with them does not see.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.errors import MismatchError
+from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.rinex import read_navigation
+from railfix.simulate.scenario import Scenario
+from railfix.timescale import gpst_minus_utc
+
+Rows = NDArray[np.intp]
+
+#: Farthest from its reference time that a record serves [s]: half of GPS' and QZSS' least fit interval, Galileo's
+#: and BeiDou's as `railfix.orbits`.
+_SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
+#: A record whose transmission time is not known or not believed was sent so long before its reference time [s].
+_SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
+_SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": ("D1", "D2")}
+
+
+def sky_of_file(scenario: Scenario, path: str) -> Navigation:
+    """Records of the scenario's constellations that serve its time.
+
+    A satellite takes part when at every moment of the run the newest record transmitted is within its
+    validity. Galileo's are the I/NAV ones. A transmission time that the file does not tell is set to
+    the constellation's usual one. Klobuchar's coefficients are GPS'; they serve all.
+
+    Raises
+    ------
+    InputFileError
+        The file is no navigation file.
+    MismatchError
+        The scenario's time is not within the file's records, or the file lacks Klobuchar's coefficients.
+    """
+    whole = read_navigation(path)
+    if "G" not in whole.klobuchar and scenario.sky.ionosphere_scale > 0.0:
+        raise MismatchError(
+            f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; take another file, "
+            "or set sky.ionosphere_scale to 0"
+        )
+    records = _believed(whole.kepler, scenario.sky.systems)
+    first = scenario.start
+    last = first + np.timedelta64(round(scenario.duration_s * 1e9), "ns")
+    kept = [rows for name in np.unique(records.satellite) if len(rows := _serving(records, str(name), first, last))]
+    if not kept:
+        span = f"{records.toe.min()} to {records.toe.max()}" if len(records) else "none of these constellations"
+        raise MismatchError(
+            f"{path}: no satellite of {scenario.sky.systems!r} has records for all of {first} to {last} GPS time, "
+            f"the scenario's; reference times in the file: {span}"
+        )
+    return Navigation(
+        kepler=_rows(records, np.concatenate(kept)),
+        glonass=no_glonass(),
+        klobuchar={"G": whole.klobuchar["G"]} if "G" in whole.klobuchar else {"G": np.zeros(8)},
+        leap_seconds=int(gpst_minus_utc(first)) if whole.leap_seconds is None else whole.leap_seconds,
+        sources=whole.sources,
+    )
+
+
+def no_glonass() -> GlonassRecords:
+    """No record of GLONASS, which is not simulated."""
+    none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
+    vectors = np.empty((0, 3))
+    whole = np.empty(0, dtype=np.int64)
+    return GlonassRecords(
+        satellite=np.empty(0, dtype="<U3"), toe=times, transmitted=times, clock_bias_s=none, relative_frequency=none,
+        position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=whole,
+        frequency_channel=whole, age_days=none,
+    )  # fmt: skip
+
+
+def _rows(records: KeplerRecords, rows: NDArray[np.intp] | NDArray[np.bool_]) -> KeplerRecords:
+    return replace(records, **{item.name: getattr(records, item.name)[rows] for item in fields(records)})
+
+
+def _believed(records: KeplerRecords, systems: str) -> KeplerRecords:
+    """Records of the signals that are simulated, with transmission times that can be true."""
+    letter = records.satellite.astype("<U1")
+    usable = np.zeros(len(records), dtype=np.bool_)
+    delay = np.where(letter == "E", records.group_delay_2_s, records.group_delay_1_s)
+    for system in systems:
+        usable |= (letter == system) & np.isin(records.message, _SIGNALS_MESSAGE[system]) & np.isfinite(delay)
+    records, letter = _rows(records, usable), letter[usable]
+    serves, before = (
+        np.array([round(table[str(s)] * 1e9) for s in letter], dtype="timedelta64[ns]")
+        for table in (_SERVES_S, _SENT_BEFORE_S)
+    )
+    early = records.toe - records.transmitted
+    told = ~np.isnat(records.transmitted) & (np.abs(early) <= serves)
+    return replace(records, transmitted=np.where(told, records.transmitted, records.toe - before))
+
+
+def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Rows:
+    """Rows of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
+    rows = np.flatnonzero(records.satellite == satellite)
+    rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
+    # Of records sent at one time the one for later.
+    rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0), True)]
+    sent = records.transmitted[rows]
+    begin, end = (int(np.searchsorted(sent, time, side="right")) for time in (first, last))
+    if begin == 0 or not len(rows):
+        return np.empty(0, dtype=np.intp)
+    rows = rows[begin - 1 : end]
+    limit = np.timedelta64(round(_SERVES_S[satellite[0]] * 1e9), "ns")
+    from_time = np.maximum(records.transmitted[rows], first)
+    to_time = np.append(records.transmitted[rows][1:], last)
+    served = (np.abs(from_time - records.toe[rows]) <= limit) & (np.abs(to_time - records.toe[rows]) <= limit)
+    return np.asarray(rows[: len(rows) if served.all() else 0])
