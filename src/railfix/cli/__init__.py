@@ -15,6 +15,7 @@ from railfix.cli.ablate import ablate as ablate_command
 from railfix.cli.cn0_curve import cn0_curve as cn0_curve_command
 from railfix.cli.demo import demo as demo_command
 from railfix.cli.error_model import error_model as error_model_command
+from railfix.cli.evaluate import evaluate as evaluate_command
 from railfix.cli.map import map_app
 from railfix.cli.plot_screens import plot_screens as plot_screens_command
 from railfix.cli.run import run as run_command
@@ -91,6 +92,7 @@ def railfix(
 app.command("run")(run_command)
 app.command("demo")(demo_command)
 app.command("ablate")(ablate_command)
+app.command("evaluate")(evaluate_command)
 app.command("cn0-curve")(cn0_curve_command)
 app.command("error-model")(error_model_command)
 app.command("plot-screens")(plot_screens_command)

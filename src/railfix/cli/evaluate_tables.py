@@ -1,0 +1,207 @@
+"""What ``railfix evaluate`` shows: tables with the conventional position beside the one on the map."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import polars as pl
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
+
+if TYPE_CHECKING:
+    from railfix.evaluate import Evaluation
+
+#: Width that the tables need; longer lines are for a wider window.
+_WIDTH: Final = 140
+_NAMES: Final = {
+    "constrained": "on the map",
+    "constrained_ok": "  of status ok",
+    "conventional": "conventional",
+}
+_GROUPINGS: Final = {
+    "configuration": "By configuration, all runs",
+    "line": "By line, all runs",
+    "environment": "By environment",
+    "speed": "By speed",
+    "satellites": "By satellites used",
+    "status": "By status",
+    "section": "By section of the line",
+}
+#: Rows of sections that are shown; the files have all.
+_MOST_SECTIONS: Final = 20
+
+
+def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: Literal["nothing", "p1"]) -> None:
+    """Figures of each run, then by groups, then where the files are."""
+    console = Console(highlight=False)
+    console.width = max(console.width, _WIDTH)
+    for run in evaluation.runs:
+        console.print(f"{run.name}: {run.configuration}; line {run.line}", markup=False, soft_wrap=True)
+        for antenna, method in run.method.items():
+            told = "differences of chainage" if method == "chainage" else "along the trajectory"
+            console.print(
+                f"  {antenna}: against {run.reference}, {told}; {run.outside[antenna]:,} epochs outside the reference",
+                markup=False,
+                soft_wrap=True,
+            )
+        for note in run.notes:
+            console.print(f"  note: {note}", markup=False, soft_wrap=True)
+    console.print(
+        "\nErrors along the line in metres, + toward its end; [..] limits of 95 % confidence".replace(
+            "95 %", f"{100 * evaluation.options.confidence:g} %"
+        ),
+        markup=False,
+    )
+    console.print(_whole(evaluation.figures.filter(pl.col("grouping") == "all")))
+    console.print("Metres run and seconds passed between two positions")
+    console.print(_intervals(evaluation.intervals))
+    if evaluation.levels is not None:
+        console.print("Protection levels")
+        console.print(_levels(evaluation.levels))
+    several = len(evaluation.runs) > 1
+    for grouping, head in _GROUPINGS.items():
+        rows = evaluation.figures.filter(pl.col("grouping") == grouping, pl.col("epochs_of") == "own")
+        if several and grouping in ("environment", "speed"):
+            rows = rows.filter(pl.col("run") == "all")
+        if rows.is_empty() or (grouping == "environment" and rows["group"].unique().to_list() == ["unknown"]):
+            continue
+        console.print(head)
+        console.print(_grouped(rows))
+        if grouping == "section" and rows.n_unique(["run", "antenna", "group"]) > _MOST_SECTIONS:
+            console.print(f"  the first {_MOST_SECTIONS}; all are in tables.csv (--out)")
+    if beside == "p1":
+        _show_p1(console)
+    for path in files.values():
+        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+
+
+def _table(*heads: str, text: int) -> Table:
+    """A table whose first columns are text and the others numbers."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="left" if number < text else "right", no_wrap=number >= text)
+    return table
+
+
+def _whole(rows: pl.DataFrame) -> Table:
+    heads = ("epochs", "rate %", "of run %", "mean", "std", "rms", "p50", "p95", "p99", "max", "at", "wrong", "/sigma")
+    table = _table("run", "antenna", "position", *heads, text=3)
+    order = {name: number for number, name in enumerate(_NAMES)}
+    rows = rows.with_columns(_order=pl.col("position").replace_strict(order))
+    for run, antenna in rows.select("run", "antenna").unique(maintain_order=True).iter_rows():
+        mine = rows.filter(pl.col("run") == run, pl.col("antenna") == antenna).sort("epochs_of", descending=True)
+        for row in mine.sort("epochs_of", "_order", descending=[True, False]).iter_rows(named=True):
+            name = _NAMES[row["position"]] + (", epochs of both" if row["epochs_of"] == "common" else "")
+            table.add_row(
+                run,
+                antenna,
+                name,
+                f"{row['observed'] if row['epochs_of'] == 'own' else row['positions']:,}",
+                _percent(row["rate"]) + _limits(row, "rate", 100.0, 1),
+                _percent(row["rate_of_run"]),
+                _metres(row["mean_m"], sign="+") + _limits(row, "mean", 1.0, 2),
+                *(_metres(row[name]) for name in ("std_m", "rms_m", "p50_m")),
+                _metres(row["p95_m"]) + _limits(row, "p95", 1.0, 1),
+                *(_metres(row[name]) for name in ("p99_m", "max_m")),
+                "-" if row["max_at_chainage_m"] is None else f"{row['max_at_chainage_m']:.0f} m",
+                f"{row['wrong_places']:,}",
+                _metres(row["normalised_rms"]),
+            )
+    return table
+
+
+def _grouped(rows: pl.DataFrame) -> Table:
+    """Constrained and conventional of each group in one row."""
+    heads = ("epochs", "rate %", "mean", "std", "p50", "p95", "max")
+    table = _table("run", "group", "antenna", *heads, *(f"conv.\n{head}" for head in heads[1:]), text=3)
+    keys = ["run", "configuration", "line", "antenna", "group"]
+    left = rows.filter(pl.col("position") == "constrained")
+    right = rows.filter(pl.col("position") == "conventional")
+    both = left.join(right, on=keys, how="left", suffix="_conventional", maintain_order="left")
+    # one antenna beside both together tells nothing new of the groups
+    if "all" in both["antenna"]:
+        both = both.filter(pl.col("antenna") == "all")
+    if rows["grouping"][0] == "section":
+        both = both.head(_MOST_SECTIONS)
+    for row in both.iter_rows(named=True):
+        cells = [f"{row['observed']:,}"]
+        for suffix in ("", "_conventional"):
+            cells.append(_percent(row[f"rate{suffix}"]))
+            cells.append(_metres(row[f"mean_m{suffix}"], sign="+"))
+            cells += [_metres(row[f"{name}{suffix}"]) for name in ("std_m", "p50_m", "p95_m", "max_m")]
+        table.add_row(row["run"], row["group"], row["antenna"], *cells)
+    return table
+
+
+def _intervals(rows: pl.DataFrame) -> Table:
+    heads = ("intervals", "standing", "p50 m", "p95 m", "largest m", "at", "p95 s", "longest s")
+    table = _table("run", "antenna", "position", *heads, text=3)
+    for row in rows.iter_rows(named=True):
+        table.add_row(
+            row["run"] if row["run"] != "all" else row["configuration"],
+            row["antenna"],
+            _NAMES[row["position"]].strip(),
+            f"{row['intervals']:,}",
+            f"{row['standing']:,}",
+            *(_metres(row[name]) for name in ("interval_p50_m", "interval_p95_m", "interval_max_m")),
+            "-" if row["interval_max_chainage_m"] is None else f"{row['interval_max_chainage_m']:.0f} m",
+            *(_metres(row[name]) for name in ("gap_p95_s", "gap_max_s")),
+        )
+    return table
+
+
+def _levels(rows: pl.DataFrame) -> Table:
+    heads = ("positions", "available %", "p50 m", "p95 m", "errors", "over level")
+    table = _table("run", "antenna", "position", "level", *heads, text=4)
+    for row in rows.iter_rows(named=True):
+        table.add_row(
+            row["run"],
+            row["antenna"],
+            _NAMES[row["position"]].strip(),
+            row["level"],
+            f"{row['positions']:,}",
+            _percent(row["availability"]),
+            _metres(row["level_p50_m"]),
+            _metres(row["level_p95_m"]),
+            f"{row['errors']:,}",
+            f"{row['over_level']:,}",
+        )
+    return table
+
+
+def _show_p1(console: Console) -> None:
+    """The figures of the source paper."""
+    console.print("The source paper, test line (table 4)")
+    table = _table("configuration", "rate %", "mean", "std", text=1)
+    for row in P1_TABLE_4:
+        table.add_row(
+            str(row["configuration"]), _percent(row["rate"]), _metres(row["mean_m"], sign="+"), _metres(row["std_m"])
+        )
+    console.print(table)
+    console.print(
+        "The source paper, commercial lines with MSAS (5): rate of the section without tunnels (figure 10), "
+        "largest error of all (figure 11)"
+    )
+    table = _table("position", "rate %", "max", text=1)
+    for row in P1_COMMERCIAL:
+        table.add_row(str(row["position"]), _percent(row["rate"]), _metres(row["max_m"]))
+    console.print(table)
+
+
+def _percent(value: Any) -> str:
+    return "-" if value is None else f"{100 * value:.2f}"
+
+
+def _metres(value: Any, *, sign: str = "") -> str:
+    return "-" if value is None else f"{value:{sign}.2f}"
+
+
+def _limits(row: dict[str, Any], name: str, factor: float, decimals: int) -> str:
+    """`` [low..high]``, nothing where there are none."""
+    unit = "" if name == "rate" else "_m"
+    low, high = row[f"{name}_low{unit}"], row[f"{name}_high{unit}"]
+    return "" if low is None else f" [{factor * low:.{decimals}f}..{factor * high:.{decimals}f}]"
