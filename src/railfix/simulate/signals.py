@@ -1,4 +1,4 @@
-"""Observations of the two receivers: ranges, clocks, delays, noise."""
+"""Observations of the two receivers: ranges, clocks, delays, errors, noise."""
 
 from __future__ import annotations
 
@@ -10,25 +10,27 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.epochs import ObservationHeader, Observations
 from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.navigation import KeplerRecords, Navigation
+from railfix.navigation import Navigation
 from railfix.simulate.alignment import Alignment, made_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.constellation import made_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
-from railfix.simulate.disturbance import Geometry
-from railfix.simulate.motion import Motion, shuttle
-from railfix.simulate.satellites import links, newest_record
+from railfix.simulate.disturbance import Disturbances, Geometry
+from railfix.simulate.environment import Environment
+from railfix.simulate.errors.common import CommonErrors
+from railfix.simulate.errors.processes import ClockWalk
+from railfix.simulate.motion import Motion, Sway, made_motion
+from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
+from railfix.simulate.satellites import links
 from railfix.simulate.scenario import ANTENNAS, Scenario
 from railfix.timescale import seconds
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.datetime64]
 
-#: Signals of each constellation, the first one first.
-SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
 #: C/N0 at elevation el [dB-Hz]: a + b sin(el); the second signal is weaker.
 CN0_HORIZON_DBHZ: Final = 34.0
 CN0_RISE_DBHZ: Final = 16.0
@@ -41,6 +43,11 @@ CHUNK_EPOCHS: Final = 2000
 _LOOK_S: Final = 60.0
 #: Half the interval of the difference that gives range rates [s].
 _RATE_S: Final = 0.005
+#: C/N0 that the sigmas of the receiver are given for, and above which it grows no quieter [dB-Hz].
+_SIGMA_AT_DBHZ: Final = 45.0
+_BEST_DBHZ: Final = 50.0
+#: Stream of random numbers of the clocks' wander.
+_WALK: Final = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +65,9 @@ class Piece:
         Standard deviation of the noise in the codes.
     clean_code_m : ndarray, shape (T, M) [m]
         The codes without noise and without disturbances.
+    error_m : ndarray, shape (T, M) [m]
+        What of `clean_code_m` is there by `Scenario.errors` and a receiver does not correct: satellites,
+        atmosphere, faults and inter-system offsets.
     """
 
     observations: Observations
@@ -65,6 +75,7 @@ class Piece:
     clock_m: Floats
     code_sigma_m: Floats
     clean_code_m: Floats
+    error_m: Floats
 
 
 class Simulation:
@@ -80,14 +91,23 @@ class Simulation:
     line : Alignment
     motion : Motion
         Of the vehicle's middle.
+    sway : Sway
+        Of the vehicle's body.
+    environment : Environment
+        What stands along the line.
+    disturbances : tuple of Disturbances
+        The environment where there is any, then the scenario's `multipath`.
     navigation : Navigation
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.line: Alignment = made_alignment(scenario.line)
-        margin = scenario.run.end_margin_m
-        self.motion: Motion = shuttle(margin, self.line.length_m - margin, scenario.duration_s, scenario.run)
+        self.motion: Motion = made_motion(self.line, scenario)
+        self.sway: Sway = Sway.of(scenario)
+        self.environment = Environment(scenario.environment, line_length_m=self.line.length_m, seed=scenario.place_seed)
+        place = () if scenario.environment.empty else (self.environment,)
+        self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
         self.navigation: Navigation = made_navigation(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Times:
@@ -102,6 +122,9 @@ class Simulation:
         if antenna != ANTENNAS[0] and settings.clocks == "separate":
             bias, drift = -0.61 * bias, 0.83 * drift
         value = bias + drift * tag_s
+        walk = self._walk(antenna)
+        if walk is not None:
+            value = value + walk.at(np.ravel(tag_s))[:, 0].reshape(np.shape(tag_s)) / SPEED_OF_LIGHT
         return value - np.rint(value * 1e3) * 1e-3 if settings.clock_steps == "millisecond" else value
 
     def clock_drift(self, antenna: str) -> float:
@@ -109,11 +132,70 @@ class Simulation:
         settings = self.scenario.receiver
         return settings.clock_drift * (0.83 if antenna != ANTENNAS[0] and settings.clocks == "separate" else 1.0)
 
+    def clock_rate_mps(self, antenna: str, tag_s: Floats) -> Floats:
+        """Rate of a receiver's clock at tags, its steps left out, shape (T,) [m/s]."""
+        even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self.clock_drift(antenna))
+        walk = self._walk(antenna)
+        return even if walk is None else even + walk.rate(tag_s)[:, 0]
+
+    def _walk(self, antenna: str) -> ClockWalk | None:
+        """Wander of a receiver's clock, the same one for both where they share it."""
+        return self._walks[0 if self.scenario.receiver.clocks == "common" else ANTENNAS.index(antenna)]
+
+    @cached_property
+    def _walks(self) -> tuple[ClockWalk | None, ...]:
+        scenario, walk = self.scenario, self.scenario.errors.clock
+        if walk.walk_m_per_sqrt_s == 0.0 and walk.frequency_walk_mps_per_sqrt_s == 0.0:
+            return (None,) * len(ANTENNAS)
+        return tuple(
+            ClockWalk(
+                (scenario.seed, _WALK, k),
+                walk=walk.walk_m_per_sqrt_s,
+                frequency_walk=walk.frequency_walk_mps_per_sqrt_s,
+                interval_s=self.interval_s,
+                duration_s=scenario.duration_s,
+            )
+            for k in range(len(ANTENNAS))
+        )
+
+    @property
+    def interval_s(self) -> float:
+        """Time between two epochs [s]."""
+        return float(self.scenario.interval / np.timedelta64(1, "s"))
+
+    @cached_property
+    def satellites(self) -> tuple[str, ...]:
+        """Satellites of `channels`, in the order of their names."""
+        return tuple(sorted({name for name, _ in self.channels}))
+
+    @cached_property
+    def common_errors(self) -> CommonErrors:
+        """Errors of satellites and atmosphere."""
+        scenario = self.scenario
+        return CommonErrors(
+            scenario.errors,
+            seed=scenario.seed,
+            start=scenario.start,
+            duration_s=scenario.duration_s,
+            origin_deg=self._origin_deg,
+            records=self.navigation.kepler,
+            satellites=self.satellites,
+        )
+
+    @cached_property
+    def _origin_deg(self) -> tuple[float, float]:
+        latitude, longitude, _ = geodetic_from_ecef(self.line.at(np.zeros(1)))
+        return float(latitude[0]), float(longitude[0])
+
     def truth(self, antenna: str, seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
         """True place of an antenna at seconds after the start, and the train's speed [m/s]."""
+        return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
+
+    def body_truth(self, offset_m: tuple[float, float, float], seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
+        """True place of a point of the body, given as the antennas are, at seconds after the start, and the speed."""
         middle, speed = self.motion.at(seconds_s)
-        vehicle = self.scenario.vehicle
-        return antenna_truth(self.line, vehicle, getattr(vehicle, antenna), middle), speed
+        roll = self.sway.roll_rad(seconds_s, speed)
+        return antenna_truth(self.line, self.scenario.vehicle, offset_m, middle, roll), speed
 
     @cached_property
     def channels(self) -> tuple[tuple[str, str], ...]:
@@ -140,7 +222,7 @@ class Simulation:
             receiver="SIMULATED",
             antenna="SIMULATED",
             approximate_ecef_m=np.round(place, -2),
-            interval_s=float(self.scenario.interval / np.timedelta64(1, "s")),
+            interval_s=self.interval_s,
             leap_seconds=self.navigation.leap_seconds,
             signals={
                 s: tuple(sorted({g for name, g in self.channels if name[0] == s}))
@@ -156,15 +238,9 @@ class Simulation:
         antenna : {"front", "rear"}
         chunk_epochs : int
         """
-        rng = np.random.default_rng([self.scenario.seed, 2, ANTENNAS.index(antenna)])
-        satellites, column = np.unique([name for name, _ in self.channels], return_inverse=True)
-        # Whole cycles that the phases are off, one number a channel.
-        ambiguity = rng.integers(-2_000_000, 2_000_000, len(self.channels)).astype(np.float64)
-        header = self.header(antenna)
+        receiver = Receiver(self, antenna)
         for first in range(0, self.scenario.epochs, chunk_epochs):
-            time = self.time(first, min(first + chunk_epochs, self.scenario.epochs))
-            noise = rng.standard_normal((len(time), len(self.channels), 4))
-            yield _piece(self, antenna, time, satellites, column, ambiguity, noise, header)
+            yield _piece(self, receiver, self.time(first, min(first + chunk_epochs, self.scenario.epochs)))
 
     def observations(self, antenna: str) -> Iterator[Observations]:
         """Observations of one antenna, piece by piece."""
@@ -176,12 +252,15 @@ class _Instant:
     """Clean quantities of S satellites at T instants: shapes (T, S).
 
     `path_m` is the distance with the troposphere, less the satellite clock; `ionosphere_m` is on L1.
+    The errors are parts of them.
     """
 
     elevation_deg: Floats
     azimuth_deg: Floats
     path_m: Floats
     ionosphere_m: Floats
+    path_error_m: Floats
+    ionosphere_error_m: Floats
 
 
 def _instant(
@@ -206,11 +285,21 @@ def _instant(
         frequency_hz=FREQUENCY_L1,
     )
     distance = np.stack([link.range_m - SPEED_OF_LIGHT * link.clock_s for link in found], axis=1)
+    errors = simulation.common_errors
+    path_error, ionosphere_error = np.zeros((2, *distance.shape))
+    if errors.active:
+        when = seconds(time - simulation.scenario.start) - late_s
+        sight = sky - antenna_ecef_m[:, None, :]
+        sight /= np.linalg.norm(sight, axis=-1, keepdims=True)
+        path_error = errors.path_m(when, sight, raised)
+        ionosphere_error = errors.ionosphere_m(when, latitude, longitude, raised, azimuth)
     return _Instant(
         elevation_deg=elevation,
         azimuth_deg=azimuth,
-        path_m=distance + scale.troposphere_scale * troposphere,
-        ionosphere_m=scale.ionosphere_scale * ionosphere,
+        path_m=distance + scale.troposphere_scale * troposphere + path_error,
+        ionosphere_m=scale.ionosphere_scale * ionosphere + ionosphere_error,
+        path_error_m=path_error,
+        ionosphere_error_m=ionosphere_error,
     )
 
 
@@ -245,79 +334,72 @@ def _geometry(
     return geometry, now, path_rate, (after.ionosphere_m - before.ionosphere_m) / (2.0 * _RATE_S)
 
 
-def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Times) -> Floats:
-    """What a signal's code is late by against the broadcast clock, shape (T,) [s].
-
-    GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2). Galileo I/NAV: BGD E5b/E1
-    likewise (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I, which the clock refers to.
-    """
-    row = newest_record(records, satellite, time)
-    letter = satellite[0]
-    frequency = CARRIER_FREQUENCY[letter]
-    if letter == "C":
-        return np.where(signal[0] == "2", records.group_delay_1_s[row], 0.0)
-    delay = records.group_delay_2_s if letter == "E" else records.group_delay_1_s
-    return np.asarray(delay[row] * (frequency["1"] / frequency[signal[0]]) ** 2)
-
-
-def _piece(
-    simulation: Simulation,
-    antenna: str,
-    time: Times,
-    satellites: NDArray[np.str_],
-    column: NDArray[np.intp],
-    ambiguity: Floats,
-    noise: Floats,
-    header: ObservationHeader,
-) -> Piece:
-    scenario, receiver = simulation.scenario, simulation.scenario.receiver
-    by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, antenna, time, satellites)
-    names, signals = (np.array(part) for part in zip(*simulation.channels, strict=True))
+def _piece(simulation: Simulation, receiver: Receiver, time: Times) -> Piece:
+    """The next epochs of a receiver."""
+    scenario, settings = simulation.scenario, simulation.scenario.receiver
+    by_satellite, now, path_rate, ionosphere_rate = _geometry(
+        simulation, receiver.antenna, time, np.array(simulation.satellites)
+    )
+    column, scale, wavelength = receiver.column, receiver.scale, receiver.wavelength_m
     geometry = replace(
         by_satellite,
-        satellite=names,
-        signal=signals,
+        satellite=receiver.names,
+        signal=receiver.signals,
         elevation_deg=now.elevation_deg[:, column],
         azimuth_deg=now.azimuth_deg[:, column],
     )
-    frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in simulation.channels])
-    wavelength = SPEED_OF_LIGHT / frequency
-    scale = (FREQUENCY_L1 / frequency) ** 2
+    tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
-    clock = SPEED_OF_LIGHT * simulation.clock_s(antenna, seconds(time - scenario.start))
-    path = now.path_m[:, column] + clock[:, None]
+    clock = SPEED_OF_LIGHT * simulation.clock_s(receiver.antenna, tags)
+    # What a channel's code and phase are longer by alike, and its rate.
+    fault, fault_rate = simulation.common_errors.fault_m(tags, receiver.names.tolist())
+    extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
+    extra_rate = fault_rate + receiver.offset_drift_mps
+    path = now.path_m[:, column] + clock[:, None] + extra
     delay = SPEED_OF_LIGHT * np.stack(
         [group_delay_s(simulation.navigation.kepler, n, g, time) for n, g in simulation.channels], axis=1
     )
-    code = path + ionosphere + delay
-    drift = SPEED_OF_LIGHT * simulation.clock_drift(antenna)
+    code = path + ionosphere + delay + receiver.group_delay_error_m
+    error = now.path_error_m[:, column] + scale * now.ionosphere_error_m[:, column]
+    drift = simulation.clock_rate_mps(receiver.antenna, tags)[:, None] + extra_rate
     doppler = -(path_rate[:, column] - scale * ionosphere_rate[:, column] + drift) / wavelength
+    noise = receiver.white(len(time))
     sine = np.sin(np.radians(np.maximum(geometry.elevation_deg, 1.0)))
-    second = np.array([g != SIGNALS[n[0]][0] for n, g in simulation.channels])
-    cn0 = CN0_HORIZON_DBHZ + CN0_RISE_DBHZ * sine + CN0_SECOND_DB * second
-    cn0 = cn0 + receiver.cn0_sigma_dbhz * noise[:, :, 3]
+    cn0 = CN0_HORIZON_DBHZ + CN0_RISE_DBHZ * sine + CN0_SECOND_DB * receiver.second
+    cn0 = cn0 + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
     added_code, added_phase, added_doppler = np.zeros((3, *code.shape))
-    for source in scenario.multipath:
-        extra = source(geometry)
-        added_code, added_phase = added_code + extra.code_m, added_phase + extra.phase_m
-        added_doppler, cn0 = added_doppler + extra.doppler_hz, cn0 + extra.cn0_db
+    for source in simulation.disturbances:
+        more = source(geometry)
+        added_code, added_phase = added_code + more.code_m, added_phase + more.phase_m
+        added_doppler, cn0 = added_doppler + more.doppler_hz, cn0 + more.cn0_db
     cn0 = np.round(cn0 / CN0_STEP_DBHZ) * CN0_STEP_DBHZ
-    sigma = receiver.code_sigma_m * 10.0 ** ((45.0 - np.minimum(cn0, 50.0)) / 20.0) / sine
-    lost = ~_tracked(now.elevation_deg, scenario)[:, column] | np.isnan(added_code)
-    phase = path - ionosphere + added_phase + receiver.phase_sigma_m * noise[:, :, 1]
+    weak = 10.0 ** ((_SIGMA_AT_DBHZ - np.minimum(cn0, _BEST_DBHZ)) / 20.0)
+    sigma = settings.code_sigma_m * weak / sine
+    grown = weak if scenario.errors.noise.weak_signals == "all" else 1.0
+    bad = ~_tracked(now.elevation_deg, scenario)[:, column] | np.isnan(added_code) | receiver.tracking.too_weak(cn0)
+    tracked = receiver.tracking.follow(bad)
+    phase = path - ionosphere + added_phase + settings.phase_sigma_m * grown * noise[:, :, 1]
+    doppler = doppler + added_doppler + settings.doppler_sigma_hz * grown * noise[:, :, 2]
     observations = Observations(
         time=time,
-        satellite=names,
-        signal=signals,
-        code_m=np.where(lost, np.nan, code + added_code + sigma * noise[:, :, 0]),
-        phase_cycles=np.where(lost, np.nan, phase / wavelength + ambiguity),
-        doppler_hz=np.where(lost, np.nan, doppler + added_doppler + receiver.doppler_sigma_hz * noise[:, :, 2]),
-        cn0_dbhz=np.where(lost, np.nan, cn0),
-        loss_of_lock=np.zeros(code.shape, dtype=np.uint8),
+        satellite=receiver.names,
+        signal=receiver.signals,
+        code_m=np.where(tracked.lost, np.nan, code + added_code + sigma * receiver.carried.code(noise[:, :, 0])),
+        phase_cycles=np.where(tracked.lost, np.nan, phase / wavelength + (receiver.ambiguity + tracked.slip_cycles)),
+        doppler_hz=np.where(tracked.lost, np.nan, doppler),
+        cn0_dbhz=np.where(tracked.lost, np.nan, cn0),
+        loss_of_lock=tracked.loss_of_lock,
         break_before=np.zeros(len(time), dtype=np.bool_),
-        header=header,
+        header=receiver.header,
     )
-    return Piece(observations=observations, geometry=geometry, clock_m=clock, code_sigma_m=sigma, clean_code_m=code)
+    return Piece(
+        observations=observations,
+        geometry=geometry,
+        clock_m=clock,
+        code_sigma_m=sigma,
+        clean_code_m=code,
+        error_m=error + extra + receiver.group_delay_error_m,
+    )
 
 
 def _tracked(elevation_deg: Floats, scenario: Scenario) -> NDArray[np.bool_]:

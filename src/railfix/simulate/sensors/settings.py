@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from railfix.errors import SettingsError
 from railfix.simulate.setting_checks import (
@@ -101,7 +102,7 @@ class TachometerSettings:
             raise SettingsError(
                 f"TachometerSettings.diameter_error_m must be small beside the diameter, got {self.diameter_error_m}"
             )
-        for before, after in zip(self.slips[:-1], self.slips[1:], strict=True):
+        for before, after in pairwise(self.slips):
             if after.start_s < before.end_s:
                 raise SettingsError(
                     f"TachometerSettings.slips must be in order and apart, got one from {after.start_s} s "

@@ -1,0 +1,138 @@
+"""Pulses of a tachometer: the times at which a wheel of the vehicle has turned by another part of a turn."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from railfix.simulate.sensors.settings import DrawnSlips, SlipInterval, TachometerSettings
+
+if TYPE_CHECKING:
+    from railfix.simulate.motion import Motion
+    from railfix.simulate.signals import Simulation
+
+Floats = NDArray[np.float64]
+
+#: Spacing of the instants between which the wheel is taken to accelerate evenly [s].
+_STEP_S: Final = 0.01
+#: Spacing at which accelerations and brakings are looked for [s], and what counts as one [m/s^2].
+_LOOK_S: Final = 0.1
+_HARD_MPS2: Final = 0.05
+#: Streams of random numbers.
+_WHEEL, _SLIPS = 20, 21
+
+
+def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
+    """Slips and slides of the run, given and drawn, in order; a drawn one that meets another is left out."""
+    scenario = simulation.scenario
+    rng = np.random.default_rng([scenario.seed, _SLIPS])
+    slips = list(settings.slips)
+    for new in _drawn(simulation.motion, scenario.duration_s, settings.drawn_slips, rng):
+        if all(new.start_s >= old.end_s or old.start_s >= new.end_s for old in slips):
+            slips.append(new)
+    return sorted(slips, key=lambda slip: slip.start_s)
+
+
+def _drawn(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.Generator) -> list[SlipInterval]:
+    edges = np.arange(0.0, duration_s + _LOOK_S, _LOOK_S)
+    speed = np.abs(motion.at(edges)[1])
+    kind = np.sign(np.where(np.abs(np.diff(speed)) > _HARD_MPS2 * _LOOK_S, np.diff(speed), 0.0))
+    change = np.flatnonzero(np.diff(kind, prepend=0.0, append=0.0))
+    found = []
+    for first, last in pairwise(change.tolist()):
+        if kind[first] == 0.0:
+            continue
+        # The numbers are drawn whether they are used or not: one phase's do not move another's.
+        chance, size, lasting, place = rng.uniform(size=4)
+        if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
+            continue
+        room = float(edges[last] - edges[first])
+        length = min(drawn.duration_s * (0.2 + 0.8 * float(lasting)), room)
+        start = float(edges[first]) + float(place) * (room - length)
+        ratio = float(kind[first]) * drawn.ratio * (0.2 + 0.8 * float(size))
+        found.append(SlipInterval(start_s=start, end_s=start + length, ratio=ratio))
+    return found
+
+
+def slip_ratio(slips: list[SlipInterval], time_s: Floats) -> Floats:
+    """Wheel speed over train speed, less 1, at times [s]."""
+    ratio = np.zeros(np.shape(time_s))
+    for slip in slips:
+        part = (time_s - slip.start_s) / (slip.end_s - slip.start_s)
+        ratio += np.where((part > 0.0) & (part < 1.0), slip.ratio * np.sin(np.pi * part), 0.0)
+    return ratio
+
+
+def pulse_times_s(
+    motion: Motion, settings: TachometerSettings, slips: list[SlipInterval], duration_s: float, phase: float
+) -> Floats:
+    """Exact times of the pulses [s after the start].
+
+    Parameters
+    ----------
+    motion : Motion
+    settings : TachometerSettings
+    slips : list of SlipInterval
+    duration_s : float
+    phase : float
+        Part of a pulse's distance that the wheel turns before the first one, in [0, 1).
+
+    Returns
+    -------
+    ndarray, shape (P,) [s]
+    """
+    node = np.append(np.arange(0.0, duration_s, _STEP_S), duration_s)
+    chainage, speed = motion.at(node)
+    step = np.diff(node)
+    surplus = np.abs(speed) * slip_ratio(slips, node)
+    rolled = np.abs(np.diff(chainage)) + (surplus[1:] + surplus[:-1]) / 2.0 * step
+    turned = np.concatenate([[0.0], np.cumsum(np.maximum(rolled, 0.0))])
+    apart = np.pi * (settings.wheel_diameter_m + settings.diameter_error_m) / settings.pulses_per_turn
+    target = apart * np.arange(phase, turned[-1] / apart, 1.0)
+    cell = np.clip(np.searchsorted(turned, target, side="left") - 1, 0, len(step) - 1)
+    # Even acceleration in each cell: s = v t + a t^2 / 2 with the distance of the whole cell kept.
+    start = (np.abs(speed) + surplus)[cell]
+    bend = 2.0 * (turned[cell + 1] - turned[cell] - start * step[cell]) / step[cell] ** 2
+    ahead = target - turned[cell]
+    root = np.sqrt(np.maximum(start**2 + 2.0 * bend * ahead, 0.0))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        since = np.where(ahead > 0.0, 2.0 * ahead / (start + root), 0.0)
+    return np.asarray(node[cell] + np.minimum(since, step[cell]))
+
+
+def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
+    """Pulses as the tachometer gives them, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    scenario = simulation.scenario
+    rng = np.random.default_rng([scenario.seed, _WHEEL])
+    slips = wheel_slips(simulation, settings)
+    time = pulse_times_s(simulation.motion, settings, slips, scenario.duration_s, float(rng.uniform()))
+    speed = simulation.motion.at(time)[1]
+    turning = np.abs(speed) * (1.0 + slip_ratio(slips, time))
+    kept = turning >= settings.lowest_mps
+    time, direction = time[kept], np.where(speed[kept] < 0.0, -1, 1).astype(np.int8)
+    if settings.jitter_s > 0.0:
+        time = time + settings.jitter_s * rng.standard_normal(len(time))
+        order = np.argsort(time, kind="stable")
+        time, direction = time[order], direction[order]
+    if settings.resolution_s > 0.0:
+        time = np.rint(time / settings.resolution_s) * settings.resolution_s
+    tag = scenario.start + np.round(time * 1e9).astype("timedelta64[ns]")
+    return pl.DataFrame(
+        {"time_gpst": tag, "pulse": np.arange(1, len(time) + 1, dtype=np.int64), "direction": direction}
+    )
+
+
+def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
+    """Truth of the wheel's slips and slides, see `railfix.simulate.sensors.tables.COLUMNS`."""
+    scenario = simulation.scenario
+    slips = wheel_slips(simulation, settings)
+    start, end = (
+        scenario.start + np.round(np.array(part, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
+        for part in ([slip.start_s for slip in slips], [slip.end_s for slip in slips])
+    )
+    ratio = np.array([slip.ratio for slip in slips], dtype=np.float64)
+    return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
