@@ -110,9 +110,12 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
     place = observations.header.approximate_ecef_m
     trajectory = line_between(*two_points(place, beside_m))
     config = parse_config(
-        {"screens": ["elevation", "raim"], "elevation": {"mask_deg": 15.0}, "map_plan_sigma_m": map_sigma_m}
-        if map_sigma_m
-        else {"screens": ["elevation", "raim"], "elevation": {"mask_deg": 15.0}}
+        {
+            "screens": ["elevation", "raim"],
+            "elevation": {"mask_deg": 15.0},
+            "map_plan_sigma_m": map_sigma_m,
+            "raim_protection": "on",
+        }
     )
     processor = EpochProcessor(config, read_navigation([folder / station.navigation]), {"front": trajectory})
     result = processor.process({"front": observations})[0].antennas["front"]

@@ -43,6 +43,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "carrying",
         "placing",
         "fault_free",
+        "protecting",
         "pipeline",
     ),
     6: ("range_errors", "simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),

@@ -27,6 +27,7 @@ TIGHT: dict[str, object] = {
     "raim": {"false_alarm": 0.2},
     "antenna_spacing": {"limit_m": 1.0},
     "antenna_pair": {"limit_m": 3.0},
+    "raim_protection": "on",
 }
 
 
@@ -65,7 +66,7 @@ def test_raim_of_each_epoch(result: Result) -> None:
 
 def test_protection_level_is_known_where_no_fault_is_left(result: Result) -> None:
     positions = positions_table(result)
-    level, sigma = column(positions, "protection_level_m"), column(positions, "along_sigma_m")
+    level, sigma = column(positions, "raim_level_m"), column(positions, "along_sigma_m")
     faulty = positions["raim_outcome"].cast(pl.String).is_in(["inseparable", "unresolved"]).to_numpy()
     assert faulty.any()
     np.testing.assert_array_equal(np.isnan(level), faulty)
@@ -93,7 +94,7 @@ def test_without_raim_nothing_is_said() -> None:
     off = result_of({"screens": ["elevation"]})
     positions, observations = positions_table(off), observations_table(off)
     assert set(positions["raim_outcome"].cast(pl.String)) == {Outcome.UNTESTABLE.name.lower()}
-    assert positions["protection_level_m"].null_count() == positions.height
+    assert positions["raim_level_m"].null_count() == positions.height
     assert positions["metric_antenna_spacing_m"].null_count() == positions.height
     assert all(observations[name].null_count() == observations.height for name in METRICS)
 

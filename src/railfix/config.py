@@ -40,7 +40,8 @@ from railfix.carrier import ContinuityLimits, PhaseLimits, SlipLimits, Smoothing
 from railfix.clock_offsets import ClockOffsetLimits
 from railfix.constrained import ConstrainedLimits
 from railfix.errors import InputFileError, SettingsError
-from railfix.measurement import CodeNoise
+from railfix.measurement import CodeNoise, NominalErrors
+from railfix.protection import RiskBudget
 from railfix.raim import RaimLimits
 from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
 from railfix.section import SectionLimits
@@ -63,6 +64,8 @@ SCREENS: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenn
 #: Settings that are the limits of a room.
 ROOMS: Final = (
     "noise",
+    "nominal",
+    "risk",
     "elevation",
     "cn0",
     "doppler",
@@ -142,9 +145,23 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
+    sbas : {"off", "on"}
+        Corrections of an SBAS in place of the models; satellites without a valid one are refused. Needs a log
+        of its messages.
+    error_model : path or None
+        Errors by direction and C/N0 (``railfix error-model``): their overbounds take the place of `noise` as weights,
+        and the protection level rests on them. Without it the level rests on `noise` times the scale estimated
+        so far, which promises nothing about tails.
+    nominal : NominalErrors
+        What a model of local errors alone leaves out, where no SBAS tells it.
+    protection : {"on", "off"}
+        Whether positions get a protection level along the line with its parts (`railfix.protection`).
+    risk : RiskBudget
+        Integrity risk per hour, its shares, and the probabilities of faults that the level stands for.
+    alarm_limit_m : float
+        Protection level from which on a position is not available. P4 takes a car length, 20 m.
     raim_protection : {"on", "off"}
-        Whether positions get RAIM's protection level along the line: 5 us an epoch in a batch, 0.3 ms for an
-        epoch by itself.
+        Whether positions also get P4's level: the largest slope times the bias that the test misses.
     noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
@@ -184,7 +201,13 @@ class Config(BaseModel):
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
-    raim_protection: Literal["on", "off"] = "on"
+    sbas: Literal["off", "on"] = "off"
+    error_model: Path | None = None
+    nominal: NominalErrors = Field(default_factory=NominalErrors)
+    protection: Literal["on", "off"] = "on"
+    risk: RiskBudget = Field(default_factory=RiskBudget)
+    alarm_limit_m: float = Field(default=20.0, gt=0)
+    raim_protection: Literal["on", "off"] = "off"
     carrier: Literal["off", "smoothed", "float"] = "off"
     phase_sigma_m: float = Field(default=0.01, gt=0)
     slips: SlipLimits = Field(default_factory=SlipLimits)

@@ -21,6 +21,8 @@ Masks = NDArray[np.bool_]
 
 #: A pseudorange lies between these [m]: nearest satellite less a receiver clock 33 ms off, GEO plus the same.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
+#: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
+_SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +69,42 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
         cn0 = np.where(np.isnan(cn0_dbhz), noise.cn0_reference_dbhz, np.minimum(cn0_dbhz, noise.cn0_cap_dbhz))
         sigma = sigma * 10.0 ** ((noise.cn0_reference_dbhz - cn0) / 20.0)
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class NominalErrors:
+    """Standard deviations of what a local error model does not cover, where no SBAS tells them: assumptions.
+
+    ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
+    (A.4.4.10.4 and A.4.2.4).
+
+    Attributes
+    ----------
+    satellite_sigma_m : float
+        Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions
+        promise 2 m and 95 % of the time less.
+    ionosphere_sigma_m : float
+        Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
+    troposphere_sigma_m : float
+        Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4: 0.12 m).
+    """
+
+    satellite_sigma_m: float = 0.8
+    ionosphere_sigma_m: float = 1.0
+    troposphere_sigma_m: float = 0.12
+
+    def __post_init__(self) -> None:
+        for name in ("satellite_sigma_m", "ionosphere_sigma_m", "troposphere_sigma_m"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+    def sigma_m(self, elevation_deg: Floats) -> Floats:
+        """Standard deviation at elevations, any shape [m]; NaN below the horizon."""
+        sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
+        thin_shell = 1.0 / np.sqrt(1.0 - (_SHELL * np.sqrt(1.0 - sine**2)) ** 2)
+        wet = 1.001 / np.sqrt(0.002001 + sine**2)
+        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell) ** 2)
+        return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
 
 def channel_order(

@@ -24,6 +24,7 @@ from railfix.cn0_curve import read_cn0_curve
 from railfix.config import Config
 from railfix.constants import CLOCK_GROUP
 from railfix.epochs import Observations
+from railfix.error_model import read_error_model
 from railfix.fault_free import fault_free, protected
 from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
@@ -31,10 +32,11 @@ from railfix.noise_scale import noise_scale, own_sigma_m
 from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
 from railfix.placing import Place, place_on_line, redundancy_of
 from railfix.preparation import Prepared, prepare
+from railfix.protecting import protect, with_coordinates
 from railfix.raim import Outcome
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.refusals import alone_on_their_clocks, satellites_refused, whole_reason
-from railfix.results import AntennaResult, AntennaState, Floats, Raim, Result, State
+from railfix.results import AntennaResult, AntennaState, Floats, Protection, Raim, Result, State
 from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
 from railfix.section import SearchIndex
 from railfix.spp import SinglePoint, single_point
@@ -69,6 +71,7 @@ class EpochProcessor:
         }
         self._channels = ChannelBook(config, navigation)
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
+        self._error_model = None if config.error_model is None else read_error_model(config.error_model)
         self._cn0_curve = None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve)
         self._klobuchar, notes = self._ionosphere()
         self.notes = (*notes, *self._what_screens_lack())
@@ -145,7 +148,9 @@ class EpochProcessor:
     def _screened(self, name: str, obs: Observations, state: AntennaState) -> tuple[Prepared, AntennaState]:
         """Corrected ranges of one antenna, and what the screens of one antenna refuse."""
         channels = self._channels.of(obs)
-        one = prepare(obs, channels, self.config, self.navigation, self._index[name], self._klobuchar)
+        one = prepare(
+            obs, channels, self.config, self.navigation, self._index[name], self._klobuchar, self._error_model
+        )
         if "elevation" in self.config.screens:
             verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
             one.screened("elevation", verdict, Reason.ELEVATION_MASK)
@@ -234,6 +239,9 @@ class EpochProcessor:
             raim = protected(ranges, index.trajectory, place.constrained, raim, scale, self.config)
         one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
         one_map = place.constrained
+        level = None
+        if self.config.protection == "on":
+            level = protect(one, ranges, index.trajectory, one_map, raim, scale, self.config)
         own_sigma = own_sigma_m(redundancy_of(ranges), one_map.wsse, one_map.exact_map_sigma_m, scale)
         status = self._status(one.code_m, ranges, index.trajectory, place, raim, own_sigma)
         arc = one_map.arc_m
@@ -255,6 +263,7 @@ class EpochProcessor:
             arc_m=arc,
             along_sigma_m=np.sqrt((scale * exact) ** 2 + (total**2 - exact**2)),
             phase=phase,
+            protection=level,
         )
         return found, replace(state, offsets=offsets, log_variance_sum=sums[0], log_variance_weight=sums[1])
 
@@ -340,6 +349,7 @@ class EpochProcessor:
             constrained=constrained,
             phase=found.phase,
             raim=replace(found.raim, protection_level_m=np.where(has, found.raim.protection_level_m, np.nan)),
+            protection=None if found.protection is None else with_coordinates(found.protection, has, self.config),
             clocks=one.clocks,
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,
@@ -360,3 +370,4 @@ class _Found:
     arc_m: Floats
     along_sigma_m: Floats
     phase: PhasePositions | None
+    protection: Protection | None

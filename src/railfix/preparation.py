@@ -14,6 +14,7 @@ from railfix.channels import Channels
 from railfix.clock_elimination import Ranges
 from railfix.config import Config
 from railfix.epochs import Observations
+from railfix.error_model import ErrorModel
 from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.measurement import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.navigation import Navigation
@@ -53,6 +54,8 @@ class Prepared:
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
         Delays taken off the codes; 0 where the model is off.
     corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
+    bias_m : ndarray, shape (T, K) [m]
+        Largest nominal bias of each range by the error model; 0 without one.
     reason : ndarray of int64, shape (T, K)
         Written to by `refuse` alone.
     screens : dict of str to Screened
@@ -74,6 +77,7 @@ class Prepared:
     troposphere_m: Floats
     corrected_code_m: Floats
     sigma_m: Floats
+    bias_m: Floats
     reason: Bits
     screens: dict[str, Screened] = field(default_factory=dict)
     slips: Slips | None = None
@@ -129,6 +133,7 @@ def prepare(
     navigation: Navigation,
     index: SearchIndex,
     klobuchar: Floats | None,
+    error_model: ErrorModel | None = None,
 ) -> Prepared:
     """Find the satellites of the channels, correct their codes, weigh them.
 
@@ -143,6 +148,8 @@ def prepare(
         Of the antenna's trajectory.
     klobuchar : ndarray, shape (8,), or None
         Ionospheric coefficients; None leaves the ionosphere uncorrected.
+    error_model : ErrorModel, optional
+        Gives the weights in place of ``config.noise``.
 
     Returns
     -------
@@ -172,7 +179,10 @@ def prepare(
     if config.troposphere == "saastamoinen":
         troposphere = saastamoinen_delay_m(latitude, height, elevation)
     clean = clean - ionosphere - troposphere
-    sigma = code_sigma_m(cn0, elevation, noise=config.noise)
+    if error_model is None:
+        sigma, bias = code_sigma_m(cn0, elevation, noise=config.noise), np.zeros(code.shape)
+    else:
+        sigma, bias = _modelled(error_model, index, anchor, elevation, azimuth, cn0, config)
     reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
     return Prepared(
         observations=obs,
@@ -188,8 +198,26 @@ def prepare(
         troposphere_m=troposphere,
         corrected_code_m=clean,
         sigma_m=sigma,
+        bias_m=bias,
         reason=reason,
     )
+
+
+def _modelled(
+    model: ErrorModel,
+    index: SearchIndex,
+    anchor: Floats,
+    elevation: Floats,
+    azimuth: Floats,
+    cn0: Floats,
+    config: Config,
+) -> tuple[Floats, Floats]:
+    """Sigma and bias of the ranges by an error model, shapes (T, K); what it does not cover comes on top."""
+    arc, _ = index.trajectory.nearest(anchor)
+    sigma, bias = model.at(elevation, azimuth - index.trajectory.body_azimuth_deg(arc)[:, None], cn0)
+    if model.covers == "local":
+        sigma = np.hypot(sigma, config.nominal.sigma_m(elevation))
+    return sigma, np.nan_to_num(bias)
 
 
 _ANCHOR_WEIGHT: Final = np.array(1.0 / ANCHOR_SIGMA_M**2)

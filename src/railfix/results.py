@@ -14,6 +14,7 @@ from railfix.carrying import CarrierState
 from railfix.clock_offsets import OffsetState
 from railfix.constrained import Constrained
 from railfix.orbits import SatelliteStates
+from railfix.protection import ProtectionLevel
 from railfix.screens import DopplerState, Screened
 from railfix.section import Section
 from railfix.spp import SinglePoint
@@ -50,6 +51,22 @@ class Raim:
     excluded: NDArray[np.bool_]
     own_error_m: Floats
     protection_level_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protection:
+    """Protection levels of T epochs.
+
+    Attributes
+    ----------
+    level : ProtectionLevel
+        NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
+    status : ndarray of int8, shape (T,)
+        `protection.Status` against `Config.alarm_limit_m`.
+    """
+
+    level: ProtectionLevel
+    status: NDArray[np.int8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,6 +150,8 @@ class AntennaResult:
         Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
     raim : Raim
         Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
+    protection : Protection or None
+        Protection levels along the line; None where they are off.
     clocks : tuple of str
         Letter of each receiver clock of the results above, length G.
     clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
@@ -174,6 +193,7 @@ class AntennaResult:
     constrained: Constrained
     phase: PhasePositions | None
     raim: Raim
+    protection: Protection | None
     clocks: tuple[str, ...]
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats

@@ -14,6 +14,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from railfix.pipeline import AntennaResult, Result
+from railfix.protection import Cause
+from railfix.protection import Status as LevelStatus
 from railfix.raim import Outcome
 from railfix.reasons import Reason, Status, reason_text
 from railfix.screens import DopplerScreened
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
 STATUS_TYPE: Final = pl.Enum([s.text for s in Status])
 #: Words of the column ``raim_outcome``.
 OUTCOME_TYPE: Final = pl.Enum([o.name.lower() for o in Outcome])
+#: Words of the column ``protection_cause``, and of ``protection_status``.
+CAUSE_TYPE: Final = pl.Enum([c.name.lower() for c in Cause])
+LEVEL_STATUS_TYPE: Final = pl.Enum([s.name.lower() for s in LevelStatus])
 #: Decimals written to CSV: 0.1 mm, and the same in degrees.
 CSV_DECIMALS_M: Final = 4
 CSV_DECIMALS_DEG: Final = 9
@@ -51,8 +56,20 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "`passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
     "raim_statistic": "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
     "raim_threshold": "what it is compared with; a fault is detected from there on",
-    "protection_level_m": "along the line: error by a fault that RAIM misses, and by noise; "
-    "infinite where a satellite is unchecked, empty where a fault is left",
+    "raim_level_m": "P4's level: error by a fault that RAIM misses, and by noise; infinite where a satellite is "
+    "unchecked, empty where a fault is left or `raim_protection` is off",
+    "protection_level_m": "along the line: the error exceeds it with the stated risk, the largest of its three parts; "
+    "infinite where `protection_cause` says why, empty where a fault is left",
+    "protection_fault_free_m": "part of it for noise without a fault",
+    "protection_one_fault_m": "part of it for a fault of one satellite; 0 where that is less likely than its share",
+    "protection_two_faults_m": "part of it for faults of two satellites; 0 where that is less likely than its share",
+    "protection_k_fault_free": "sigmas that the first part stands for",
+    "protection_k_one_fault": "sigmas that the second part stands for, beside its threshold",
+    "protection_k_two_faults": "sigmas that the third part stands for, beside its threshold",
+    "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
+    "protection_cause": "what sets the level: "
+    "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
+    "protection_status": "`available` within the alarm limit, `unavailable`, or `alarm`: ranges contradict the level",
     "metric_antenna_spacing_m": "screen `antenna_spacing`: distance of the two positions less that of the antennas",
     "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
     "conventional_offset_m": "distance of the 3-D single point from that point",
@@ -158,9 +175,43 @@ def _raim_columns(result: AntennaResult) -> dict[str, pl.Series]:
         "raim_outcome": words.gather(pl.Series(values=result.raim.outcome.astype(np.uint32))),
         "raim_statistic": _floats(result.raim.statistic),
         "raim_threshold": _floats(result.raim.threshold),
-        "protection_level_m": _floats(result.raim.protection_level_m),
+        "raim_level_m": _floats(result.raim.protection_level_m),
+        **_protection_columns(result),
         "metric_antenna_spacing_m": _floats(np.full(len(result), np.nan) if spacing is None else spacing.metric),
     }
+
+
+#: Columns of the protection level by its fields.
+_OF_LEVEL: Final = {
+    "protection_level_m": "level_m",
+    "protection_fault_free_m": "fault_free_m",
+    "protection_one_fault_m": "one_fault_m",
+    "protection_two_faults_m": "two_fault_m",
+    "protection_k_fault_free": "k_fault_free",
+    "protection_k_one_fault": "k_one_fault",
+    "protection_k_two_faults": "k_two_faults",
+    "protection_separation": "separation",
+}
+
+
+def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
+    """The protection level, its parts, and what it means; all null where it is off."""
+    found, epochs = result.protection, len(result)
+    words = {
+        "protection_cause": (CAUSE_TYPE, None if found is None else found.level.cause),
+        "protection_status": (LEVEL_STATUS_TYPE, None if found is None else found.status),
+    }
+    columns = {
+        name: _floats(np.full(epochs, np.nan) if found is None else getattr(found.level, field))
+        for name, field in _OF_LEVEL.items()
+    }
+    for name, (kind, values) in words.items():
+        if values is None:
+            columns[name] = pl.Series(values=[None], dtype=kind).new_from_index(0, epochs)
+        else:
+            listed = pl.Series(values=kind.categories, dtype=kind)
+            columns[name] = listed.gather(pl.Series(values=values.astype(np.uint32)))
+    return columns
 
 
 def positions_table(result: Result) -> pl.DataFrame:

@@ -242,6 +242,7 @@ def _pictures_of_positions(antenna: str, grid: _Grid, config: Config) -> Iterato
                 sides="above",
             ),
         )
+    if config.protection == "on":
         level = grid.epochs("protection_level_m")
         level[~np.isfinite(level)] = np.nan
         yield (
@@ -250,8 +251,8 @@ def _pictures_of_positions(antenna: str, grid: _Grid, config: Config) -> Iterato
                 title=f"{antenna}: protection level along the line against the alarm limit (finite ones)",
                 label="protection level [m]",
                 metric=level,
-                reject=level > config.raim.alarm_limit_m,
-                limit=config.raim.alarm_limit_m,
+                reject=level > config.alarm_limit_m,
+                limit=config.alarm_limit_m,
                 sides="above",
             ),
         )

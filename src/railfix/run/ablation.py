@@ -173,7 +173,7 @@ def ablate_files(
         processors = {
             name: EpochProcessor(
                 # Nobody asks for a protection level here.
-                config.model_copy(update={"screens": chosen, "raim_protection": "off"}),
+                config.model_copy(update={"screens": chosen, "protection": "off"}),
                 navigation,
                 line.trajectories,
             )

@@ -1,0 +1,86 @@
+"""The protection level of the positions: which sigmas, biases and probabilities it rests on."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.antenna import Trajectory
+from railfix.clock_elimination import Ranges
+from railfix.config import Config
+from railfix.constrained import Constrained
+from railfix.preparation import Prepared
+from railfix.protection import ProtectionLevel, RiskBudget, along_track_level, availability
+from railfix.raim import Outcome, constrained_model
+from railfix.results import Protection, Raim
+
+Floats = NDArray[np.float64]
+#: What a level rests on, by `Config.sbas`: the integrity of an SBAS and fault hypotheses of local causes, or
+#: hypotheses of satellites' own faults as well (ARAIM).
+KIND: Final = {"on": "sbas", "off": "separation"}
+
+
+def risk_of(config: Config) -> RiskBudget:
+    """The budget in force: with SBAS the satellites' own faults are its business, what is left is local."""
+    if config.sbas == "off":
+        return config.risk
+    return replace(config.risk, satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
+
+
+def protect(
+    one: Prepared,
+    ranges: Ranges,
+    trajectory: Trajectory,
+    constrained: Constrained,
+    raim: Raim,
+    scale: Floats,
+    config: Config,
+) -> Protection:
+    """Levels of the positions of a chunk.
+
+    Parameters
+    ----------
+    one : Prepared
+    ranges : Ranges
+        What the positions were solved with.
+    trajectory : Trajectory
+    constrained : Constrained
+    raim : Raim
+    scale : ndarray, shape (T,)
+        The receiver's noise scale; an error model stands for itself and is not scaled.
+    config : Config
+
+    Returns
+    -------
+    Protection
+    """
+    faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
+    arc = np.where(faulty, np.nan, constrained.arc_m)
+    model = constrained_model(ranges, trajectory, arc, section=np.maximum(constrained.section, 0))
+    level = along_track_level(
+        model,
+        [name[0] for name in one.satellite.tolist()],
+        risk=risk_of(config),
+        scale=scale if config.error_model is None else 1.0,
+        bias_m=one.bias_m,
+        n_excluded=raim.excluded.sum(axis=1),
+    )
+    return _judged(level, config)
+
+
+def _judged(level: ProtectionLevel, config: Config) -> Protection:
+    return Protection(
+        level=level, status=availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    )
+
+
+def with_coordinates(protection: Protection, has: NDArray[np.bool_], config: Config) -> Protection:
+    """The same without the levels of positions that are dropped."""
+    values = {}
+    for item in fields(ProtectionLevel):
+        value = getattr(protection.level, item.name)
+        values[item.name] = np.where(has, value, np.nan) if value.dtype == np.float64 else value
+    return _judged(ProtectionLevel(**values), config)
