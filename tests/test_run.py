@@ -16,8 +16,8 @@ from polars.testing import assert_frame_equal
 from broken_bench import EPOCHS, Bench, bench_in
 from railfix.config import Config
 from railfix.demonstration import demo_inputs, demo_truth
-from railfix.evaluate import evaluate_run
 from railfix.errors import MismatchError, NoPositionError
+from railfix.evaluate import evaluate_run
 from railfix.pipeline import EpochProcessor, Result
 from railfix.reasons import POSITIONED, Reason, Status, reason_text
 from railfix.rinex import read_navigation, read_observations, scan_observations

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from railfix.demonstration import Comparison
+    from railfix.evaluate import Evaluation
 
 
 def demo(
@@ -20,13 +20,13 @@ def demo(
 ) -> None:
     """Run the main job on the log that comes with railfix, and compare it with the truth.
 
-    The log is made up: a train with two antennas, 18.2 m apart, shuttles on a test line of 756 m with
-    curves and cant, seen by two receivers at 10 Hz, with noise and without multipath. railfix
-    positions it as `railfix run` does, works out the error along the line of each position and of
-    the conventional one (3-D single point, moved to the nearest point), and draws a picture.
+    The log is made up: a train with two antennas on a test line with curves and cant; the README beside
+    the log tells what it holds. railfix positions it as `railfix run` does, and sets the positions
+    on the map, and the conventional ones (3-D single point, moved to the nearest point), against the
+    truth as `railfix report` does.
 
     Into DIR come `positions.csv`, `positions.parquet`, `observations.parquet`, `run.json` and
-    `picture.png`.
+    `report.html`, the page to open in a browser.
 
     Example:
 
@@ -35,7 +35,8 @@ def demo(
     Exit codes: 0 done; 8 DIR cannot be written; 1 a defect of railfix.
     """
     from railfix.cli.console import progress_bar, show_summary
-    from railfix.demonstration import compare, demo_inputs, draw
+    from railfix.demonstration import demo_inputs, demo_truth
+    from railfix.report import read_runs, write_page
     from railfix.run import RunOptions, run_files
 
     inputs = demo_inputs()
@@ -43,14 +44,15 @@ def demo(
         options = RunOptions(observations="write", overwrite="replace")
         summary = run_files(inputs, out=out, options=options, progress=progress)
     show_summary(summary)
-    comparison = compare(inputs, summary.files["positions.parquet"])
-    show_comparison(comparison)
-    picture = draw(comparison, out / "picture.png")
-    typer.echo(f"wrote {picture}")
+    runs, evaluation = read_runs([out], [demo_truth()])
+    page = write_page(runs, evaluation, out / "report.html", title="railfix demo: a made-up run against its truth")
+    if evaluation is not None:
+        show_errors(evaluation)
     typer.echo(f"the log, its track map, vehicle and truth: {inputs.front[0].parent}")
+    typer.echo(f"the report, to open in a browser: {page}")
 
 
-def show_comparison(comparison: Comparison) -> None:
+def show_errors(evaluation: Evaluation) -> None:
     """Errors along the line on the map, and of the conventional position."""
     from rich.console import Console
     from rich.table import Table
@@ -60,8 +62,12 @@ def show_comparison(comparison: Comparison) -> None:
     table = Table()
     for head in ("antenna", "position", "rate", "mean", "std", "p50", "p95", "largest"):
         table.add_column(head, justify="left" if head in ("antenna", "position") else "right")
-    for name, antenna in comparison.antennas.items():
-        for label, figures in (("on the map", antenna.on_map), ("conventional", antenna.conventional)):
-            lengths = (figures.mean_m, figures.std_m, figures.p50_m, figures.p95_m, figures.max_m)
-            table.add_row(name, label, f"{100 * figures.rate:.2f} %", *(f"{value:.2f}" for value in lengths))
+    rows = evaluation.figures.filter(grouping="all", epochs_of="own").sort("antenna", maintain_order=True)
+    names = {"constrained": "on the map", "conventional": "conventional"}
+    for row in rows.iter_rows(named=True):
+        if row["antenna"] != "all" and row["position"] in names:
+            lengths = (row[name] for name in ("mean_m", "std_m", "p50_m", "p95_m", "max_m"))
+            cells = ("-" if value is None else f"{value:.2f}" for value in lengths)
+            rate = "-" if row["rate"] is None else f"{100 * row['rate']:.2f} %"
+            table.add_row(row["antenna"], names[row["position"]], rate, *cells)
     console.print(table)

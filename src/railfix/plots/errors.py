@@ -1,8 +1,9 @@
 """Charts of the error along the line (P1 figures 7, 8, 10, 11) and of the levels that bound it.
 
-The tables have one row an epoch of one antenna: ``time_gpst``, ``reference_chainage_m`` (where the
-antenna was), ``error_m`` and ``conventional_error_m`` (+ toward the end of the line), and, as far as
-there is any, ``along_sigma_m`` and ``protection_level_m``.
+The tables have one row an epoch of one antenna, as `railfix.evaluate.Evaluation.epochs` has them:
+``time_gpst``, ``chainage_m`` (where the antenna was), ``error_m`` and ``conventional_error_m`` (+ toward
+the end of the line), and, as far as there are any, ``along_sigma_m``, ``reference_good`` and columns of
+protection levels.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from railfix.plots.chart import (
     BLACK,
     CONSTRAINED,
     CONVENTIONAL,
+    GREEN,
     GREY,
     PURPLE,
     Band,
@@ -74,7 +76,7 @@ def error_over_chainage(errors: pl.DataFrame, *, title: str = "Error along the l
     -------
     Chart
     """
-    x = floats(errors, "reference_chainage_m")
+    x = floats(errors, "chainage_m")
     return _errors(errors, x, name="error-chainage", title=title, x_label="chainage of the reference [m]", start=None)
 
 
@@ -87,23 +89,24 @@ def _errors(
     if len(at):
         layers.append(Band(label="± sigma stated", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
         caption.append("The band is the standard deviation that railfix states, the greatest of each short piece.")
-    level = floats(errors, "protection_level_m")
-    at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
-    if len(at):
-        for sign, label in ((1.0, "± protection level"), (-1.0, "")):
-            layers.append(Line(label=label, colour=PURPLE, x=at, y=sign * most, width=1.0, dash="dashed"))
-        share = np.isfinite(level).mean()
-        caption.append(f"Protection levels are finite at {100 * share:.1f} % of the epochs.")
+    for column, colour in zip(level_columns(errors), (PURPLE, GREEN, BLACK, GREY), strict=False):
+        level = floats(errors, column)
+        at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
+        if len(at):
+            name_of = column.removesuffix("_m").replace("_", " ")
+            for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
+                layers.append(Line(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
+            caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
     epoch = since(errors, start_of(errors))
     shown = whole = 0
     for label, column, colour, shape in _SERIES:
-        y = floats(errors, column)
+        y = good_errors(errors, column)
         rows = extremes(x, y)
         shown, whole = shown + len(rows), whole + int(np.isfinite(x + y).sum())
         layers.append(
             Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows], epoch_s=epoch[rows])  # type: ignore[arg-type]
         )
-    scale = error_scale(np.concatenate([floats(errors, column) for _, column, _, _ in _SERIES]))
+    scale = error_scale(np.concatenate([good_errors(errors, column) for _, column, _, _ in _SERIES]))
     if scale["y_scale"] == "symlog":
         caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
     return Chart(
@@ -116,6 +119,20 @@ def _errors(
         start=start,
         **scale,
     )
+
+
+def good_errors(errors: pl.DataFrame, column: str) -> Floats:
+    """Errors of a column, NaN where the reference is worse than it must be."""
+    values = floats(errors, column)
+    if "reference_good" in errors.columns:
+        values[~errors["reference_good"].to_numpy()] = np.nan
+    return values
+
+
+def level_columns(table: pl.DataFrame) -> list[str]:
+    """Protection levels among the columns that tell any."""
+    named = [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
+    return [name for name in named if np.isfinite(floats(table, name)).any()]
 
 
 def error_scale(error_m: Floats) -> dict[str, Any]:
@@ -166,7 +183,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the
     for run, errors in runs.items():
         for label, column, _, _ in reversed(_SERIES):
             names.append(f"{run}, {label}")
-            error = floats(errors, column)
+            error = good_errors(errors, column)
             values.append(error[np.isfinite(error)])
     layers = []
     for label, _, colour, _ in reversed(_SERIES):

@@ -162,44 +162,43 @@ def nice_step(rough: float) -> float:
     return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
 
 
-def interval(positions: pl.DataFrame, column: str = "chainage_m") -> tuple[Floats, Floats]:
-    """Distance along the line from each position to the one before.
+def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
+    """Distance from each position to the one before while the train ran.
 
     Parameters
     ----------
-    positions : polars.DataFrame
-        Of one antenna, in order of time. Where it has ``reference_chainage_m``, that says where the antenna
-        was; otherwise the positions themselves do.
-    column : str
-        Chainage of the positions; NaN where there is none.
+    table : polars.DataFrame
+        Of one antenna, in order of time. Of an evaluation (`railfix.evaluate.EPOCH_COLUMNS`) the distances
+        of the reference are taken; of positions alone (`railfix.tables.POSITION_COLUMNS`), their own.
+    prefix : "" or the start of the names of the conventional ones
+        Which positions.
 
     Returns
     -------
-    ndarray, ndarray, shape (P - 1,) [m]
-        Place of each position but the first, and the distance.
+    ndarray, ndarray, shape (P,) [m]
+        Place of each position but the first, and the distance; where the train stood there is none.
     """
-    place = floats(positions, column)
-    has = np.isfinite(place)
-    known = floats(positions, "reference_chainage_m")
-    if np.isfinite(known).any():
-        has &= np.isfinite(known)
-        place = known
-    at = place[has]
+    if f"{prefix}interval_m" in table.columns:
+        place, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
+        ran = distance > 0.0
+        return place[ran], distance[ran]
+    place = floats(table, f"{prefix}chainage_m")
+    at = place[np.isfinite(place)]
     return at[1:], np.abs(np.diff(at))
 
 
 _FIXES: Final = (
-    ("conventional", "conventional_chainage_m", CONVENTIONAL, "square"),
-    ("on the map", "chainage_m", CONSTRAINED, "dot"),
+    ("conventional", "conventional_", CONVENTIONAL, "square"),
+    ("on the map", "", CONSTRAINED, "dot"),
 )
 
 
-def interval_over_chainage(positions: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:
+def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:
     """Distance from each position to the one before, over the place (P1 figure 12).
 
     Parameters
     ----------
-    positions : polars.DataFrame
+    table : polars.DataFrame
         See `interval`.
     title : str
 
@@ -210,8 +209,8 @@ def interval_over_chainage(positions: pl.DataFrame, *, title: str = "Positioning
     layers: list[Layer] = []
     shown = whole = 0
     said = []
-    for label, column, colour, shape in _FIXES:
-        x, y = interval(positions, column)
+    for label, prefix, colour, shape in _FIXES:
+        x, y = interval(table, prefix)
         rows = extremes(x, y)
         shown, whole = shown + len(rows), whole + len(x)
         layers.append(Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows]))  # type: ignore[arg-type]
@@ -220,7 +219,7 @@ def interval_over_chainage(positions: pl.DataFrame, *, title: str = "Positioning
     return Chart(
         name="interval-chainage",
         title=title,
-        caption=f"Distance along the line from each position to the one before. {_by(positions)} "
+        caption=f"Distance along the line from each position to the one before. {_by(table)} "
         f"The longest: {', '.join(said)}.{told(shown, whole)}",
         x_label="chainage [m]",
         y_label="from the position before [m]",
@@ -229,12 +228,12 @@ def interval_over_chainage(positions: pl.DataFrame, *, title: str = "Positioning
     )
 
 
-def interval_distribution(positions: pl.DataFrame, *, title: str = "Positioning interval, distribution") -> Chart:
+def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning interval, distribution") -> Chart:
     """How many positions are how far from the one before (P1 figure 12).
 
     Parameters
     ----------
-    positions : polars.DataFrame
+    table : polars.DataFrame
         See `interval`.
     title : str
 
@@ -242,7 +241,7 @@ def interval_distribution(positions: pl.DataFrame, *, title: str = "Positioning 
     -------
     Chart
     """
-    found = {label: interval(positions, column)[1] for label, column, _, _ in _FIXES}
+    found = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in found.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)
     edges = np.arange(0.0, largest + 2.0 * step, step)
@@ -255,7 +254,7 @@ def interval_distribution(positions: pl.DataFrame, *, title: str = "Positioning 
     return Chart(
         name="interval-distribution",
         title=title,
-        caption=f"Positions by their distance from the one before, bars {step:g} m wide. {_by(positions)}",
+        caption=f"Positions by their distance from the one before, bars {step:g} m wide. {_by(table)}",
         x_label="from the position before [m]",
         y_label="positions",
         layers=tuple(layers),
@@ -264,9 +263,9 @@ def interval_distribution(positions: pl.DataFrame, *, title: str = "Positioning 
     )
 
 
-def _by(positions: pl.DataFrame) -> str:
-    if np.isfinite(floats(positions, "reference_chainage_m")).any():
-        return "Distances are those of the reference."
+def _by(table: pl.DataFrame) -> str:
+    if "interval_m" in table.columns:
+        return "Distances that the train ran by the reference; where it stood there is none."
     return "Without a reference the positions themselves tell the distance, their noise included."
 
 

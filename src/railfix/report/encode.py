@@ -1,0 +1,152 @@
+"""Charts as text for the page: plain values, and arrays as base 64."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
+from railfix.timescale import seconds
+
+_EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
+#: Of whole numbers packed in 16 bits: unknown.
+_UNKNOWN: Final = 65535
+
+
+def script_json(value: Any) -> str:
+    """JSON that cannot end the script element it stands in.
+
+    Parameters
+    ----------
+    value : object
+        Plain values.
+
+    Raises
+    ------
+    ValueError
+        A NaN or an infinity stands outside an array.
+    """
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for mark, code in (("<", "\\u003c"), (">", "\\u003e"), ("\u2028", "\\u2028"), ("\u2029", "\\u2029")):
+        text = text.replace(mark, code)
+    return text
+
+
+def packed(values: NDArray[Any], kind: str = "f") -> str:
+    """An array as base 64, little endian, after the letter of its kind.
+
+    Parameters
+    ----------
+    values : ndarray
+    kind : {"f", "h", "i"}
+        32-bit floats, unsigned 16-bit, unsigned 32-bit.
+    """
+    dtype = {"f": "<f4", "h": "<u2", "i": "<u4"}[kind]
+    return kind + base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode("ascii")
+
+
+def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
+    """A chart as plain values.
+
+    Parameters
+    ----------
+    chart : Chart
+    epochs_from : datetime64[ns], optional
+        From when ``epoch_s`` of its points counts, in place of `Chart.start`.
+
+    Returns
+    -------
+    dict
+    """
+    found: dict[str, Any] = {
+        "title": chart.title,
+        "x_label": chart.x_label,
+        "y_label": chart.y_label,
+        "x_scale": chart.x_scale,
+        "y_scale": chart.y_scale,
+        "y_linear": chart.y_linear,
+        "x_range": chart.x_range,
+        "y_range": chart.y_range,
+        "equal": chart.equal,
+        "layers": [_layer(layer) for layer in chart.layers],
+    }
+    if chart.start is not None:
+        found["start"] = since_1970(chart.start)
+    if epochs_from is not None:
+        found["epoch0"] = since_1970(epochs_from)
+    return found
+
+
+def since_1970(time: np.datetime64) -> float:
+    """A time as seconds, to the microsecond."""
+    return round(float(seconds(time - _EPOCH_ZERO)), 6)
+
+
+def _layer(layer: Layer) -> dict[str, Any]:
+    values: dict[str, Any] = {"label": layer.label, "colour": layer.colour}
+    match layer:
+        case Points():
+            values |= {"kind": "points", "shape": layer.shape, "size": layer.size}
+            values |= {"x": packed(layer.x), "y": packed(layer.y)}
+            if layer.epoch_s is not None:
+                values["epoch"] = packed(layer.epoch_s)
+        case Line():
+            values |= {"kind": "line", "width": layer.width, "dash": layer.dash}
+            values |= {"x": packed(layer.x), "y": packed(layer.y)}
+        case Band():
+            values |= {"kind": "band", "x": packed(layer.x), "low": packed(layer.low), "high": packed(layer.high)}
+        case Bars():
+            values |= {"kind": "bars", "left": packed(layer.left), "right": packed(layer.right)}
+            values["height"] = packed(layer.height)
+        case Cells():
+            values |= _cells(layer)
+        case Ranges():
+            values |= {"kind": "ranges", "names": list(layer.names)}
+            values |= {name: packed(getattr(layer, name)) for name in ("low", "mid", "high")}
+        case Marks():
+            values |= {"kind": "marks", "x": packed(layer.x), "y": packed(layer.y), "words": list(layer.words)}
+    return values
+
+
+def _cells(layer: Cells) -> dict[str, Any]:
+    """Cells that are not empty; the page takes them as equally wide."""
+    column, row = np.nonzero(layer.counts)
+    return {
+        "kind": "cells",
+        "x0": float(layer.x_edges[0]),
+        "x1": float(layer.x_edges[-1]),
+        "y0": float(layer.y_edges[0]),
+        "y1": float(layer.y_edges[-1]),
+        "nx": layer.counts.shape[0],
+        "ny": layer.counts.shape[1],
+        "most": int(layer.counts.max(initial=1)),
+        "a": packed(column, "h"),
+        "b": packed(row, "h"),
+        "n": packed(layer.counts[column, row], "i"),
+    }
+
+
+def sky_values(sky: SkyEpochs) -> dict[str, Any]:
+    """Satellites over an antenna as plain values; angles and C/N0 in hundredths."""
+    values: dict[str, Any] = {
+        "start": since_1970(sky.start),
+        "epoch": packed(sky.epoch_s),
+        "first": packed(sky.first, "i"),
+        "azimuth": packed(np.round(100.0 * (sky.azimuth_deg % 360.0)), "h"),
+        "elevation": packed(np.round(100.0 * np.clip(sky.elevation_deg, 0.0, 90.0)), "h"),
+        "cn0": packed(np.where(np.isfinite(sky.cn0_dbhz), np.round(100.0 * sky.cn0_dbhz), _UNKNOWN), "h"),
+    }
+    for name, words, first in (
+        ("satellite", sky.satellite, ()),
+        ("signal", sky.signal, ()),
+        ("reason", sky.reason, ("used",)),
+    ):
+        known = [*first, *(str(word) for word in np.unique(words) if word not in first)]
+        code = {word: number for number, word in enumerate(known)}
+        values[name] = packed(np.array([code[str(word)] for word in words], dtype=np.int64), "h")
+        values[{"satellite": "names", "signal": "signals", "reason": "reasons"}[name]] = known
+    return values

@@ -1,0 +1,282 @@
+"""Tables of the report: what was run, what came of it, what it came to against the reference."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import polars as pl
+
+from railfix.evaluate import Evaluation
+from railfix.evaluate.run_folder import flattened
+from railfix.report.html import absent, items, number, share, table, text
+from railfix.report.runs import ReportedRun
+
+_POSITION_NAMES = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
+
+
+def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> str:
+    """One row a run and antenna: rates and, with a reference, errors."""
+    head = ["run", "antenna", "preset", "epochs", "with position", "rate", "ok", "sigma p95"]
+    judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
+    rows = []
+    for run in runs:
+        for antenna, facts in _antennas(run).items():
+            sigma = facts.get("along_sigma_m") or {}
+            row = [
+                run.name,
+                antenna,
+                run.config.preset,
+                number(facts.get("epochs"), 0),
+                number(facts.get("epochs_with_position"), 0),
+                share(facts.get("positioning_rate")),
+                share(facts.get("ok_rate")),
+                number(_plain(sigma.get("p95_m")), 2, " m"),
+            ]
+            if evaluation:
+                found = {p: _figures(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
+                row += [number(found["constrained"].get(k), 2, " m") for k in ("mean_m", "std_m", "p95_m", "max_m")]
+                row += [number(found["conventional"].get(k), 2, " m") for k in ("p95_m", "max_m")]
+            rows.append(row)
+    caption = "rate: of the epochs with observations; sigma p95: standard deviation along the line that railfix states"
+    if evaluation:
+        caption += "; errors along the line, mean and std with sign, p95 and largest of the size"
+    return table(head + judged, rows, caption=caption, right=range(3, 14))
+
+
+def _figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
+    name = _name_in(evaluation, run)
+    rows = evaluation.figures.filter(
+        pl.col("grouping") == "all",
+        pl.col("epochs_of") == "own",
+        pl.col("run") == name,
+        pl.col("antenna") == antenna,
+        pl.col("position") == position,
+    )
+    return rows.row(0, named=True) if len(rows) == 1 else {}
+
+
+def _name_in(evaluation: Evaluation, run: ReportedRun) -> str:
+    return next(r.name for r in evaluation.runs if r.path.resolve() == run.folder.path.resolve())
+
+
+def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
+    known: Mapping[str, Mapping[str, Any]] = run.record.get("antennas") or {}
+    return {name: known.get(name) or {} for name in run.folder.antennas}
+
+
+def what_was_run(run: ReportedRun) -> str:
+    """Command, versions, inputs with hashes, the line, notes."""
+    record = run.record
+    written = datetime.fromtimestamp((run.folder.path / "run.json").stat().st_mtime, tz=UTC)
+    versions: Mapping[str, Any] = record.get("versions") or {}
+    spans = [
+        f"{name}: {facts.get('first_epoch_gpst')} to {facts.get('last_epoch_gpst')} GPS time"
+        for name, facts in _antennas(run).items()
+    ]
+    track = run.folder.track_facts
+    vehicle = (record.get("line") or {}).get("vehicle") or {}
+    rows = [
+        ("folder", str(run.folder.path)),
+        ("written", written.strftime("%Y-%m-%d %H:%M:%S UTC")),
+        ("epochs", "; ".join(spans)),
+        ("reference", run.reference or "none given"),
+        ("line", f"{run.folder.line_name}, {track.get('length_m', '?')} m, {track.get('points', '?')} points"),
+        ("vehicle", str(vehicle.get("name") or "none; the track is taken as the antenna's own path")),
+        ("versions", ", ".join(f"{name} {value}" for name, value in versions.items())),
+        ("platform", str(record.get("platform", "not told"))),
+        ("wall time", f"{record.get('wall_s', '?')} s"),
+    ]
+    parts = [
+        table(["", "what was run"], rows),
+        f"<pre>{text(shlex.join(str(word) for word in record.get('command') or []))}</pre>",
+        table(
+            ["input", "file", "bytes", "SHA-256"],
+            [
+                [str(f["input"]), str(f["path"]), number(f.get("bytes"), 0), str(f.get("sha256", ""))]
+                for f in record.get("inputs") or []
+            ],
+            right=[2],
+            mono=[1, 3],
+        ),
+    ]
+    notes = [*(str(note) for note in record.get("notes") or []), *run.notes]
+    parts.append(f"<h4>Notes</h4>{items(notes)}" if notes else "<p>The run left no notes.</p>")
+    return "\n".join(parts)
+
+
+def settings(run: ReportedRun) -> str:
+    """Settings asked for beside those in force."""
+    asked = flattened(run.record.get("settings_asked") or {})
+    used = flattened(run.record.get("settings_used") or {})
+    names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
+    names += [name for name in used if name not in asked]
+    rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
+    count = len(asked)
+    told = f"{count} of {len(used)} settings were asked for; the rest are defaults."
+    return f"<details><summary>Settings asked for and used</summary><p>{text(told)}</p>" + (
+        table(["setting", "asked", "used"], rows, asked=range(count)) + "</details>"
+    )
+
+
+def budget(run: ReportedRun) -> str:
+    """Epochs by status, and pseudoranges by the first reason that refused them."""
+    antennas = _antennas(run)
+    names = list(antennas)
+    statuses = dict.fromkeys(s for facts in antennas.values() for s, n in (facts.get("status") or {}).items() if n)
+    rows = [
+        ["epochs", *(number(antennas[n].get("epochs"), 0) for n in names)],
+        ["with observations", *(number(antennas[n].get("epochs_with_observations"), 0) for n in names)],
+        ["with position", *(number(antennas[n].get("epochs_with_position"), 0) for n in names)],
+        *([f"  {s}", *(number((antennas[n].get("status") or {}).get(s, 0), 0) for n in names)] for s in statuses),
+        ["positioning rate", *(share(antennas[n].get("positioning_rate")) for n in names)],
+        ["rate of ok", *(share(antennas[n].get("ok_rate")) for n in names)],
+    ]
+    few = dict.fromkeys(r for f in antennas.values() for r in f.get("too_few_satellites_by_first_reason") or {})
+    rows += [
+        [
+            f"too few satellites, by {r}",
+            *(number((antennas[n].get("too_few_satellites_by_first_reason") or {}).get(r, 0), 0) for n in names),
+        ]
+        for r in few
+    ]
+    first, only = "observations_refused_by_first_reason", "observations_refused_by_one_reason_alone"
+    reasons = dict.fromkeys(r for facts in antennas.values() for r in facts.get(first) or {})
+    head = ["", *(word for n in names for word in (n, "share", "it alone"))]
+    observed = {n: antennas[n].get("observations") or 0 for n in names}
+
+    def cells(count: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
+        return [
+            word
+            for n in names
+            for word in (
+                number(count[n], 0),
+                share(count[n] / observed[n] if observed[n] else None),
+                "" if alone is None else number(alone[n], 0),
+            )
+        ]
+
+    told = [
+        ["observed", *cells(observed, None)],
+        ["used", *cells({n: antennas[n].get("observations_used") or 0 for n in names}, None)],
+    ]
+    for reason in reasons:
+        counts = {n: (antennas[n].get(first) or {}).get(reason, 0) for n in names}
+        alone = {n: (antennas[n].get(only) or {}).get(reason, 0) for n in names}
+        told.append([f"  {reason}", *cells(counts, alone)])
+    return table(["", *names], rows, caption="Epochs by status", right=range(1, 9)) + table(
+        head, told, caption="Pseudoranges by the first reason that refused them, and by it alone", right=range(1, 9)
+    )
+
+
+def merits(run: ReportedRun, evaluation: Evaluation) -> str:
+    """Figures of merit, intervals and levels of one run, constrained beside conventional."""
+    name = _name_in(evaluation, run)
+    figures = evaluation.figures.filter(pl.col("run") == name, pl.col("epochs_of") == "own")
+    whole = figures.filter(pl.col("grouping") == "all")
+    confidence = f"{100 * evaluation.options.confidence:g} %"
+    head = "antenna|position|errors|rate|mean|std|p50|p95|p99|largest|over 50 m|error / sigma, rms".split("|")
+    parts = [
+        table(
+            head,
+            [_merit(row, "antenna") for row in whole.iter_rows(named=True)],
+            caption=f"Errors along the line in metres, + toward its end; [{confidence} limits by blocks of time]",
+            right=range(2, 12),
+        )
+    ]
+    for grouping, word in (("environment", "environment"), ("speed", "speed"), ("satellites", "satellites used")):
+        rows = figures.filter(pl.col("grouping") == grouping, pl.col("position") != "constrained_ok")
+        if rows["group"].n_unique() > 1:
+            inside = table(
+                [word, *head[1:]],
+                [_merit(row, "group", antenna=str(row["antenna"])) for row in rows.iter_rows(named=True)],
+                right=range(2, 12),
+            )
+            parts.append(f"<details><summary>By {text(word)}</summary>{inside}</details>")
+    parts.append(_intervals(evaluation, name))
+    parts.append(_levels(evaluation, name))
+    return "\n".join(parts)
+
+
+def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
+    where = f"{antenna} {_POSITION_NAMES[row['position']]}".strip()
+    return [
+        str(row[first]),
+        where,
+        number(row["errors"], 0),
+        share(row["rate"]) + _limits(row["rate_low"], row["rate_high"], per_cent=True),
+        number(row["mean_m"]) + _limits(row["mean_low_m"], row["mean_high_m"]),
+        number(row["std_m"]),
+        number(row["p50_m"]),
+        number(row["p95_m"]) + _limits(row["p95_low_m"], row["p95_high_m"]),
+        number(row["p99_m"]),
+        number(row["max_m"]),
+        number(row["wrong_places"], 0),
+        number(row["normalised_rms"]),
+    ]
+
+
+def _limits(low: float | None, high: float | None, *, per_cent: bool = False) -> str:
+    if low is None or high is None:
+        return ""
+    ends = (share(low, 1), share(high, 1)) if per_cent else (number(low), number(high))
+    return f" [{ends[0]} to {ends[1]}]"
+
+
+def _intervals(evaluation: Evaluation, name: str) -> str:
+    rows = evaluation.intervals.filter(pl.col("run") == name) if "run" in evaluation.intervals.columns else None
+    if rows is None or not len(rows):
+        return absent("There are no intervals between positions to tell.")
+    columns = [f"interval_{name}_m" for name in ("mean", "p50", "p95", "p99", "max")] + ["gap_p95_s", "gap_max_s"]
+    return table(
+        ["antenna", "position", "intervals", "mean", "p50", "p95", "p99", "largest", "gap p95, s", "largest, s"],
+        [
+            [
+                str(r["antenna"]),
+                _POSITION_NAMES[r["position"]],
+                number(r["intervals"], 0),
+                *(number(r[c]) for c in columns),
+            ]
+            for r in rows.iter_rows(named=True)
+        ],
+        caption="Positioning interval: metres that the train ran from one position to the next",
+        right=range(2, 10),
+    )
+
+
+def _levels(evaluation: Evaluation, name: str) -> str:
+    if evaluation.levels is None:
+        return ""
+    rows = evaluation.levels.filter(pl.col("run") == name) if "run" in evaluation.levels.columns else evaluation.levels
+    return table(
+        ["level", "antenna", "position", "positions", "finite", "p50", "p95", "errors", "over the level", "share"],
+        [
+            [
+                str(r["level"]),
+                str(r["antenna"]),
+                _POSITION_NAMES[r["position"]],
+                number(r["positions"], 0),
+                number(r["with_level"], 0),
+                number(r["level_p50_m"]),
+                number(r["level_p95_m"]),
+                number(r["errors"], 0),
+                number(r["over_level"], 0),
+                share(r["over_level_share"], 3),
+            ]
+            for r in rows.iter_rows(named=True)
+        ],
+        caption="Protection levels in metres, and the errors that were larger",
+        right=range(3, 10),
+    )
+
+
+def _plain(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return " ".join(str(v) for v in value)
+    return "none" if value is None else str(value)
