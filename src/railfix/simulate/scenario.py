@@ -250,6 +250,8 @@ class Scenario:
         Sensors on board besides the receivers.
     environment : EnvironmentSettings
         What stands along the line; nothing by default.
+    place_seed : int
+        Of what is drawn along the line, so that runs of other seeds pass the same place.
     multipath : tuple of Disturbances
         More that is added to the clean signals, from Python only; not in `describe` nor in scenario files.
     """
@@ -265,11 +267,12 @@ class Scenario:
     receiver: ReceiverSettings = field(default_factory=ReceiverSettings)
     errors: ErrorSettings = field(default_factory=ErrorSettings)
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
+    place_seed: int = 1
     sensors: SensorSettings | None = None
     multipath: tuple[Disturbances, ...] = ()
 
     def __post_init__(self) -> None:
-        require_not_negative(self, "seed")
+        require_not_negative(self, "seed", "place_seed")
         require_positive(self, "duration_s", "rate_hz")
         if abs(1e7 / self.rate_hz - round(1e7 / self.rate_hz)) > 1e-6:
             raise SettingsError(f"Scenario.rate_hz must give an interval of whole 100 ns, got {self.rate_hz}")

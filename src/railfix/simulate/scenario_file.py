@@ -1,0 +1,230 @@
+"""Scenario files: TOML of one run, or a recipe that lists many.
+
+One run holds the settings of `Scenario` by their names::
+
+    description = "what this is"
+    seed = 7
+    start = 2024-03-05T03:10:00
+    duration_s = "run"
+
+    [line]
+    kind = "generated"
+    length_m = 36_000.0
+
+    [run]
+    cruise_mps = 30.0
+
+``duration_s = "run"`` lasts until the train stands at its last stop. A recipe names a base, another
+file beside it or a shipped one, and for each run what differs::
+
+    description = "four runs"
+    base = "p1-commercial"
+
+    [[runs]]
+    name = "01-rising"
+    seed = 1
+
+    [[runs]]
+    name = "02-falling"
+    seed = 2
+    run.direction = "falling"
+
+Paths in a file (``sky.nav``, ``line.file.path``) are relative to it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+from railfix.errors import InputFileError, SettingsError
+from railfix.simulate.alignment import made_alignment
+from railfix.simulate.motion import made_motion
+from railfix.simulate.scenario import Scenario
+from railfix.simulate.settings_tables import from_table, to_toml
+
+#: Word for a duration that the run curve gives.
+WHOLE_RUN: Final = "run"
+_FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """What a scenario file asks for.
+
+    Attributes
+    ----------
+    path : Path
+    description : str
+    names : tuple of str
+        Of the runs; one empty name where the file is a single run.
+    tables : tuple of dict
+        Settings of each run, paths in them absolute.
+    """
+
+    path: Path
+    description: str
+    names: tuple[str, ...]
+    tables: tuple[Mapping[str, Any], ...]
+
+    def scenario(self, number: int = 0, *, seed: int | None = None, duration_s: float | None = None) -> Scenario:
+        """Scenario of a run, counted from 0; `seed` and `duration_s` stand over those of the file.
+
+        Raises
+        ------
+        SettingsError
+            A setting is misspelt, of the wrong kind, or out of range.
+        InputFileError
+            The track file of a line whose run gives the duration cannot be read.
+        """
+        table = dict(self.tables[number])
+        if seed is not None:
+            table["seed"] = seed
+        if duration_s is not None:
+            table["duration_s"] = duration_s
+        whole = table.get("duration_s") == WHOLE_RUN
+        if whole:
+            del table["duration_s"]
+        name = self.names[number]
+        source = f"{self.path}, run {name}" if name else str(self.path)
+        scenario: Scenario = from_table(Scenario, table, where="", source=source)
+        if not whole:
+            return scenario
+        try:
+            return replace(scenario, duration_s=whole_run_s(scenario))
+        except SettingsError as error:
+            raise SettingsError(f"{source}: {error}") from None
+
+
+def whole_run_s(scenario: Scenario) -> float:
+    """Time until the train has stood at its last stop of the first way, in whole seconds."""
+    motion = made_motion(made_alignment(scenario.line), scenario, duration_s=0.0)
+    run = scenario.run
+    last = run.stations[-1 if run.direction == "rising" else 0].dwell_s if run.stations else run.stand_s
+    return float(math.ceil(float(motion.time_s[-1]) + last))
+
+
+def shipped_scenarios() -> dict[str, Path]:
+    """Scenario files that come with railfix, by name."""
+    return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"))}
+
+
+def find_scenario(name: str | PathLike[str]) -> Path:
+    """A scenario file by its path, or by the name of a shipped one.
+
+    Raises
+    ------
+    InputFileError
+        Neither.
+    """
+    shipped, path = shipped_scenarios(), Path(name)
+    if path.is_file() or (path.suffix and str(name) not in shipped):
+        return path
+    if str(name) not in shipped:
+        raise InputFileError(name, f"is neither a scenario file nor a shipped one; shipped are {', '.join(shipped)}")
+    return shipped[str(name)]
+
+
+def load_recipe(name: str | PathLike[str]) -> Recipe:
+    """What a scenario file asks for: one run or many.
+
+    Parameters
+    ----------
+    name : path-like
+        A path, or the name of a shipped scenario.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, or no TOML.
+    SettingsError
+        A recipe is not one: names twice, other keys. Settings of a run are checked by `Recipe.scenario`.
+    """
+    path = find_scenario(name)
+    table = _read(path)
+    description = str(table.pop("description", ""))
+    if "runs" not in table and "base" not in table:
+        return Recipe(path=path, description=description, names=("",), tables=(_absolute(table, path),))
+    unknown = sorted(set(table) - {"base", "runs"})
+    if unknown:
+        raise SettingsError(f"{path}: unknown key {unknown[0]} in a recipe; known are description, base, runs")
+    runs = table.get("runs")
+    if not isinstance(runs, list) or not runs or not all(isinstance(run, dict) for run in runs):
+        raise SettingsError(f"{path}: a recipe lists its runs as [[runs]], each with a name and what differs")
+    base: Mapping[str, Any] = {}
+    if "base" in table:
+        beside = path.parent / str(table["base"])
+        below = load_recipe(beside if beside.is_file() else str(table["base"]))
+        if len(below.names) > 1 or below.names[0]:
+            raise SettingsError(f"{path}: base {table['base']!r} is a recipe itself; name a single run")
+        base = below.tables[0]
+    names = [run.pop("name", "") for run in runs]
+    for name_of in names:
+        if not isinstance(name_of, str) or not re.fullmatch(r"[\w.-]*\w", name_of) or names.count(name_of) > 1:
+            raise SettingsError(
+                f"{path}: each of [[runs]] has its own name, letters, digits, - and _ (its folder), got {name_of!r}"
+            )
+    tables = tuple(_over(base, _absolute(run, path)) for run in runs)
+    return Recipe(path=path, description=description, names=tuple(names), tables=tables)
+
+
+def load_scenario(name: str | PathLike[str]) -> Scenario:
+    """The scenario of a file that holds one run.
+
+    Parameters
+    ----------
+    name : path-like
+        A path, or the name of a shipped scenario.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, or no TOML.
+    SettingsError
+        A setting is misspelt, of the wrong kind, or out of range; or the file lists many runs.
+    """
+    recipe = load_recipe(name)
+    if recipe.names[0]:
+        raise SettingsError(f"{recipe.path}: lists {len(recipe.names)} runs, expected one; use load_recipe")
+    return recipe.scenario()
+
+
+def scenario_toml(scenario: Scenario) -> str:
+    """A scenario as the TOML that `load_scenario` reads; `multipath` is not in it."""
+    return to_toml(scenario)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read as a scenario file ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputFileError(path, "is no text file; a scenario is TOML") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputFileError(path, f"is no valid TOML: {error}") from None
+
+
+def _absolute(table: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The same settings with the paths in them relative to the file made absolute."""
+    sky, line = table.get("sky"), table.get("line")
+    if isinstance(sky, dict) and isinstance(sky.get("nav"), str) and sky["nav"] != "none":
+        sky["nav"] = str(path.resolve().parent / sky["nav"])
+    if isinstance(line, dict) and isinstance(file := line.get("file"), dict) and isinstance(file.get("path"), str):
+        file["path"] = str(path.resolve().parent / file["path"])
+    return table
+
+
+def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings over those of a base, table by table."""
+    both = {**base, **values}
+    for name in set(base) & set(values):
+        if isinstance(base[name], Mapping) and isinstance(values[name], Mapping):
+            both[name] = _over(base[name], values[name])
+    return both
