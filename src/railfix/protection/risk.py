@@ -71,10 +71,10 @@ class RiskBudget:
         Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s:
         multipath of a moving train changes within seconds, that of a standing one within tens of seconds,
         SBAS corrections within minutes (DO-229D appendix J counts 10 samples an hour). More samples are
-        the safe side; from 10 to 3600 the fault-free K grows by 1.0.
+        the safe side; from 10 to 3600 the fault-free K grows by 0.9.
     fault_free_share, one_fault_share, two_fault_share : float
-        Of what an epoch may risk; together at most 1. The level is the largest of the three parts, and each
-        K moves by 0.1 only when its share doubles: thirds.
+        Of what an epoch may risk; together at most 1. The level is the largest of the three parts, and a
+        share twice as large lowers a K of 6 by 0.1, one of 3 by 0.2: thirds.
     exclusion_share : float
         Of the risk, kept for epochs with one and (as much again) with two satellites excluded.
     false_alarm : float

@@ -41,4 +41,4 @@ def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayL
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
     level = np.asarray(level_m, dtype=np.float64)
     status = np.where(level <= alarm_limit_m, Status.AVAILABLE, Status.UNAVAILABLE)
-    return np.where(np.isfinite(level) & ~np.asarray(consistent), Status.ALARM, status).astype(np.int8)
+    return np.where(~np.isnan(level) & ~np.asarray(consistent), Status.ALARM, status).astype(np.int8)

@@ -1,0 +1,286 @@
+"""Level along the track: by hand, and against deleting rows and solving every subset again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import norm
+
+import protection_oracle
+import raim_oracle as oracle
+from railfix.clock_elimination import UNTIED_M
+from railfix.protection import Cause, ProtectionLevel, RiskBudget, Status, along_track_level, availability, sbas_level
+from railfix.raim import LinearModel, constrained_model, point_model
+
+pytestmark = pytest.mark.requirement("C2")
+
+ARC = np.array([731.0])
+#: A risk whose parts are all asked for, and leave figures that can be followed.
+HAND = RiskBudget(
+    risk_per_hour=1e-4,
+    samples_per_hour=1.0,
+    exclusion_share=0.0,
+    false_alarm=0.01,
+    satellite_prior={"G": 0.008, "E": 0.006, "C": 0.009},
+    local_prior=0.002,
+)
+
+
+def hand_model(error_m: tuple[float, ...]) -> LinearModel:
+    """Five satellites of one clock, 1 m each, none sees the map error: docs/protection-level.md."""
+    cosine = np.array([0.8, -0.8, 0.4, -0.4, 0.0])
+    design = np.zeros((1, 5, 3))
+    design[0, :, 0] = cosine
+    return LinearModel(
+        root_weight=np.ones((1, 5)),
+        clock=np.zeros(5, dtype=np.intp),
+        clock_covariance_m2=np.full((1, 1, 1), 0.2),
+        design=design,
+        covariance_m2=np.diag([1.0 / 1.6, 0.09, 0.36])[None],
+        prior=np.diag([0.0, 1.0 / 0.09, 1.0 / 0.36]),
+        misfit=np.array([error_m]),
+        freedom=np.array([3]),
+        interest=1,
+    )
+
+
+def test_case_worked_by_hand():
+    """docs/protection-level.md follows these figures."""
+    got = along_track_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    assert got.sigma_m[0] == pytest.approx(np.sqrt(0.625), abs=1e-12)
+    assert got.unchecked_risk[0] == pytest.approx(1e-5, rel=1e-9)  # 10 triples of 0.01^3
+    # 9e-5 left, 3e-5 for each part.
+    assert got.k_fault_free[0] == pytest.approx(norm.isf(1.5e-5), abs=1e-9)
+    assert got.k_one_fault[0] == pytest.approx(norm.isf(6e-4), abs=1e-9)  # 3e-5 over 5 of 0.01
+    assert got.k_two_faults[0] == pytest.approx(norm.isf(0.03), abs=1e-9)  # 3e-5 over 10 of 0.0001
+    assert got.k_false_alarm[0] == pytest.approx(norm.isf(0.01 / 30), abs=1e-9)
+    assert [round(float(k[0]), 3) for k in (got.k_fault_free, got.k_one_fault, got.k_two_faults)] == [
+        4.173,
+        3.239,
+        1.881,
+    ]
+    # Without satellite 1: 1/0.8 = 1.25 m^2, of which 0.625 is the separation. Without 1 and 2: 1/0.32.
+    assert got.fault_free_m[0] == pytest.approx(norm.isf(1.5e-5) * np.sqrt(0.625), abs=1e-9)
+    assert got.one_fault_m[0] == pytest.approx(
+        norm.isf(0.01 / 30) * np.sqrt(0.625) + norm.isf(6e-4) * np.sqrt(1.25), abs=1e-9
+    )
+    assert got.two_fault_m[0] == pytest.approx(
+        norm.isf(0.01 / 30) * np.sqrt(2.5) + norm.isf(0.03) * np.sqrt(3.125), abs=1e-9
+    )
+    parts = (got.fault_free_m, got.one_fault_m, got.two_fault_m, got.level_m)
+    assert [round(float(part[0]), 2) for part in parts] == [3.30, 6.31, 8.71, 8.71]
+    assert got.worst_one[0] in (0, 1)
+    assert tuple(got.worst_two[0]) in ((0, 1), (0, 2), (1, 3))
+    assert got.cause[0] == Cause.TWO_FAULTS
+    # 3 m on satellite 1 move the position by 0.8 * 3/1.6 = 1.5 m; without it 0: 1.5 m against 3.403 * 0.791 m.
+    assert got.consistent[0]
+    assert got.separation[0] == pytest.approx(1.5 / (norm.isf(0.01 / 30) * np.sqrt(0.625)), abs=1e-9)
+    off = along_track_level(hand_model((6.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    assert not off.consistent[0]
+    assert off.separation[0] == pytest.approx(2.0 * got.separation[0], abs=1e-9)
+    assert availability(off.level_m, 20.0, consistent=off.consistent)[0] == Status.ALARM
+
+
+def test_case_worked_by_hand_against_rows_and_columns():
+    cosine = hand_model((0.0,) * 5).design[0, :, 0]
+    design = np.zeros((7, 4))
+    design[:5, 0], design[:5, 3] = cosine, 1.0
+    design[5, 1] = design[6, 2] = 1.0  # map rows
+    case = oracle.Problem(
+        design=design,
+        observed=np.array([3.0, 0, 0, 0, 0, 0, 0]),
+        sigma_m=np.ones(5),
+        channels=np.arange(5),
+        scale_of=np.array([1.0, 0.3, 0.6, 1.0]),
+        interest=1,
+        freedom=3,
+    )
+    expected = protection_oracle.level(
+        case, dict.fromkeys(range(5), 0.01), risk_per_sample=1e-4, share=1 / 3, false_alarm=0.01
+    )
+    got = along_track_level(hand_model((3.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
+    assert got.fault_free_m[0] == pytest.approx(expected.fault_free_m, abs=1e-9)
+    assert got.one_fault_m[0] == pytest.approx(expected.one_fault_m, abs=1e-9)
+    assert got.two_fault_m[0] == pytest.approx(expected.two_fault_m, abs=1e-9)
+    assert got.separation[0] == pytest.approx(expected.separation, abs=1e-9)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    system=st.sampled_from(
+        [
+            ("GGGGG", None),
+            ("GGGGGEEE", None),
+            ("GGGGEEC", None),
+            ("GGGEE", None),
+            ("GGGGGEEECCC", None),
+            ("GGGGGEEE", (0.0, 1.0)),
+            ("GGGGECC", (0.0, 0.5, UNTIED_M)),
+        ]
+    ),
+    scale=st.sampled_from([1.0, 0.6, 2.5]),
+    biased=st.booleans(),
+    shared=st.booleans(),
+    risk=st.sampled_from([1e-2, 1e-3, 1e-4]),
+    fault=st.floats(-20.0, 20.0),
+)
+@settings(max_examples=250, deadline=None)
+def test_level_equals_solving_every_subset_again(seed, system, scale, biased, shared, risk, fault):
+    systems, ties = system
+    ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault})
+    model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    budget = replace(HAND, risk_per_hour=risk, constellation_prior={"E": 1e-5, "C": 1e-4} if shared else {})
+    bias = np.random.default_rng(seed).uniform(0.0, 1.0, len(systems)) if biased else None
+    constellations = tuple(
+        (tuple(c for c, s in enumerate(systems) if s == letter), p)
+        for letter, p in budget.constellation_prior.items()
+        if letter in systems
+    )
+    expected = protection_oracle.level(
+        case,
+        dict(enumerate(budget.prior(list(systems)))),
+        risk_per_sample=risk,
+        share=1 / 3,
+        false_alarm=0.01,
+        scale=scale,
+        bias_m=bias,
+        constellations=constellations,
+    )
+    if expected.sigma_m > 100.0:
+        return  # at the edge of what the ranges determine
+    got = along_track_level(model, list(systems), risk=budget, scale=scale, bias_m=bias)
+    assert got.sigma_m[0] == pytest.approx(expected.sigma_m, rel=1e-7)
+    for mine, theirs in (
+        (got.fault_free_m, expected.fault_free_m),
+        (got.one_fault_m, expected.one_fault_m),
+        (got.two_fault_m, expected.two_fault_m),
+    ):
+        if not 1e3 < theirs < np.inf:
+            assert mine[0] == pytest.approx(theirs, rel=1e-6)
+    assert got.level_m[0] == max(got.fault_free_m[0], got.one_fault_m[0], got.two_fault_m[0])
+    if max(expected.one_fault_m, expected.two_fault_m) < 1e3:
+        assert got.separation[0] == pytest.approx(expected.separation, rel=1e-5, abs=1e-9)
+        assert got.consistent[0] == (got.separation[0] <= 1.0)
+
+
+def test_noise_scale_multiplies_the_ranges_not_the_map():
+    """The level grows with the noise, but by less: the map error stays what it is."""
+    ranges = oracle.made(ARC, "GGGGGEEE", seed=3)
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    one, two = (along_track_level(model, list("GGGGGEEE"), scale=s) for s in (1.0, 2.0))
+    assert one.level_m[0] < two.level_m[0] < 2.0 * one.level_m[0]
+    assert two.sigma_m[0] == pytest.approx(np.sqrt(model.position_covariance_m2(np.array([2.0]))[0, 0, 0]), rel=1e-12)
+
+
+def test_batch_equals_epoch_by_epoch_and_gaps_stay_empty():
+    arc = np.linspace(200.0, 1800.0, 40)
+    ranges = oracle.made(arc, "GGGGGGEEEECC", seed=8)
+    weight = ranges.weight * (np.random.default_rng(1).random(ranges.weight.shape) > 0.25)
+    arc = np.where(np.arange(40) % 7 == 3, np.nan, arc)
+    model = constrained_model(replace(ranges, weight=weight), oracle.LINE, arc)
+    scale = np.linspace(0.5, 2.0, 40)
+    out = np.arange(40) % 4
+    whole = along_track_level(model, list("GGGGGGEEEECC"), scale=scale, n_excluded=out)
+    for t in range(40):
+        each = along_track_level(model.take(np.array([t])), list("GGGGGGEEEECC"), scale=scale[t], n_excluded=out[t])
+        for name in ProtectionLevel.__dataclass_fields__:
+            mine, alone = getattr(whole, name)[t : t + 1], getattr(each, name)
+            if mine.dtype == float:
+                assert mine == pytest.approx(alone, rel=1e-12, nan_ok=True)
+            else:
+                assert np.array_equal(mine, alone)
+    empty = np.isnan(arc)
+    assert np.isnan(whole.level_m[empty]).all()
+    assert (whole.cause[empty] == Cause.NO_POSITION).all()
+    assert not whole.consistent[empty].any()
+    assert np.isfinite(whole.level_m[~empty & (out == 0)]).any()
+    assert np.isinf(whole.level_m[~empty & (out == 3)]).all()
+    assert (whole.cause[~empty & (out == 3)] == Cause.BUDGET).all()
+    assert len(along_track_level(model.take(np.zeros(0, dtype=int)), list("GGGGGGEEEECC")).level_m) == 0
+
+
+def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligible():
+    # Two satellites of one clock fix the position: either fault is invisible.
+    ranges = oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 3])
+    model = constrained_model(oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 1]), oracle.LINE, ARC)
+    got = along_track_level(model, list("GGGEEE"))
+    assert np.isinf(got.level_m[0])
+    assert got.cause[0] == Cause.UNCHECKED
+    rare = replace(HAND, satellite_prior={"G": 1e-7, "E": 1e-7}, local_prior=0.0)
+    small = along_track_level(model, list("GGGEEE"), risk=rare)
+    assert small.level_m[0] == small.fault_free_m[0] < np.inf
+    assert small.k_one_fault[0] == -np.inf
+    nothing = along_track_level(constrained_model(ranges, oracle.LINE, ARC), list("GGGEEE"))
+    assert np.isnan(nothing.level_m[0])
+
+
+def test_pair_that_only_vouches_for_itself_has_no_effect():
+    """Two satellites of a clock of their own: alone each is useless without the other."""
+    seven = oracle.made(ARC, "GGGGGGEE", seed=6)
+    model = constrained_model(seven, oracle.LINE, ARC)
+    got = along_track_level(model, list("GGGGGGEE"), risk=HAND)
+    case = oracle.problem_on_line(seven, 0, ARC[0])
+    solved = protection_oracle.Resolved(case, 1.0)
+    pair, single = solved.without((6, 7)), solved.without((6,))
+    assert pair.sigma_m == pytest.approx(single.sigma_m, rel=1e-9)
+    assert np.isfinite(got.level_m[0])
+
+
+def test_excluded_satellites_raise_the_level():
+    ranges = oracle.made(ARC, "GGGGGEEEE", seed=5)
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    levels = [along_track_level(model, list("GGGGGEEEE"), n_excluded=e) for e in range(4)]
+    assert levels[0].level_m[0] < levels[1].level_m[0] < levels[2].level_m[0] < np.inf
+    assert np.isinf(levels[3].level_m[0])
+    never = along_track_level(model, list("GGGGGEEEE"), risk=RiskBudget(exclusion_share=0.0), n_excluded=1)
+    assert never.cause[0] == Cause.BUDGET
+
+
+def test_constellation_fault_that_nothing_checks():
+    """All satellites of one constellation: without it there is no position."""
+    model = constrained_model(oracle.made(ARC, "GGGGGG", seed=5), oracle.LINE, ARC)
+    got = along_track_level(model, list("GGGGGG"), risk=RiskBudget(constellation_prior={"G": 1e-4}))
+    assert got.cause[0] == Cause.UNCHECKED
+    assert got.worst_constellation[0] == "G"
+    both = constrained_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    ok = along_track_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
+    assert np.isfinite(ok.level_m[0])
+
+
+def test_refusals():
+    model = constrained_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
+    with pytest.raises(ValueError, match="5 channels, got 4"):
+        along_track_level(model, list("GGGG"))
+    with pytest.raises(ValueError, match="constellation 'X'"):
+        along_track_level(model, list("GGGGX"))
+    with pytest.raises(ValueError, match="scale must be positive"):
+        along_track_level(model, list("GGGGG"), scale=0.0)
+    with pytest.raises(ValueError, match="got a negative one"):
+        along_track_level(model, list("GGGGG"), n_excluded=-1)
+    space = point_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE.at_arc(ARC))
+    with pytest.raises(ValueError, match="a model on the line"):
+        along_track_level(space, list("GGGGG"))
+    with pytest.raises(ValueError, match="a model on the line"):
+        sbas_level(space, k=5.33)
+
+
+def test_status():
+    level = np.array([19.0, 20.0, 21.0, np.inf, np.nan, 5.0, np.inf, np.nan])
+    consistent = np.array([True, True, True, True, True, False, False, False])
+    got = availability(level, 20.0, consistent=consistent)
+    assert [Status(s).name for s in got] == [
+        "AVAILABLE",
+        "AVAILABLE",
+        "UNAVAILABLE",
+        "UNAVAILABLE",
+        "UNAVAILABLE",
+        "ALARM",
+        "ALARM",
+        "UNAVAILABLE",
+    ]
+    with pytest.raises(ValueError, match="positive"):
+        availability(level, 0.0)

@@ -1,0 +1,94 @@
+"""The risk: K against DO-229's constants, probabilities against counting every combination of faults."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from railfix.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
+from railfix.protection.risk import more_than_two, pair_sum
+
+pytestmark = pytest.mark.requirement("C2")
+
+
+def test_k_of_a_risk_on_both_sides_of_a_line():
+    assert round(k_factor(1e-7), 3) == 5.327
+    assert round(k_factor(1e-8), 2) == 5.73
+    assert k_factor(1.0) == 0.0
+    assert 2.0 * norm.sf(k_factor(3e-9)) == pytest.approx(3e-9, rel=1e-9)
+    for risk in (0.0, -1.0, 1.1, np.nan):
+        with pytest.raises(ValueError, match="a risk is a probability"):
+            k_factor(risk)
+
+
+def test_constants_of_do_229():
+    """V: 1e-7 in one dimension; H, PA: 2e-9 in one; H, NPA: 5e-9 in two, that is 1e-7 an hour, half, 10 samples."""
+    assert round(k_factor(1e-7), 2) == K_V
+    assert round(k_factor(2e-9), 1) == K_H_PA
+    assert round(float(np.sqrt(chi2.isf(0.5e-7 / 10.0, 2))), 2) == K_H_NPA
+    # Along a line it would be less.
+    assert k_factor(0.5e-7 / 10.0) < K_H_NPA - 0.3
+
+
+def test_risk_of_an_hour_is_divided_among_its_samples():
+    assert RiskBudget(risk_per_hour=1e-7, samples_per_hour=10.0).sample_k == pytest.approx(5.7307, abs=1e-4)
+    assert RiskBudget().risk_per_sample == pytest.approx(1e-7 / 360)
+    grow = RiskBudget(samples_per_hour=3600.0).sample_k - RiskBudget(samples_per_hour=10.0).sample_k
+    assert grow == pytest.approx(0.9, abs=0.05)  # as the docstring says
+
+
+def test_fault_probabilities_bound_what_counting_gives():
+    rng = np.random.default_rng(2)
+    for n in (1, 2, 3, 6, 9):
+        prior = rng.uniform(0.0, 0.05, n)
+        exact = np.zeros(n + 1)
+        for state in product((0, 1), repeat=n):
+            exact[sum(state)] += np.prod(np.where(state, prior, 1.0 - prior))
+        assert exact[2:3].sum() <= pair_sum(prior[None])[0] + 1e-15
+        assert exact[3:].sum() <= more_than_two(prior[None])[0] + 1e-15
+        assert more_than_two(prior[None])[0] <= 1.6 * exact[3:].sum() + 1e-15
+    assert more_than_two(np.full((1, 20), 2e-5))[0] == pytest.approx(1140 * 8e-15, rel=1e-9)
+
+
+def test_every_set_that_could_be_left_together_spends_the_risk():
+    risk = RiskBudget(exclusion_share=0.2)
+    total = 12
+    spent = risk.sample_risk(total, 0)
+    spent += 12 * risk.sample_risk(total - 1, 1) + 66 * risk.sample_risk(total - 2, 2)
+    assert spent == pytest.approx(risk.risk_per_sample, rel=1e-12)
+    assert MOST_EXCLUDED == 2
+    assert risk.sample_risk(9, 3) == 0.0
+    assert risk.sample_risk([9, 9], [0, 1], 1.0).tolist() == [0.0, 0.0]
+
+
+def test_priors_and_what_they_leave():
+    risk = RiskBudget()
+    assert risk.prior(list("GE")) == pytest.approx([2e-5, 4e-5])
+    risk.require(["G"] * 10 + ["E"] * 10)
+    with pytest.raises(ValueError, match=r"more than two of 20 satellites are faulty with probability 1\.1e-06"):
+        RiskBudget(satellite_prior={"G": 1e-3}, local_prior=0.0).require(["G"] * 20)
+    with pytest.raises(ValueError, match="constellation 'X'"):
+        risk.prior(["X"])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"risk_per_hour": 0.0},
+        {"risk_per_hour": np.nan},
+        {"samples_per_hour": 0.0},
+        {"fault_free_share": 0.5},
+        {"two_fault_share": 0.0},
+        {"exclusion_share": 0.5},
+        {"false_alarm": 1.0},
+        {"local_prior": -1e-5},
+        {"satellite_prior": {"G": 1.0}},
+        {"constellation_prior": {"G": np.nan}},
+    ],
+)
+def test_budgets_that_are_refused(wrong):
+    with pytest.raises(ValueError, match=r"probability|positive|exclusion_share"):
+        RiskBudget(**wrong)
