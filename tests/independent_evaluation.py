@@ -1,0 +1,334 @@
+"""Figures of merit worked out a second time, plainly: csv, loops and statistics, without railfix.
+
+Run ``python tests/independent_evaluation.py RUN TRUTH`` to print the figures of a run whose chainage is the truth's.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import math
+import statistics
+import sys
+from bisect import bisect_left
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+GAP_S, SIGMA_M, STANDING_MPS, SECTION_M = 2.5, 0.5, 0.3, 500.0
+SPEEDS = (20.0, 60.0, 100.0)
+SATELLITES = (4, 5, 6, 7, 8, 10, 12, 15, 20)
+BLOCK_S, DRAWS, SEED, CONFIDENCE = 20.0, 200, 0, 0.95
+NAN = math.nan
+
+
+def nanoseconds(text):
+    return int(np.datetime64(text, "ns").astype(np.int64))
+
+
+def number(text):
+    return float(text) if text not in ("", None) else NAN
+
+
+def rows_of(path):
+    with gzip.open(path, "rt") if str(path).endswith(".gz") else Path(path).open() as file:
+        return list(csv.DictReader(file))
+
+
+def percentile(values, share):
+    """Linear between the values."""
+    ordered = sorted(values)
+    place = share * (len(ordered) - 1)
+    low = math.floor(place)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (place - low) * (ordered[high] - ordered[low])
+
+
+def reference_at(truth, times, time):
+    """Chainage, speed, sigma and environment at a time; None where the reference does not tell."""
+    i = bisect_left(times, time)
+    if i < len(times) and times[i] == time:
+        return truth[i]
+    if i in (0, len(times)) or (times[i] - times[i - 1]) / 1e9 > GAP_S:
+        return None
+    share = (time - times[i - 1]) / (times[i] - times[i - 1])
+    a, b = truth[i - 1], truth[i]
+    return (*(x + share * (y - x) for x, y in zip(a[:3], b[:3], strict=True)), a[3] if share <= 0.5 else b[3])
+
+
+def epochs_of(positions, truth):
+    """Every epoch of one antenna, those put in included, as dictionaries."""
+    known = [
+        (number(r["chainage_m"]), number(r["speed_mps"]), number(r.get("sigma_m")), r.get("environment") or "unknown")
+        for r in truth
+    ]
+    clock = [nanoseconds(r["time_gpst"]) for r in truth]
+    logged = {nanoseconds(r["time_gpst"]): r for r in positions}
+    times = sorted(logged)
+    step = statistics.median([b - a for a, b in pairwise(times)])
+    whole = []
+    for a, b in pairwise(times):
+        whole.append(a)
+        parts = round((b - a) / step) if b - a > 1.5 * step else 1
+        whole += [a + int(k * (b - a) / parts) for k in range(1, parts)]
+    whole.append(times[-1])
+    found = []
+    for time in whole:
+        at, row = reference_at(known, clock, time), logged.get(time, {})
+        one = {"time": time, "in": at is not None, "status": row.get("status", "not_logged")}
+        one["observed"] = one["status"] not in ("not_logged", "no_observation")
+        one["chainage"], one["speed"], one["sigma"], one["environment"] = at or (NAN, NAN, NAN, "unknown")
+        one["speed"] = abs(one["speed"])
+        one["good"] = one["in"] and not one["sigma"] > SIGMA_M
+        one["n"] = number(row.get("n_used"))
+        one["along"] = number(row.get("along_sigma_m"))
+        one["level"] = number(row.get("protection_level_m"))
+        one["map"] = number(row.get("chainage_m")) - one["chainage"]
+        one["3d"] = number(row.get("conventional_chainage_m")) - one["chainage"]
+        one["block"] = math.floor((time - whole[0]) / 1e9 / BLOCK_S)
+        found.append(one)
+    return found
+
+
+def put_distance(epochs):
+    """Distance run, at the epochs inside the reference."""
+    total, before = 0.0, None
+    for one in epochs:
+        if not one["in"]:
+            continue
+        if before is not None:
+            step = abs(one["chainage"] - before["chainage"])
+            took = (one["time"] - before["time"]) / 1e9
+            speed = (one["speed"] + before["speed"]) / 2
+            if took > GAP_S or math.isnan(speed):
+                speed = step / took
+            if speed >= STANDING_MPS:
+                total += step
+        one["moved"] = total
+        before = one
+
+
+def has(one, position, epochs_of_both):
+    mapped, point = not math.isnan(one["map"]), not math.isnan(one["3d"])
+    if epochs_of_both == "common" and not (mapped and point):
+        return False
+    if position == "conventional":
+        return point
+    return mapped and (position == "constrained" or one["status"] == "ok")
+
+
+def limits(epochs, position):
+    """Blocks drawn with replacement: limits of mean, rate and 95th percentile."""
+    names = sorted({one["block"] for one in epochs})
+    if len(names) < 5:
+        return len(names), [NAN] * 6
+    errors = {name: [] for name in names}
+    observed, positioned = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
+    for one in epochs:
+        observed[one["block"]] += one["observed"]
+        positioned[one["block"]] += has(one, position, "own")
+        if has(one, position, "own") and one["good"]:
+            errors[one["block"]].append(one["3d" if position == "conventional" else "map"])
+    means, rates, tails = [], [], []
+    for draw in np.random.default_rng(SEED).integers(0, len(names), (DRAWS, len(names))):
+        drawn = [names[i] for i in draw]
+        seen = sum(observed[name] for name in drawn)
+        if seen:
+            rates.append(sum(positioned[name] for name in drawn) / seen)
+        values = [e for name in drawn for e in errors[name]]
+        if values:
+            means.append(statistics.fmean(values))
+            tails.append(sorted(abs(e) for e in values)[math.ceil(0.95 * len(values) - 1e-9) - 1])
+    out = []
+    for values in (means, rates, tails):
+        for share in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2):
+            out.append(percentile(values, share) if values else NAN)
+    return len(names), out
+
+
+def figures(epochs, position, both, *, with_limits):
+    inside = [one for one in epochs if one["in"]]
+    positions = [one for one in inside if has(one, position, both)]
+    judged = [one for one in positions if one["good"]]
+    column = "3d" if position == "conventional" else "map"
+    errors = [one[column] for one in judged]
+    size = [abs(e) for e in errors]
+    observed = sum(one["observed"] for one in inside)
+    out = {
+        "epochs": len(inside),
+        "observed": observed,
+        "positions": len(positions),
+        "left_out": len(positions) - len(judged),
+        "errors": len(errors),
+        "rate": len(positions) / observed if observed else NAN,
+        "rate_of_run": len(positions) / len(inside),
+        "wrong_places": sum(s > 50 for s in size),
+    }
+    if with_limits:
+        blocks, told = limits(inside, position)
+        out["blocks"] = blocks
+        names = ("mean_low_m", "mean_high_m", "rate_low", "rate_high", "p95_low_m", "p95_high_m")
+        out |= dict(zip(names, told, strict=True))
+    if not errors:
+        return out
+    out |= {
+        "mean_m": statistics.fmean(errors),
+        "std_m": statistics.pstdev(errors),
+        "rms_m": math.sqrt(statistics.fmean([e * e for e in errors])),
+        "max_m": max(size),
+        "lowest_m": min(errors),
+        "highest_m": max(errors),
+    }
+    out |= {f"p{q}_m": percentile(size, q / 100) for q in (50, 95, 99)}
+    out |= {f"over_{limit}_m": sum(s > limit for s in size) / len(size) for limit in (5, 10, 20, 50)}
+    worst = max(judged, key=lambda one: abs(one[column]))
+    out |= {"max_at_time": worst["time"], "max_at_chainage_m": worst["chainage"]}
+    stated = [one["sigma"] for one in judged if not math.isnan(one["sigma"])]
+    out["reference_sigma_p50_m"] = statistics.median(stated) if stated else NAN
+    if position != "conventional":
+        ratio = [one["map"] / one["along"] for one in judged]
+        out |= {
+            "along_sigma_p50_m": statistics.median([one["along"] for one in judged]),
+            "normalised_mean": statistics.fmean(ratio),
+            "normalised_rms": math.sqrt(statistics.fmean([r * r for r in ratio])),
+        }
+        out |= {f"over_{n}_sigma": sum(abs(r) > n for r in ratio) / len(ratio) for n in (1, 2, 3)}
+    return out
+
+
+def speed_class(speed):
+    kmh = speed * 3.6
+    if speed < STANDING_MPS:
+        return "standing"
+    if kmh < SPEEDS[0]:
+        return f"under {SPEEDS[0]:g} km/h"
+    for low, high in pairwise(SPEEDS):
+        if low <= kmh < high:
+            return f"{low:g} to {high:g} km/h"
+    return f"over {SPEEDS[-1]:g} km/h"
+
+
+def satellite_class(count):
+    if math.isnan(count):
+        return "unknown"
+    if count < SATELLITES[0]:
+        return f"under {SATELLITES[0]}"
+    for low, high in pairwise(SATELLITES):
+        if low <= count < high:
+            return str(low) if high == low + 1 else f"{low} to {high - 1}"
+    return f"{SATELLITES[-1]} and more"
+
+
+def section(chainage):
+    first = math.floor(chainage / SECTION_M) * SECTION_M
+    return f"{first:.0f} to {first + SECTION_M:.0f} m"
+
+
+GROUPINGS = {
+    "all": lambda _: "all",
+    "section": lambda one: section(one["chainage"]),
+    "environment": lambda one: one["environment"],
+    "speed": lambda one: speed_class(one["speed"]),
+    "satellites": lambda one: satellite_class(one["n"]),
+    "status": lambda one: one["status"],
+}
+KINDS = (
+    ("constrained", "own"),
+    ("constrained_ok", "own"),
+    ("conventional", "own"),
+    ("constrained", "common"),
+    ("conventional", "common"),
+)
+
+
+def all_figures(by_antenna):
+    """(grouping, group, antenna, position, epochs) to figures."""
+    found = {}
+    pools = {**by_antenna, "all": [one for epochs in by_antenna.values() for one in epochs]}
+    for antenna, epochs in pools.items():
+        for grouping, group_of in GROUPINGS.items():
+            groups = {}
+            for one in epochs:
+                if one["in"]:
+                    groups.setdefault(group_of(one), []).append(one)
+            for group, members in groups.items():
+                for position, both in KINDS:
+                    told = both == "own" and grouping not in ("satellites", "status")
+                    found[grouping, group, antenna, position, both] = figures(members, position, both, with_limits=told)
+    return found
+
+
+def intervals(epochs, position):
+    inside = [one for one in epochs if one["in"]]
+    fixes = [one for one in inside if has(one, position, "own")]
+    pairs = list(pairwise(fixes))
+    ran = [(b["moved"] - a["moved"], a) for a, b in pairs if b["moved"] - a["moved"] > 0]
+    gaps = [((b["time"] - a["time"]) / 1e9, a) for a, b in pairs]
+    metres = [m for m, _ in ran]
+    widest = max(ran, key=lambda pair: pair[0])
+    longest = max(gaps, key=lambda pair: pair[0])
+    return {
+        "intervals": len(ran),
+        "standing": len(pairs) - len(ran),
+        "interval_mean_m": statistics.fmean(metres),
+        "interval_p50_m": percentile(metres, 0.5),
+        "interval_p95_m": percentile(metres, 0.95),
+        "interval_p99_m": percentile(metres, 0.99),
+        "interval_max_m": widest[0],
+        "interval_max_chainage_m": widest[1]["chainage"],
+        "gap_p50_s": percentile([g for g, _ in gaps], 0.5),
+        "gap_p95_s": percentile([g for g, _ in gaps], 0.95),
+        "gap_max_s": longest[0],
+        "gap_max_from": longest[1]["time"],
+        "before_first_s": (fixes[0]["time"] - inside[0]["time"]) / 1e9,
+        "after_last_s": (inside[-1]["time"] - fixes[-1]["time"]) / 1e9,
+    }
+
+
+def levels(epochs, position):
+    inside = [one for one in epochs if one["in"]]
+    fixes = [one for one in inside if has(one, position, "own")]
+    finite = [one for one in fixes if math.isfinite(one["level"])]
+    judged = [one for one in finite if one["good"]]
+    over = sum(abs(one["map"]) > one["level"] for one in judged)
+    observed = sum(one["observed"] for one in inside)
+    return {
+        "observed": observed,
+        "positions": len(fixes),
+        "infinite": sum(math.isinf(one["level"]) for one in fixes),
+        "with_level": len(finite),
+        "available": len(finite),
+        "availability": len(finite) / observed,
+        "level_p50_m": statistics.median([one["level"] for one in finite]),
+        "level_p95_m": percentile([one["level"] for one in finite], 0.95),
+        "errors": len(judged),
+        "over_level": over,
+        "over_level_share": over / len(judged),
+    }
+
+
+def evaluated(run, truth):
+    """Figures, intervals and levels of a run folder against a truth file."""
+    positions, places = rows_of(Path(run) / "positions.csv"), rows_of(truth)
+    by_antenna = {}
+    for antenna in dict.fromkeys(row["antenna"] for row in positions):
+        epochs = epochs_of(
+            [row for row in positions if row["antenna"] == antenna],
+            [row for row in places if row["antenna"] == antenna],
+        )
+        put_distance(epochs)
+        by_antenna[antenna] = epochs
+    kinds = ("constrained", "constrained_ok", "conventional")
+    return (
+        all_figures(by_antenna),
+        {(a, p): intervals(epochs, p) for a, epochs in by_antenna.items() for p in kinds},
+        {(a, p): levels(epochs, p) for a, epochs in by_antenna.items() for p in kinds[:2]},
+    )
+
+
+if __name__ == "__main__":
+    for part in evaluated(*sys.argv[1:]):
+        for key, values in part.items():
+            print(*key)
+            print("   ", *(f"{name}={value}" for name, value in values.items()))
