@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-#: Repetitions; the stretch on which each path's triangle lies settles in two or three.
-_ROUNDS: Final = 3
+#: Repetitions: with an error of few hundredths of a chip three or four settle it, a wide spacing wants more.
+_ROUNDS_NARROW: Final = 4
+_ROUNDS_WIDE: Final = 12
+#: Up to this spacing the correlator is narrow [chips].
+_NARROW_CHIPS: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +120,7 @@ def _zero(c: Complexes, late: Floats, follow: Floats, spacing: float) -> Floats:
     half = 0.5 * spacing
     error = np.zeros(c.shape[1])
     own = np.abs(c) ** 2
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS_NARROW if spacing <= _NARROW_CHIPS else _ROUNDS_WIDE):
         x = error - late
         triangle = _triangle(x)
         prompt = (c * triangle).sum(axis=0)

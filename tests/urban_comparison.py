@@ -1,0 +1,251 @@
+"""Simulated surroundings beside recorded cities: errors of the codes and C/N0 by elevation, printed.
+
+Run ``python tests/urban_comparison.py`` with the recordings beside the checkout; without them only the
+simulated columns are printed. Nothing is fitted: the kinds of `railfix.simulate.environment.kinds` are
+chosen from what such places look like.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import recordings_score
+import recordings_truth
+from railfix.constants import CLOCK_GROUP
+from railfix.evaluate import interpolate_reference
+from railfix.geodesy import range_with_rotation
+from railfix.measurement import CodeNoise, code_sigma_m
+from railfix.pipeline import AntennaResult
+from railfix.reasons import Reason
+from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings
+from railfix.simulate.environment import ElectrificationSettings, Environment, EnvironmentSettings, SectionSettings
+
+Floats = NDArray[np.float64]
+
+#: Constellations that both sides have.
+SYSTEMS: Final = "GJEC"
+#: Length of the simulated line [m], its cruising speed [m/s], and seeds that are put together.
+LENGTH_M: Final = 4000.0
+CRUISE_MPS: Final = 40.0 / 3.6
+SEEDS: Final = (1, 2, 3)
+#: Reasons for which a code is not compared.
+NO_RANGE: Final = int(
+    Reason.UNHEALTHY
+    | Reason.NO_EPHEMERIS
+    | Reason.EPHEMERIS_TOO_OLD
+    | Reason.IMPLAUSIBLE_CODE
+    | Reason.OTHER_SIGNAL_TAKEN
+    | Reason.NO_CORRECTION
+)
+#: Elevations below this are left out of the errors [deg].
+MASK_DEG: Final = 10.0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Codes less true range, and what goes with them, shapes (T, K); NaN where not tracked."""
+
+    name: str
+    satellite: NDArray[np.str_]
+    residual_m: Floats
+    elevation_deg: Floats
+    cn0_dbhz: Floats
+    in_view: NDArray[np.bool_] | None = None
+
+    def errors_m(self) -> Floats:
+        """Residuals less one clock an epoch and one offset a constellation, shape (T, K).
+
+        Clocks are medians weighted by the elevation and C/N0 of the satellites, so that they follow the
+        clear ones; the same for recordings and simulations.
+        """
+        weight = 1.0 / code_sigma_m(self.cn0_dbhz, self.elevation_deg, noise=CodeNoise()) ** 2
+        group = np.array([CLOCK_GROUP[str(name)[0]] for name in self.satellite])
+        letters = sorted(set(group.tolist()), key=lambda letter: letter != "G")
+        clocks = {g: weighted_median(self.residual_m[:, group == g], weight[:, group == g]) for g in letters}
+        offset = {g: float(np.nanmedian(clocks[g] - clocks["G"])) for g in letters}
+        tied = self.residual_m - np.array([offset[g] for g in group])
+        return tied - weighted_median(tied, weight)[:, None]
+
+
+def weighted_median(value: Floats, weight: Floats) -> Floats:
+    """Weighted median along the last axis; NaN where there is nothing."""
+    there = np.isfinite(value) & np.isfinite(weight)
+    order = np.argsort(np.where(there, value, np.inf), axis=1)
+    share = np.cumsum(np.take_along_axis(np.where(there, weight, 0.0), order, axis=1), axis=1)
+    middle = np.argmax(share >= 0.5 * share[:, -1:], axis=1)
+    found = np.take_along_axis(value, np.take_along_axis(order, middle[:, None], axis=1), axis=1)[:, 0]
+    return np.where(there.any(axis=1), found, np.nan)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What is compared."""
+
+    codes: int
+    p50_m: float
+    p95_m: float
+    over_20_m: float
+    late_over_20_m: float
+    early_over_20_m: float
+    tracked: float
+
+
+def figures(sample: Sample) -> Figures:
+    """Figures of the codes above the mask."""
+    error = sample.errors_m()
+    high = sample.elevation_deg >= MASK_DEG
+    e = error[np.isfinite(error) & high]
+    tracked = np.nan
+    if sample.in_view is not None:
+        tracked = float(np.isfinite(sample.residual_m[high & sample.in_view]).mean())
+    size = np.abs(e)
+    return Figures(
+        codes=len(e),
+        p50_m=float(np.median(size)),
+        p95_m=float(np.percentile(size, 95)),
+        over_20_m=float((size > 20.0).mean()),
+        late_over_20_m=float((e > 20.0).mean()),
+        early_over_20_m=float((e < -20.0).mean()),
+        tracked=tracked,
+    )
+
+
+def cn0_by_elevation(sample: Sample) -> Floats:
+    """Mean, p5 and p95 of C/N0 per 10 deg of elevation, shape (9, 3) [dB-Hz]; NaN below 30 values."""
+    table = np.full((9, 3), np.nan)
+    for k in range(9):
+        inside = (sample.elevation_deg >= 10.0 * k) & (sample.elevation_deg < 10.0 * (k + 1))
+        c = sample.cn0_dbhz[inside & np.isfinite(sample.residual_m) & np.isfinite(sample.cn0_dbhz)]
+        if len(c) >= 30:
+            table[k] = c.mean(), np.percentile(c, 5), np.percentile(c, 95)
+    return table
+
+
+def simulated(kind: str, *, seeds: tuple[int, ...] = SEEDS, duration_s: float = 780.0) -> Sample:
+    """A train at 40 km/h at most, 1 Hz, on a line that is of one kind from end to end."""
+    parts = []
+    for seed in seeds:
+        settings = EnvironmentSettings(
+            electrification=ElectrificationSettings(),
+            sections=(SectionSettings(from_m=0.0, to_m=LENGTH_M, kind=kind),) if kind != "none" else (),
+        )
+        place = Environment(settings, line_length_m=LENGTH_M, seed=seed)
+        scenario = Scenario(
+            seed=seed,
+            # Another sky for each seed.
+            start=np.datetime64("2024-03-05T00:10:00", "ns") + np.timedelta64(5 * seed, "h"),
+            duration_s=duration_s,
+            rate_hz=1.0,
+            line=LineSettings(length_m=LENGTH_M),
+            run=RunSettings(cruise_mps=CRUISE_MPS, stand_s=30.0),
+            sky=SkySettings(systems=SYSTEMS),
+            multipath=() if kind == "none" else (place,),
+        )
+        for piece in Simulation(scenario).pieces("front"):
+            observed = piece.observations
+            parts.append(
+                Sample(
+                    kind,
+                    observed.satellite,
+                    observed.code_m - piece.clean_code_m,
+                    piece.geometry.elevation_deg,
+                    observed.cn0_dbhz,
+                    piece.geometry.elevation_deg >= scenario.sky.cutoff_deg,
+                )
+            )
+    return together(f"sim. {kind}", parts)
+
+
+def together(name: str, parts: list[Sample]) -> Sample:
+    """Epochs of several samples one below the other, columns by satellite."""
+    satellites = np.array(sorted({str(s) for part in parts for s in part.satellite}))
+    tables = []
+    for part in parts:
+        column = np.searchsorted(satellites, part.satellite)
+        views = np.zeros(part.residual_m.shape) if part.in_view is None else part.in_view.astype(np.float64)
+        table = np.full((*part.residual_m.shape[:1], len(satellites), 4), np.nan)
+        table[:, column] = np.stack([part.residual_m, part.elevation_deg, part.cn0_dbhz, views], axis=-1)
+        tables.append(table)
+    whole = np.concatenate(tables)
+    return Sample(name, satellites, whole[..., 0], whole[..., 1], whole[..., 2], whole[..., 3] == 1.0)
+
+
+def recorded(name: str, antenna: AntennaResult, truth: recordings_truth.Truth) -> Sample:
+    """A recording's corrected codes against its reference trajectory."""
+    columns = antenna.columns
+    satellite, reason = antenna.satellite[columns], antenna.reason[:, columns]
+    place = interpolate_reference(antenna.time, *truth)
+    distance, _ = range_with_rotation(antenna.satellites.position_ecef_m, place[:, None, :])
+    residual = np.where(reason & NO_RANGE == 0, antenna.corrected_code_m[:, columns] - distance, np.nan)
+    wanted = np.array([str(s)[0] in SYSTEMS for s in satellite])
+    return Sample(
+        name,
+        satellite[wanted],
+        residual[:, wanted],
+        antenna.elevation_deg[:, columns][:, wanted],
+        antenna.cn0_dbhz[:, columns][:, wanted],
+    )
+
+
+def recordings(data: Path) -> list[Sample]:
+    """UrbanNav TST with both receivers, smartLoc Berlin."""
+    kinematic = data / "kinematic"
+    samples = []
+    for name, run in (
+        ("Hong Kong F9P", recordings_score.urbannav_f9p),
+        ("Hong Kong M8T", recordings_score.urbannav_m8t),
+    ):
+        antenna = run(data).result
+        assert antenna is not None
+        samples.append(recorded(name, antenna, recordings_truth.urbannav_truth(kinematic / "urbannav_tst")))
+    log = recordings_score.smartloc_ranges(kinematic / "smartloc_berlin")
+    place = interpolate_reference(log.time, *recordings_truth.smartloc_truth(kinematic / "smartloc_berlin"))
+    distance, _ = range_with_rotation(log.sat_ecef_m, place[:, None, :])
+    wanted = np.array([str(s)[0] in SYSTEMS for s in log.satellite])
+    samples.append(
+        Sample(
+            "Berlin M8T",
+            log.satellite[wanted],
+            (log.code_m - distance)[:, wanted],
+            log.elevation_deg[:, wanted],
+            log.cn0_dbhz[:, wanted],
+        )
+    )
+    return samples
+
+
+def print_tables(samples: list[Sample]) -> None:
+    """Both tables, a sample a row."""
+    print("| codes above 10 deg | codes | p50 m | p95 m | over 20 m % | late > 20 m % | early > 20 m % | tracked % |")
+    print("|---|---|---|---|---|---|---|---|")
+    for sample in samples:
+        f = figures(sample)
+        seen = "-" if np.isnan(f.tracked) else f"{100 * f.tracked:.0f}"
+        print(
+            f"| {sample.name} | {f.codes} | {f.p50_m:.2f} | {f.p95_m:.1f} | {100 * f.over_20_m:.1f} "
+            f"| {100 * f.late_over_20_m:.1f} | {100 * f.early_over_20_m:.1f} | {seen} |"
+        )
+    print("\n| C/N0: mean (p5 to p95) | " + " | ".join(f"{10 * k}-{10 * k + 10} deg" for k in range(9)) + " |")
+    print("|---" * 10 + "|")
+    for sample in samples:
+        cells = ["-" if np.isnan(row[0]) else "{:.0f} ({:.0f}-{:.0f})".format(*row) for row in cn0_by_elevation(sample)]
+        print(f"| {sample.name} | " + " | ".join(cells) + " |")
+
+
+def main() -> int:
+    samples = [simulated(kind) for kind in ("none", "open", "suburban", "urban", "station", "canyon")]
+    data = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if data.is_dir():
+        samples += recordings(data)
+    print_tables(samples)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
