@@ -145,9 +145,9 @@ class Config(BaseModel):
     noise_prior : float
         Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
         being estimated; infinite holds the scale at 1.
-    sbas : {"off", "on"}
-        Corrections of an SBAS in place of the models; satellites without a valid one are refused. Needs a log
-        of its messages.
+    sbas : tuple of path
+        Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
+        one are refused. None: no SBAS.
     error_model : path or None
         Errors by direction and C/N0 (``railfix error-model``): their overbounds take the place of `noise` as weights,
         and the protection level rests on them. Without it the level rests on `noise` times the scale estimated
@@ -201,7 +201,7 @@ class Config(BaseModel):
     antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
-    sbas: Literal["off", "on"] = "off"
+    sbas: tuple[Path, ...] = ()
     error_model: Path | None = None
     nominal: NominalErrors = Field(default_factory=NominalErrors)
     protection: Literal["on", "off"] = "on"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +18,39 @@ from railfix.raim import Outcome, constrained_model
 from railfix.results import Protection, Raim
 
 Floats = NDArray[np.float64]
-#: What a level rests on, by `Config.sbas`: the integrity of an SBAS and fault hypotheses of local causes, or
-#: hypotheses of satellites' own faults as well (ARAIM).
-KIND: Final = {"on": "sbas", "off": "separation"}
+#: What a level rests on: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
+#: satellites' own faults as well (ARAIM).
+KINDS: Final = ("sbas", "separation")
+
+
+def kind_of(config: Config) -> str:
+    """Which of `KINDS` the levels of a run are."""
+    return KINDS[0] if config.sbas else KINDS[1]
+
+
+def level_facts(config: Config) -> dict[str, Any]:
+    """What the levels of a run rest on, as plain values; empty where they are off."""
+    if config.protection == "off":
+        return {}
+    risk = risk_of(config)
+    sigmas = "noise settings times the receiver's estimated scale: no promise about tails"
+    return {
+        "kind": kind_of(config),
+        "sigmas": sigmas if config.error_model is None else str(config.error_model),
+        "alarm_limit_m": config.alarm_limit_m,
+        "risk_per_hour": risk.risk_per_hour,
+        "samples_per_hour": risk.samples_per_hour,
+        "risk_per_sample": risk.risk_per_sample,
+        "k_of_whole_risk": round(risk.sample_k, 3),
+        "satellite_prior": dict(risk.satellite_prior),
+        "local_prior": risk.local_prior,
+        "false_alarm": risk.false_alarm,
+    }
 
 
 def risk_of(config: Config) -> RiskBudget:
     """The budget in force: with SBAS the satellites' own faults are its business, what is left is local."""
-    if config.sbas == "off":
+    if kind_of(config) == "separation":
         return config.risk
     return replace(config.risk, satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
 

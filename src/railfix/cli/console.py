@@ -85,6 +85,15 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
     for label, field in (("p50", "p50_m"), ("p95", "p95_m"), ("largest", "max_m")):
         cells = [f"{getattr(sigma[n], field):.2f} m" if n in sigma else "-" for n in names]
         table.add_row(f"sigma along the line, {label}", *cells)
+    levels = summary.levels
+    if levels:
+        for label, field in (("p50", "p50_m"), ("p95", "p95_m")):
+            found = {n: getattr(levels[n], field) for n in names if n in levels}
+            cells = [f"{found[n]:.2f} m" if found.get(n) is not None else "-" for n in names]
+            table.add_row(f"protection level, {label}", *cells)
+        for word in ("available", "alarm"):
+            shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
+            table.add_row(f"  {word}", *shown)
     return table
 
 

@@ -27,7 +27,9 @@ from railfix.cli.settings import (
     Choices,
     ConfigOption,
     CurveOption,
+    ErrorModelOption,
     PresetOption,
+    SbasOption,
     ScreensOption,
     SettingOption,
     WithoutOption,
@@ -43,6 +45,7 @@ def run(
     out: OutOption,
     rear: RearOption = None,
     sp3: Sp3Option = None,
+    sbas: SbasOption = None,
     vehicle: VehicleOption = None,
     config: ConfigOption = None,
     preset: PresetOption = None,
@@ -50,6 +53,7 @@ def run(
     screens: ScreensOption = None,
     without: WithoutOption = None,
     cn0_curve: CurveOption = None,
+    error_model: ErrorModelOption = None,
     crs: CrsOption = None,
     height_datum: DatumOption = None,
     geoid: GeoidOption = None,
@@ -116,6 +120,8 @@ def run(
             screens=screens,
             without=tuple(without or ()),
             cn0_curve=cn0_curve,
+            error_model=error_model,
+            sbas=tuple(sbas or ()),
         )
     )
     inputs = RunInputs(

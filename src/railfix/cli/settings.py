@@ -60,6 +60,25 @@ CurveOption = Annotated[
         help="Mean C/N0 over elevation of antenna and receiver, made by railfix cn0-curve.",
     ),
 ]
+SbasOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--sbas",
+        metavar="FILE",
+        rich_help_panel="Inputs",
+        help="Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B); its corrections take the place of the models, and "
+        "satellites without a valid one are refused.",
+    ),
+]
+ErrorModelOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--error-model",
+        metavar="TOML",
+        rich_help_panel=_PANEL,
+        help="Errors of the pseudoranges on this line, made by railfix error-model, for weights and protection level.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +96,8 @@ class Choices:
         Names with commas, or "none".
     without : sequence of str
         Screens to switch off.
-    cn0_curve : Path or None
+    cn0_curve, error_model : Path or None
+    sbas : sequence of Path
     """
 
     config: Path | None = None
@@ -86,6 +106,8 @@ class Choices:
     screens: str | None = None
     without: tuple[str, ...] = ()
     cn0_curve: Path | None = None
+    error_model: Path | None = None
+    sbas: tuple[Path, ...] = ()
 
 
 def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
@@ -122,6 +144,10 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         values["screens"] = [] if choices.screens.strip() == "none" else _screens("--screens", choices.screens)
     if choices.cn0_curve is not None:
         values["cn0_curve"] = str(choices.cn0_curve)
+    if choices.error_model is not None:
+        values["error_model"] = str(choices.error_model)
+    if choices.sbas:
+        values["sbas"] = [str(path) for path in choices.sbas]
     if choices.without:
         dropped = [name for text in choices.without for name in _screens("--without", text)]
         values["screens"] = [name for name in parse_config(values, source=source).screens if name not in dropped]

@@ -6,7 +6,7 @@ import sys
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -163,7 +163,7 @@ def ablate_files(
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
-    inputs = replace(inputs, cn0_curve=config.cn0_curve)
+    inputs = inputs.with_settings(config)
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
@@ -213,6 +213,8 @@ def ablate_files(
             navigation=navigation,
             tally=tallies[ALL],
             sigma={},
+            protection={},
+            found_levels={},
             notes=notes,
             wall_s=wall,
         )

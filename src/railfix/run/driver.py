@@ -15,12 +15,13 @@ from railfix.config import Config
 from railfix.errors import SettingsError
 from railfix.navigation import Navigation
 from railfix.pipeline import EpochProcessor, State
+from railfix.protecting import level_facts
 from railfix.rinex import read_navigation
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
 from railfix.run.inputs import Antenna, RunInputs, collected
 from railfix.run.output import OutputFolder
-from railfix.run.record import AlongSigma, along_sigma, run_record
+from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
 from railfix.run.sources import Line, Log, TrackReading, open_line
 from railfix.run.tally import Tally
 from railfix.sp3 import read_sp3
@@ -79,6 +80,8 @@ class RunSummary:
     tally : Tally
     sigma : mapping of str to AlongSigma
         Percentiles of the along-track standard deviation by antenna.
+    levels : mapping of str to Levels
+        Protection levels by antenna; empty where they are off.
     notes : tuple of str
     files : mapping of str to Path
         The results.
@@ -87,6 +90,7 @@ class RunSummary:
 
     tally: Tally
     sigma: Mapping[str, AlongSigma]
+    levels: Mapping[str, Levels]
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
@@ -126,7 +130,7 @@ def run_files(
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
-    inputs = replace(inputs, cn0_curve=config.cn0_curve)
+    inputs = inputs.with_settings(config)
     inputs.check()
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
@@ -137,7 +141,7 @@ def run_files(
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
         check_positions(tally)
-        sigma = along_sigma(folder)
+        sigma, found_levels = along_sigma(folder), levels(folder)
         notes = notes_of(line, navigation, tally, logs)
         wall = clock.perf_counter() - began
         record = run_record(
@@ -150,12 +154,14 @@ def run_files(
             navigation=navigation,
             tally=tally,
             sigma=sigma,
+            protection=level_facts(config),
+            found_levels=found_levels,
             notes=notes,
             wall_s=wall,
         )
         folder.write_json("run.json", record)
         files = folder.commit(_footer(record))
-    return RunSummary(tally=tally, sigma=sigma, notes=notes, files=files, wall_s=wall)
+    return RunSummary(tally=tally, sigma=sigma, levels=found_levels, notes=notes, files=files, wall_s=wall)
 
 
 def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Line, dict[Antenna, Log]]:

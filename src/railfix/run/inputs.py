@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from railfix.config import Config
 from railfix.errors import InputFileError
 
 Antenna = Literal["front", "rear"]
@@ -26,8 +27,11 @@ class RunInputs:
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
         Track map, joined to a route in this order.
-    vehicle, config, cn0_curve, truth : Path or None
-        The curve is named by the settings; the truth is asked for by `ablate` alone.
+    vehicle, config, truth : Path or None
+        The truth is asked for by `ablate` alone.
+    cn0_curve, error_model : Path or None
+    sbas : tuple of Path
+        Named by the settings (`with_settings`).
     """
 
     front: tuple[Path, ...]
@@ -38,7 +42,13 @@ class RunInputs:
     vehicle: Path | None = None
     config: Path | None = None
     cn0_curve: Path | None = None
+    error_model: Path | None = None
+    sbas: tuple[Path, ...] = ()
     truth: Path | None = None
+
+    def with_settings(self, config: Config) -> RunInputs:
+        """The same with the files that settings name."""
+        return replace(self, cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=config.sbas)
 
     def named(self) -> Iterator[tuple[str, Path]]:
         """Each file with the name of what it is."""

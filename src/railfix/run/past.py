@@ -102,6 +102,6 @@ def _inputs(record: Mapping[str, Any]) -> RunInputs:
     values: dict[str, Any] = {}
     for item in fields(RunInputs):
         paths = listed.get(item.name, [])
-        many = item.name in ("front", "rear", "nav", "sp3", "track")
+        many = item.name in ("front", "rear", "nav", "sp3", "track", "sbas")
         values[item.name] = tuple(paths) if many else (paths[0] if paths else None)
     return RunInputs(**values)

@@ -29,6 +29,36 @@ class AlongSigma:
     max_m: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class Levels:
+    """Protection levels of an antenna: median and 95th percentile of the finite ones [m], and epochs by status."""
+
+    p50_m: float | None
+    p95_m: float | None
+    available: int
+    unavailable: int
+    alarm: int
+
+
+def levels(folder: OutputFolder) -> dict[str, Levels]:
+    """Protection levels by antenna, from the rows written so far; empty where they are off."""
+    level, status = pl.col("protection_level_m"), pl.col("protection_status").cast(pl.String)
+    finite = level.filter(level.is_finite())
+    table = (
+        folder.scan("positions.parquet")
+        .filter(status.is_not_null())
+        .group_by("antenna")
+        .agg(
+            p50_m=finite.quantile(0.5),
+            p95_m=finite.quantile(0.95),
+            **{word: (status == word).sum() for word in ("available", "unavailable", "alarm")},
+        )
+        .sort("antenna")
+        .collect()
+    )
+    return {row.pop("antenna"): Levels(**row) for row in table.iter_rows(named=True)}
+
+
 def along_sigma(folder: OutputFolder) -> dict[str, AlongSigma]:
     """Percentiles by antenna, from the rows written so far."""
     sigma = pl.col("along_sigma_m")
@@ -57,6 +87,8 @@ def run_record(
     navigation: Navigation,
     tally: Tally,
     sigma: Mapping[str, AlongSigma],
+    protection: Mapping[str, Any],
+    found_levels: Mapping[str, Levels],
     notes: Sequence[str],
     wall_s: float,
 ) -> dict[str, Any]:
@@ -76,6 +108,9 @@ def run_record(
     navigation : Navigation
     tally : Tally
     sigma : mapping of str to AlongSigma
+    protection : mapping
+        What the protection levels rest on (`protecting.level_facts`).
+    found_levels : mapping of str to Levels
     notes : sequence of str
     wall_s : float
 
@@ -98,11 +133,16 @@ def run_record(
             "klobuchar_from": sorted(navigation.klobuchar),
             "precise": "" if navigation.precise is None else navigation.precise.source,
         },
+        "protection": dict(protection),
         "notes": list(notes),
         "positioning_rate": _overall_rate(tally),
         "ok_rate": _overall_ok_rate(tally),
         "antennas": {
-            name: {**antenna.as_dict(), "along_sigma_m": asdict(sigma[name]) if name in sigma else None}
+            name: {
+                **antenna.as_dict(),
+                "along_sigma_m": asdict(sigma[name]) if name in sigma else None,
+                "protection_level": asdict(found_levels[name]) if name in found_levels else None,
+            }
             for name, antenna in tally.antennas.items()
         },
         "wall_s": round(wall_s, 3),
