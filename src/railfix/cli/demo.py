@@ -41,7 +41,7 @@ def demo(
 
     inputs = demo_inputs()
     with progress_bar() as progress:
-        options = RunOptions(observations="write", overwrite="replace")
+        options = RunOptions(observations="write", overwrite="replace", chunk_epochs=200)
         summary = run_files(inputs, out=out, options=options, progress=progress)
     show_summary(summary)
     runs, evaluation = read_runs([out], [demo_truth()])

@@ -44,3 +44,9 @@ def start_of(table: pl.DataFrame) -> np.datetime64:
 def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
     """Times of a table [s] from a start."""
     return seconds(table["time_gpst"].to_numpy().astype("datetime64[ns]") - start)
+
+
+def nice_step(rough: float) -> float:
+    """1, 2 or 5 times a power of ten, at least `rough`."""
+    power = 10.0 ** np.floor(np.log10(max(rough, 1e-9)))
+    return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))

@@ -30,8 +30,8 @@ from railfix.plots.chart import (
     Points,
     Ranges,
 )
-from railfix.plots.columns import floats, since, start_of
-from railfix.plots.thinning import extremes, told
+from railfix.plots.columns import floats, nice_step, since, start_of
+from railfix.plots.thinning import spread, told
 
 Floats = NDArray[np.float64]
 
@@ -89,10 +89,12 @@ def _errors(
     if len(at):
         layers.append(Band(label="± sigma stated", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
         caption.append("The band is the standard deviation that railfix states, the greatest of each short piece.")
+    levels = []
     for column, colour in zip(level_columns(errors), (PURPLE, GREEN, BLACK, GREY), strict=False):
         level = floats(errors, column)
         at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
         if len(at):
+            levels.append(most)
             name_of = column.removesuffix("_m").replace("_", " ")
             for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
                 layers.append(Line(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
@@ -101,14 +103,21 @@ def _errors(
     shown = whole = 0
     for label, column, colour, shape in _SERIES:
         y = good_errors(errors, column)
-        rows = extremes(x, y)
+        rows = spread(x, y)
         shown, whole = shown + len(rows), whole + int(np.isfinite(x + y).sum())
         layers.append(
             Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows], epoch_s=epoch[rows])  # type: ignore[arg-type]
         )
-    scale = error_scale(np.concatenate([good_errors(errors, column) for _, column, _, _ in _SERIES]))
+    every = np.concatenate([good_errors(errors, column) for _, column, _, _ in _SERIES])
+    scale = error_scale(every)
     if scale["y_scale"] == "symlog":
         caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
+    elif levels and np.isfinite(every).any():
+        # a few wide levels are not to press the errors flat
+        top = 1.25 * max(float(np.nanmax(np.abs(every))), *(float(np.nanmedian(most)) for most in levels))
+        scale["y_range"] = (-top, top)
+        if max(float(np.nanmax(most)) for most in levels) > top:
+            caption.append(f"Levels beyond ± {top:.1f} m are cut off.")
     return Chart(
         name=name,
         title=title,
@@ -143,7 +152,7 @@ def error_scale(error_m: Floats) -> dict[str, Any]:
     usual, largest = float(np.percentile(size, 98)), float(size.max())
     if largest <= 8.0 * max(usual, 0.5):
         return {"y_scale": "linear"}
-    return {"y_scale": "symlog", "y_linear": float(np.ceil(max(usual, 1.0)))}
+    return {"y_scale": "symlog", "y_linear": nice_step(max(usual, 1.0))}
 
 
 def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -221,12 +230,12 @@ def stanford(error_m: ArrayLike, level_m: ArrayLike, alarm_limit_m: float, *, ti
     Returns
     -------
     Chart
-        The axes end at three times the alarm limit; what is beyond counts in the last cells.
+        The axes end at one and a half times the alarm limit; what is beyond counts in the last cells.
     """
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
     known = np.isfinite(error) & ~np.isnan(level)
     error, level = error[known], level[known]
-    top = 3.0 * alarm_limit_m
+    top = 1.5 * alarm_limit_m
     edges = np.linspace(0.0, top, 121)
     inside = np.nextafter(top, 0.0)
     counts, _, _ = np.histogram2d(np.minimum(error, inside), np.minimum(level, inside), bins=(edges, edges))

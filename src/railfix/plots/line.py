@@ -23,8 +23,8 @@ from railfix.plots.chart import (
     Marks,
     Points,
 )
-from railfix.plots.columns import floats, points, since, start_of, words
-from railfix.plots.thinning import extremes, one_a_cell, told
+from railfix.plots.columns import floats, nice_step, points, since, start_of, words
+from railfix.plots.thinning import one_a_cell, spread, told
 from railfix.reasons import Status
 
 Floats = NDArray[np.float64]
@@ -156,12 +156,6 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
     return Marks(label=label, colour=BLACK, x=np.array(found_x), y=np.array(found_y), words=tuple(texts))
 
 
-def nice_step(rough: float) -> float:
-    """1, 2 or 5 times a power of ten, at least `rough`."""
-    power = 10.0 ** np.floor(np.log10(max(rough, 1e-9)))
-    return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
-
-
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
     """Distance from each position to the one before while the train ran.
 
@@ -211,7 +205,7 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
     said = []
     for label, prefix, colour, shape in _FIXES:
         x, y = interval(table, prefix)
-        rows = extremes(x, y)
+        rows = spread(x, y)
         shown, whole = shown + len(rows), whole + len(x)
         layers.append(Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows]))  # type: ignore[arg-type]
         if len(y):
@@ -246,15 +240,16 @@ def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning inte
     step = nice_step(max(largest, 1e-3) / 40.0)
     edges = np.arange(0.0, largest + 2.0 * step, step)
     layers = []
-    for label, _, colour, _ in _FIXES:
+    for side, (label, _, colour, _) in enumerate(_FIXES):
         counts, _ = np.histogram(found[label], bins=edges)
+        left = edges[:-1] + 0.5 * side * step
         layers.append(
-            Bars(label=label, colour=colour, left=edges[:-1], right=edges[1:], height=counts.astype(np.float64))
+            Bars(label=label, colour=colour, left=left, right=left + 0.5 * step, height=counts.astype(np.float64))
         )
     return Chart(
         name="interval-distribution",
         title=title,
-        caption=f"Positions by their distance from the one before, bars {step:g} m wide. {_by(table)}",
+        caption=f"Positions by their distance from the one before, in classes of {step:g} m. {_by(table)}",
         x_label="from the position before [m]",
         y_label="positions",
         layers=tuple(layers),
@@ -288,7 +283,7 @@ def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") 
     shown = whole = 0
     for label, column, colour in (("refused", "n_rejected", CONVENTIONAL), ("used", "n_used", CONSTRAINED)):
         y = floats(positions, column)
-        rows = extremes(x, y)
+        rows = spread(x, y)
         shown, whole = shown + len(rows), whole + len(x)
         layers.append(Points(label=label, colour=colour, x=x[rows], y=y[rows], epoch_s=x[rows]))
     return Chart(

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from railfix.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
 from railfix.errors import OutputError
 from railfix.plots.chart import Chart, Layer, Line, Points
+from railfix.plots.columns import nice_step
 from railfix.plots.draw import draw_chart
-from railfix.plots.thinning import extremes, told
+from railfix.plots.thinning import extremes, spread, told
 from railfix.screens import Cn0Limits
 from railfix.timescale import seconds
 
@@ -128,7 +129,7 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
     shown = whole = 0
     for mask, colour, label in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "refused")):
         along, metric = where[mask], picture.metric[mask]
-        rows = extremes(along, metric)
+        rows = spread(along, metric)
         shown, whole = shown + len(rows), whole + int(np.count_nonzero(np.isfinite(along + metric)))
         layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
     limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
@@ -136,6 +137,7 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
     # one line for all channels: the tightest limit of each epoch, where channels differ
     least = np.full(len(limit), np.nan)
     least[finite] = np.nanmin(limit[finite], axis=1)
+    same = bool((~finite).all() or np.nanmax(limit) == np.nanmin(limit))
     rows = extremes(x, least)
     rows = rows[np.argsort(x[rows], kind="stable")]
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
@@ -146,15 +148,16 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
     if finite.any() and picture.sides != "below" and len(values):
         top = 6.0 * float(np.nanmedian(least))
         if top > 0.0 and values.max() > top:
-            scale = {"y_scale": "symlog", "y_linear": top / 2.0}
+            scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
     return Chart(
         name=name,
         title=f"{picture.title}: {judged:,} judged, {refused:,} refused ({share})",
-        caption=told(shown, whole).strip(),
+        caption=(("" if same else "The line is the tightest limit of each epoch.") + told(shown, whole)).strip(),
         x_label=x_label,
         y_label=picture.label,
         layers=tuple(layers),
         start=start,
+        width="half",
         **scale,
     )
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from railfix.cn0_curve import KINDS, Cn0Curve
 from railfix.cn0_curve.curve import satellite_kind
-from railfix.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Layer, Line, SkyEpochs
+from railfix.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Layer, Line, Points, SkyEpochs
 from railfix.plots.columns import floats, since, start_of, words
 from railfix.reasons import Reason, first_reason
 from railfix.screens import Cn0Limits
@@ -24,7 +24,7 @@ _CN0_EDGES: Final = np.arange(10.0, 60.5, 0.5)
 #: Fewest samples of a piece of elevation to draw a mean of.
 _LEAST: Final = 10
 #: Epochs of the pictures of the sky.
-SKY_EPOCHS: Final = 1200
+SKY_EPOCHS: Final = 2000
 
 
 def cn0_over_elevation(
@@ -109,7 +109,7 @@ def _lines(
             label = f"{limits.deficit_dbhz:g} dB below"
             yield Line(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
     else:
-        yield _mean_of(rows)
+        yield from _mean_of(rows)
     if limits is not None and limits.floor_dbhz is not None:
         floor = np.full(2, limits.floor_dbhz)
         yield Line(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
@@ -118,13 +118,15 @@ def _lines(
         yield Line(label=f"mask {mask_deg:g} deg", colour=GREY, x=edge, y=np.array([10.0, 60.0]), dash="dotted")
 
 
-def _mean_of(rows: pl.DataFrame) -> Line:
+def _mean_of(rows: pl.DataFrame) -> Iterator[Layer]:
     elevation, cn0 = floats(rows, "elevation_deg"), floats(rows, "cn0_dbhz")
     piece = np.minimum((elevation / 5.0).astype(np.intp), 17)
     count = np.bincount(piece, minlength=18)
     total = np.bincount(piece, weights=cn0, minlength=18)
     mean = np.where(count >= _LEAST, total / np.maximum(count, 1), np.nan)
-    return Line(label="mean of this run", colour=BLUE, x=np.arange(2.5, 90.0, 5.0), y=mean, width=2.0)
+    middle = np.arange(2.5, 90.0, 5.0)
+    yield Line(label="mean of this run", colour=BLUE, x=middle, y=mean, width=2.0)
+    yield Points(label="mean of this run", colour=BLUE, x=middle, y=mean, size=6.0)
 
 
 def sky_epochs(
@@ -158,9 +160,10 @@ def sky_epochs(
     known = known.filter(pl.col("elevation_deg") >= 0.0)
     times = known["time_gpst"].unique().sort()
     if len(times) > epochs:
-        even = times.gather(np.unique(np.linspace(0, len(times) - 1, epochs // 2).astype(np.int64)))
-        extra = pl.Series([] if wanted is None else wanted[: epochs // 2], dtype=times.dtype)
-        kept = pl.concat([even, extra.filter(extra.is_in(times.implode()))]).unique().sort()
+        extra = pl.Series([] if wanted is None else wanted[: epochs // 2], dtype=times.dtype).unique()
+        extra = extra.filter(extra.is_in(times.implode()))
+        even = times.gather(np.unique(np.linspace(0, len(times) - 1, epochs - len(extra)).astype(np.int64)))
+        kept = pl.concat([even, extra]).unique().sort()
         known = known.filter(pl.col("time_gpst").is_in(kept.implode()))
     else:
         kept = times

@@ -67,26 +67,30 @@ def one_a_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> In
     return rows
 
 
-def envelope(x: Floats, y: Floats, *, points: int = POINTS) -> tuple[Floats, Floats]:
-    """A line with the greatest `y` of every piece of rising `x`; NaN stays where a whole piece is NaN.
+def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
+    """Rows that look like all: the extremes of every short piece, and one row a cell of a fine grid.
 
     Parameters
     ----------
-    x : ndarray, shape (P,)
-        Rising.
-    y : ndarray, shape (P,)
+    x, y : ndarray, shape (P,)
+        Rows with NaN are left out.
     points : int
+        How many rows at most; all, if there are no more.
 
     Returns
     -------
-    ndarray, ndarray, shape (Q,)
+    ndarray of int
+        Rows in rising order.
     """
-    if len(x) <= points:
-        return x, y
-    edges = np.linspace(0, len(x), points + 1).astype(np.intp)[:-1]
-    greatest = np.maximum.reduceat(np.where(np.isnan(y), -np.inf, y), edges)
-    greatest[np.isneginf(greatest)] = np.nan
-    return x[edges], greatest
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if len(rows) <= points:
+        return rows
+    outer = extremes(x, y, points=points // 3)
+    across, up = x[rows], y[rows]
+    low, high = np.percentile(up, (1.0, 99.0))
+    wide, tall = float(np.ptp(across)) or 1.0, float(high - low) or 1.0
+    inner = one_a_cell(400.0 * across / wide, 120.0 * up / tall, cell=1.0, points=points - len(outer))
+    return np.asarray(np.union1d(outer, rows[inner]), dtype=np.intp)
 
 
 def told(shown: int, whole: int) -> str:

@@ -11,7 +11,7 @@ from railfix.plots.chart import BLUE, GREY, Chart, Line, Points
 from railfix.timescale import seconds
 
 
-def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Processing time") -> Chart:
+def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Time an epoch") -> Chart:
     """Time an epoch over the run, the mean of each chunk.
 
     Parameters
@@ -34,9 +34,9 @@ def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Proces
     return Chart(
         name="processing-time",
         title=title,
-        caption=f"{len(x):,} chunks of {epochs.max(initial=0):,.0f} epochs of one antenna at most, each at the time of "
-        f"its first; reading and writing not included. Over the run {whole:.3f} ms an epoch. A chunk is positioned "
-        "as a whole: live, epoch by epoch, each takes longer.",
+        caption=f"Mean of each of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of all antennas, at "
+        f"the time of the first; reading and writing not included. Over the run {whole:.3f} ms an epoch and antenna. A "
+        "chunk is positioned as a whole: live, epoch by epoch, each takes longer.",
         x_label="GPS time",
         y_label="ms an epoch",
         layers=(

@@ -5,7 +5,7 @@
   const INK = "#1b1b1b", GRID = "#e3e3e3", AXIS = "#767676";
   const PRINT_WIDTH = { wide: 760, half: 420, sky: 360 };
   const plots = [], skies = {};
-  let drawn = 0, printing = false;
+  let printing = false;
 
   // ---- numbers: float32 or whole numbers, little endian, base 64
   function bytes(text) {
@@ -69,7 +69,7 @@
   }
   function plain(value, n) {
     const text = value.toFixed(n);
-    return text.replace(/\B(?=(\d{3})+(?!\d))/g, n > 3 ? "" : " ").replace("-", "\u2212");
+    return text.replace(/\B(?=(\d{3})+(?!\d))/g, n > 3 ? "" : ",").replace("-", "\u2212");
   }
   function clock(seconds, n) {
     const day = ((seconds % 86400) + 86400) % 86400, whole = Math.floor(day + 0.5 * Math.pow(10, -n) * (n ? 1 : 0) + 1e-6);
@@ -148,7 +148,11 @@
       const button = document.createElement("button"), sample = document.createElement("i");
       sample.style.background = layer.kind === "line" ? `linear-gradient(${layer.colour},${layer.colour}) center/100% 3px no-repeat` :
         layer.kind === "band" || layer.kind === "bars" ? layer.colour + "66" : layer.colour;
-      if (layer.kind === "points") sample.style.cssText += layer.shape === "dot" ?
+      const glyph = layer.kind === "marks" ? "+" : layer.shape === "cross" ? "\u00d7" : "";
+      if (glyph) {
+        sample.style.cssText = `background:none;width:auto;height:auto;font-style:normal;font-weight:700;color:${layer.colour}`;
+        sample.textContent = glyph;
+      } else if (layer.kind === "points") sample.style.cssText += layer.shape === "dot" ?
         `;width:.7rem;border-radius:50%` : `;width:.7rem;background:none;border:2px solid ${layer.colour}`;
       button.type = "button";
       button.setAttribute("aria-pressed", "true");
@@ -234,7 +238,6 @@
     pen.strokeStyle = AXIS;
     pen.lineWidth = 1;
     pen.strokeRect(box.left + 0.5, box.top + 0.5, box.right - box.left - 1, box.bottom - box.top - 1);
-    if (!this.figure.dataset.drawn) drawn++;
     this.figure.dataset.drawn = marks;
   };
 
@@ -253,7 +256,10 @@
     pen.fillStyle = INK;
     pen.textAlign = "center";
     pen.textBaseline = "top";
-    for (const [v, text] of xs) pen.fillText(text, box.px(v), box.bottom + 5);
+    for (const [v, text] of xs) {
+      const half = pen.measureText(text).width / 2;
+      pen.fillText(text, Math.min(box.px(v), box.width - half - 1), box.bottom + 5);
+    }
     pen.fillText(chart.start === undefined ? chart.x_label : chart.x_label + ", " + date(chart.start + box.x[0]),
       (box.left + box.right) / 2, box.bottom + 23);
     pen.textAlign = "right";
@@ -523,7 +529,7 @@
     this.time.textContent = date(data.start + data.epoch[k]) + " " + clock(data.start + data.epoch[k], 1);
     grid(pen, c, r);
     this.rows.textContent = "";
-    const order = [];
+    const order = [], taken = [];
     for (let i = data.first[k]; i < data.first[k + 1]; i++) order.push(i);
     order.sort((a, b) => (data.reason[a] === 0 ? 0 : 1) - (data.reason[b] === 0 ? 0 : 1) || data.satellite[a] - data.satellite[b]);
     for (const i of order) {
@@ -535,10 +541,7 @@
       pen.beginPath();
       if (used) { pen.arc(x, y, 5, 0, 6.2832); pen.fill(); }
       else { pen.moveTo(x - 4, y - 4); pen.lineTo(x + 4, y + 4); pen.moveTo(x - 4, y + 4); pen.lineTo(x + 4, y - 4); pen.stroke(); }
-      pen.fillStyle = INK;
-      pen.textAlign = x > width - 60 ? "right" : "left";
-      pen.textBaseline = "middle";
-      pen.fillText(data.names[data.satellite[i]] + (cn0 === cn0 ? " " + cn0.toFixed(0) : ""), x + (x > width - 60 ? -8 : 8), y);
+      label(pen, data.names[data.satellite[i]] + (cn0 === cn0 ? " " + cn0.toFixed(0) : ""), x, y, width, taken);
       const row = document.createElement("tr");
       for (const [text, right] of [[data.names[data.satellite[i]]], [data.signals[data.signal[i]]], [elevation.toFixed(0), 1],
         [azimuth.toFixed(0), 1], [cn0 === cn0 ? cn0.toFixed(1) : "", 1], [data.reasons[data.reason[i]]]]) {
@@ -549,9 +552,21 @@
       }
       this.rows.append(row);
     }
-    if (!this.figure.dataset.drawn) drawn++;
     this.figure.dataset.drawn = order.length;
   };
+  // A name beside its satellite, where no other name stands if there is such a place.
+  function label(pen, text, x, y, width, taken) {
+    const wide = pen.measureText(text).width;
+    const places = [[x + 8, y], [x - 8 - wide, y], [x - wide / 2, y - 13], [x - wide / 2, y + 13]].filter(
+      p => p[0] > 0 && p[0] + wide < width);
+    const free = p => taken.every(t => p[0] > t[1] || p[0] + wide < t[0] || Math.abs(p[1] - t[2]) > 12);
+    const place = places.find(free) || places[0] || [x + 8, y];
+    taken.push([place[0], place[0] + wide, place[1]]);
+    pen.fillStyle = INK;
+    pen.textAlign = "left";
+    pen.textBaseline = "middle";
+    pen.fillText(text, place[0], place[1]);
+  }
   function grid(pen, c, r) {
     pen.strokeStyle = AXIS;
     pen.fillStyle = INK;
@@ -589,23 +604,31 @@
     figure.plot = plot;
     plots.push(plot);
   });
-  const watch = new IntersectionObserver(function (entries) {
-    for (const entry of entries) if (entry.isIntersecting) {
-      watch.unobserve(entry.target);
-      entry.target.plot.draw();
-      if (drawn === 1) timing("first");
+  function near() {
+    for (const plot of plots) {
+      if (plot.figure.dataset.drawn) continue;
+      const place = plot.figure.getBoundingClientRect();
+      if (place.top > window.innerHeight + 300 || place.bottom < -300) continue;
+      plot.draw();
+      timing("drawn");
     }
-    timing("drawn");
-  }, { rootMargin: "300px" });
-  plots.forEach(plot => watch.observe(plot.figure));
+  }
+  near();
+  let waiting = false;
+  window.addEventListener("scroll", function () {
+    if (waiting) return;
+    waiting = true;
+    setTimeout(function () { waiting = false; near(); }, 60);
+  }, { passive: true });
   window.addEventListener("load", () => timing("load"));
   function again() { for (const plot of plots) if (printing || plot.figure.dataset.drawn) plot.draw(); }
   let wide = window.innerWidth, later = 0;
   window.addEventListener("resize", function () {
+    near();
     if (window.innerWidth === wide || printing) return;
     wide = window.innerWidth;
     clearTimeout(later);
-    later = setTimeout(again, 150);
+    later = setTimeout(function () { again(); near(); }, 150);
   });
   window.addEventListener("beforeprint", function () {
     printing = true;
