@@ -89,6 +89,7 @@ def satellite_states(
     navigation: Navigation,
     *,
     max_age_s: float | None = None,
+    record: Indices | None = None,
 ) -> SatelliteStates:
     """Satellites at the instants of transmission ``time - code / c - dt_sv``.
 
@@ -111,6 +112,9 @@ def satellite_states(
         whatever age, and a satellite without any has no record either.
     max_age_s : float, optional
         Tighter limit on the distance from toe than the records' own validity [s].
+    record : ndarray of int, shape (T, M), optional
+        Rows of `navigation.kepler` to take instead of choosing, -1 for none at all: corrections
+        hold for one issue of data (`issues.issue_records`). GLONASS is not concerned.
 
     Returns
     -------
@@ -124,12 +128,14 @@ def satellite_states(
     if code_m.shape != (len(time), len(satellite)) or len(signal) != len(satellite):
         expected = (len(time), len(satellite))
         raise ValueError(f"code_m has shape {code_m.shape}, expected {expected}; signal has {len(signal)} channels")
+    if record is not None and record.shape != code_m.shape:
+        raise ValueError(f"record has shape {record.shape}, expected {code_m.shape}")
     table = table_of(navigation)
     plan = table.plan(satellite, signal)
     found = _Found.empty(code_m.shape)
     observed = np.isfinite(code_m)
     if len(plan.kepler) and len(navigation.kepler):
-        _fill_kepler(table, plan, time, code_m, observed, max_age_s, found)
+        _fill_kepler(table, plan, time, code_m, observed, max_age_s, found, record)
     if len(plan.glonass) and len(navigation.glonass):
         _fill_glonass(table, plan, time, code_m, observed, max_age_s, found)
     if navigation.precise is not None:
@@ -170,12 +176,24 @@ def _limit(validity: NDArray[np.timedelta64], max_age_s: float | None) -> NDArra
 
 
 def _fill_kepler(
-    table: Table, plan: Plan, time: Datetimes, code_m: Floats, observed: Masks, max_age_s: float | None, found: _Found
+    table: Table,
+    plan: Plan,
+    time: Datetimes,
+    code_m: Floats,
+    observed: Masks,
+    max_age_s: float | None,
+    found: _Found,
+    record: Indices | None,
 ) -> None:
     """Fill in the channels of GPS, QZSS, Galileo and BeiDou."""
     limit = _limit(table.validity, max_age_s)
-    rows, valid, future = table.lookup.find(plan.preferred, time, limit)
-    if plan.any_other:
+    if record is None:
+        rows, valid, future = table.lookup.find(plan.preferred, time, limit)
+    else:
+        rows = record[:, plan.kepler].T
+        valid = (rows >= 0) & (np.abs(time - table.lookup.toe[rows]) <= limit[rows])
+        future = (rows >= 0) & (table.lookup.available[rows] > time)
+    if record is None and plan.any_other:
         others, other_valid, other_future = table.lookup.find(plan.other, time, limit)
         # What was on the air goes before what is right after the fact.
         better = other_valid & (~valid | (future & ~other_future))
