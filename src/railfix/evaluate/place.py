@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 SAME_MAP_M: Final = 1.0
 #: Answers further than this from the trajectory at their chainage show that it is not that of the run [m].
 SAME_TRAJECTORY_M: Final = 0.01
+#: Points of one vehicle lie within this of each other along the line [m].
+_WITHIN_VEHICLE_M: Final = 45.0
 #: Chainages may lie beyond the ends by their rounding [m].
 _ROUNDING_M: Final = 1e-3
 
@@ -114,8 +116,8 @@ def errors_of(
     InputFileError
         The track or the vehicle cannot be read.
     """
+    against, trusted = _against_chainage(run, antenna, answers)
     if method != "trajectory":
-        against = _against_chainage(run, antenna, answers)
         if against is None:
             return Errors(
                 method="chainage",
@@ -131,7 +133,7 @@ def errors_of(
     trajectory, used, said = find_trajectory(run, antenna, answers, files)
     arc, other = (_arc(trajectory, c) for c in (answers.chainage_m, answers.conventional_chainage_m))
     place = answers.reference_chainage_m
-    if not np.isfinite(place).any():
+    if not trusted:
         place = trajectory.chainage_at(trajectory.nearest(answers.reference_ecef_m)[0])
     return Errors(
         method="trajectory",
@@ -143,24 +145,25 @@ def errors_of(
     )
 
 
-def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> str | None:
-    """Why differences of chainage cannot be taken; None where they can."""
+def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[str | None, bool]:
+    """Why differences of chainage cannot be taken, None where they can; and whether it tells places all the same."""
     known = np.isfinite(answers.reference_ecef_m[:, 0])
     with_chainage = np.isfinite(answers.reference_chainage_m)
     if not with_chainage.any():
-        return "the reference has no chainage"
+        return "the reference has no chainage", False
     if (known & ~with_chainage).any():
         count = int((known & ~with_chainage).sum())
-        return f"the reference has no chainage at {count} of {int(known.sum())} epochs"
+        return f"the reference has no chainage at {count} of {int(known.sum())} epochs", False
     point = run.chainage_of.get(antenna, "antenna")
-    if point != "antenna":
-        return f"the run's chainage is that of the {point}, the reference's that of the antenna"
     difference = np.abs(answers.chainage_m - answers.reference_chainage_m)
     apart = np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1)
     both = np.isfinite(difference) & np.isfinite(apart)
-    if both.any() and (off := float(np.median(np.abs(difference - apart)[both]))) > SAME_MAP_M:
-        return f"the chainages of run and reference are not of one map (off by {off:.1f} m at the median)"
-    return None
+    off = float(np.median(np.abs(difference - apart)[both])) if both.any() else 0.0
+    if off > SAME_MAP_M + (0.0 if point == "antenna" else _WITHIN_VEHICLE_M):
+        return f"the chainages of run and reference are not of one map (off by {off:.1f} m at the median)", False
+    if point != "antenna":
+        return f"the run's chainage is that of the {point}, the reference's that of the antenna", True
+    return None, True
 
 
 def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:

@@ -1,0 +1,520 @@
+"""Evaluation of made-up runs whose figures can be worked out by hand."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+import synthetic
+from railfix.antenna import Trajectory
+from railfix.cli import app
+from railfix.errors import InputFileError, MismatchError, SettingsError
+from railfix.evaluate import (
+    EvaluationOptions,
+    RunAndReference,
+    TrackFiles,
+    evaluate_run,
+    evaluate_runs,
+)
+from railfix.evaluate.blocks import block_limits
+from railfix.evaluate.epochs import travelled, with_missing
+from railfix.evaluate.sections import read_sections
+from railfix.reference_log import AntennaReference, write_reference
+from railfix.timescale import timedelta
+from railfix.track_map import Track, read_track, write_track_csv
+
+pytestmark = pytest.mark.requirement("D2")
+
+START = np.datetime64("2024-03-05T01:00:00", "ns")
+#: 2 km, level and straight, points every 10 m.
+LINE = Track.from_ecef(synthetic.enu_to_ecef(np.stack([np.arange(0, 2001, 10.0), *np.zeros((2, 201))], axis=1)))
+PATH = Trajectory.from_track(LINE)
+
+
+def at(chainage: np.ndarray) -> np.ndarray:
+    return PATH.at_arc(PATH.arc_at_chainage(chainage))
+
+
+def reference(time_s: np.ndarray, chainage: np.ndarray, **columns: object) -> dict[str, AntennaReference]:
+    blank = np.full(len(time_s), np.nan)
+    whole = {
+        "time": START + timedelta(time_s),
+        "ecef_m": at(chainage),
+        "chainage_m": chainage,
+        "speed_mps": blank,
+        "sigma_m": blank,
+        "source": np.full(len(time_s), "truth"),
+        "environment": np.full(len(time_s), ""),
+    }
+    return {"front": AntennaReference(**whole | columns)}  # type: ignore[arg-type]
+
+
+def write_run(
+    folder: Path,
+    time_s: np.ndarray,
+    chainage: np.ndarray,
+    *,
+    conventional: np.ndarray | None = None,
+    status: list[str] | None = None,
+    track: Path | None = None,
+    chainage_of: str = "antenna",
+    settings: dict | None = None,
+    **columns: np.ndarray,
+) -> Path:
+    """A run folder of one antenna; NaN where there is no position."""
+    folder.mkdir(parents=True)
+    conventional = chainage if conventional is None else conventional
+    has = np.isfinite(chainage)
+    rows = {
+        "time_gpst": START + timedelta(np.asarray(time_s, dtype=np.float64)),
+        "antenna": ["front"] * len(time_s),
+        "status": status or np.where(has, "ok", "too_few_satellites").tolist(),
+        "chainage_m": chainage,
+        "along_sigma_m": np.where(has, 2.0, np.nan),
+        "n_used": np.where(has, 8, 2),
+        "conventional_chainage_m": conventional,
+    }
+    for prefix, values in (("", chainage), ("conventional_", conventional)):
+        place = at(values)
+        rows |= {f"{prefix}{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
+    pl.DataFrame(rows | columns, nan_to_null=True).write_parquet(folder / "positions.parquet")
+    entries = []
+    if track is not None:
+        digest = hashlib.sha256(track.read_bytes()).hexdigest()
+        entries = [{"input": "track", "path": str(track), "bytes": track.stat().st_size, "sha256": digest}]
+    record = {
+        "inputs": entries,
+        "settings_used": settings or {"preset": "default", "screens": ["elevation"]},
+        "line": {"track": {"name": "straight"}, "chainage_of": {"front": chainage_of}},
+    }
+    (folder / "run.json").write_text(json.dumps(record))
+    return folder
+
+
+def test_errors_and_rates_by_hand(tmp_path: Path):
+    """Six epochs of which one has no position, one a gross error, one a reference that is too bad."""
+    time, place = np.arange(6.0), np.arange(100.0, 160.0, 10.0)
+    answer = place + np.array([1.0, -2.0, np.nan, 3.0, 60.0, 100.0])
+    sigma = np.array([0.1, 0.1, 0.1, 0.1, 0.1, 0.6])
+    status = ["ok", "ok", "too_few_satellites", "uncertain", "ok", "ok"]
+    run = write_run(tmp_path / "run", time, answer, status=status, conventional=place + np.array([5.0] * 5 + [np.nan]))
+    found = evaluate_run(run, reference(time, place, sigma_m=sigma))
+    expected = {"epochs": 6, "observed": 6, "positions": 5, "left_out": 1, "errors": 4, "wrong_places": 1}
+    assert {name: found.figure(name) for name in expected} == expected
+    assert found.figure("rate") == pytest.approx(5 / 6)
+    assert found.figure("mean_m") == pytest.approx(15.5, abs=1e-6)
+    assert found.figure("std_m") == pytest.approx(np.std([1.0, -2.0, 3.0, 60.0]), abs=1e-6)
+    assert found.figure("rms_m") == pytest.approx(np.sqrt((1 + 4 + 9 + 3600) / 4), abs=1e-6)
+    assert found.figure("p50_m") == pytest.approx(2.5, abs=1e-6)
+    assert found.figure("lowest_m") == pytest.approx(-2.0, abs=1e-6)
+    assert found.figure("max_m") == pytest.approx(60.0, abs=1e-6)
+    assert found.figure("max_at_chainage_m") == pytest.approx(140.0, abs=1e-6)
+    assert found.figure("max_at_time") == (START + np.timedelta64(4, "s")).astype("datetime64[us]").item()
+    assert [found.figure(f"over_{limit}_m") for limit in (5, 10, 20, 50)] == [0.25] * 4
+    assert found.figure("over_1_sigma") == pytest.approx(0.5)  # 3 and 60 over 2; the 2.0 is not over it
+    assert found.figure("normalised_mean") == pytest.approx(15.5 / 2, abs=1e-6)
+    assert found.figure("positions", position="constrained_ok") == 4
+    assert found.figure("rate", position="constrained_ok") == pytest.approx(4 / 6)
+    assert found.figure("positions", epochs_of="common") == 4
+    assert found.figure("mean_m", position="conventional", epochs_of="common") == pytest.approx(5.0, abs=1e-6)
+    assert found.figure("positions", position="conventional") == 5
+    assert found.figure("over_1_sigma", position="conventional") is None
+    statuses = found.figures.filter(grouping="status", position="constrained", epochs_of="own")
+    assert dict(zip(statuses["group"], statuses["errors"], strict=True)) == {
+        "ok": 3,
+        "too_few_satellites": 0,
+        "uncertain": 1,
+    }
+    assert statuses.filter(group="too_few_satellites")["mean_m"].item() is None
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+@pytest.mark.parametrize("method", ["chainage", "trajectory"])
+def test_the_sign_does_not_turn_with_the_train(tmp_path: Path, direction: float, method: str):
+    """An answer 3 m nearer the end of the line is +3 m, running up or down."""
+    time = np.arange(20.0)
+    place = 1000.0 + direction * 20.0 * time
+    track = tmp_path / "line.csv"
+    write_track_csv(LINE, track)
+    run = write_run(tmp_path / "run", time, place + 3.0, track=track)
+    found = evaluate_run(run, reference(time, place), options=EvaluationOptions(method=method))
+    assert found.figure("mean_m") == pytest.approx(3.0, abs=2e-3)
+    assert found.figure("std_m") == pytest.approx(0.0, abs=2e-3)
+    assert found.epochs["speed_mps"].to_numpy() == pytest.approx(20.0, abs=1e-6)
+    assert found.intervals.filter(position="constrained")["interval_max_m"].item() == pytest.approx(20.0, abs=1e-6)
+
+
+def test_a_tunnel_without_epochs_counts_in_the_rate_of_the_run(tmp_path: Path):
+    """1 Hz at 20 m/s: 10 epochs, 30 s of tunnel that the log skips, 10 epochs."""
+    time = np.concatenate([np.arange(10.0), np.arange(40.0, 50.0)])
+    whole = np.arange(50.0)
+    environment = np.where((whole >= 10) & (whole < 40), "tunnel", "open")
+    run = write_run(tmp_path / "run", time, 20.0 * time)
+    found = evaluate_run(run, reference(whole, 20.0 * whole, environment=environment))
+    assert found.figure("rate") == 1.0
+    assert found.figure("rate_of_run") == pytest.approx(20 / 50)
+    tunnel = {"grouping": "environment", "group": "tunnel"}
+    assert (found.figure("epochs", **tunnel), found.figure("observed", **tunnel)) == (30, 0)
+    assert found.figure("rate", **tunnel) is None
+    assert found.figure("rate_of_run", **tunnel) == 0.0
+    assert found.figure("rate_of_run", grouping="environment", group="open") == 1.0
+    gap = found.intervals.filter(position="constrained").row(0, named=True)
+    assert gap["interval_max_m"] == pytest.approx(31 * 20.0, abs=1e-6)
+    assert gap["gap_max_s"] == pytest.approx(31.0)
+    assert gap["interval_max_chainage_m"] == pytest.approx(180.0, abs=1e-6)
+    assert gap["interval_max_from"] == found.epochs["time_gpst"][9]
+    assert gap["interval_p50_m"] == pytest.approx(20.0, abs=1e-6)
+    assert found.epochs.filter(status="not_logged").height == 30
+
+
+def test_the_reference_that_is_missing_in_the_tunnel_is_not_the_run_s_fault(tmp_path: Path):
+    """Epochs outside the reference count nowhere; the distance run over its gap is kept."""
+    time = np.arange(50.0)
+    known = np.concatenate([np.arange(10.0), np.arange(40.0, 50.0)])
+    answer = np.where((time >= 9.5) & (time < 39.5), np.nan, 20.0 * time)
+    found = evaluate_run(write_run(tmp_path / "run", time, answer), reference(known, 20.0 * known))
+    assert found.runs[0].outside == {"front": 30}
+    assert found.figure("epochs") == 20
+    assert found.figure("rate_of_run") == 1.0
+    assert found.intervals.filter(position="constrained")["interval_max_m"].item() == pytest.approx(620.0, abs=1e-6)
+    fixed = evaluate_run(write_run(tmp_path / "fixed", time, 20.0 * time), reference(known, 20.0 * known))
+    table = fixed.epochs.filter(pl.col("time_gpst") == START + np.timedelta64(25, "s"))
+    assert table["interval_m"].item() == pytest.approx(20.0, abs=1e-6)
+    assert table["in_reference"].item() is False
+
+
+def test_standing_is_no_interval_and_turning_is_one(tmp_path: Path):
+    """Runs 5 s up at 10 m/s, stands 10 s with a reference that trembles, runs back without a position at the turn."""
+    time = np.arange(21.0)
+    place = np.concatenate([100.0 + 10.0 * np.arange(6), np.full(10, 150.0), 150.0 - 10.0 * np.arange(1, 6)])
+    place[6:15] += np.tile([0.05, -0.05, 0.02], 3)
+    answer = place.copy()
+    answer[[3, 4, 5]] = np.nan
+    found = evaluate_run(write_run(tmp_path / "run", time, answer), reference(time, place))
+    row = found.intervals.filter(position="constrained").row(0, named=True)
+    assert row["standing"] == 9
+    assert row["intervals"] == 2 + 1 + 5
+    assert row["interval_max_m"] == pytest.approx(30.0, abs=1e-6)
+    assert row["gap_max_s"] == pytest.approx(4.0)
+    speeds = found.figures.filter(grouping="speed", position="constrained", epochs_of="own")
+    assert dict(zip(speeds["group"], speeds["epochs"], strict=True))["standing"] == 9
+
+
+def test_distance_over_a_turn_between_two_positions_is_the_way_and_not_the_displacement():
+    time = START + timedelta(np.arange(5.0))
+    chainage = np.array([0.0, 10.0, 20.0, 10.0, 0.0])
+    moved = travelled(
+        time, np.abs(np.diff(chainage)), np.ones(5, dtype=bool), np.full(5, np.nan), options=EvaluationOptions()
+    )
+    assert moved == pytest.approx([0.0, 10.0, 20.0, 30.0, 40.0])
+    told = np.array([0.0, 0.1, 0.1, 0.1, 0.0])  # the reference says that it stands
+    moved = travelled(time, np.full(4, 0.4), np.ones(5, dtype=bool), told, options=EvaluationOptions())
+    assert moved == pytest.approx(np.zeros(5))
+
+
+def test_epochs_are_put_in_at_the_step_of_the_log():
+    """Tags off the whole second stay as they are; a gap of three steps gets two."""
+    time = START + timedelta(np.array([0.0, 1.003, 1.998, 3.0, 6.0, 7.0]))
+    whole, logged, step = with_missing(time)
+    assert step == pytest.approx(1.0, abs=0.01)
+    assert logged.tolist() == [True, True, True, True, False, False, True, True]
+    assert (whole[~logged] == START + timedelta(np.array([4.0, 5.0]))).all()
+    assert (whole[logged] == time).all()
+    alone, logged, step = with_missing(time[:1])
+    assert (len(alone), logged.all(), np.isnan(step)) == (1, True, True)
+
+
+def test_limits_by_blocks_by_hand():
+    """Six blocks of which one is without a position: the mean is drawn from five values, the rate from six."""
+    block = np.repeat(np.arange(6), 10)
+    error = np.repeat([1.0, 1.0, 1.0, 1.0, 1.0, np.nan], 10)
+    has = np.isfinite(error)
+    arguments = {"replicates": 2000, "seed": 3, "confidence": 0.95}
+    found = block_limits(error, np.ones(60, dtype=bool), has, block, **arguments)
+    assert found.blocks == 6
+    assert found.mean_m == (1.0, 1.0)
+    assert found.p95_m == (1.0, 1.0)
+    # The number of draws of the empty block is binomial (6, 1/6): P(0) = 0.335, P(at least 3) = 0.062,
+    # P(at least 4) = 0.0087; so the upper limit is 1 and the lower one 1/2.
+    assert found.rate == (pytest.approx(0.5), 1.0)
+    few = block_limits(error[:40], np.ones(40, dtype=bool), has[:40], block[:40], **arguments)
+    assert few.blocks == 4
+    assert np.isnan([*few.mean_m, *few.rate, *few.p95_m]).all()
+
+
+def test_limits_widen_with_errors_that_stay():
+    """The same errors, once independent and once the same for a minute: the mean is known ten times worse."""
+    rng = np.random.default_rng(1)
+    block = np.repeat(np.arange(40), 100)
+    seen = np.ones(4000, dtype=bool)
+    arguments = {"replicates": 1000, "seed": 0, "confidence": 0.95}
+    free = block_limits(rng.normal(size=4000), seen, seen, block, **arguments)
+    stuck = block_limits(np.repeat(rng.normal(size=40), 100), seen, seen, block, **arguments)
+    width = [high - low for low, high in (free.mean_m, stuck.mean_m)]
+    assert width[0] == pytest.approx(2 * 1.96 / np.sqrt(4000), rel=0.3)
+    assert width[1] == pytest.approx(2 * 1.96 / np.sqrt(40), rel=0.3)
+
+
+def test_percentiles_of_the_draws_are_exact_with_many_errors():
+    """Over the number of nodes, against the draws made one by one."""
+    rng = np.random.default_rng(5)
+    error, block = rng.standard_cauchy(9000), rng.integers(0, 7, 9000)
+    seen = np.ones(9000, dtype=bool)
+    found = block_limits(error, seen, seen, block, replicates=50, seed=2, confidence=0.9)
+    draws = []
+    for drawn in np.random.default_rng(2).integers(0, 7, (50, 7)):
+        values = np.concatenate([np.abs(error[block == b]) for b in drawn])
+        draws.append(np.quantile(values, 0.95, method="inverted_cdf"))
+    assert found.p95_m == pytest.approx(tuple(np.percentile(draws, [5.0, 95.0])), abs=1e-9)
+
+
+def test_chainage_is_not_taken_where_it_is_not_the_same(tmp_path: Path):
+    """Another zero, another point of the vehicle, none at all: along the trajectory, and said; or refused."""
+    time = np.arange(20.0)
+    place = 500.0 + 20.0 * time
+    track = tmp_path / "line.csv"
+    write_track_csv(LINE, track)
+    run = write_run(tmp_path / "run", time, place + 3.0, track=track)
+    centre = write_run(tmp_path / "centre", time, place + 3.0, track=track, chainage_of="centre")
+    moved = {"front": replace(reference(time, place)["front"], chainage_m=place + 100.0)}
+    some = {"front": replace(reference(time, place)["front"], chainage_m=np.where(time < 3, np.nan, place))}
+    for folder, known, told in (
+        (run, moved, "not of one map (off by 94.0 m"),
+        (run, some, "no chainage at 3 of 20"),
+        (centre, reference(time, place), "is that of the centre"),
+    ):
+        found = evaluate_run(folder, known)
+        assert found.runs[0].method == {"front": "trajectory"}
+        assert any(told in note for note in found.runs[0].notes)
+        assert found.figure("mean_m") == pytest.approx(3.0, abs=2e-3)
+        assert found.epochs["chainage_m"].to_numpy() == pytest.approx(place, abs=2e-3)
+        with pytest.raises(MismatchError, match="take the trajectory instead"):
+            evaluate_run(folder, known, options=EvaluationOptions(method="chainage"))
+
+
+def test_another_track_is_refused(tmp_path: Path):
+    time = np.arange(20.0)
+    place = 500.0 + 20.0 * time
+    track, other = tmp_path / "line.csv", tmp_path / "other.csv"
+    write_track_csv(LINE, track)
+    shifted = synthetic.enu_to_ecef(np.stack([np.arange(0, 2001, 10.0), np.full(201, 4.0), np.zeros(201)], axis=1))
+    write_track_csv(Track.from_ecef(shifted), other)
+    run = write_run(tmp_path / "run", time, place, track=track)
+    along = EvaluationOptions(method="trajectory")
+    known = reference(time, place)
+    with pytest.raises(MismatchError, match=r"other\.csv: is not the track of .* up to 4\.0"):
+        evaluate_run(run, known, options=along, files=TrackFiles(track=(other,)))
+    moved = tmp_path / "moved.csv"
+    track.rename(moved)
+    with pytest.raises(InputFileError, match="no longer there; give it with --track"):
+        evaluate_run(run, known, options=along)
+    found = evaluate_run(run, known, options=along, files=TrackFiles(track=(moved,)))
+    assert found.figure("max_m") < 2e-3
+    assert read_track(moved).chainage_m[-1] == pytest.approx(2000.0, abs=0.01)
+    moved.write_text("# note: the same with a remark\n" + moved.read_text())
+    found = evaluate_run(run, known, options=along, files=TrackFiles(track=(moved,)))
+    assert any("not byte for byte" in note for note in found.runs[0].notes)
+
+
+def test_sections_tell_the_environment_where_the_reference_does_not(tmp_path: Path):
+    file = tmp_path / "sections.csv"
+    file.write_text("from_m,to_m,environment\n0,100,open\n100,200,cutting\n300,400,station\n")
+    at_places = read_sections(file).at(np.array([0.0, 99.9, 100.0, 250.0, 300.0, 400.0, 400.1, np.nan]))
+    assert at_places.tolist() == ["open", "open", "cutting", "", "station", "station", "", ""]
+    time = np.arange(5.0)
+    place = np.array([50.0, 99.0, 150.0, 250.0, 350.0])
+    run = write_run(tmp_path / "run", time, place)
+    told = np.array(["", "depot", "", "", ""])
+    found = evaluate_run(run, reference(time, place, environment=told), sections=file)
+    assert found.epochs["environment"].to_list() == ["open", "depot", "cutting", "unknown", "station"]
+    for text, line in (("0,100,open\n50,80,cutting\n", 3), ("5,5,open\n", 2), ("0,9,\n", 2)):
+        file.write_text("from_m,to_m,environment\n" + text)
+        with pytest.raises(InputFileError, match=f"line {line}"):
+            read_sections(file)
+
+
+def test_protection_levels_by_hand(tmp_path: Path):
+    time, place = np.arange(5.0), 100.0 + 10.0 * np.arange(5)
+    answer = place + np.array([1.0, 4.0, -4.0, 1.0, np.nan])
+    level = np.array([3.0, 3.0, np.inf, 12.0, np.nan])
+    run = write_run(tmp_path / "run", time, answer, along_protection_level_m=level)
+    found = evaluate_run(run, reference(time, place), options=EvaluationOptions(alarm_limit_m=10.0))
+    row = found.levels.filter(position="constrained").row(0, named=True)
+    assert row["level"] == "along_protection_level_m"
+    counts = ("observed", "positions", "infinite", "with_level", "available", "errors", "over_level")
+    assert [row[name] for name in counts] == [5, 4, 1, 3, 2, 3, 1]
+    assert row["availability"] == pytest.approx(2 / 5)
+    bare = evaluate_run(write_run(tmp_path / "bare", time, answer), reference(time, place))
+    assert bare.levels is None
+
+
+def campaign(folder: Path) -> list[RunAndReference]:
+    """Two days of GPS and of GPS with QZSS, 100 epochs each, errors of 2 and 1 m and of 4 and 3 m."""
+    time = np.arange(100.0)
+    place = 100.0 + 10.0 * time
+    runs = []
+    for systems, errors in (("G", (2.0, 4.0)), ("GJ", (1.0, 3.0))):
+        for day, error in enumerate(errors):
+            settings = {"preset": "p1", "systems": list(systems), "screens": ["elevation"], "noise": {"floor": 1.0}}
+            run = write_run(folder / f"day{day}" / systems, time, place + error, settings=settings)
+            runs.append(RunAndReference(run=run, reference=reference(time, place)))
+    return runs
+
+
+def test_a_campaign_by_configuration(tmp_path: Path):
+    found = evaluate_runs(campaign(tmp_path))
+    assert [run.name for run in found.runs] == ["day0/G", "day1/G", "day0/GJ", "day1/GJ"]
+    assert {run.configuration for run in found.runs} == {"p1; systems: G", "p1; systems: G J"}
+    for group, mean, lowest, highest in (("p1; systems: G", 3.0, 2.0, 4.0), ("p1; systems: G J", 2.0, 1.0, 3.0)):
+        where = {"grouping": "configuration", "group": group}
+        assert found.figure("errors", **where) == 200
+        assert found.figure("mean_m", **where) == pytest.approx(mean, abs=1e-6)
+        assert found.figure("std_m", **where) == pytest.approx(1.0, abs=1e-6)
+        assert found.figure("lowest_m", **where) == pytest.approx(lowest, abs=1e-6)
+        assert found.figure("highest_m", **where) == pytest.approx(highest, abs=1e-6)
+    assert found.figure("epochs", grouping="line") == 400
+    assert found.figure("mean_m", run="all") == pytest.approx(2.5, abs=1e-6)
+    assert found.figure("mean_m", run="day1/G") == pytest.approx(4.0, abs=1e-6)
+    # Blocks of different runs are different blocks, though they have the same times.
+    assert found.figure("blocks", run="all") == 8
+    pooled = found.intervals.filter(run="all", configuration="p1; systems: G", position="constrained")
+    assert pooled["intervals"].item() == 198  # nothing from one run to the next
+    assert pooled["interval_max_m"].item() == pytest.approx(10.0, abs=1e-6)
+    named = evaluate_runs(
+        [replace(run, configuration=f"set {i // 2}") for i, run in enumerate(campaign(tmp_path / "b"))]
+    )
+    assert found.figure("mean_m", grouping="configuration", group="p1; systems: G") == named.figure(
+        "mean_m", grouping="configuration", group="set 0"
+    )
+    with pytest.raises(SettingsError, match="given twice"):
+        evaluate_runs(campaign(tmp_path / "c")[:1] * 2)
+    with pytest.raises(LookupError, match="8 rows"):
+        found.figure("mean_m", grouping="section")
+
+
+def test_a_hundred_thousand_epochs(tmp_path: Path):
+    """As many as the source paper evaluated, 145 km at 10 Hz: every epoch counts, the limits are told."""
+    time = np.arange(100_240) * 0.1
+    place = 1000.0 + 900.0 * np.sin(time / 900.0)
+    error = np.random.default_rng(0).normal(0.5, 2.0, len(time))
+    run = write_run(tmp_path / "run", time, place + error)
+    found = evaluate_run(run, reference(time, place))
+    assert found.figure("errors") == 100_240
+    assert found.figure("mean_m") == pytest.approx(0.5, abs=4 * 2.0 / np.sqrt(100_240))
+    assert found.figure("blocks") == 168
+    assert found.figure("mean_low_m") < 0.5 < found.figure("mean_high_m")
+    assert found.intervals.filter(position="constrained")["interval_max_m"].item() == pytest.approx(0.1, abs=1e-3)
+
+
+def test_the_command_writes_every_table(tmp_path: Path):
+    runs = campaign(tmp_path / "runs")[:2]
+    arguments = ["evaluate", *(str(run.run) for run in runs), "--out", str(tmp_path / "out"), "--beside-p1"]
+    for number, run in enumerate(runs):
+        file = tmp_path / f"reference{number}.csv"
+        write_reference(file, run.reference)  # type: ignore[arg-type]
+        arguments += ["--reference", str(file)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "By configuration, all runs" in result.output
+    assert "65.80" in result.output
+    assert "+3.00" in result.output
+    written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert {entry["input"] for entry in written["inputs"]} == {"positions", "record", "reference"}
+    for entry in written["inputs"]:
+        assert entry["sha256"] == hashlib.sha256(Path(entry["path"]).read_bytes()).hexdigest()
+    tables = pl.read_csv(tmp_path / "out" / "tables.csv")
+    assert set(written["columns"]["figures"]) - set(tables.columns) == set()
+    assert len(written["figures"]) == len(tables)
+    epochs = pl.read_parquet(tmp_path / "out" / "errors.parquet")
+    assert set(epochs.columns) == set(written["columns"]["epochs"])
+    assert len(epochs) == 200
+    again = CliRunner().invoke(app, arguments)
+    assert again.exit_code == 8
+    assert CliRunner().invoke(app, [*arguments, "--overwrite"]).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "told"),
+    [
+        (["--reference", "absent.csv"], 3, "absent.csv"),
+        (["--reference", "{reference}", "--reference", "{reference}"], 4, "given 2 times for 1 runs"),
+        (["--reference", "{reference}", "--label", "a", "--label", "b"], 4, "--label is given 2 times"),
+        (["--reference", "{late}"], 5, "no time in common"),
+        (["--reference", "{reference}", "--speed-classes", "20,x"], 4, "--speed-classes"),
+        (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "speed_edges_kmh"),
+        (["--reference", "{reference}", "--section-length", "0"], 4, "section_m"),
+        (["--reference", "{reference}", "--sections", "absent.csv"], 3, "absent.csv"),
+        (["--reference", "{reference}", "--method", "trajectory"], 3, "names no track"),
+        (["--reference", "auto"], 3, "names no log of the front antenna"),
+        (["--reference", "{reference}", "--out", "{reference}"], 8, "expected a folder"),
+        ([], 2, "--reference"),
+        (["--reference", "{reference}", "--method", "guess"], 2, "--method"),
+    ],
+)
+def test_errors_of_the_command(tmp_path: Path, change: list[str], code: int, told: str):
+    time = np.arange(5.0)
+    run = write_run(tmp_path / "run", time, 10.0 * time)
+    files = {"reference": tmp_path / "reference.csv", "late": tmp_path / "late.csv"}
+    write_reference(files["reference"], reference(time, 10.0 * time))
+    write_reference(files["late"], reference(time + 1e5, 10.0 * time))
+    arguments = [part.format(**files) for part in change]
+    result = CliRunner().invoke(app, ["evaluate", str(run), *arguments])
+    assert result.exit_code == code, result.output
+    assert told in " ".join(result.output.split())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["late.csv", "reference.csv", "run"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda run: (run / "run.json").unlink(), r"run\.json: there is no such file"),
+        (lambda run: (run / "run.json").write_text("{"), r"run\.json: cannot be read as JSON"),
+        (lambda run: (run / "positions.parquet").unlink(), "holds neither positions.parquet nor positions.csv"),
+        (lambda run: (run / "positions.parquet").write_bytes(b"PAR1"), "cannot be read as a table"),
+        (
+            lambda run: (
+                pl.read_parquet(run / "positions.parquet").drop("n_used").write_parquet(run / "positions.parquet")
+            ),
+            "has no column n_used",
+        ),
+        (
+            lambda run: pl.concat([pl.read_parquet(run / "positions.parquet")] * 2).write_parquet(
+                run / "positions.parquet"
+            ),
+            "twice at one time",
+        ),
+    ],
+)
+def test_a_spoilt_run_is_one_sentence(tmp_path: Path, spoil, told: str):
+    time = np.arange(5.0)
+    run = write_run(tmp_path / "run", time, 10.0 * time)
+    spoil(run)
+    with pytest.raises(InputFileError, match=told):
+        evaluate_run(run, reference(time, 10.0 * time))
+
+
+def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
+    time = np.arange(5.0)
+    run = write_run(tmp_path / "run", time, 10.0 * time)
+    log = tmp_path / "logs" / "front.obs"
+    log.parent.mkdir()
+    log.touch()
+    record = json.loads((run / "run.json").read_text())
+    record["inputs"] = [{"input": "front", "path": str(log), "bytes": 0, "sha256": ""}]
+    (run / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputFileError, match="holds no reference"):
+        evaluate_run(run)
+    write_reference(log.parent / "reference.csv", reference(time, 10.0 * time))
+    found = evaluate_run(run)
+    assert found.figure("max_m") < 1e-3
+    assert any("found beside the log" in note for note in found.runs[0].notes)
+    write_reference(log.parent / "truth.csv", reference(time, 10.0 * time))
+    with pytest.raises(InputFileError, match=r"truth\.csv and reference\.csv"):
+        evaluate_run(run)
