@@ -84,15 +84,16 @@ def epochs_of(positions, truth):
         one["n"] = number(row.get("n_used"))
         one["along"] = number(row.get("along_sigma_m"))
         one["level"] = number(row.get("protection_level_m"))
-        one["map"] = number(row.get("chainage_m")) - one["chainage"]
-        one["3d"] = number(row.get("conventional_chainage_m")) - one["chainage"]
+        answers = number(row.get("chainage_m")), number(row.get("conventional_chainage_m"))
+        one["map"], one["3d"] = (answer - one["chainage"] for answer in answers)
+        one["has map"], one["has 3d"] = (not math.isnan(answer) for answer in answers)
         one["block"] = math.floor((time - whole[0]) / 1e9 / BLOCK_S)
         found.append(one)
     return found
 
 
 def put_distance(epochs):
-    """Distance run, at the epochs inside the reference."""
+    """Distance run, from the first epoch inside the reference to the last; over its gaps shared out by time."""
     total, before = 0.0, None
     for one in epochs:
         if not one["in"]:
@@ -105,12 +106,16 @@ def put_distance(epochs):
                 speed = step / took
             if speed >= STANDING_MPS:
                 total += step
+            for between in epochs:
+                if before["time"] < between["time"] < one["time"]:
+                    share = (between["time"] - before["time"]) / (one["time"] - before["time"])
+                    between["moved"] = before["moved"] + share * (total - before["moved"])
         one["moved"] = total
         before = one
 
 
 def has(one, position, epochs_of_both):
-    mapped, point = not math.isnan(one["map"]), not math.isnan(one["3d"])
+    mapped, point = one["has map"], one["has 3d"]
     if epochs_of_both == "common" and not (mapped and point):
         return False
     if position == "conventional":
@@ -260,7 +265,7 @@ def all_figures(by_antenna):
 
 
 def intervals(epochs, position):
-    inside = [one for one in epochs if one["in"]]
+    inside = [one for one in epochs if "moved" in one]
     fixes = [one for one in inside if has(one, position, "own")]
     pairs = list(pairwise(fixes))
     ran = [(b["moved"] - a["moved"], a) for a, b in pairs if b["moved"] - a["moved"] > 0]

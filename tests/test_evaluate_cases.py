@@ -188,6 +188,9 @@ def test_the_reference_that_is_missing_in_the_tunnel_is_not_the_run_s_fault(tmp_
     table = fixed.epochs.filter(pl.col("time_gpst") == START + np.timedelta64(25, "s"))
     assert table["interval_m"].item() == pytest.approx(20.0, abs=1e-6)
     assert table["in_reference"].item() is False
+    row = fixed.intervals.filter(position="constrained").row(0, named=True)
+    assert (row["intervals"], row["gap_max_s"]) == (49, pytest.approx(1.0))
+    assert row["interval_max_m"] == pytest.approx(20.0, abs=1e-6)
 
 
 def test_standing_is_no_interval_and_turning_is_one(tmp_path: Path):

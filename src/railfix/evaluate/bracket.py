@@ -60,7 +60,14 @@ def bracket(
         Rising, at least two.
     largest_gap_s : float [s]
         Longest step of the reference that is bridged.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two instants of the reference.
     """
+    if len(reference_time) < 2:
+        raise ValueError(f"reference_time has {len(reference_time)} instants, at least two were expected")
     last = len(reference_time) - 1
     after = np.searchsorted(reference_time, time, side="left")
     exact = (after <= last) & (reference_time[np.minimum(after, last)] == time)

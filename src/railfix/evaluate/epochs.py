@@ -45,6 +45,8 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "reference_sigma_m": "standard deviation of the reference along the track",
     "reference_source": "where the reference has its place from",
     "n_used": "satellites used",
+    "positioned": "a position on the map",
+    "conventional_positioned": "a 3-D single point",
     "error_m": "on the map, + toward the end of the line",
     "conventional_error_m": "3-D single point at its nearest point of the trajectory, + toward the end",
     "along_sigma_m": "standard deviation that the run gave",
@@ -223,11 +225,14 @@ def antenna_epochs(
         "reference_sigma_m": sigma,
         "reference_source": np.where(known, reference.source[at.nearest], ""),
         "n_used": column("n_used"),
+        "positioned": np.isfinite(answers.chainage_m),
+        "conventional_positioned": np.isfinite(answers.conventional_chainage_m),
         "error_m": errors.error_m,
         "conventional_error_m": errors.conventional_error_m,
         "along_sigma_m": column("along_sigma_m"),
     }
     for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
+        # Over gaps of the reference the way is shared out by time, so that positions there count.
         columns[f"{prefix}interval_m"] = since_last(moved, np.isfinite(answered))
         columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
     columns["block"] = (clock // options.block_s).astype(np.int64)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import polars as pl
 
-from railfix.errors import InputFileError, SettingsError
+from railfix.errors import InputFileError, MismatchError, SettingsError
 from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, level_columns
 from railfix.evaluate.figures import ALL, KEYS, classed, figures_by
 from railfix.evaluate.intervals import interval_table
@@ -229,6 +229,8 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
     notes = []
     if isinstance(item.reference, Mapping):
         references, told = item.reference, "given"
+        if missing := [name for name in folder.antennas if name not in references]:
+            raise MismatchError(f"{folder.path}: the references given have none of the {missing[0]} antenna; add it")
     else:
         path = item.reference or reference_beside(folder)
         if item.reference is None:

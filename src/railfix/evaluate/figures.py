@@ -73,7 +73,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
 _LIMITS: Final = ("mean_low_m", "mean_high_m", "rate_low", "rate_high", "p95_low_m", "p95_high_m")
 _USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
-    "reference_sigma_m", "n_used", "error_m", "conventional_error_m", "along_sigma_m", "block",
+    "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
+    "error_m", "conventional_error_m", "along_sigma_m", "block",
 )  # fmt: skip
 
 
@@ -128,14 +129,21 @@ def _satellite_names(options: EvaluationOptions) -> list[str]:
     return ["unknown", f"under {edges[0]}", *between, f"{edges[-1]} and more"]
 
 
+def positioned(position: str) -> pl.Expr:
+    """Whether an epoch has a position of one kind of `POSITIONS`."""
+    if position == "conventional":
+        return pl.col("conventional_positioned")
+    if position == "constrained_ok":
+        return pl.col("positioned") & (pl.col("status") == Status.OK.text)
+    return pl.col("positioned")
+
+
 def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     """Epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
     column = "conventional_error_m" if position == "conventional" else "error_m"
-    has = pl.col(column).is_not_null()
-    if position == "constrained_ok":
-        has &= pl.col("status") == Status.OK.text
+    has = positioned(position)
     if epochs_of == "common":
-        has &= pl.col("error_m").is_not_null() & pl.col("conventional_error_m").is_not_null()
+        has &= pl.col("positioned") & pl.col("conventional_positioned")
     sigma = pl.lit(None, pl.Float64) if position == "conventional" else pl.col("along_sigma_m")
     return (
         epochs.with_columns(has=has, error=pl.when(has & pl.col("reference_good")).then(pl.col(column)), sigma=sigma)

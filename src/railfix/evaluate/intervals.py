@@ -6,8 +6,7 @@ from typing import Final
 
 import polars as pl
 
-from railfix.evaluate.figures import POSITIONS, largest_first
-from railfix.reasons import Status
+from railfix.evaluate.figures import POSITIONS, largest_first, positioned
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
@@ -20,7 +19,7 @@ INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "interval_p99_m": "the same",
     "interval_max_m": "the same",
     "interval_max_from": "time of the position before the largest, GPS time",
-    "interval_max_chainage_m": "where the train was at it",
+    "interval_max_chainage_m": "where the train was at it; empty in a gap of the reference",
     "gap_p50_s": "time between two positions",
     "gap_p95_s": "the same",
     "gap_max_s": "the same",
@@ -50,11 +49,10 @@ def interval_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame:
 
 
 def _of_position(epochs: pl.DataFrame, position: str, by: list[str]) -> pl.DataFrame:
-    has = pl.col("conventional_error_m" if position == "conventional" else "error_m").is_not_null()
-    if position == "constrained_ok":
-        has &= pl.col("status") == Status.OK.text
     keys = list(dict.fromkeys([*by, *_OF]))
-    spanned = epochs.filter("in_reference").select(*keys, "time_gpst", "chainage_m", "moved_m", has=has)
+    spanned = epochs.filter(pl.col("moved_m").is_not_null()).select(
+        *keys, "time_gpst", "chainage_m", "moved_m", has=positioned(position)
+    )
     edges = (
         spanned.group_by(keys, maintain_order=True)
         .agg(

@@ -7,8 +7,8 @@ from typing import Final
 import polars as pl
 
 from railfix.evaluate.epochs import level_columns
+from railfix.evaluate.figures import positioned
 from railfix.evaluate.options import EvaluationOptions
-from railfix.reasons import Status
 
 #: Columns of the table of levels beside its keys, with their unit and meaning.
 LEVEL_COLUMNS: Final[dict[str, str]] = {
@@ -45,9 +45,7 @@ def level_table(epochs: pl.DataFrame, by: list[str], options: EvaluationOptions)
         if epochs[level].null_count() == len(epochs):
             continue
         for position in ("constrained", "constrained_ok"):
-            has = pl.col("error_m").is_not_null()
-            if position == "constrained_ok":
-                has &= pl.col("status") == Status.OK.text
+            has = positioned(position)
             tables.append(
                 spanned.with_columns(has=has, finite=has & pl.col(level).is_finite().fill_null(value=False))
                 .group_by(by, maintain_order=True)
