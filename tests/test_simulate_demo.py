@@ -1,4 +1,4 @@
-"""The shipped run: what its command makes again, found where it is installed; the command itself."""
+"""The shipped run: what its command makes again, and found where it is installed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from typer.testing import CliRunner
 
 from conftest import ROOT
+from railfix.cli import app
 from railfix.errors import InputFileError
 from railfix.rinex import read_navigation, read_observations
 from railfix.simulate import DEMO_FILES, Scenario, demo_data, demo_files, demo_folder, write_run
-from railfix.simulate.__main__ import main
 from railfix.track_map import read_track
 from railfix.vehicle import antenna_trajectory, read_vehicle
 
@@ -23,7 +24,8 @@ pytestmark = pytest.mark.requirement("D4")
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made") / "data" / "demo"
-    assert main([str(folder)]) == 0
+    done = CliRunner().invoke(app, ["simulate", "demo", "--out", str(folder)])
+    assert done.exit_code == 0, done.output
     return folder
 
 
@@ -32,7 +34,8 @@ def test_the_data_are_small_and_stand_where_they_are_looked_for() -> None:
     assert sum(p.stat().st_size for p in files) < 3_000_000
     assert demo_folder() == ROOT / "data" / "demo"
     assert all(path.is_file() for path in demo_files().values())
-    assert {p.name for p in demo_folder().iterdir()} == set(DEMO_FILES.values())
+    names = {p.name for p in demo_folder().iterdir()}
+    assert set(DEMO_FILES.values()) <= names <= {*DEMO_FILES.values(), "sections.csv", "scenario.toml"}
 
 
 def test_the_command_makes_the_shipped_run_again(made: Path) -> None:
@@ -52,7 +55,7 @@ def test_the_command_makes_the_shipped_run_again(made: Path) -> None:
     for name in ("track", "vehicle"):
         assert shipped[name].read_text() == (made / DEMO_FILES[name]).read_text()
     settings = [p.read_text().split("| setting |")[1] for p in (shipped["readme"], made / DEMO_FILES["readme"])]
-    assert settings[0] == settings[1]
+    assert set(settings[0].splitlines()) <= set(settings[1].splitlines()), "a setting has another default now"
 
 
 def test_the_same_scenario_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -94,32 +97,3 @@ def test_a_missing_demonstration_is_one_clear_sentence(tmp_path: Path, monkeypat
     for name in DEMO_FILES.values():
         (installed / name).touch()
     assert demo_folder() == installed
-
-
-def test_exit_codes_of_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "file").touch()
-    assert main([str(tmp_path / "file")]) == 8
-    assert main([str(tmp_path / "out"), "--seconds", "-1"]) == 4
-    assert main([str(tmp_path / "out"), "--systems", "Q"]) == 4
-    assert not (tmp_path / "out").exists()
-    errors = capsys.readouterr().err.splitlines()
-    assert len(errors) == 3
-    assert all(line.startswith("railfix.simulate: error: ") for line in errors)
-    for wrong in (["--unknown"], [], [str(tmp_path), "--signals", "3"]):
-        with pytest.raises(SystemExit) as ended:
-            main(wrong)
-        assert ended.value.code == 2
-
-
-def test_the_command_takes_its_options(tmp_path: Path) -> None:
-    run = ["--seconds", "2", "--rate", "5", "--line-km", "2", "--clocks", "common", "--plain"]
-    sky = ["--systems", "GC", "--satellites", "9", "--signals", "2"]
-    assert main([str(tmp_path), *run, *sky]) == 0
-    observed = read_observations(tmp_path / "front.rnx")
-    assert len(observed) == 10
-    seen = np.isfinite(observed.code_m)
-    satellites = {s: seen[:, observed.satellite == s].any(axis=1) for s in np.unique(observed.satellite)}
-    assert (sum(v.astype(int) for v in satellites.values()) == 9).all()
-    assert set(observed.system) == {"G", "C"}
-    assert set(observed.signal) == {"1C", "2L", "2I", "6I"}
-    assert read_track(tmp_path / "track.csv").chainage_m[-1] == pytest.approx(2000.0, abs=0.05)

@@ -70,9 +70,7 @@ def milliseconds(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--run", type=Path, help="folder of `python -m railfix.simulate`; the demonstration unless given"
-    )
+    parser.add_argument("--run", type=Path, help="folder of `railfix simulate`; the demonstration unless given")
     parser.add_argument("--epochs", type=int, default=1500)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: elevation only")

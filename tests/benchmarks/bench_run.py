@@ -61,8 +61,9 @@ def run(command: list[str]) -> Spent:
 
 def simulate(folder: Path) -> None:
     """An hour of a train on 20 km of line, 18 satellites on two signals, two antennas."""
-    options = "--seconds 3600 --line-km 20 --systems GJEC --satellites 18 --signals 2 --plain"
-    command = [sys.executable, "-m", "railfix.simulate", str(folder), *options.split()]
+    options = "--seconds 3600 --set line.length_m=20000 --set sky.systems=GJEC --set sky.satellites_at_most=18"
+    options += " --set receiver.signals_per_satellite=2 --plain --overwrite"
+    command = [sys.executable, "-m", "railfix", "simulate", "demo", "--out", str(folder), *options.split()]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 

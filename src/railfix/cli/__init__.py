@@ -20,6 +20,7 @@ from railfix.cli.map import map_app
 from railfix.cli.plot_screens import plot_screens as plot_screens_command
 from railfix.cli.report import report as report_command
 from railfix.cli.run import run as run_command
+from railfix.cli.simulate import simulate as simulate_command
 from railfix.errors import RailfixError
 
 
@@ -97,6 +98,7 @@ app.command("evaluate")(evaluate_command)
 app.command("cn0-curve")(cn0_curve_command)
 app.command("error-model")(error_model_command)
 app.command("plot-screens")(plot_screens_command)
+app.command("simulate")(simulate_command)
 app.command("report")(report_command)
 app.add_typer(map_app)
 

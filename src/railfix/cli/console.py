@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def progress_bar() -> Iterator[ProgressCall]:
+def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     """A bar on the standard error output, with the rate and the time left; silent where that is no terminal."""
     console = Console(stderr=True)
     columns = (
@@ -32,7 +32,7 @@ def progress_bar() -> Iterator[ProgressCall]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("positions", total=1.0, epochs=0, rate=0.0)
+        task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
         def show(*, epochs: int, fraction: float) -> None:
             elapsed = bar.tasks[task].elapsed or 0.0

@@ -138,7 +138,7 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
     if choices.preset is not None:
         values["preset"] = _preset(choices.preset)
     for text in choices.setting:
-        _set(values, text)
+        set_value(values, text)
         source = "--set"
     if choices.screens is not None:
         values["screens"] = [] if choices.screens.strip() == "none" else _screens("--screens", choices.screens)
@@ -175,7 +175,7 @@ def _screens(option: str, text: str) -> list[str]:
     return names
 
 
-def _set(values: dict[str, Any], text: str) -> None:
+def set_value(values: dict[str, Any], text: str) -> None:
     """Put one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
     import tomllib
 

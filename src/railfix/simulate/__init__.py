@@ -1,8 +1,8 @@
 """Runs that never happened, with their truth: RINEX logs of two antennas on a made line under a made sky.
 
-`Scenario` holds every choice, `write_run` makes the files, `Simulation` gives the arrays piece by
-piece. The same scenario gives the same numbers. ``python -m railfix.simulate --help`` is the same
-from the command line.
+`Scenario` holds every choice, `load_scenario` reads one from TOML, `write_run` makes the files,
+`Simulation` gives the arrays piece by piece. The same scenario gives the same numbers.
+``railfix simulate`` is the same from the command line.
 
 The orbits, the delays and the rigid body are computed here apart from the rooms that the estimators
 use, by the same published formulas, so that an error in either shows as a position that is off.
@@ -23,7 +23,7 @@ from railfix.simulate.line_settings import (
     Terrain,
 )
 from railfix.simulate.motion import Motion, made_motion, run_curve, shuttle
-from railfix.simulate.run import truth_table, write_run
+from railfix.simulate.run import section_table, truth_table, write_run
 from railfix.simulate.scenario import (
     ANTENNAS,
     ReceiverSettings,
@@ -34,6 +34,7 @@ from railfix.simulate.scenario import (
     Station,
     VehicleSettings,
 )
+from railfix.simulate.scenario_file import Recipe, load_recipe, load_scenario, scenario_toml, shipped_scenarios
 from railfix.simulate.signals import Piece, Simulation
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "Motion",
     "Piece",
     "ReceiverSettings",
+    "Recipe",
     "RunSettings",
     "Scenario",
     "Simulation",
@@ -64,10 +66,15 @@ __all__ = [
     "antenna_truth",
     "demo_files",
     "demo_folder",
+    "load_recipe",
+    "load_scenario",
     "made_alignment",
     "made_motion",
     "made_navigation",
     "run_curve",
+    "scenario_toml",
+    "section_table",
+    "shipped_scenarios",
     "shuttle",
     "truth_table",
     "write_run",

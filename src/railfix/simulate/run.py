@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -15,15 +17,18 @@ import polars as pl
 from railfix.epochs import Observations
 from railfix.errors import OutputError
 from railfix.rinex.write import write_navigation, write_observations
+from railfix.simulate.run_readme import run_readme
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
+from railfix.simulate.sensors.tables import sensor_tables
+from railfix.simulate.settings_tables import to_toml
 from railfix.simulate.signals import Simulation
 from railfix.timescale import seconds
 from railfix.track_map import write_track_csv
 
-#: Decimals of metres and metres a second in the truth.
+#: Decimals of metres, metres a second and metres a second squared in the truth.
 TRUTH_DECIMALS: Final = 4
 _TIME_FORMAT: Final = "%Y-%m-%dT%H:%M:%S%.9f"
-_COMMENTS: Final = ("SIMULATED: NO SATELLITE, TRAIN OR LINE OF THIS FILE EXISTS",)
+_COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",)
 
 
 def truth_table(simulation: Simulation) -> pl.DataFrame:
@@ -34,8 +39,9 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
     polars.DataFrame
         One row an epoch and antenna: `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point
         abeam the antenna, as the track map counts), `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps`
-        (negative toward falling chainage). The place is that of the true instant, which is the tag
-        less the receiver clock's bias.
+        (negative toward falling chainage), `acceleration_mps2` (along the line, positive toward rising
+        chainage), `environment` (what stands along the line there, "open" where nothing). The place is
+        that of the true instant, which is the tag less the receiver clock's bias.
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)
@@ -43,7 +49,8 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
     mapped = line.track().chainage_m
     tables = []
     for antenna in ANTENNAS:
-        truth, speed = simulation.truth(antenna, tags - simulation.clock_s(antenna, tags))
+        instant = tags - simulation.clock_s(antenna, tags)
+        truth, speed = simulation.truth(antenna, instant)
         tables.append(
             pl.DataFrame(
                 {
@@ -55,10 +62,24 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
                     "y_m": truth.ecef_m[:, 1],
                     "z_m": truth.ecef_m[:, 2],
                     "speed_mps": speed,
+                    "acceleration_mps2": simulation.motion.acceleration_at(instant),
+                    "environment": simulation.environment.label_at(truth.chainage_m),
                 }
             )
         )
     return pl.concat(tables).sort("time_gpst", maintain_order=True)
+
+
+def section_table(simulation: Simulation) -> pl.DataFrame:
+    """What stands along the line, from end to end: `from_m`, `to_m` (as the track map counts), `environment`."""
+    line = simulation.line
+    ends = [m for part in simulation.environment.sections for m in (part.from_m, part.to_m)]
+    edges = np.unique(np.clip([0.0, *ends, line.length_m], 0.0, line.length_m))
+    kinds = simulation.environment.label_at((edges[:-1] + edges[1:]) / 2.0)
+    first = np.append(True, kinds[1:] != kinds[:-1])
+    begins = edges[:-1][first]
+    mapped = np.interp([*begins, line.length_m], line.sampled_chainage_m(), line.track().chainage_m)
+    return pl.DataFrame({"from_m": mapped[:-1], "to_m": mapped[1:], "environment": kinds[first]})
 
 
 def write_run(
@@ -69,7 +90,7 @@ def write_run(
     command: str = "",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run and write its files; those of the same names are replaced.
+    """Simulate a run and write its files; those of the same names are replaced, all together at the end.
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
@@ -77,6 +98,9 @@ def write_run(
     track.csv                    track map
     vehicle.toml                 vehicle
     truth.csv.gz                 `truth_table` (truth.csv)
+    sections.csv                 `section_table`
+    tachometer.parquet, ...      sensors, where the scenario has any (`sensor_tables`)
+    scenario.toml                the scenario, as `load_scenario` reads it
     README.md                    what this is and how it was made
     ============================ ===================================================
 
@@ -86,6 +110,7 @@ def write_run(
     folder : path-like
         Made where it does not exist.
     packing : {"packed", "plain"}
+        Plain: nothing is compressed, and sensors are CSV.
     command : str
         The command that made it, for the README.
     progress : callable, optional
@@ -94,23 +119,49 @@ def write_run(
     Returns
     -------
     dict of str to Path
-        The files, by ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``readme``.
+        The files, by ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, the
+        sensors' names, ``scenario``, ``readme``.
 
     Raises
     ------
     OutputError
         A file cannot be written.
+    InputFileError, MismatchError, SettingsError
+        A track or navigation file that the scenario names does not serve.
     """
     out = Path(folder)
+    simulation = Simulation(scenario)
+    tables = sensor_tables(simulation)
+    before = out.exists()
     try:
         out.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=".railfix-", dir=out))
     except OSError as error:
         raise OutputError(f"{out}: the folder cannot be made ({error.strerror or error})") from error
+    try:
+        staged = _write_files(simulation, tables, staging, packing, command, progress)
+        return {name: _in_place(path, out) for name, path in staged.items()}
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if not before and not any(out.iterdir()):
+            out.rmdir()
+
+
+def _write_files(
+    simulation: Simulation,
+    tables: dict[str, pl.DataFrame],
+    out: Path,
+    packing: Literal["packed", "plain"],
+    command: str,
+    progress: Callable[[str, int], None] | None,
+) -> dict[str, Path]:
+    scenario = simulation.scenario
     observation, packed = ("crx.gz", ".gz") if packing == "packed" else ("rnx", "")
     files = {name: out / f"{name}.{observation}" for name in ANTENNAS}
     files |= {"nav": out / f"nav.rnx{packed}", "track": out / "track.csv", "vehicle": out / "vehicle.toml"}
-    files |= {"truth": out / f"truth.csv{packed}", "readme": out / "README.md"}
-    simulation = Simulation(scenario)
+    files |= {"truth": out / f"truth.csv{packed}", "sections": out / "sections.csv"}
+    files |= {name: out / f"{name}.{'parquet' if packed else 'csv'}" for name in tables}
+    files |= {"scenario": out / "scenario.toml", "readme": out / "README.md"}
     for antenna in ANTENNAS:
 
         def watched(antenna: str = antenna) -> Iterator[Observations]:
@@ -123,12 +174,33 @@ def write_run(
     write_navigation(simulation.navigation, files["nav"], comments=_COMMENTS)
     write_track_csv(simulation.line.track(), files["track"])
     _write(files["vehicle"], vehicle_toml(scenario.vehicle).encode())
-    text = BytesIO()
-    truth_table(simulation).write_csv(text, float_precision=TRUTH_DECIMALS, datetime_format=_TIME_FORMAT)
-    content = text.getvalue()
-    _write(files["truth"], gzip.compress(content, compresslevel=9, mtime=0) if packed else content)
-    _write(files["readme"], _readme(simulation, files, command).encode())
+    content = _csv(truth_table(simulation), TRUTH_DECIMALS)
+    _write(files["truth"], gzip.compress(content, compresslevel=6, mtime=0) if packed else content)
+    _write(files["sections"], _csv(section_table(simulation), TRUTH_DECIMALS))
+    for name, table in tables.items():
+        _write(files[name], _parquet(table) if packed else _csv(table, None))
+    _write(files["scenario"], to_toml(scenario).encode())
+    _write(files["readme"], run_readme(simulation, files, command).encode())
     return files
+
+
+def _csv(table: pl.DataFrame, decimals: int | None) -> bytes:
+    text = BytesIO()
+    table.write_csv(text, float_precision=decimals, datetime_format=_TIME_FORMAT)
+    return text.getvalue()
+
+
+def _parquet(table: pl.DataFrame) -> bytes:
+    content = BytesIO()
+    table.write_parquet(content)
+    return content.getvalue()
+
+
+def _in_place(path: Path, out: Path) -> Path:
+    try:
+        return path.replace(out / path.name)
+    except OSError as error:
+        raise OutputError(f"{out / path.name}: the file cannot be written ({error.strerror or error})") from error
 
 
 def vehicle_toml(vehicle: VehicleSettings) -> str:
@@ -145,41 +217,8 @@ def vehicle_toml(vehicle: VehicleSettings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
-    scenario = simulation.scenario
-    satellites = {name for name, _ in simulation.channels}
-    made = f"Made by `{command}`.\n" if command else "Made by `railfix.simulate.write_run`.\n"
-    settings = "\n".join(f"| {name} | {value} |" for name, value in scenario.describe().items())
-    return f"""# A simulated run
-
-Everything in this folder is invented: no such line, train or satellite exists, and the place is only
-somewhere in Japan. It is not a recording.
-
-{made}
-| file | what |
-|---|---|
-| {files["front"].name}, {files["rear"].name} | RINEX 3.04 observations of the two roof antennas |
-| {files["nav"].name} | RINEX 3.04 broadcast records |
-| {files["track"].name} | track map, {len(simulation.line.track())} points; ellipsoidal heights |
-| {files["vehicle"].name} | bogie distance, gauge, antennas |
-| {files["truth"].name} | truth: chainage of the centreline point abeam each antenna, its place (ECEF), speed |
-
-{scenario.epochs} epochs at {scenario.rate_hz:g} Hz from {scenario.start} GPS time, {len(satellites)} satellites.
-The ranges hold the light time, the Earth's rotation, satellite and receiver clocks, group delays, Klobuchar's
-ionosphere, Saastamoinen's troposphere (standard atmosphere, 70 % humidity) and white noise; no multipath.
-The delays are those that a receiver corrects, so no error of the atmosphere is left unless a scale below says so.
-
-| setting | value |
-|---|---|
-{settings}
-"""
-
-
 def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        temporary.write_bytes(content)
-        temporary.replace(path)
+        path.write_bytes(content)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: the file cannot be written ({error.strerror or error})") from error
+        raise OutputError(f"{path.parent}: {path.name} cannot be written ({error.strerror or error})") from error

@@ -26,10 +26,14 @@ file beside it or a shipped one, and for each run what differs::
 
     [[runs]]
     name = "02-falling"
+    parts = ["back"]
     seed = 2
+
+    [parts.back]
     run.direction = "falling"
 
-Paths in a file (``sky.nav``, ``line.file.path``) are relative to it.
+Parts are settings that several runs share; a run's own stand over those of its parts, later parts
+over earlier ones, and all over the base. Paths in a file (``sky.nav``, ``line.file.path``) are relative to it.
 """
 
 from __future__ import annotations
@@ -38,6 +42,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -73,8 +78,14 @@ class Recipe:
     names: tuple[str, ...]
     tables: tuple[Mapping[str, Any], ...]
 
-    def scenario(self, number: int = 0, *, seed: int | None = None, duration_s: float | None = None) -> Scenario:
-        """Scenario of a run, counted from 0; `seed` and `duration_s` stand over those of the file.
+    def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
+        """Scenario of a run, counted from 0.
+
+        Parameters
+        ----------
+        number : int
+        changes : mapping, optional
+            Settings that stand over those of the file, in tables as the file has them.
 
         Raises
         ------
@@ -83,11 +94,7 @@ class Recipe:
         InputFileError
             The track file of a line whose run gives the duration cannot be read.
         """
-        table = dict(self.tables[number])
-        if seed is not None:
-            table["seed"] = seed
-        if duration_s is not None:
-            table["duration_s"] = duration_s
+        table = _over(self.tables[number], changes or {})
         whole = table.get("duration_s") == WHOLE_RUN
         if whole:
             del table["duration_s"]
@@ -151,9 +158,9 @@ def load_recipe(name: str | PathLike[str]) -> Recipe:
     description = str(table.pop("description", ""))
     if "runs" not in table and "base" not in table:
         return Recipe(path=path, description=description, names=("",), tables=(_absolute(table, path),))
-    unknown = sorted(set(table) - {"base", "runs"})
+    unknown = sorted(set(table) - {"base", "runs", "parts"})
     if unknown:
-        raise SettingsError(f"{path}: unknown key {unknown[0]} in a recipe; known are description, base, runs")
+        raise SettingsError(f"{path}: unknown key {unknown[0]} in a recipe; known are description, base, parts, runs")
     runs = table.get("runs")
     if not isinstance(runs, list) or not runs or not all(isinstance(run, dict) for run in runs):
         raise SettingsError(f"{path}: a recipe lists its runs as [[runs]], each with a name and what differs")
@@ -170,8 +177,20 @@ def load_recipe(name: str | PathLike[str]) -> Recipe:
             raise SettingsError(
                 f"{path}: each of [[runs]] has its own name, letters, digits, - and _ (its folder), got {name_of!r}"
             )
-    tables = tuple(_over(base, _absolute(run, path)) for run in runs)
+    tables = tuple(_over(_with_parts(base, run, table.get("parts", {}), path), run) for run in runs)
     return Recipe(path=path, description=description, names=tuple(names), tables=tables)
+
+
+def _with_parts(
+    base: Mapping[str, Any], run: dict[str, Any], parts: Mapping[str, Any], path: Path
+) -> Mapping[str, Any]:
+    """The base with the parts that a run names; paths in the run and its parts made absolute."""
+    _absolute(run, path)
+    for name in run.pop("parts", []):
+        if not isinstance(parts.get(name), dict):
+            raise SettingsError(f"{path}: parts has no table {name!r}; it has {', '.join(parts) or 'none'}")
+        base = _over(base, _absolute(deepcopy(parts[name]), path))
+    return base
 
 
 def load_scenario(name: str | PathLike[str]) -> Scenario:

@@ -63,7 +63,6 @@ def from_table(kind: type[Any], table: Any, *, where: str, source: str) -> Any:
         raise SettingsError(f"{source}: {where + ': ' if where else ''}{error}") from None
 
 
-@lru_cache(maxsize=64)
 def _hints(kind: type[Any]) -> dict[str, Any]:
     hints = get_type_hints(kind)
     return {item.name: hints[item.name] for item in fields(kind) if item.name not in _NOT_IN_FILES}

@@ -1,0 +1,114 @@
+"""The README of a simulated run: what its files are, what is in the signals, every setting."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from railfix.simulate.scenario import Scenario
+from railfix.simulate.sensors.tables import COLUMNS
+from railfix.simulate.signals import Simulation
+
+#: Groups of settings of which the README names only what is not at its default.
+_SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
+
+
+def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
+    """Text of a run's README.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    files : dict of str to Path
+        As `railfix.simulate.write_run` gives them.
+    command : str
+        The command that made them; empty for a call from Python.
+    """
+    scenario = simulation.scenario
+    made = f"Made by `{command}`.\n" if command else "Made by `railfix.simulate.write_run`.\n"
+    satellites = {name for name, _ in simulation.channels}
+    rows = "\n".join(f"| {name} | {what} |" for name, what in _files(simulation, files).items())
+    settings = "\n".join(f"| {name} | {value} |" for name, value in _settings(scenario).items())
+    return f"""# A simulated run
+
+{_invented(scenario)}
+It is not a recording.
+
+{made}
+| file | what |
+|---|---|
+{rows}
+
+{scenario.epochs} epochs at {scenario.rate_hz:g} Hz from {scenario.start} GPS time, {len(satellites)} satellites.
+The ranges hold the light time, the Earth's rotation, satellite and receiver clocks, group delays, Klobuchar's
+ionosphere, Saastamoinen's troposphere (standard atmosphere, 70 % humidity) and white noise; the delays are those
+that a receiver corrects, unless a scale below says otherwise.
+
+{_switched_on(scenario)}
+
+| setting | value |
+|---|---|
+{settings}
+"""
+
+
+def _invented(scenario: Scenario) -> str:
+    if scenario.line.kind != "file" and not scenario.sky.nav:
+        return "Everything in this folder is invented: no such line, train or satellite exists."
+    line = "the line is that of a track file" if scenario.line.kind == "file" else "no such line exists"
+    sky = "the satellites are those of a navigation file" if scenario.sky.nav else "no such satellites exist"
+    return f"The train and all measurements in this folder are invented; {line}, {sky}."
+
+
+def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
+    error = simulation.scenario.line.map_error
+    off = ", off by its error (line.map_error)" if error.plan_sigma_m or error.height_sigma_m else ""
+    what = {
+        "front": "RINEX 3.04 observations of the front roof antenna",
+        "rear": "the same of the rear antenna",
+        "nav": "RINEX 3.04 broadcast records",
+        "track": f"track map, {len(simulation.line.track())} points; ellipsoidal heights{off}",
+        "vehicle": "bogie distance, gauge, antennas",
+        "truth": "truth: chainage of the centreline point abeam each antenna, its place (ECEF), speed, acceleration, "
+        "what stands along the line there",
+        "sections": "truth: what stands along the line",
+        "scenario": "all settings; `railfix simulate` makes the same run of it",
+        "readme": "this",
+    }
+    sensors = {name: "; ".join(f"`{c}`: {t}" for c, t in columns.items()) for name, columns in COLUMNS.items()}
+    return {path.name: (what | sensors)[name] for name, path in files.items()}
+
+
+def _switched_on(scenario: Scenario) -> str:
+    """One sentence a group of errors: on, or none."""
+    usual = Scenario().errors
+    names = [item.name for item in fields(usual)]
+    errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]
+    parts = [
+        f"Errors of satellites, atmosphere and receivers: {', '.join(errors)}."
+        if errors
+        else "No errors of satellites or atmosphere.",
+        "No multipath and nothing in the way."
+        if scenario.environment.empty and not scenario.multipath
+        else "Multipath and shadows of what stands along the line (truth and sections name it).",
+        "No sensors besides the receivers." if scenario.sensors is None else "Sensors besides the receivers.",
+    ]
+    if scenario.vehicle.sway_sigma_deg:
+        parts.append("The body sways.")
+    if scenario.multipath:
+        parts.append("Disturbances from Python, which no setting below describes.")
+    return " ".join(parts)
+
+
+def _settings(scenario: Scenario) -> dict[str, Any]:
+    """Settings by their names; of the longer groups what is not at its default."""
+    usual = Scenario(sensors=None).describe()
+    table = {}
+    for name, value in scenario.describe().items():
+        same = name in usual and (value == usual[name] or (isinstance(value, float) and np.isnan(value)))
+        if not (name.startswith(_SHORT) and same):
+            table[name] = value
+    return table
