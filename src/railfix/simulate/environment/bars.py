@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from railfix.simulate.environment.waves import edge_amplitude, per_metre, strip_
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
+
+#: Bars are left out where less of them than this counts.
+_LEAST_WEIGHT: Final = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +54,11 @@ class Bar:
         beside = (self.q * self.ray_p - self.p * self.ray_q) / plane
         far = toward / plane
         scale = per_metre(far, wavelength_m)
-        ahead = np.maximum(toward, 0.0) / away
-        strip = strip_field(beside * scale, self.width_m * scale)
-        return np.asarray(strip * ahead * self._share(far * self.ray_axis, scale * plane))
+        weight = np.maximum(toward, 0.0) / away * self._share(far * self.ray_axis, scale * plane)
+        kept = np.flatnonzero(weight > _LEAST_WEIGHT)
+        field = np.zeros(len(weight), dtype=np.complex128)
+        field[kept] = weight[kept] * strip_field(beside[kept] * scale[kept], self.width_m * scale[kept])
+        return field
 
     def thrown(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Amplitude, extra path [m], and direction (p, q) of what a bar behind throws to the antenna.

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Complexes = NDArray[np.complex128]
 
-#: Repetitions: with an error of few hundredths of a chip three or four settle it, a wide spacing wants more.
-_ROUNDS_NARROW: Final = 4
+#: Repetitions: with an error of few hundredths of a chip three settle it, a wide spacing wants more.
+_ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12
 #: Up to this spacing the correlator is narrow [chips].
 _NARROW_CHIPS: Final = 0.2
@@ -83,54 +84,66 @@ def tracked(
     -------
     Tracked
     """
-    strength = np.abs(field)
-    main = np.argmax(strength, axis=0)
     column = np.arange(field.shape[1])
+    strength = np.sqrt(field.real**2 + field.imag**2)
+    main = np.argmax(strength, axis=0)
     first, first_rate, anchor = extra_m[main, column], rate_mps[main, column], field[main, column]
+    size = np.maximum(strength[main, column], 1e-9)
     delay, rate = extra_m - first, rate_mps - first_rate
-    safe = np.where(np.abs(anchor) > 1e-9, anchor, 1.0)
-    c = field / safe * np.exp(-2.0j * np.pi * delay / wavelength_m)
-    turning_hz = rate / wavelength_m
+    # Relative to the main path: c = (a + jb) exp(-j 2 pi delay / wavelength).
+    # From here single precision: 1e-7 of a chip or of a wave.
+    turn = np.asarray(np.remainder(delay / wavelength_m, 1.0) * (2.0 * np.pi), dtype=np.float32)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    a = np.asarray((field.real * anchor.real + field.imag * anchor.imag) / size**2, dtype=np.float32)
+    b = np.asarray((field.imag * anchor.real - field.real * anchor.imag) / size**2, dtype=np.float32)
+    real, imaginary = a * cosine + b * sine, b * cosine - a * sine
+    turning_hz = np.asarray(rate / wavelength_m, dtype=np.float32)
     follow = 1.0 / np.sqrt(1.0 + (turning_hz / code_loop_hz) ** 2)
-    late = delay / chip_m
-    error = _zero(c, late, follow, spacing_chips)
-    weight = c * _triangle(error - late)
-    power = np.abs((weight * follow).sum(axis=0)) ** 2 + ((1.0 - follow**2) * np.abs(weight) ** 2).sum(axis=0)
-    heard = weight / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
-    carrier = heard.sum(axis=0)
-    carrier = np.where(np.abs(carrier) > 1e-9, carrier, 1e-9)
-    turned = np.angle(carrier * safe / np.abs(safe))
-    pulled = np.real((heard * rate).sum(axis=0) / carrier)
-    limit = np.abs(rate * (strength > 0.05 * strength.max(axis=0))).max(axis=0)
+    late = np.asarray(delay / chip_m, dtype=np.float32)
+    error = _zero(real, imaginary, late, follow, spacing_chips)
+    triangle = _triangle(error - late)
+    heard = triangle * follow
+    power = (real * heard).sum(axis=0) ** 2 + (imaginary * heard).sum(axis=0) ** 2
+    power += (((1.0 - follow**2) * triangle**2) * (real**2 + imaginary**2)).sum(axis=0)
+    heard = triangle / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
+    real, imaginary = real * heard, imaginary * heard
+    carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
+    turned = np.arctan2(
+        quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
+    )
+    pulled = (carrier * (real * rate).sum(axis=0) + quadrature * (imaginary * rate).sum(axis=0)) / np.maximum(
+        carrier**2 + quadrature**2, 1e-18
+    )
+    limit = np.abs(rate * (strength > 0.05 * size)).max(axis=0)
     return Tracked(
         code_m=first + error * chip_m,
         phase_m=first - turned * wavelength_m / (2.0 * np.pi),
         rate_mps=first_rate + np.clip(pulled, -limit, limit),
-        gain_db=20.0 * np.log10(np.maximum(np.sqrt(power) * np.abs(anchor), 1e-9)),
+        gain_db=20.0 * np.log10(np.maximum(np.sqrt(power) * size, 1e-9)),
         main=main,
     )
 
 
-def _triangle(x: Floats) -> Floats:
+def _triangle(x: Singles) -> Singles:
     return np.maximum(1.0 - np.abs(x), 0.0)
 
 
-def _zero(c: Complexes, late: Floats, follow: Floats, spacing: float) -> Floats:
-    """Zero of the discriminator, in chips from the main path (whose c is 1 and `late` 0)."""
+def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spacing: float) -> Singles:
+    """Zero of the discriminator, in chips from the main path (which is 1 and `late` by 0)."""
     half = 0.5 * spacing
-    error = np.zeros(c.shape[1])
-    own = np.abs(c) ** 2
+    error = np.zeros(real.shape[1], dtype=np.float32)
+    own = (1.0 - follow) * (real**2 + imaginary**2)
     for _ in range(_ROUNDS_NARROW if spacing <= _NARROW_CHIPS else _ROUNDS_WIDE):
         x = error - late
+        away = np.abs(x)
         triangle = _triangle(x)
-        prompt = (c * triangle).sum(axis=0)
+        carrier, quadrature = (real * triangle).sum(axis=0), (imaginary * triangle).sum(axis=0)
         # Part of each path in phase with the sum: its own square stands, the rest swings.
-        steady = own * triangle
-        in_phase = follow * (np.real(np.conj(prompt) * c) - steady) + steady
-        near = np.abs(x) < half
+        in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
+        near = away < half
         # Early less late of a path at x: -2 x when near, else a plateau that falls to 0 past a chip.
-        far = np.sign(-x) * np.minimum(spacing, np.maximum(1.0 + half - np.abs(x), 0.0))
+        far = np.copysign(np.clip(1.0 + half - away, 0.0, spacing), -x)
         push = np.where(near, 2.0 * late, far) * in_phase
         slope = 2.0 * (near * in_phase).sum(axis=0)
-        error = np.clip(push.sum(axis=0) / np.where(slope > 1e-3, slope, 1e-3), -half, half)
+        error = np.clip(push.sum(axis=0) / np.maximum(slope, 1e-3), -half, half)
     return error

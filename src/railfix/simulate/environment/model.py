@@ -12,7 +12,7 @@ from railfix.constants import SPEED_OF_LIGHT
 from railfix.signals import carrier_frequency_hz
 from railfix.simulate.disturbance import Disturbance, Geometry
 from railfix.simulate.environment.bars import Electrification
-from railfix.simulate.environment.correlator import tracked
+from railfix.simulate.environment.correlator import Tracked, tracked
 from railfix.simulate.environment.faces import FREE_V, Rays, mirrored, roof_amplitude, shadow
 from railfix.simulate.environment.kinds import drawn_sections
 from railfix.simulate.environment.place import built
@@ -28,6 +28,8 @@ CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5"
 _NO_FIELD: Final = 0.01
 #: The platforms of a station stand so high over the rails [m].
 PLATFORM_M: Final = 1.1
+#: Signals worked out at once: arrays of these stay in the processor's cache.
+_BLOCK: Final = 8192
 #: Below this elevation nothing is worked out: no receiver tracks there [deg].
 _LEAST_ELEVATION_DEG: Final = 0.5
 
@@ -93,31 +95,36 @@ class Environment:
         inside = label == "tunnel"
         code[inside], cn0[inside] = np.nan, -99.0
         epoch, channel = np.nonzero((geometry.elevation_deg > _LEAST_ELEVATION_DEG) & ~inside[:, None])
-        if len(epoch):
-            wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(geometry.satellite, geometry.signal)
-            rays = _rays(geometry, epoch, channel, wavelength, self.settings.antenna_height_m)
-            paths = self._paths(rays, label[epoch] == "station")
-            receiver = self.settings.receiver
-            ratio = [
-                CHIP_RATIO.get(f"{n[0]}{g[:1]}", 1.0) for n, g in zip(geometry.satellite, geometry.signal, strict=True)
-            ]
-            got = tracked(
-                paths.field,
-                paths.extra_m,
-                paths.growth * geometry.speed_mps[epoch],
-                wavelength_m=rays.wavelength_m,
-                chip_m=receiver.chip_m * np.array(ratio)[channel],
-                spacing_chips=receiver.spacing_chips,
-                code_loop_hz=receiver.code_loop_hz,
-                carrier_loop_hz=receiver.carrier_loop_hz,
-            )
+        platform = label == "station"
+        wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(geometry.satellite, geometry.signal)
+        names = zip(geometry.satellite.tolist(), geometry.signal.tolist(), strict=True)
+        ratio = np.array([CHIP_RATIO.get(name[0] + signal[:1], 1.0) for name, signal in names])
+        receiver = self.settings.receiver
+        chip = receiver.chip_m * ratio
+        for first in range(0, len(epoch), _BLOCK):
+            e, c = epoch[first : first + _BLOCK], channel[first : first + _BLOCK]
+            rays = _rays(geometry, e, c, wavelength, self.settings.antenna_height_m)
+            got = self._tracked(rays, platform[e], geometry.speed_mps[e], chip[c])
             clear = receiver.cn0_horizon_dbhz + receiver.cn0_rise_dbhz * rays.z
             lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
-            code[epoch, channel] = np.where(lost, np.nan, got.code_m)
-            phase[epoch, channel] = got.phase_m
-            doppler[epoch, channel] = -got.rate_mps / rays.wavelength_m
-            cn0[epoch, channel] = got.gain_db
+            code[e, c] = np.where(lost, np.nan, got.code_m)
+            phase[e, c] = got.phase_m
+            doppler[e, c] = -got.rate_mps / rays.wavelength_m
+            cn0[e, c] = got.gain_db
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
+
+    def _tracked(self, rays: Rays, platform: NDArray[np.bool_], speed_mps: Floats, chip_m: Floats) -> Tracked:
+        receiver, paths = self.settings.receiver, self._paths(rays, platform)
+        return tracked(
+            paths.field,
+            paths.extra_m,
+            paths.growth * speed_mps,
+            wavelength_m=rays.wavelength_m,
+            chip_m=chip_m,
+            spacing_chips=receiver.spacing_chips,
+            code_loop_hz=receiver.code_loop_hz,
+            carrier_loop_hz=receiver.carrier_loop_hz,
+        )
 
     def _paths(self, rays: Rays, platform: NDArray[np.bool_]) -> Paths:
         """Direct path, ground, what bars throw, and one reflection a row of faces."""
