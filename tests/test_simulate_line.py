@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from railfix.errors import SettingsError
+from railfix.errors import InputFileError, SettingsError
 from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.simulate import (
+    Element,
+    GeneratedLine,
+    Gradient,
+    LineFile,
     LineSettings,
+    MapError,
     RunSettings,
     Scenario,
+    SpeedLimit,
+    Station,
+    Terrain,
     VehicleSettings,
     antenna_truth,
     made_alignment,
+    made_motion,
     shuttle,
 )
+from railfix.simulate.motion import Sway
 from railfix.simulate.run import vehicle_toml
 from railfix.track_map import read_track, write_track_csv
 from railfix.vehicle import antenna_trajectory, read_vehicle
@@ -100,11 +112,9 @@ def test_a_long_line_keeps_its_pattern_height_and_direction() -> None:
 
 @pytest.mark.requirement("A2")
 @pytest.mark.parametrize("antenna", ["front", "rear"])
-def test_the_antenna_is_where_the_map_says(tmp_path: object, antenna: str) -> None:
+def test_the_antenna_is_where_the_map_says(tmp_path: Path, antenna: str) -> None:
     """The trajectory of the map's polyline, against the rigid body on the continuous curve."""
-    from pathlib import Path
-
-    folder = Path(str(tmp_path))
+    folder = tmp_path
     vehicle = VehicleSettings()
     write_track_csv(LINE.track(), folder / "track.csv")
     (folder / "vehicle.toml").write_text(vehicle_toml(vehicle))
@@ -176,3 +186,214 @@ def test_the_train_runs_as_it_was_told() -> None:
 def test_settings_that_make_no_run_are_refused(settings: object) -> None:
     with pytest.raises(SettingsError):
         settings()  # type: ignore[operator]
+
+
+# ---------------------------------------------------------------- lines of elements, of a seed, of a file
+
+
+def elements_line(**more: object) -> LineSettings:
+    """Straight, clothoid, circle of 300 m to the right with 80 mm, clothoid, straight; falling, then rising."""
+    return LineSettings(
+        kind="elements",
+        elements=(
+            Element(kind="straight", length_m=200.0),
+            Element(kind="transition", length_m=60.0),
+            Element(kind="curve", length_m=150.0, radius_m=300.0, cant_m=0.080),
+            Element(kind="transition", length_m=60.0),
+            Element(kind="straight", length_m=230.0),
+        ),
+        gradients=(
+            Gradient(from_m=0.0, permille=-5.0),
+            Gradient(from_m=350.0, permille=12.0, vertical_radius_m=3000.0),
+        ),
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def test_a_line_of_elements_is_what_they_say() -> None:
+    line = made_alignment(elements_line())
+    assert line.length_m == pytest.approx(700.0)
+    assert line.curvature_at([100.0, 230.0, 300.0, 440.0]) == pytest.approx(np.array([0.0, 0.5, 1.0, 0.5]) / 300.0)
+    assert line.lean_at([100.0, 230.0, 300.0]) == pytest.approx([0.0, 0.040, 0.080])
+    # Turned by the circle and half of each clothoid: (150 + 60) / 300 rad, the meridians' convergence apart.
+    start, end = (line.tangent_at(np.array([m]))[0] for m in (0.0, 700.0))
+    assert np.degrees(np.arccos(start @ end)) == pytest.approx(np.degrees(210.0 / 300.0), abs=0.05)
+    # The vertical curve of 3000 m takes 51 m, its middle at the change.
+    assert line.grade_at([0.0, 324.0, 350.0, 376.0]) == pytest.approx([-0.005, -0.005, 0.0035, 0.012], abs=1e-9)
+    track = line.track()
+    middle = track.height_m[0] - 0.005 * 324.5
+    assert np.interp(324.5, track.chainage_m, track.height_m) == pytest.approx(middle, abs=0.02)
+    assert np.nanmax(track.cant_m) == pytest.approx(0.080)
+    assert set(np.round(track.radius_m[np.isfinite(track.radius_m) & (track.radius_m < 301.0)], 3)) == {300.0}
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (lambda: LineSettings(kind="elements"), "elements"),
+        (lambda: Element(kind="curve", length_m=10.0), "radius_m"),
+        (lambda: Element(kind="straight", length_m=10.0, cant_m=0.1), "cant_m"),
+        (lambda: LineSettings(kind="generated", file=LineFile(path="x.csv")), "file"),
+        (lambda: LineSettings(generated=GeneratedLine(seed=2)), "generated"),
+        (lambda: LineSettings(kind="file", file=LineFile(path="x.csv"), length_m=5.0), "the file's own"),
+        (lambda: GeneratedLine(terrain=(Terrain(from_m=5.0),)), "begin at 0"),
+        (lambda: made_alignment(LineSettings(kind="elements", elements=(
+            Element(kind="straight", length_m=100.0), Element(kind="curve", length_m=90.0, radius_m=400.0)))),
+         "without a transition"),
+        (lambda: made_alignment(LineSettings(kind="elements", elements=(Element(kind="straight", length_m=700.0),),
+            gradients=(Gradient(from_m=300.0, permille=9.0), Gradient(from_m=310.0, permille=0.0)))), "overlaps"),
+    ],
+)  # fmt: skip
+def test_lines_that_cannot_be_are_refused(settings: object, told: str) -> None:
+    with pytest.raises(SettingsError, match=told):
+        settings()  # type: ignore[operator]
+
+
+MOUNTAIN = Terrain(from_m=12_000.0, radius_m=(300.0, 800.0), straight_m=(60.0, 400.0), permille=25.0)
+
+
+def test_a_generated_line_keeps_its_ranges() -> None:
+    settings = LineSettings(
+        kind="generated", length_m=20_000.0, generated=GeneratedLine(seed=5, terrain=(Terrain(), MOUNTAIN))
+    )
+    line = made_alignment(settings)
+    again = made_alignment(settings)
+    np.testing.assert_array_equal(line.at([0.0, 9999.0, 20_000.0]), again.at([0.0, 9999.0, 20_000.0]))
+    s = np.arange(0.0, 20_000.0, 1.0)
+    bend = np.abs(line.curvature_at(s))
+    assert bend[s < 11_000.0].max() <= 1.0 / 400.0 + 1e-9
+    assert 1.0 / 800.0 < bend[s > 13_000.0].max() <= 1.0 / 300.0 + 1e-9
+    grade = np.abs(line.grade_at(s))
+    assert grade[s < 11_000.0].max() <= 0.0100001
+    assert 0.011 < grade.max() <= 0.0250001
+    # Cant on circles is the equilibrium cant of 110 km/h, in steps of 5 mm, and 105 mm at most.
+    circle = (bend > 0.0) & (np.abs(np.gradient(bend)) < 1e-12)
+    ideal = np.minimum((110.0 / 3.6) ** 2 * bend[circle] / 9.80665 * 1.137, 0.105)
+    assert np.abs(np.abs(line.lean_at(s))[circle] - ideal).max() < 0.0026
+    # Transitions are long enough: the cant rises by no more than 1 in 400.
+    assert np.abs(np.diff(line.lean_at(s))).max() < 1.0 / 400.0 + 1e-9
+    # It goes somewhere: no loop.
+    assert np.linalg.norm(line.at(20_000.0) - line.at(0.0)) > 10_000.0
+    other = made_alignment(LineSettings(kind="generated", length_m=20_000.0, generated=GeneratedLine(seed=6)))
+    assert np.linalg.norm(other.at(20_000.0) - line.at(20_000.0)) > 100.0
+
+
+def test_a_track_file_becomes_the_line_it_was_sampled_from(tmp_path: Path) -> None:
+    """The spline through a map's points against the clothoids that the map was sampled from."""
+    write_track_csv(LINE.track(), tmp_path / "track.csv")
+    line = made_alignment(LineSettings(kind="file", file=LineFile(path=str(tmp_path / "track.csv"))))
+    assert line.length_m == pytest.approx(756.0, abs=1e-3)
+    s = np.linspace(0.0, line.length_m, 5001)
+    assert np.linalg.norm(line.at(s) - LINE.at(s), axis=1).max() < 0.005
+    assert np.linalg.norm(line.tangent_at(s), axis=1) == pytest.approx(1.0, abs=1e-6)
+    assert np.abs(line.lean_at(s) - LINE.lean_at(s)).max() < 1e-4
+    assert np.abs(line.kilometrage_at(s) - LINE.kilometrage_at(s)).max() < 1e-3
+    np.testing.assert_array_equal(line.track().latitude_deg, read_track(tmp_path / "track.csv").latitude_deg)
+    part = made_alignment(
+        LineSettings(kind="file", file=LineFile(path=str(tmp_path / "track.csv"), from_m=100.0, to_m=400.0))
+    )
+    assert 270.0 < part.length_m < 300.0
+
+
+def test_a_track_file_that_jitters_or_lacks_points_is_refused(tmp_path: Path) -> None:
+    track = LINE.track()
+    rough = read_track_with_jitter(tmp_path, track.latitude_deg, track.longitude_deg, track.height_m)
+    with pytest.raises(InputFileError, match="radius of"):
+        made_alignment(LineSettings(kind="file", file=LineFile(path=str(rough))))
+    with pytest.raises(InputFileError, match="at least 4"):
+        made_alignment(LineSettings(kind="file", file=LineFile(path=str(rough), from_m=5e5)))
+
+
+def read_track_with_jitter(folder: Path, lat: np.ndarray, lon: np.ndarray, height: np.ndarray) -> Path:
+    """The map with every second point 0.5 m to the north."""
+    from railfix.track_map import Track
+
+    moved = lat + np.where(np.arange(len(lat)) % 2 == 0, 0.5 / 111_000.0, 0.0)
+    write_track_csv(Track.from_geodetic(moved, lon, height), folder / "rough.csv")
+    return folder / "rough.csv"
+
+
+def test_the_map_is_off_by_the_error_that_was_asked_for() -> None:
+    error = MapError(plan_sigma_m=0.3, height_sigma_m=0.6, correlation_m=200.0, seed=3)
+    line = made_alignment(LineSettings(length_m=60_000.0, map_error=error))
+    clean = made_alignment(LineSettings(length_m=60_000.0))
+    s = line.sampled_chainage_m()
+    np.testing.assert_array_equal(line.at(s[:50]), clean.at(s[:50]), "the truth is the same")
+    latitude, longitude, _ = geodetic_from_ecef(clean.at(s))
+    off = np.einsum("nij,nj->ni", enu_axes(latitude, longitude), line.track().ecef_m - clean.at(s))
+    assert off == pytest.approx(line.map_error_m(s), abs=1e-6)
+    # 300 correlation lengths: the sigma is known to some 5 percent.
+    assert off.std(axis=0) == pytest.approx([0.3, 0.3, 0.6], rel=0.2)
+    even = line.map_error_m(np.arange(0.0, 60_000.0, 10.0))[:, 2]
+    assert np.corrcoef(even[20:], even[:-20])[0, 1] == pytest.approx(np.exp(-0.5), abs=0.12)
+    assert np.abs(np.diff(even)).max() < 0.15, "smooth"
+
+
+# ---------------------------------------------------------------- run curves, swaying
+
+
+def test_a_run_curve_keeps_all_limits_and_stops() -> None:
+    line = made_alignment(LineSettings(length_m=6_000.0))
+    run = RunSettings(
+        cruise_mps=25.0,
+        stations=(Station(at_m=50.0), Station(at_m=2_500.0, dwell_s=40.0), Station(at_m=5_900.0, dwell_s=20.0)),
+        limits=(SpeedLimit(from_m=1_000.0, to_m=1_200.0, limit_mps=9.0),),
+        cant_deficiency_m=0.05,
+    )
+    scenario = Scenario(duration_s=1500.0, line=LineSettings(length_m=6_000.0), run=run)
+    motion = made_motion(line, scenario)
+    time = np.arange(0.0, 1500.0, 0.05)
+    chainage, speed = motion.at(time)
+    assert chainage.min() == pytest.approx(50.0)
+    assert chainage.max() == pytest.approx(5_900.0)
+    assert np.diff(chainage) == pytest.approx((speed[1:] + speed[:-1]) / 2.0 * 0.05, abs=3e-3)
+    assert np.abs(np.diff(speed)).max() <= 0.8 * 0.05 + 1e-9
+    assert np.abs(speed[(chainage > 1_000.0) & (chainage < 1_200.0)]).max() <= 9.0 + 1e-9
+    # In every curve: the equilibrium cant of the speed is within the deficiency over the cant there is.
+    needed = speed**2 * np.abs(line.curvature_at(chainage)) / 9.80665 * (1.067 + 0.070)
+    assert (needed - np.abs(line.lean_at(chainage))).max() <= 0.05 + 1e-6
+    # Curves of 160 m with 90 mm: v^2 = g R 0.14 / 1.137; it is reached.
+    slow = np.sqrt(9.80665 * 160.0 * 0.14 / 1.137)
+    inside = np.abs(line.curvature_at(chainage)) > 1.0 / 160.1
+    assert np.abs(speed[inside & (speed != 0.0)]).max() == pytest.approx(slow, rel=1e-6)
+    standing = (speed == 0.0) & (np.abs(chainage - 2_500.0) < 1e-6)
+    first_way = time < time[np.argmax(chainage > 5_899.9)]
+    assert (standing & first_way).sum() * 0.05 == pytest.approx(40.0, abs=0.11)
+    acceleration = motion.acceleration_at(time)
+    assert np.median(np.abs(np.diff(speed) / 0.05 - acceleration[:-1])) < 1e-9
+
+
+def test_a_run_the_other_way_is_its_mirror_and_ends_standing() -> None:
+    line = made_alignment(LineSettings())
+    up, down = (
+        made_motion(line, Scenario(run=RunSettings(direction=way, at_end="stand", acceleration_mps2=0.8)))  # type: ignore[arg-type]
+        for way in ("rising", "falling")
+    )
+    time = np.arange(0.0, 300.0, 0.1)
+    (there, fast), (back, slow) = up.at(time), down.at(time)
+    assert there + back == pytest.approx(756.0, abs=1e-6)
+    assert fast == pytest.approx(-slow, abs=1e-9)
+    assert there[-1] == pytest.approx(736.0)
+    assert (fast[time > 100.0] == 0.0).all()
+    # The same as the shuttle, which knows no limits but its own, but for the 2 m in which the top speed is reached.
+    plain = shuttle(20.0, 736.0, 80.0, RunSettings(acceleration_mps2=0.8)).at(time[:700])[0]
+    assert plain == pytest.approx(there[:700], abs=0.01)
+
+
+def test_the_body_sways_with_its_sigma_and_not_at_rest() -> None:
+    scenario = Scenario(vehicle=VehicleSettings(sway_sigma_deg=0.5, sway_period_s=1.5))
+    sway = Sway.of(scenario)
+    time = np.arange(0.0, 600.0, 0.1)
+    roll = sway.roll_rad(time, np.full(time.shape, 30.0))
+    assert np.degrees(roll.std()) == pytest.approx(0.5, rel=0.15)
+    crossings = (np.diff(np.sign(roll)) != 0).sum()
+    assert 2.0 * 600.0 / crossings == pytest.approx(1.5, rel=0.1)
+    assert (sway.roll_rad(time, np.zeros(time.shape)) == 0.0).all()
+    middle = np.full(len(time), 45.0)
+    still, swaying = (antenna_truth(LINE, scenario.vehicle, scenario.vehicle.front, middle, r) for r in (0.0, roll))
+    # 3.95 m over the rails turn by the roll; the way the antennas are apart stays.
+    assert np.linalg.norm(swaying.ecef_m - still.ecef_m, axis=1) == pytest.approx(
+        np.abs(roll) * np.hypot(3.95, 0.25), rel=1e-3, abs=1e-5
+    )
+    rear = antenna_truth(LINE, scenario.vehicle, scenario.vehicle.rear, middle, roll)
+    assert np.linalg.norm(swaying.ecef_m - rear.ecef_m, axis=1) == pytest.approx(18.2, abs=1e-6)
