@@ -44,9 +44,10 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "placing",
         "fault_free",
         "protecting",
+        "sbas_use",
         "pipeline",
     ),
-    6: ("range_errors", "simulate", "evaluate", "tables", "plots", "report", "run", "demonstration", "cli"),
+    6: ("range_errors", "simulate", "evaluate", "tables", "reference", "plots", "report", "run", "demonstration", "cli"),
 }
 FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 

@@ -126,7 +126,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     quality = table.numbers("quality", blank=-1.0) if "quality" in table else np.full(len(table), -1.0)
     return PositionLog(
         path=str(path),
-        time=_csv_times(table),
+        time=positions_times(table),
         ecef_m=ecef_from_geodetic(*values.T) if geodetic else values,
         quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
         sigma_m=np.full((len(table), 3), np.nan),
@@ -154,7 +154,8 @@ def _check_latitude(table: NamedColumns, geodetic: Floats) -> None:
         raise table.error(row, f"latitude_deg {geodetic[row, 0]:g} is over 90; are latitude and longitude swapped?")
 
 
-def _csv_times(table: NamedColumns) -> Datetimes:
+def positions_times(table: NamedColumns) -> Datetimes:
+    """The column ``time_gpst``; NaT where it is blank or absent."""
     if "time_gpst" not in table:
         return np.full(len(table), np.datetime64("NaT", "ns"))
     cells = table.cells["time_gpst"]

@@ -1,0 +1,23 @@
+"""Where the antennas really were, from fixed positions and what measures the way between them (P1 3.1(2), 4.2(2)).
+
+`build_references` works on arrays, `reference_files` on files.
+"""
+
+from railfix.reference.build import Built, Gap, ReferenceData, build_references
+from railfix.reference.fixes import Fixes, Refusal
+from railfix.reference.sensors import Acceleration, Pulses, read_acceleration, read_pulses
+from railfix.reference.settings import ReferenceSettings
+
+__all__ = [
+    "Acceleration",
+    "Built",
+    "Fixes",
+    "Gap",
+    "Pulses",
+    "ReferenceData",
+    "ReferenceSettings",
+    "Refusal",
+    "build_references",
+    "read_acceleration",
+    "read_pulses",
+]

@@ -1,0 +1,424 @@
+"""Reference positions of one run: fixes judged, put on the track, the gaps between them bridged.
+
+1. The positions of each antenna are judged by themselves, in pairs, by their place (`fixes`).
+2. The Dopplers are solved for the speed along the track at the places so far, which between fixes are at
+   first those of an even run, and after a round those of the smoother.
+3. The way between fixes is held against the way travelled; fixes that do not agree go.
+4. Everything together is smoothed (`smoother`); 2 and 4 are repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.antenna import Trajectory
+from railfix.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
+from railfix.errors import MismatchError, NoPositionError
+from railfix.position_log import PositionLog
+from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel
+from railfix.reference.sensors import Acceleration, Pulses
+from railfix.reference.settings import ReferenceSettings
+from railfix.reference.smoother import Evidence, Smoothed, lasting_error_mps, smooth
+from railfix.reference.ways import LONGEST_STEP_S, Speeds, fused, instants, nearest
+from railfix.reference.wheel import Wheel, wheel_of
+from railfix.reference_log import AntennaReference
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Datetimes = NDArray[np.datetime64]
+
+#: Standard gravity [m/s2].
+GRAVITY_MPS2: Final = 9.80665
+#: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
+_ROUNDS: Final = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceData:
+    """What a reference is made of, read.
+
+    Attributes
+    ----------
+    logs : mapping of str to PositionLog
+        Positions by antenna, front, rear or both.
+    trajectories : mapping of str to Trajectory
+        Of these antennas, and of those of `dopplers`.
+    dopplers : mapping of str to Dopplers
+        By antenna; may be empty.
+    pulses : Pulses or None
+    acceleration : Acceleration or None
+    facing : {1, -1}
+        1 where the vehicle's front points to rising chainage.
+    distance_m : float [m]
+        Between the two antennas on the body; NaN where the body is not known.
+    """
+
+    logs: Mapping[str, PositionLog]
+    trajectories: Mapping[str, Trajectory]
+    dopplers: Mapping[str, Dopplers] = field(default_factory=dict)
+    pulses: Pulses | None = None
+    acceleration: Acceleration | None = None
+    facing: int = 1
+    distance_m: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap:
+    """A stretch between two good fixes that are further apart than the log's usual step."""
+
+    start: np.datetime64
+    end: np.datetime64
+    length_s: float
+    bridged: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Built:
+    """The reference of one antenna, and what it came from.
+
+    Attributes
+    ----------
+    reference : AntennaReference
+    fixes : Fixes
+        Every row of the log of positions with its refusal.
+    gaps : tuple of Gap
+    left_out : dict of str to int
+        Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
+    bridged_by : dict of str to int
+        Bridged instants by the sensors that measured there.
+    facts : dict
+        Plain values: what was estimated and used.
+    """
+
+    reference: AntennaReference
+    fixes: Fixes
+    gaps: tuple[Gap, ...]
+    left_out: dict[str, int]
+    bridged_by: dict[str, int]
+    facts: dict[str, Any]
+
+
+def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
+    """Reference positions of every antenna that has a log of positions.
+
+    Parameters
+    ----------
+    data : ReferenceData
+    settings : ReferenceSettings, optional
+
+    Returns
+    -------
+    dict of str to Built
+
+    Raises
+    ------
+    NoPositionError
+        Fewer than two good fixes.
+    MismatchError
+        Two logs of positions without the distance between the antennas; pulses or accelerations of another time.
+    """
+    settings = settings or ReferenceSettings()
+    judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
+    if len(judged) == 2:
+        if not np.isfinite(data.distance_m):
+            raise MismatchError(
+                "two logs of positions need the vehicle's antennas to check their distance; name a vehicle"
+            )
+        one, other = judged
+        pair = (judged[one], judged[other])
+        judged = {
+            one: judge_pair(pair[0], pair[1], data.distance_m, settings),
+            other: judge_pair(pair[1], pair[0], data.distance_m, settings),
+        }
+    return {name: _Builder(name, data, settings).built(fixes) for name, fixes in judged.items()}
+
+
+class _Builder:
+    """The work on one antenna."""
+
+    def __init__(self, name: str, data: ReferenceData, settings: ReferenceSettings) -> None:
+        self.name, self.data, self.settings = name, data, settings
+        self.trajectory = data.trajectories[name]
+
+    def built(self, fixes: Fixes) -> Built:
+        """From judged fixes to the reference."""
+        fixes = judge_place(fixes, self.trajectory, self.settings)
+        good = self._good(fixes)
+        speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
+        wheel = None
+        if self.data.pulses is not None:
+            _check_time(self.data.pulses.path, self.data.pulses.time, fixes.time[good])
+            wheel = wheel_of(self.data.pulses, self.settings.pulse_m, fixes.time[good], fixes.arc_m[good])
+        if self.data.acceleration is not None:
+            _check_time(self.data.acceleration.path, self.data.acceleration.time, fixes.time[good])
+        lasting, windows = self._lasting(speeds, fixes, good)
+        judged = fixes
+        fixes = judge_travel(judged, lambda time: self._travelled(time, speeds, wheel, judged, lasting), self.settings)
+        good = self._good(fixes)
+        span = fixes.time[(fixes.time >= fixes.time[good[0]]) & (fixes.time <= fixes.time[good[-1]])]
+        time = instants(np.unique(span), [d.time for d in self._sources().values()])
+        at = np.searchsorted(time, fixes.time[good])
+        place = np.interp(_since(time, time), _since(fixes.time[good], time), fixes.arc_m[good])
+        smoothed = None
+        for _ in range(_ROUNDS if self.data.dopplers else 1):
+            speeds = self._speeds(time, place)
+            lasting, windows = self._lasting(speeds, fixes, good)
+            evidence = self._evidence(time, at, fixes, good, speeds, wheel, place)
+            smoothed = smooth(evidence, self.settings, doppler_bias_mps=lasting)
+            place = np.clip(smoothed.arc_m, 0.0, self.trajectory.arc_m[-1])
+        if smoothed is None:
+            raise AssertionError("at least one round is made")
+        facts = self._facts(speeds, lasting, windows, wheel, smoothed)
+        return self._result(time, at, fixes, good, evidence, replace(smoothed, arc_m=place), facts)
+
+    def _good(self, fixes: Fixes) -> Indices:
+        good = fixes.good
+        if len(good) < 2:
+            told = ", ".join(f"{count} {what}" for what, count in fixes.counts().items() if count)
+            raise NoPositionError(f"{self.name}: fewer than two good fixes ({told}); no reference can be made")
+        return good
+
+    def _sources(self) -> Mapping[str, Dopplers]:
+        """Dopplers that can be put on this antenna's path: its own, and the other's where a vehicle ties the two."""
+        tied = self.trajectory.body_chainage_m is not None
+        return {name: d for name, d in self.data.dopplers.items() if name == self.name or tied}
+
+    def _speeds(self, time: Datetimes, place_m: Floats) -> dict[str, tuple[Speeds, DopplerSpeed]]:
+        """Doppler speeds of every receiver, seen from places along this antenna's path."""
+        found = {}
+        for name, dopplers in self._sources().items():
+            t = _since(dopplers.time, time)
+            arc = np.interp(t, _since(time, time), place_m, left=np.nan, right=np.nan)
+            path = self.data.trajectories[name]
+            if name != self.name:
+                arc = path.arc_of_body(self.trajectory.body_at(arc))
+            section, _ = path.segment_at(arc)
+            tangent = np.where(np.isfinite(arc)[:, None], path.tangent[section], np.nan)
+            solved = doppler_speed(dopplers, path.at_arc(arc), tangent, limits=self.settings.doppler)
+            rows = np.flatnonzero(np.isfinite(solved.speed_mps))
+            speeds = Speeds(
+                time=dopplers.time[rows], speed_mps=solved.speed_mps[rows], sigma_mps=solved.sigma_mps[rows]
+            )
+            found[name] = (speeds, solved)
+        return found
+
+    def _joined(self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]]) -> Speeds | None:
+        """All receivers' speeds as one."""
+        if not speeds:
+            return None
+        own = [part for part, _ in speeds.values()]
+        time = own[0].time if len(own) == 1 else np.unique(np.concatenate([part.time for part in own]))
+        if len(own) > 1:
+            apart = np.diff(time, prepend=time[:1] - np.timedelta64(1, "s")) > np.timedelta64(20, "ms")
+            time = time[apart]
+        speed, sigma = fused(time, own)
+        rows = np.flatnonzero(np.isfinite(speed))
+        return Speeds(time=time[rows], speed_mps=speed[rows], sigma_mps=sigma[rows])
+
+    def _travelled(
+        self,
+        time: Datetimes,
+        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        wheel: Wheel | None,
+        fixes: Fixes,
+        lasting_mps: float,
+    ) -> tuple[Floats, Floats]:
+        """Way travelled up to instants and its variance: by the wheel where there is one, else by Dopplers."""
+        joined = self._joined(speeds)
+        settings = self.settings
+        if wheel is not None:
+            good = fixes.good
+            way = wheel.distance_m(time, self._hint(time, joined, fixes.time[good], fixes.arc_m[good]))
+            step = np.abs(np.diff(way, prepend=way[:1]))
+            return way, np.cumsum(settings.slip_m**2 * np.nan_to_num(step))
+        if joined is None:
+            return np.full(len(time), np.nan), np.full(len(time), np.nan)
+        way, white = joined.way(time)
+        lasting = 2.0 * settings.doppler_bias_s * lasting_mps**2 * _since(time, time)
+        return way, white + lasting
+
+    def _hint(self, time: Datetimes, joined: Speeds | None, fix_time: Datetimes, fix_m: Floats) -> Floats:
+        """Speeds that tell the direction of the wheel: Dopplers, else fixes that follow each other closely."""
+        step = seconds(np.diff(fix_time))
+        slope = np.where(step <= LONGEST_STEP_S, np.diff(fix_m) / step, np.nan)
+        section = np.searchsorted(fix_time, time, side="right") - 1
+        inside = (section >= 0) & (section < len(slope))
+        hint = np.where(inside, slope[np.clip(section, 0, len(slope) - 1)], np.nan)
+        if joined is not None and len(joined.time):
+            row = nearest(joined.time, time)
+            hint = np.where(row >= 0, joined.speed_mps[np.maximum(row, 0)], hint)
+        return np.asarray(hint)
+
+    def _lasting(
+        self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], fixes: Fixes, good: Indices
+    ) -> tuple[float, int]:
+        joined = self._joined(speeds)
+        if joined is None or len(joined.time) < 2:
+            return self.settings.doppler_bias_mps, 0
+        way, white = joined.way(fixes.time[good])
+        return lasting_error_mps(fixes.time[good], way, white, fixes.arc_m[good], fixes.sigma_m[good], self.settings)
+
+    def _evidence(
+        self,
+        time: Datetimes,
+        at: Indices,
+        fixes: Fixes,
+        good: Indices,
+        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        wheel: Wheel | None,
+        place_m: Floats,
+    ) -> Evidence:
+        blank = np.full(len(time), np.nan)
+        fix, sigma, way = blank.copy(), blank.copy(), blank
+        fix[at], sigma[at] = fixes.arc_m[good], fixes.sigma_m[good]
+        doppler, doppler_sigma = fused(time, [part for part, _ in speeds.values()])
+        if wheel is not None:
+            hint = self._hint(time, self._joined(speeds), fixes.time[good], fixes.arc_m[good])
+            way = wheel.distance_m(time, hint)
+        acceleration = np.full(len(time) - 1, np.nan)
+        if self.data.acceleration is not None:
+            acceleration = self.data.facing * self.data.acceleration.mean_over(time)
+            if self.data.acceleration.kind == "specific_force":
+                middle = (place_m[1:] + place_m[:-1]) / 2.0
+                section, _ = self.trajectory.segment_at(middle)
+                climb = np.einsum("ki,ki->k", self.trajectory.tangent[section], self.trajectory.up[section])
+                acceleration = acceleration - GRAVITY_MPS2 * climb
+        return Evidence(
+            time=time,
+            fix_m=fix,
+            fix_sigma_m=sigma,
+            doppler_mps=doppler,
+            doppler_sigma_mps=doppler_sigma,
+            wheel_m=way,
+            wheel_sigma_m=0.0 if wheel is None else wheel.reading_sigma_m,
+            acceleration_mps2=acceleration,
+        )
+
+    def _facts(
+        self,
+        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        lasting: float,
+        windows: int,
+        wheel: Wheel | None,
+        smoothed: Smoothed,
+    ) -> dict[str, Any]:
+        """What was estimated, as plain values."""
+        facts: dict[str, Any] = {"doppler": None, "pulses": None, "acceleration": None}
+        if speeds:
+            facts["doppler"] = {
+                "receivers": {
+                    name: {
+                        "epochs": len(part.time),
+                        "sigma_p50_mps": float(np.median(part.sigma_mps)) if len(part.time) else None,
+                        "noise_scale": solved.scale,
+                        "rejected": int(solved.rejected.sum()),
+                        "used": int(solved.used.sum()),
+                    }
+                    for name, (part, solved) in speeds.items()
+                },
+                "lasting_error_mps": lasting,
+                "lasting_error_from": f"{windows} windows between fixes" if windows >= 20 else "settings",
+            }
+        if wheel is not None:
+            facts["pulses"] = {
+                "pulse_m": wheel.pulse_m,
+                "pulse_m_from": wheel.source,
+                "kind": wheel.pulses.kind,
+                "direction": "from the table" if wheel.pulses.signed else "from Dopplers and fixes",
+                "scale_correction": -float(smoothed.wheel_scale[-1]),
+            }
+        if self.data.acceleration is not None:
+            facts["acceleration"] = {"kind": self.data.acceleration.kind, "facing": self.data.facing}
+        return facts
+
+    def _result(
+        self,
+        time: Datetimes,
+        at: Indices,
+        fixes: Fixes,
+        good: Indices,
+        evidence: Evidence,
+        smoothed: Smoothed,
+        facts: dict[str, Any],
+    ) -> Built:
+        settings, trajectory = self.settings, self.trajectory
+        is_fix = np.zeros(len(time), dtype=np.bool_)
+        is_fix[at] = True
+        after = np.clip(np.searchsorted(at, np.arange(len(time))), 1, len(at) - 1)
+        length = seconds(time[at[after]] - time[at[after - 1]])
+        # Errors that fixes have in common the smoother cannot see: a bridged instant has them too.
+        t = _since(time, time)
+        common = np.interp(t, t[at], fixes.sigma_m[good])
+        sigma = np.where(is_fix, common, np.hypot(smoothed.sigma_m, common))
+        arc = smoothed.arc_m.copy()
+        arc[at] = fixes.arc_m[good]
+        long = ~is_fix & (length > settings.max_gap_s)
+        uncertain = ~is_fix & ~long & (sigma > settings.max_sigma_m)
+        keep = np.flatnonzero(~long & ~uncertain)
+        reference = AntennaReference(
+            time=time[keep],
+            ecef_m=trajectory.at_arc(arc[keep]),
+            chainage_m=trajectory.chainage_at(arc[keep]),
+            speed_mps=smoothed.speed_mps[keep],
+            sigma_m=sigma[keep],
+            source=np.where(is_fix[keep], "rtk", "bridged"),
+            environment=np.full(len(keep), ""),
+        )
+        usual = float(np.median(seconds(np.diff(time))))
+        gap = seconds(np.diff(fixes.time[good]))
+        gaps = tuple(
+            Gap(
+                start=fixes.time[good[i]],
+                end=fixes.time[good[i + 1]],
+                length_s=float(gap[i]),
+                bridged=bool(gap[i] <= settings.max_gap_s),
+            )
+            for i in np.flatnonzero(gap > 1.5 * usual).tolist()
+        )
+        left_out = {
+            "before_first_fix": int((fixes.time < fixes.time[good[0]]).sum()),
+            "after_last_fix": int((fixes.time > fixes.time[good[-1]]).sum()),
+            "long_gap": int(long.sum()),
+            "uncertain": int(uncertain.sum()),
+        }
+        bridged = keep[~is_fix[keep]]
+        return Built(
+            reference=reference,
+            fixes=fixes,
+            gaps=gaps,
+            left_out=left_out,
+            bridged_by=_bridged_by(evidence, bridged),
+            facts=facts,
+        )
+
+
+def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
+    """Bridged instants by the sensors that have a number there."""
+    has = {
+        "doppler": np.isfinite(evidence.doppler_mps)[rows],
+        "pulses": np.isfinite(evidence.wheel_m)[rows],
+        "acceleration": np.isfinite(evidence.acceleration_mps2)[np.minimum(rows, len(evidence.acceleration_mps2) - 1)],
+    }
+    code = sum(mask.astype(np.int64) << i for i, mask in enumerate(has.values()))
+    names = {
+        c: " and ".join(name for i, name in enumerate(has) if c >> i & 1) or "nothing" for c in range(1 << len(has))
+    }
+    return {names[int(c)]: int((code == c).sum()) for c in np.unique(code)}
+
+
+def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:
+    if time[-1] < fix_time[0] or time[0] > fix_time[-1]:
+        raise MismatchError(
+            f"{path}: from {time[0]} to {time[-1]}, the fixes from {fix_time[0]} to {fix_time[-1]}: no time in common; "
+            "give those of the same run, in GPS time"
+        )
+
+
+def _since(time: Datetimes, origin: Datetimes) -> Floats:
+    return seconds(time - origin[0])

@@ -1,0 +1,272 @@
+"""Which positions are good enough to be a reference, and why the others are not (P1 3.1(2), 4.2(2), P2 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import IntFlag
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.antenna import Trajectory
+from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.position_log import PositionLog
+from railfix.reference.matching import Matched, match
+from railfix.reference.settings import ReferenceSettings
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Bits = NDArray[np.int64]
+Datetimes = NDArray[np.datetime64]
+Indices = NDArray[np.intp]
+
+#: Positions of two antennas that are tagged no further apart belong to one instant [ns].
+SAME_INSTANT_NS: Final = 5_000_000
+#: Runs of agreeing fixes that a run may be joined to, back from it.
+_LOOK_BACK: Final = 60
+#: Standard deviations of the travelled distance that a difference may have.
+_TRAVEL_SIGMAS: Final = 3.0
+_FIX: Final = 1
+
+
+class Refusal(IntFlag):
+    """Why a position is no reference; 0: it is one."""
+
+    NONE = 0
+    NO_POSITION = 1
+    NOT_FIXED = 2
+    LOW_RATIO = 4
+    REPEATED = 8
+    UNPAIRED = 16
+    SPACING = 32
+    OFF_TRACK = 64
+    OFF_HEIGHT = 128
+    TRAVEL = 256
+
+    @property
+    def text(self) -> str:
+        """The word in the output, by the bits that are set."""
+        return " ".join(flag.name.lower() for flag in Refusal if flag and flag in self and flag.name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixes:
+    """Positions of one antenna, judged, n rows in order of time.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (n,)
+    ecef_m : ndarray, shape (n, 3) [m]
+    quality : ndarray of int, shape (n,)
+    ratio : ndarray, shape (n,)
+        NaN where the log has none.
+    sigma_enu_m : ndarray, shape (n, 3) [m]
+        East, north, up; NaN where the log has none.
+    refusal : ndarray of int64, shape (n,)
+        `Refusal` bits; a row that fails at one stage is not asked at the next.
+    spacing_m : ndarray, shape (n,) [m]
+        Distance to the other antenna less the body's; NaN where it was not looked at.
+    arc_m, lateral_m, height_m : ndarray, shape (n,) [m]
+        Place on the trajectory, and how far off it; NaN where it was not looked at.
+    sigma_m : ndarray, shape (n,) [m]
+        Along the track.
+    travel_m : ndarray, shape (n,) [m]
+        Way since the good fix before, less the way travelled; NaN where nothing measured that.
+    """
+
+    time: Datetimes
+    ecef_m: Floats
+    quality: NDArray[np.int64]
+    ratio: Floats
+    sigma_enu_m: Floats
+    refusal: Bits
+    spacing_m: Floats
+    arc_m: Floats
+    lateral_m: Floats
+    height_m: Floats
+    sigma_m: Floats
+    travel_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def good(self) -> Indices:
+        """Rows without a refusal."""
+        return np.flatnonzero(self.refusal == 0)
+
+    def counts(self) -> dict[str, int]:
+        """Number of rows by reason, the good ones first."""
+        counted = {"good": int((self.refusal == 0).sum())}
+        for flag in Refusal:
+            if flag:
+                counted[flag.text] = int((self.refusal & flag != 0).sum())
+        return counted
+
+
+def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
+    """The rows of a log by what they say of themselves: a position, a fix, its ratio.
+
+    A log that tells no quality (a CSV without the column) is taken as all fixed.
+    """
+    timed = np.flatnonzero(~np.isnat(log.time))
+    rows = timed[np.argsort(log.time[timed], kind="stable")]
+    time, ecef = log.time[rows], log.ecef_m[rows]
+    ratio = np.full(len(rows), np.nan) if log.ratio is None else log.ratio[rows]
+    refusal = np.zeros(len(rows), dtype=np.int64)
+    _refuse(refusal, np.asarray(~np.isfinite(ecef).all(axis=1)), Refusal.NO_POSITION)
+    if log.has_quality:
+        _refuse(refusal, log.quality[rows] != _FIX, Refusal.NOT_FIXED)
+    with np.errstate(invalid="ignore"):
+        _refuse(refusal, np.asarray(ratio < settings.ratio), Refusal.LOW_RATIO)
+    repeated = np.zeros(len(rows), dtype=np.bool_)
+    repeated[1:] = np.diff(time) == np.timedelta64(0, "ns")
+    _refuse(refusal, repeated, Refusal.REPEATED)
+    blank = np.full(len(rows), np.nan)
+    return Fixes(
+        time=time,
+        ecef_m=ecef,
+        quality=log.quality[rows],
+        ratio=ratio,
+        sigma_enu_m=log.sigma_m[rows][:, [1, 0, 2]],
+        refusal=refusal,
+        spacing_m=blank,
+        arc_m=blank,
+        lateral_m=blank,
+        height_m=blank,
+        sigma_m=blank,
+        travel_m=blank,
+    )
+
+
+def _refuse(refusal: Bits, mask: NDArray[np.bool_], reason: Refusal) -> None:
+    """Give a reason to rows that have none yet."""
+    refusal[mask & (refusal == 0)] |= reason
+
+
+def judge_pair(one: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
+    """The rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
+    rows = np.flatnonzero(other.refusal & ~np.int64(_OF_THE_PAIR) == 0)
+    refusal, spacing = one.refusal.copy(), np.full(len(one), np.nan)
+    paired = np.zeros(len(one), dtype=np.bool_)
+    if len(rows):
+        there = other.time[rows].astype(np.int64)
+        here = one.time.astype(np.int64)
+        after = np.clip(np.searchsorted(there, here), 1, max(len(there) - 1, 1))
+        after = np.minimum(after, len(there) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.where(np.abs(there[before] - here) <= np.abs(there[after] - here), before, after)
+        paired = (np.abs(there[nearest] - here) <= SAME_INSTANT_NS) & (refusal == 0)
+        apart = np.linalg.norm(one.ecef_m - other.ecef_m[rows[nearest]], axis=1) - distance_m
+        spacing = np.where(paired, apart, np.nan)
+    if settings.unpaired == "refuse":
+        _refuse(refusal, ~paired, Refusal.UNPAIRED)
+    with np.errstate(invalid="ignore"):
+        _refuse(refusal, np.abs(spacing) > settings.spacing_m, Refusal.SPACING)
+    return replace(one, refusal=refusal, spacing_m=spacing)
+
+
+#: The other antenna's row counts in a pair whatever this very check said of it.
+_OF_THE_PAIR: Final = Refusal.UNPAIRED | Refusal.SPACING
+
+
+def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
+    """The rows by their distance to the trajectory, with their place on it and its standard deviation."""
+    rows = fixes.good
+    refusal = fixes.refusal.copy()
+    arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
+    if len(rows):
+        found = match(
+            fixes.time[rows],
+            fixes.ecef_m[rows],
+            trajectory,
+            lateral_m=settings.lateral_m,
+            height_m=settings.height_m,
+            max_speed_mps=settings.max_speed_mps,
+        )
+        arc[rows], lateral[rows], height[rows] = found.arc_m, found.lateral_m, found.height_m
+        sigma[rows] = _along_sigma(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory, found, settings)
+        missed = np.isnan(arc) & (refusal == 0)
+        _refuse(refusal, missed & ~(np.abs(lateral) <= settings.lateral_m), Refusal.OFF_TRACK)
+        _refuse(refusal, missed & ~(np.abs(height) <= settings.height_m), Refusal.OFF_HEIGHT)
+        # What is left is beyond an end of the line.
+        _refuse(refusal, missed, Refusal.OFF_TRACK)
+    return replace(fixes, refusal=refusal, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
+
+
+def _along_sigma(
+    sigma_enu_m: Floats, ecef_m: Floats, trajectory: Trajectory, matched: Matched, settings: ReferenceSettings
+) -> Floats:
+    """Standard deviation along the track from those east, north and up."""
+    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
+    direction = np.einsum("fij,fj->fi", enu_axes(latitude, longitude), trajectory.tangent[matched.section])
+    told = np.sqrt(np.sum((direction * sigma_enu_m) ** 2, axis=1))
+    return np.where(np.isnan(told), settings.fix_sigma_m, np.maximum(told, settings.fix_floor_m))
+
+
+def judge_travel(
+    fixes: Fixes,
+    travelled: Callable[[Datetimes], tuple[Floats, Floats]],
+    settings: ReferenceSettings,
+) -> Fixes:
+    """The rows by the way between them against the way travelled (P2 3.3).
+
+    Neighbours that agree make a run; a wrong fix, or a stretch of them on wrong ambiguities, is a run of its
+    own, and so is what follows an error of the sensor. Kept is the chain of runs that holds most fixes, where
+    each joint that does not agree counts against it. So a short stretch that agrees with neither side goes, and
+    where long stretches on both sides stay apart, the sensor is held wrong and both stay.
+
+    Parameters
+    ----------
+    fixes : Fixes
+    travelled : callable
+        Way travelled up to instants and its variance since the start, along rising chainage; NaN where unknown.
+    settings : ReferenceSettings
+    """
+    rows = fixes.good
+    if len(rows) < 2:
+        return fixes
+    way, variance = travelled(fixes.time[rows])
+    offset = fixes.arc_m[rows] - way
+
+    def agrees(i: Indices, j: Indices) -> NDArray[np.bool_]:
+        spread = np.abs(variance[j] - variance[i]) + fixes.sigma_m[rows[i]] ** 2 + fixes.sigma_m[rows[j]] ** 2
+        limit = settings.travel_m + settings.travel_share * np.abs(way[j] - way[i]) + _TRAVEL_SIGMAS * np.sqrt(spread)
+        # Where nothing measured the way nothing is refused.
+        return np.asarray(~(np.abs(offset[j] - offset[i]) > limit))
+
+    keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), settings.travel_hold_s)
+    refusal, travel = fixes.refusal.copy(), np.full(len(fixes), np.nan)
+    refusal[rows[~keep]] |= Refusal.TRAVEL
+    kept = np.flatnonzero(keep)
+    travel[rows[kept[1:]]] = np.diff(offset[kept])
+    return replace(fixes, refusal=refusal, travel_m=travel)
+
+
+def _best_chain(
+    agrees: Callable[[Indices, Indices], NDArray[np.bool_]], time_s: Floats, hold_s: float
+) -> NDArray[np.bool_]:
+    """Which fixes are in the chain of runs of most seconds, less `hold_s` for each joint that does not agree."""
+    count = len(time_s)
+    worth = np.minimum(np.diff(time_s, append=time_s[-1] + np.median(np.diff(time_s))), 1.0)
+    every = np.arange(count)
+    cuts = np.flatnonzero(~agrees(every[:-1], every[1:])) + 1
+    first, last = np.append(0, cuts), np.append(cuts, count) - 1
+    total = np.concatenate([[0.0], np.cumsum(worth)])
+    size = total[last + 1] - total[first]
+    best, came = size.copy(), np.full(len(first), -1)
+    for j in range(1, len(first)):
+        before = np.arange(max(0, j - _LOOK_BACK), j)
+        joint = np.where(agrees(last[before], np.full(len(before), first[j])), 0.0, hold_s)
+        score = best[before] - joint
+        k = int(np.argmax(score))
+        if score[k] > 0.0:
+            best[j], came[j] = size[j] + score[k], before[k]
+    keep = np.zeros(count, dtype=np.bool_)
+    j = int(np.argmax(best))
+    while j >= 0:
+        keep[first[j] : last[j] + 1] = True
+        j = int(came[j])
+    return keep

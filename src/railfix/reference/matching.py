@@ -1,0 +1,156 @@
+"""Fixes on the antenna's trajectory: which pass of the line, where on it, how far off it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from railfix.antenna import Trajectory
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Masks = NDArray[np.bool_]
+
+#: A pass out of reach costs this much more than any other choice [m].
+_OUT_OF_REACH_M = 1e6
+#: Positions may jitter by this much more than the train can run [m].
+_JITTER_M = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matched:
+    """Positions on a trajectory, F of them.
+
+    Attributes
+    ----------
+    arc_m : ndarray, shape (F,) [m]
+        Of the pass chosen; NaN where no pass is near enough.
+    lateral_m, height_m : ndarray, shape (F,) [m]
+        To the right of and above the trajectory there; those of the nearest point where no pass is near enough.
+    section : ndarray of int, shape (F,)
+        Segment of the trajectory.
+    """
+
+    arc_m: Floats
+    lateral_m: Floats
+    height_m: Floats
+    section: Indices
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Passes:
+    """Where the line passes near positions, P of them, by position."""
+
+    position: Indices
+    section: Indices
+    arc_m: Floats
+    lateral_m: Floats
+    height_m: Floats
+
+
+def match(
+    time: NDArray[np.datetime64],
+    ecef_m: Floats,
+    trajectory: Trajectory,
+    *,
+    lateral_m: float,
+    height_m: float,
+    max_speed_mps: float,
+) -> Matched:
+    """Put positions on a trajectory.
+
+    Where the line passes a place more than once (a loop, laps), the chain of passes is taken that a train
+    no faster than `max_speed_mps` can run, and of several such the one with the shortest way.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (F,)
+        Rising.
+    ecef_m : ndarray, shape (F, 3) [m]
+    trajectory : Trajectory
+    lateral_m, height_m : float [m]
+        Passes further off are none.
+    max_speed_mps : float [m/s]
+
+    Returns
+    -------
+    Matched
+    """
+    count = len(ecef_m)
+    nearest, _ = trajectory.nearest(ecef_m)
+    section, _ = trajectory.segment_at(nearest)
+    offset = ecef_m - trajectory.at_arc(nearest)
+    arc = np.full(count, np.nan)
+    lateral, height = _beside(offset, trajectory, section)
+    passes = _passes(ecef_m, trajectory, lateral_m, height_m)
+    chosen = _chain(passes, seconds(time - time[0]) if count else np.empty(0), max_speed_mps)
+    at = passes.position[chosen]
+    arc[at], section[at] = passes.arc_m[chosen], passes.section[chosen]
+    lateral[at], height[at] = passes.lateral_m[chosen], passes.height_m[chosen]
+    return Matched(arc_m=arc, lateral_m=lateral, height_m=height, section=section)
+
+
+def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
+    """Components of offsets to the right, and square to the path and that."""
+    right, along = trajectory.across[section], trajectory.tangent[section]
+    return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
+
+
+def _passes(ecef_m: Floats, trajectory: Trajectory, lateral_m: float, height_m: float) -> _Passes:
+    """Local minima of the distance along the line that are within the limits."""
+    length = trajectory.length_m
+    middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
+    reach = float(np.hypot(lateral_m, height_m)) + 0.5 * float(length.max())
+    lists = cKDTree(middle).query_ball_point(ecef_m, np.full(len(ecef_m), reach), return_sorted=True)
+    position = np.repeat(np.arange(len(ecef_m)), [len(x) for x in lists])
+    section = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=len(position))
+    delta = ecef_m[position] - trajectory.ecef_m[section]
+    along = np.einsum("pi,pi->p", delta, trajectory.tangent[section])
+    foot = np.clip(along, 0.0, length[section])
+    offset = delta - foot[:, None] * trajectory.tangent[section]
+    away = np.linalg.norm(offset, axis=1)
+    joined = (position[1:] == position[:-1]) & (section[1:] == section[:-1] + 1)
+    best = np.ones(len(position), dtype=np.bool_)
+    best[1:] &= ~joined | (away[1:] < away[:-1])
+    best[:-1] &= ~joined | (away[:-1] <= away[1:])
+    lateral, height = _beside(offset, trajectory, section)
+    # beyond the ends of the line there is nothing to be on
+    beyond = np.abs(along - foot) > 0.5
+    beyond &= (section == 0) | (section == len(length) - 1)
+    near = best & (np.abs(lateral) <= lateral_m) & (np.abs(height) <= height_m) & ~beyond
+    return _Passes(
+        position=position[near],
+        section=section[near],
+        arc_m=(trajectory.arc_m[section] + foot)[near],
+        lateral_m=lateral[near],
+        height_m=height[near],
+    )
+
+
+def _chain(passes: _Passes, time_s: Floats, max_speed_mps: float) -> Indices:
+    """One pass a position: the cheapest chain from the first to the last (dynamic programming)."""
+    found, first = np.unique(passes.position, return_index=True)
+    if len(found) == len(passes.position):
+        return np.arange(len(found))
+    edges = np.append(first, len(passes.position)).tolist()
+    cost = np.abs(passes.lateral_m[edges[0] : edges[1]])
+    came: list[Indices] = []
+    for k, (begin, end) in enumerate(pairwise(edges[1:])):
+        start = edges[k]
+        way = np.abs(passes.arc_m[begin:end, None] - passes.arc_m[None, start:begin])
+        reach = max_speed_mps * (time_s[found[k + 1]] - time_s[found[k]]) + _JITTER_M
+        # The shortest way counts; a second pass of a crossing costs what it is longer by.
+        total = cost + way + np.where(way > reach, _OUT_OF_REACH_M, 0.0)
+        came.append(total.argmin(axis=1))
+        cost = total.min(axis=1) + np.abs(passes.lateral_m[begin:end])
+    best = int(np.argmin(cost))
+    chosen = [edges[-2] + best]
+    for k in range(len(came) - 1, -1, -1):
+        best = int(came[k][best])
+        chosen.append(edges[k] + best)
+    return np.array(chosen[::-1], dtype=np.intp)

@@ -1,0 +1,284 @@
+"""The way between fixes: everything that measures it, weighed against each other, closed on the fixes.
+
+The unknowns of each instant are the place along the track, the speed, and one slow error for each
+kind of sensor: the lasting part of the Doppler speed's error, the difference and the scale of the
+wheel's distance, the accelerometer's offset. A forward-backward smoother over the whole run
+(`chain`) then shares the closing error of a gap back over it, in proportion to what each part of it
+may have contributed, and its standard deviation grows from both ends to the middle. Which sensor
+counts for how much is not chosen: their variances say so at every instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.reference.chain import Chain
+from railfix.reference.settings import ReferenceSettings
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+#: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].
+_ANY_SPEED_MPS: Final = 100.0
+_ANY_DISTANCE_M: Final = 1e4
+#: Doppler speeds beyond this many standard deviations weigh less (P. J. Huber, 1964), in this many rounds.
+_HUBER: Final = 2.0
+_ROUNDS: Final = 4
+#: Drift of the wheel's scale [1 per square root of s] and of the accelerometer's offset [m/s2 per square root of s].
+_SCALE_DRIFT: Final = 3e-6
+_OFFSET_DRIFT_MPS2: Final = 1e-3
+#: Least standard deviations: of a reading of the wheel [m], of its difference over a step [m].
+_LEAST_READING_M: Final = 1e-3
+_LEAST_STEP_M: Final = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """What is known along one antenna's path at N instants; NaN where nothing is.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        Rising, steps of at most some seconds.
+    fix_m, fix_sigma_m : ndarray, shape (N,) [m]
+        Arc length of good fixes.
+    doppler_mps, doppler_sigma_mps : ndarray, shape (N,) [m/s]
+    wheel_m : ndarray, shape (N,) [m]
+        Cumulated distance of the wheel along rising chainage, from any start.
+    wheel_sigma_m : float [m]
+        Of one reading: half a pulse and the like.
+    acceleration_mps2 : ndarray, shape (N - 1,) [m/s2]
+        Mean of each step along rising chainage, without gravity.
+    """
+
+    time: NDArray[np.datetime64]
+    fix_m: Floats
+    fix_sigma_m: Floats
+    doppler_mps: Floats
+    doppler_sigma_mps: Floats
+    wheel_m: Floats
+    wheel_sigma_m: float
+    acceleration_mps2: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smoothed:
+    """Place and speed of every instant.
+
+    Attributes
+    ----------
+    arc_m, sigma_m : ndarray, shape (N,) [m]
+    speed_mps, speed_sigma_mps : ndarray, shape (N,) [m/s]
+    wheel_scale : ndarray, shape (N,)
+        Share that the wheel's distance is too long by; NaN without a wheel.
+    """
+
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats
+    speed_sigma_mps: Floats
+    wheel_scale: Floats
+
+
+class _Unknowns:
+    """Column of each unknown."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        self.place, self.speed, self.count = 0, 1, 2
+        self.doppler = self._next(np.isfinite(evidence.doppler_mps).any())
+        self.difference = self._next(np.isfinite(evidence.wheel_m).any())
+        self.scale = self._next(self.difference >= 0)
+        self.offset = self._next(np.isfinite(evidence.acceleration_mps2).any())
+
+    def _next(self, present: object) -> int:
+        if not present:
+            return -1
+        self.count += 1
+        return self.count - 1
+
+
+def smooth(evidence: Evidence, settings: ReferenceSettings, *, doppler_bias_mps: float) -> Smoothed:
+    """Place and speed at every instant from all evidence at once.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With at least one fix.
+    settings : ReferenceSettings
+    doppler_bias_mps : float [m/s]
+        Standard deviation of the lasting part of the Doppler speed's error.
+
+    Returns
+    -------
+    Smoothed
+    """
+    t = seconds(evidence.time - evidence.time[0])
+    fixed = np.flatnonzero(np.isfinite(evidence.fix_m))
+    nominal = np.interp(t, t[fixed], evidence.fix_m[fixed])
+    unknowns = _Unknowns(evidence)
+    seen = np.flatnonzero(np.isfinite(evidence.doppler_mps))
+    relief = np.ones(len(seen))
+    for _ in range(_ROUNDS if len(seen) else 1):
+        chain = Chain.empty(len(t), unknowns.count)
+        _add_motion(chain, unknowns, evidence, np.diff(t), np.diff(nominal), settings)
+        row = _one(unknowns, unknowns.place)
+        chain.add_single(fixed, row, (evidence.fix_m - nominal)[fixed], evidence.fix_sigma_m[fixed] ** -2.0)
+        _add_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings, doppler_bias_mps)
+        _add_wheel(chain, unknowns, evidence, np.diff(t), nominal, settings)
+        _add_offset(chain, unknowns, np.diff(t), settings)
+        value, covariance = chain.solve()
+        if len(seen):
+            left = np.abs(evidence.doppler_mps - value[:, unknowns.speed] - value[:, unknowns.doppler])[seen]
+            relief = np.minimum(1.0, _HUBER * evidence.doppler_sigma_mps[seen] / np.maximum(left, 1e-12))
+    spread = np.sqrt(np.maximum(np.einsum("kii->ki", covariance), 0.0))
+    return Smoothed(
+        arc_m=nominal + value[:, unknowns.place],
+        sigma_m=spread[:, unknowns.place],
+        speed_mps=value[:, unknowns.speed],
+        speed_sigma_mps=spread[:, unknowns.speed],
+        wheel_scale=value[:, unknowns.scale] if unknowns.scale >= 0 else np.full(len(t), np.nan),
+    )
+
+
+def _add_motion(
+    chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, moved: Floats, settings: ReferenceSettings
+) -> None:
+    """Speed is the change of place; its own change is measured, or white noise."""
+    chain.add_single(np.array([0]), _one(unknowns, unknowns.speed), np.zeros(1), np.full(1, _ANY_SPEED_MPS**-2))
+    measured = np.isfinite(evidence.acceleration_mps2)
+    acceleration = np.where(measured, evidence.acceleration_mps2, 0.0)
+    density = np.where(measured, settings.acceleration_mps2, settings.free_mps2) ** 2
+    before, after = np.zeros((2, len(dt), 2, unknowns.count))
+    after[:, 0, unknowns.place] = after[:, 1, unknowns.speed] = 1.0
+    before[:, 0, unknowns.place] = before[:, 1, unknowns.speed] = -1.0
+    before[:, 0, unknowns.speed] = -dt
+    if unknowns.offset >= 0:
+        before[:, 0, unknowns.offset] = np.where(measured, dt**2 / 2.0, 0.0)
+        before[:, 1, unknowns.offset] = np.where(measured, dt, 0.0)
+    value = np.stack([acceleration * dt**2 / 2.0 - moved, acceleration * dt], axis=1)
+    # Inverse of density [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]].
+    weight = np.empty((len(dt), 2, 2))
+    weight[:, 0, 0], weight[:, 1, 1] = 12.0 / dt**3, 4.0 / dt
+    weight[:, 0, 1] = weight[:, 1, 0] = -6.0 / dt**2
+    chain.add_steps(before, after, value, weight / density[:, None, None])
+
+
+def _add_doppler(
+    chain: Chain,
+    unknowns: _Unknowns,
+    evidence: Evidence,
+    dt: Floats,
+    seen: Indices,
+    relief: Floats,
+    settings: ReferenceSettings,
+    bias_mps: float,
+) -> None:
+    """Doppler speed = speed + lasting error + noise; the lasting error is a first-order Gauss-Markov process."""
+    if unknowns.doppler < 0:
+        return
+    kept = np.exp(-dt / settings.doppler_bias_s)
+    variance = bias_mps**2
+    chain.add_single(np.array([0]), _one(unknowns, unknowns.doppler), np.zeros(1), np.full(1, 1.0 / variance))
+    _add_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
+    row = _one(unknowns, unknowns.speed) + _one(unknowns, unknowns.doppler)
+    chain.add_single(seen, row, evidence.doppler_mps[seen], relief * evidence.doppler_sigma_mps[seen] ** -2.0)
+
+
+def _add_wheel(
+    chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, nominal: Floats, settings: ReferenceSettings
+) -> None:
+    """Reading = place + difference; the difference changes with the way by the scale, and by slip."""
+    if unknowns.difference < 0:
+        return
+    read = np.flatnonzero(np.isfinite(evidence.wheel_m))
+    way = np.diff(evidence.wheel_m)
+    known = np.isfinite(way)
+    way = np.where(known, way, 0.0)
+    row = _one(unknowns, unknowns.place) + _one(unknowns, unknowns.difference)
+    start = evidence.wheel_m[read[0]] - nominal[read[0]]
+    weight = np.full(len(read), max(evidence.wheel_sigma_m, _LEAST_READING_M) ** -2)
+    chain.add_single(read, row, evidence.wheel_m[read] - start - nominal[read], weight)
+    for unknown, sigma in ((unknowns.difference, _ANY_DISTANCE_M), (unknowns.scale, settings.wheel_scale)):
+        chain.add_single(np.array([0]), _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
+    before, after = np.zeros((2, len(way), 1, unknowns.count))
+    after[:, 0, unknowns.difference], before[:, 0, unknowns.difference] = 1.0, -1.0
+    before[:, 0, unknowns.scale] = -way
+    variance = np.where(known, settings.slip_m**2 * np.abs(way) + _LEAST_STEP_M**2, _ANY_DISTANCE_M**2)
+    chain.add_steps(before, after, np.zeros((len(way), 1)), (1.0 / variance)[:, None, None])
+    _add_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
+
+
+def _add_offset(chain: Chain, unknowns: _Unknowns, dt: Floats, settings: ReferenceSettings) -> None:
+    """The accelerometer's offset, a random walk."""
+    if unknowns.offset >= 0:
+        prior = np.full(1, settings.acceleration_bias_mps2**-2)
+        chain.add_single(np.array([0]), _one(unknowns, unknowns.offset), np.zeros(1), prior)
+        _add_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
+
+
+def _add_walk(chain: Chain, unknown: int, kept: Floats, weight: Floats) -> None:
+    """``x_{k+1} = kept x_k`` with noise, for one unknown."""
+    before, after = np.zeros((2, len(kept), 1, chain.right.shape[1]))
+    after[:, 0, unknown], before[:, 0, unknown] = 1.0, -kept
+    chain.add_steps(before, after, np.zeros((len(kept), 1)), weight[:, None, None])
+
+
+def _one(unknowns: _Unknowns, unknown: int) -> Floats:
+    row = np.zeros(unknowns.count)
+    row[unknown] = 1.0
+    return row
+
+
+def lasting_error_mps(
+    time: NDArray[np.datetime64],
+    way_m: Floats,
+    variance_m2: Floats,
+    fix_m: Floats,
+    fix_sigma_m: Floats,
+    settings: ReferenceSettings,
+) -> tuple[float, int]:
+    """Size of the lasting part of the Doppler speed's error, from what it fails to close by between fixes.
+
+    Over windows as long as its time of correlation the way by Doppler is compared with the fixes'. What the
+    noise of single speeds and of the fixes does not explain is the lasting part.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (F,)
+        Of the fixes.
+    way_m, variance_m2 : ndarray, shape (F,)
+        Way by Doppler up to each fix, and the variance of its white part since the start; NaN where unknown.
+    fix_m, fix_sigma_m : ndarray, shape (F,) [m]
+
+    Returns
+    -------
+    float
+        Standard deviation [m/s]; that of the settings where fewer than `_WINDOWS` windows are there.
+    int
+        Number of windows.
+    """
+    t = seconds(time - time[0])
+    tau = settings.doppler_bias_s
+    end = np.searchsorted(t, t + tau - 0.5)
+    inside = np.flatnonzero(end < len(t))
+    inside = inside[t[end[inside]] - t[inside] <= 1.5 * tau]
+    end = end[inside]
+    closing = (way_m[end] - way_m[inside]) - (fix_m[end] - fix_m[inside])
+    white = variance_m2[end] - variance_m2[inside] + fix_sigma_m[end] ** 2 + fix_sigma_m[inside] ** 2
+    usable = np.isfinite(closing) & (white < 1e4)
+    if usable.sum() < _WINDOWS:
+        return settings.doppler_bias_mps, int(usable.sum())
+    ratio = (t[end] - t[inside])[usable] / tau
+    gain = 2.0 * tau**2 * (ratio - 1.0 + np.exp(-ratio))
+    # Median of a squared normal variable: 0.455.
+    left = np.median(closing[usable] ** 2) / 0.455 - np.median(white[usable])
+    return float(np.sqrt(max(left / float(np.median(gain)), _LEAST_LASTING_MPS**2))), int(usable.sum())
+
+
+_WINDOWS: Final = 20
+_LEAST_LASTING_MPS: Final = 1e-3

@@ -1,0 +1,226 @@
+"""Errors of the bridged reference: half of the fixes of real recordings taken away in gaps of 5 to 60 s.
+
+Run ``python tests/reference_gaps.py`` with the recordings beside the checkout. The inertial reference of a
+recording, once a second, plays the fixes; the map is made from it. For each gap length L the fixes of every second
+stretch of L seconds are removed, at four phases, and the reference is built from the rest. Each bridged instant
+is then compared with the inertial reference, along the map.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import recordings_truth
+from railfix.antenna import Trajectory
+from railfix.config import DEFAULT_SIGNALS
+from railfix.doppler_speed import Dopplers, dopplers_of_log
+from railfix.evaluate import along_track_error, interpolate_reference
+from railfix.position_log import PositionLog
+from railfix.reference import Pulses, ReferenceData, ReferenceSettings, build_references
+from railfix.rinex import read_navigation, read_observations
+from railfix.timescale import seconds, timedelta
+from recordings_score import trajectory_of
+
+Floats = NDArray[np.float64]
+
+LENGTHS_S: Final = (5, 10, 20, 30, 60)
+PHASES: Final = 4
+#: Uncertain instants are judged too.
+SETTINGS: Final = ReferenceSettings(max_sigma_m=1e6, max_gap_s=90.0)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Fixes once a second, the map, and what bridges."""
+
+    name: str
+    truth: tuple[NDArray[np.datetime64], Floats]
+    log: PositionLog
+    trajectory: Trajectory
+    dopplers: Dopplers | None = None
+    pulses: Pulses | None = None
+
+    def true(self, time: NDArray[np.datetime64]) -> Floats:
+        """Places at instants."""
+        return interpolate_reference(time, *self.truth)
+
+    def data(self, keep: NDArray[np.bool_], bridge: str) -> ReferenceData:
+        """The recording with some of its fixes."""
+        log = replace(
+            self.log,
+            time=self.log.time[keep],
+            ecef_m=self.log.ecef_m[keep],
+            quality=self.log.quality[keep],
+            sigma_m=self.log.sigma_m[keep],
+            line=self.log.line[keep],
+        )
+        return ReferenceData(
+            logs={"front": log},
+            trajectories={"front": self.trajectory},
+            dopplers={"front": self.dopplers} if self.dopplers is not None and bridge == "doppler" else {},
+            pulses=self.pulses if bridge == "odometry" else None,
+        )
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of bridged places along the map, by gap length."""
+
+    error_m: Floats
+    sigma_m: Floats
+
+    @property
+    def ratio(self) -> float:
+        """Root of the mean of the squared errors over their own standard deviations."""
+        return float(np.sqrt(np.mean((self.error_m / self.sigma_m) ** 2)))
+
+
+def _log(time: NDArray[np.datetime64], ecef: Floats, first: np.datetime64, last: np.datetime64) -> PositionLog:
+    """One position a second between two instants."""
+    span = (time >= first) & (time <= last)
+    time, ecef = time[span], ecef[span]
+    whole = np.flatnonzero(np.diff(np.floor(seconds(time - time[0]) + 1e-3), prepend=-1.0) > 0)
+    count = len(whole)
+    return PositionLog(
+        path="truth",
+        time=time[whole],
+        ecef_m=ecef[whole],
+        quality=np.ones(count, dtype=np.int64),
+        sigma_m=np.full((count, 3), np.nan),
+        line=np.arange(count),
+    )
+
+
+def gsdc(data: Path) -> Recording:
+    folder = data / "kinematic" / "gsdc_pixel5_a"
+    return _with_dopplers("gsdc", data, folder / "Pixel5_a.21o", folder / "hour1180.21n")
+
+
+def urbannav(data: Path) -> Recording:
+    folder = data / "kinematic" / "urbannav_tst"
+    return _with_dopplers("urbannav", data, folder / "20210517.light-urban.tste.ublox.f9p.obs", folder / "hksc137c.nav")
+
+
+def _with_dopplers(name: str, data: Path, observations: Path, navigation: Path) -> Recording:
+    time, ecef = recordings_truth.TRUTHS[name](data)
+    dopplers = dopplers_of_log(
+        read_observations(observations),
+        read_navigation([navigation]),
+        systems=("G", "J", "E", "C", "R"),
+        signals=DEFAULT_SIGNALS,
+    )
+    return Recording(
+        name,
+        (time, ecef),
+        _log(time, ecef, dopplers.time[0], dopplers.time[-1]),
+        trajectory_of(time, ecef),
+        dopplers=dopplers,
+    )
+
+
+def smartloc(data: Path) -> Recording:
+    """The odometer tells speeds, 5 Hz; their sum plays its distance."""
+    time, ecef = recordings_truth.TRUTHS["smartloc"](data)
+    rows = [
+        [float(x) for x in line.split()[1:3]]
+        for line in (data / "kinematic" / "smartloc_berlin" / "Berlin_Potsdamer_Platz_Input.txt")
+        .read_text()
+        .splitlines()
+        if line.startswith("odom3")
+    ]
+    clock, speed = np.array(rows).T
+    way = np.concatenate([[0.0], np.cumsum(np.diff(clock) * (speed[1:] + speed[:-1]) / 2.0)])
+    pulses = Pulses(
+        path="odometer",
+        time=recordings_truth.SMARTLOC_START + timedelta(clock),
+        count=way,
+        kind="distance",
+        signed=False,
+    )
+    return Recording(
+        "smartloc", (time, ecef), _log(time, ecef, time[0], time[-1]), trajectory_of(time, ecef), pulses=pulses
+    )
+
+
+RECORDINGS: Final = {"gsdc": (gsdc, "doppler"), "urbannav": (urbannav, "doppler"), "smartloc": (smartloc, "odometry")}
+
+
+def bridged(recording: Recording, length_s: float, bridge: str, settings: ReferenceSettings = SETTINGS) -> Errors:
+    """Errors of the bridged instants of one gap length, all phases together."""
+    parts = []
+    t = seconds(recording.log.time - recording.log.time[0])
+    for phase in range(PHASES):
+        shifted = t + phase * 2.0 * length_s / PHASES
+        keep = (shifted % (2.0 * length_s)) >= length_s - 1e-6
+        if bridge == "interpolation":
+            parts.append(_interpolated(recording, keep))
+            continue
+        reference = build_references(recording.data(keep, bridge), settings)["front"].reference
+        rows = np.flatnonzero(reference.source == "bridged")
+        arc = recording.trajectory.arc_at_chainage(reference.chainage_m[rows])
+        error = along_track_error(arc, recording.true(reference.time[rows]), recording.trajectory)
+        seen = np.isfinite(error)
+        parts.append(np.stack([error[seen], reference.sigma_m[rows][seen]]))
+    error, sigma = np.concatenate(parts, axis=1)
+    return Errors(error, sigma)
+
+
+def _interpolated(recording: Recording, keep: NDArray[np.bool_]) -> Floats:
+    """The yardstick: an even run between the places of the fixes on the map."""
+    built = build_references(recording.data(keep, "nothing"), SETTINGS)["front"]
+    good = built.fixes.good
+    origin = recording.log.time[0]
+    removed = np.flatnonzero(~keep)
+    arc = np.interp(
+        seconds(recording.log.time[removed] - origin),
+        seconds(built.fixes.time[good] - origin),
+        built.fixes.arc_m[good],
+        left=np.nan,
+        right=np.nan,
+    )
+    gap = np.searchsorted(built.fixes.time[good], recording.log.time[removed])
+    inside = (gap > 0) & (gap < len(good))
+    step = np.full(len(removed), np.inf)
+    step[inside] = seconds(built.fixes.time[good][gap[inside]] - built.fixes.time[good][gap[inside] - 1])
+    arc = np.where(step <= SETTINGS.max_gap_s, arc, np.nan)
+    error = along_track_error(arc, recording.log.ecef_m[removed], recording.trajectory)
+    seen = np.isfinite(error)
+    return np.stack([error[seen], np.full(int(seen.sum()), np.nan)])
+
+
+def row(recording: Recording, length_s: int, bridge: str) -> str:
+    """One line of the table."""
+    errors = bridged(recording, length_s, bridge)
+    size = np.abs(errors.error_m)
+    told = f"{np.median(errors.sigma_m):8.2f} {errors.ratio:6.2f}" if np.isfinite(errors.sigma_m).all() else " " * 15
+    return (
+        f"{recording.name:9s} {length_s:4d} {bridge:13s} {len(size):6d} {np.median(size):8.3f} "
+        f"{np.percentile(size, 95):8.3f} {size.max():8.2f} {told}"
+    )
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    data = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not data.is_dir():
+        print(f"the real recordings are not at {data}", file=sys.stderr)
+        return 1
+    print("recording gap s bridge         epochs    p50 m    p95 m    max m  sigma m  error/sigma")
+    for name, (make, bridge) in RECORDINGS.items():
+        if arguments and name not in arguments:
+            continue
+        recording = make(data)
+        for length in LENGTHS_S:
+            for way in (bridge, "nothing", "interpolation"):
+                print(row(recording, length, way), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
