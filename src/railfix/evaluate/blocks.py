@@ -18,7 +18,7 @@ Integers = NDArray[np.int64]
 #: With fewer blocks than this no limits are told.
 FEWEST_BLOCKS: Final = 5
 #: Sizes of error at which the draws are counted at a time.
-_NODES: Final = 2000
+_NODES: Final = 400
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ import polars as pl
 
 from railfix.errors import InputFileError, MismatchError, SettingsError
 from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, level_columns
-from railfix.evaluate.figures import ALL, KEYS, classed, figures_by
+from railfix.evaluate.figures import ALL, KEYS, WORDS, classed, figures_by
 from railfix.evaluate.intervals import interval_table
 from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
@@ -23,6 +23,8 @@ from railfix.reference_log import AntennaReference, read_reference
 
 #: Names of a reference that is looked for beside the log of a run.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
+#: What names a run apart from the others.
+_OF_RUN: Final = ("run", "configuration", "line")
 #: Blocks of one run are numbered apart from those of the next.
 _BLOCKS_APART: Final = 10**9
 
@@ -328,25 +330,27 @@ def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
     """Every grouping of every run, and of all runs together where there are several."""
-    ready = classed(epochs, options)
-    both = _with_all(ready)
-    groupings = ("all", "section", "environment", "speed", "satellites", "status")
-    tables = [figures_by(both, grouping, options) for grouping in groupings]
+    both = _with_all(classed(epochs, options))
+    tables = [figures_by(both, ("all", "section", "environment", "speed", "satellites", "status"), options)]
     if epochs["run"].n_unique() > 1:
         for grouping in ("configuration", "line"):
-            together = {key: pl.lit(ALL) for key in ("run", "configuration", "line") if key != grouping}
             named = both.with_columns(pl.col(grouping).alias(f"{grouping}_group"), pl.lit(0).alias(f"{grouping}_rank"))
-            tables.append(figures_by(named.with_columns(**together), grouping, options))
-        whole = both.with_columns(pl.lit(ALL).alias(key) for key in ("run", "configuration", "line"))
-        tables += [figures_by(whole, grouping, options) for grouping in ("all", "environment", "speed")]
+            together = [key for key in _OF_RUN if key != grouping]
+            tables.append(figures_by(_as_one(named, together), (grouping,), options))
+        tables.append(figures_by(_as_one(both, _OF_RUN), ("all", "environment", "speed"), options))
     return pl.concat(tables)
+
+
+def _as_one(epochs: pl.DataFrame, keys: Sequence[str]) -> pl.DataFrame:
+    """The rows with `ALL` in place of what names them apart."""
+    return epochs.with_columns(pl.lit(ALL).cast(WORDS).alias(key) for key in keys)
 
 
 def _with_all(epochs: pl.DataFrame) -> pl.DataFrame:
     """The rows, and once more with both antennas as one, where there are two."""
     if epochs["antenna"].n_unique() < 2:
         return epochs
-    return pl.concat([epochs, epochs.with_columns(antenna=pl.lit(ALL))])
+    return pl.concat([epochs, _as_one(epochs, ["antenna"])])
 
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:

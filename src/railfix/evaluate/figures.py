@@ -21,6 +21,8 @@ POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings that are told with limits of confidence.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
+#: Names while they are grouped by: many rows, few words.
+WORDS: Final = pl.Categorical()
 #: In place of a name: everything together.
 ALL: Final = "all"
 
@@ -104,7 +106,10 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
     }
     inside = epochs.filter("in_reference").select(*KEYS, *_USED)
     ranked = inside.with_columns(rank.cast(pl.Int64).alias(f"{name}_rank") for name, rank in ranks.items())
-    return ranked.with_columns(expression.cast(pl.String).alias(f"{name}_group") for name, expression in names.items())
+    return ranked.with_columns(
+        pl.col(KEYS).cast(WORDS),
+        *(expression.cast(pl.String).cast(WORDS).alias(f"{name}_group") for name, expression in names.items()),
+    )
 
 
 def _rank(value: pl.Expr, edges: np.ndarray[Any, np.dtype[np.float64]]) -> pl.Expr:
@@ -152,46 +157,49 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     )
 
 
-def figures_by(
-    epochs: pl.DataFrame, grouping: str, options: EvaluationOptions, *, name: str | None = None
-) -> pl.DataFrame:
-    """Figures of one grouping, a row for every group, antenna, kind of position and choice of epochs.
+def figures_by(epochs: pl.DataFrame, groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
+    """Figures, a row for every grouping, group, antenna, kind of position and choice of epochs.
 
     Parameters
     ----------
     epochs : polars.DataFrame
         From `classed`; its columns of `KEYS` are kept apart.
-    grouping : str
+    groupings : sequence of str
         Which classes: ``f"{grouping}_group"``.
     options : EvaluationOptions
-    name : str, optional
-        Written into the column ``grouping``.
 
     Returns
     -------
     polars.DataFrame
         Columns of `FIGURE_COLUMNS`.
     """
-    rank, group = f"{grouping}_rank", f"{grouping}_group"
-    by = [*KEYS, rank, group]
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
-    tables = []
+    tables: dict[str, list[pl.DataFrame]] = {grouping: [] for grouping in groupings}
     for position, epochs_of in kinds:
         part = series(epochs, position, epochs_of)
-        table = part.group_by(by, maintain_order=True).agg(_figures(options))
-        limited = epochs_of == "own" and (name or grouping) in WITH_LIMITS
-        tables.append(_with_limits(table, part if limited else None, by, options))
-    found = pl.concat(tables).sort(rank, group, maintain_order=True)
-    return found.select(
-        pl.lit(name or grouping).alias("grouping"),
-        pl.col(group).alias("group"),
-        pl.exclude("grouping", rank, group),
+        for grouping in groupings:
+            by = [*KEYS, f"{grouping}_rank", f"{grouping}_group"]
+            table = part.group_by(by, maintain_order=True).agg(_figures(options))
+            limited = epochs_of == "own" and grouping in WITH_LIMITS
+            tables[grouping].append(_with_limits(table, part if limited else None, by, options))
+    return pl.concat(
+        [_ordered(pl.concat(parts), grouping, options) for grouping, parts in tables.items()], how="vertical"
     )
 
 
-def largest_first(column: str, by: str) -> pl.Expr:
-    """A column in falling order of another, the first of equals first, nulls at the end."""
-    return pl.col(column).sort_by(by, descending=True, nulls_last=True, maintain_order=True)
+def _ordered(table: pl.DataFrame, grouping: str, options: EvaluationOptions) -> pl.DataFrame:
+    """The table of one grouping in the order of its groups, with the columns of `FIGURE_COLUMNS`."""
+    rank, group = f"{grouping}_rank", f"{grouping}_group"
+    columns = [name for name in FIGURE_COLUMNS if not name.startswith("over_5_m")]
+    columns[columns.index("wrong_places") : columns.index("wrong_places")] = [f"over_{x:g}_m" for x in options.over_m]
+    words = [pl.col(name).cast(pl.String) for name in KEYS]
+    named = table.with_columns(*words, grouping=pl.lit(grouping), group=pl.col(group).cast(pl.String))
+    return named.sort(rank, "group", maintain_order=True).select(columns)
+
+
+def at_largest(column: str, by: str) -> pl.Expr:
+    """Value of a column where another is largest, the first of equals; null where that is null throughout."""
+    return pl.col(column).get(pl.col(by).arg_max())
 
 
 def _figures(options: EvaluationOptions) -> list[pl.Expr]:
@@ -217,10 +225,8 @@ def _figures(options: EvaluationOptions) -> list[pl.Expr]:
         size.max().alias("max_m"),
         error.min().alias("lowest_m"),
         error.max().alias("highest_m"),
-        *(
-            pl.when(good.any()).then(largest_first(column, "size").first()).alias(f"max_at_{what}")
-            for column, what in (("time_gpst", "time"), ("chainage_m", "chainage_m"))
-        ),
+        at_largest("time_gpst", "size").alias("max_at_time"),
+        at_largest("chainage_m", "size").alias("max_at_chainage_m"),
         *((size > limit).mean().alias(f"over_{limit:g}_m") for limit in options.over_m),
         (size > WRONG_PLACE_M).sum().cast(pl.Int64).alias("wrong_places"),
         pl.col("reference_sigma_m").filter(good).median().alias("reference_sigma_p50_m"),
@@ -235,7 +241,10 @@ def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
     """The table with the limits of confidence, null where none are told."""
-    groups = {} if part is None else part.partition_by(by, as_dict=True, maintain_order=True)
+    groups = {}
+    if part is not None:
+        kept = part.select(*by, "error", "observed", "has", "block")
+        groups = kept.partition_by(by, as_dict=True, maintain_order=True, include_key=False)
     rows: list[dict[str, Any]] = []
     for key in table.select(by).iter_rows():
         if key not in groups:

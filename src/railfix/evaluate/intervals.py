@@ -6,7 +6,7 @@ from typing import Final
 
 import polars as pl
 
-from railfix.evaluate.figures import POSITIONS, largest_first, positioned
+from railfix.evaluate.figures import POSITIONS, at_largest, positioned
 
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
@@ -77,12 +77,12 @@ def _of_position(epochs: pl.DataFrame, position: str, by: list[str]) -> pl.DataF
         interval_p95_m=ran.quantile(0.95, "linear"),
         interval_p99_m=ran.quantile(0.99, "linear"),
         interval_max_m=ran.max(),
-        interval_max_from=pl.when(ran.count() > 0).then(largest_first("start", "interval").first()),
-        interval_max_chainage_m=pl.when(ran.count() > 0).then(largest_first("place", "interval").first()),
+        interval_max_from=pl.when(ran.count() > 0).then(at_largest("start", "interval")),
+        interval_max_chainage_m=pl.when(ran.count() > 0).then(at_largest("place", "interval")),
         gap_p50_s=pl.col("gap").quantile(0.5, "linear"),
         gap_p95_s=pl.col("gap").quantile(0.95, "linear"),
         gap_max_s=pl.col("gap").max(),
-        gap_max_from=largest_first("start", "gap").first(),
+        gap_max_from=at_largest("start", "gap"),
     )
     whole = edges.join(found, on=by, how="left", maintain_order="left")
     counts = pl.col("intervals", "standing").fill_null(0)
