@@ -59,9 +59,11 @@ def one_a_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> In
         Rows in rising order.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
     while len(rows) > points:
-        at = np.stack([np.floor(x[rows] / cell), np.floor(y[rows] / cell)], axis=1)
-        _, first = np.unique(at, axis=0, return_index=True)
+        # rows and columns of the grid as one number each cell
+        across, up = ((v[rows] / cell).astype(np.int64) for v in (x - left, y - low))
+        _, first = np.unique(across * (int(up.max()) + 1) + up, return_index=True)
         rows = rows[np.sort(first)]
         cell *= 1.5
     return rows

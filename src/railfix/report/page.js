@@ -211,7 +211,7 @@
   };
 
   function canvasPen(canvas, width, height) {
-    const ratio = printing ? 2.5 : Math.max(2, Math.min(3, window.devicePixelRatio || 1));
+    const ratio = printing ? 2 : Math.max(2, Math.min(3, window.devicePixelRatio || 1));
     canvas.width = Math.round(width * ratio);
     canvas.height = Math.round(height * ratio);
     canvas.style.height = height + "px";
@@ -458,7 +458,7 @@
     let from = null;
     const at = event => { const r = canvas.getBoundingClientRect(); return [event.clientX - r.left, event.clientY - r.top]; };
     canvas.addEventListener("pointerdown", function (event) {
-      if (event.pointerType === "mouse" && event.button === 0) { from = at(event); canvas.setPointerCapture(event.pointerId); }
+      if (event.pointerType === "mouse" && event.button === 0) { from = at(event); if (event.isTrusted) canvas.setPointerCapture(event.pointerId); }
     });
     canvas.addEventListener("pointermove", function (event) {
       const [x, y] = at(event);

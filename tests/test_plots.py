@@ -1,0 +1,308 @@
+"""Charts: what goes into them by hand-worked cases, what thinning keeps, and that each can be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from matplotlib.figure import Figure
+
+from railfix import plots
+from railfix.geodesy import ecef_from_geodetic
+from railfix.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, Ranges, SkyEpochs
+from railfix.plots.columns import nice_step
+from railfix.plots.thinning import extremes, one_a_cell, spread
+from railfix.reasons import Reason
+from railfix.screens import Cn0Limits
+
+pytestmark = pytest.mark.requirement("D3")
+
+START = np.datetime64("2024-03-05T03:10:00", "ns")
+
+
+def times(seconds: Any) -> np.ndarray:
+    return START + (np.asarray(seconds) * 1e9).astype("timedelta64[ns]")
+
+
+def layer(chart: Chart, kind: type, label: str = "") -> Any:
+    """The layer of a kind and, where one is given, a label."""
+    (found,) = [one for one in chart.layers if isinstance(one, kind) and label in ("", one.label)]
+    return found
+
+
+@pytest.fixture
+def errors() -> pl.DataFrame:
+    """Five epochs; the fourth has no position on the map, the fifth a reference that is too bad."""
+    return pl.DataFrame(
+        {
+            "time_gpst": times([0.0, 1.0, 2.0, 3.0, 4.0]),
+            "status": ["ok", "ok", "ok", "too_few_satellites", "ok"],
+            "chainage_m": [10.0, 20.0, 30.0, 40.0, 50.0],
+            "error_m": [0.5, -1.0, 2.0, None, 9.0],
+            "conventional_error_m": [1.5, -3.0, None, 4.0, 9.0],
+            "along_sigma_m": [1.0, 1.1, 1.2, None, 1.3],
+            "protection_level_m": [5.0, float("inf"), 1.5, None, 6.0],
+            "reference_good": [True, True, True, True, False],
+            "interval_m": [None, 10.0, 10.0, None, 20.0],
+            "conventional_interval_m": [None, 10.0, None, 20.0, 10.0],
+        }
+    )
+
+
+@pytest.fixture
+def positions() -> pl.DataFrame:
+    """A straight line to the north, a position a second and 10 m apart, the third off it to the east."""
+    latitude = 35.0 + np.arange(5) * 10.0 / 110_941.0
+    ecef = ecef_from_geodetic(latitude, np.full(5, 135.0), np.full(5, 50.0))
+    aside = ecef_from_geodetic(latitude, np.full(5, 135.0 + 5.0 / 91_288.0), np.full(5, 50.0))
+    return pl.DataFrame(
+        {
+            "time_gpst": times(np.arange(5)),
+            "antenna": ["front"] * 5,
+            "status": ["ok", "ok", "uncertain", "ok", "ok"],
+            "chainage_m": np.arange(5) * 10.0,
+            "kilometrage_m": 1000.0 + np.arange(5) * 10.0,
+            **{f"{axis}_m": ecef[:, i] for i, axis in enumerate("xyz")},
+            **{f"conventional_{axis}_m": aside[:, i] for i, axis in enumerate("xyz")},
+            "conventional_chainage_m": [0.0, 11.0, None, 29.0, 40.0],
+            "n_used": [8, 7, 4, 8, 9],
+            "n_rejected": [1, 2, 5, 1, 0],
+        }
+    )
+
+
+@pytest.fixture
+def observations() -> pl.DataFrame:
+    """Two epochs of three satellites; one has a second signal, one is refused."""
+    taken, other = 0, int(Reason.OTHER_SIGNAL_TAKEN)
+    mask = int(Reason.ELEVATION_MASK | Reason.CN0_FLOOR)
+    rows = [("G01", "1C", taken, 40.0, 90.0, 45.0), ("G01", "2W", other, 40.0, 90.0, 30.0)]
+    rows += [("E05", "1C", mask, 12.0, 359.5, 28.0), ("J02", "1C", taken, 80.0, 10.0, None)]
+    table = pl.DataFrame(
+        rows, schema=["satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"], orient="row"
+    )
+    return pl.concat([table.with_columns(pl.lit(t).alias("time_gpst")) for t in times([0.0, 1.0])])
+
+
+def test_errors_are_drawn_where_they_are_known_and_the_reference_is_good(errors: pl.DataFrame) -> None:
+    over_time, over_chainage = plots.error_over_time(errors), plots.error_over_chainage(errors)
+    assert over_time.start == START
+    assert over_chainage.start is None
+    for chart, x in ((over_time, [0.0, 1.0, 2.0]), (over_chainage, [10.0, 20.0, 30.0])):
+        on_map = layer(chart, Points, "on the map")
+        np.testing.assert_array_equal(on_map.x, x)
+        np.testing.assert_array_equal(on_map.y, [0.5, -1.0, 2.0])
+        np.testing.assert_array_equal(on_map.epoch_s, [0.0, 1.0, 2.0])
+        np.testing.assert_array_equal(layer(chart, Points, "conventional").y, [1.5, -3.0, 4.0])
+        band = layer(chart, Band)
+        known = np.isfinite(band.high)
+        np.testing.assert_array_equal(band.high[known], [1.0, 1.1, 1.2, 1.3])
+        np.testing.assert_array_equal(band.low, -band.high)
+        level = layer(chart, Line, "± protection level")
+        assert set(level.y[np.isfinite(level.y)]) == {5.0, 1.5, 6.0}
+    assert "60.0 % of the epochs" in over_time.caption
+
+
+def test_a_few_huge_errors_do_not_press_the_rest_flat() -> None:
+    error = np.concatenate([np.linspace(-2.0, 2.0, 999), [66.0]])
+    table = pl.DataFrame({"time_gpst": times(np.arange(1000)), "chainage_m": np.arange(1000.0), "error_m": error})
+    chart = plots.error_over_time(table)
+    assert chart.y_scale == "symlog"
+    assert chart.y_linear == 2.0
+    assert layer(chart, Points, "on the map").y.max() == 66.0
+    assert plots.error_over_time(table.head(999)).y_scale == "linear"
+
+
+def test_ranges_of_runs(errors: pl.DataFrame) -> None:
+    chart = plots.error_ranges({"a": errors, "b": errors.with_columns(error_m=pl.lit(None, dtype=pl.Float64))})
+    on_map, conventional = layer(chart, Ranges, "on the map"), layer(chart, Ranges, "conventional")
+    assert on_map.names == ("a, on the map", "a, conventional", "b, on the map", "b, conventional")
+    np.testing.assert_array_equal(on_map.low, [-1.0, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(on_map.mid, [0.5, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(on_map.high, [2.0, np.nan, np.nan, np.nan])
+    np.testing.assert_allclose(conventional.mid, [np.nan, 2.5 / 3.0, np.nan, 2.5 / 3.0])
+
+
+def test_stanford_counts_by_hand() -> None:
+    error = [1.0, -5.0, 12.0, 3.0, 25.0, np.nan, 1.0]
+    level = [4.0, 4.0, 30.0, np.inf, 8.0, 5.0, np.nan]
+    chart = plots.stanford(error, level, 20.0)
+    assert layer(chart, Cells).counts.sum() == 5
+    for part in (
+        "5 epochs with a level",
+        "available 3 (60.000 %)",
+        "level over the alarm limit 2",
+        "misleading: error over the level 2",
+        "hazardous: error over the alarm limit, level under it 1",
+    ):
+        assert part in chart.caption
+    # 1 m error under a level of 4 m: fifth cell across, seventeenth up, of cells 0.25 m wide
+    assert layer(chart, Cells).counts[4, 16] == 1
+
+
+def test_plan_in_metres(positions: pl.DataFrame) -> None:
+    chart = plots.plan(positions)
+    assert chart.equal
+    good = layer(chart, Points, "ok (4)")
+    np.testing.assert_allclose(good.y, [-20.0, -10.0, 10.0, 20.0], atol=0.01)
+    np.testing.assert_allclose(good.x, 0.0, atol=0.01)
+    np.testing.assert_allclose(layer(chart, Points, "uncertain (1)").y, 0.0, atol=0.01)
+    np.testing.assert_allclose(layer(chart, Points, "conventional").x, 5.0, atol=0.01)
+    np.testing.assert_allclose(layer(chart, Line).y, [-20.0, -10.0, 0.0, 10.0, 20.0], atol=0.01)
+    assert set(layer(chart, Marks).words) <= {f"{k:,} m" for k in range(1000, 1041)}
+    sized = plots.plan(positions, error_m=np.array([0.1, -1.5, 3.0, np.nan, -80.0]))
+    counts = {one.label for one in sized.layers if isinstance(one, Points)}
+    assert counts == {
+        "conventional", "no reference (1)", "from 0 to 1 m (1)", "from 1 to 2 m (1)", "from 2 to 5 m (1)",
+        "10 m and more (1)",
+    }  # fmt: skip
+    nowhere = positions.with_columns(pl.lit(None, dtype=pl.Float64).alias(f"{axis}_m") for axis in "xyz")
+    assert plots.plan(nowhere).empty
+
+
+def test_intervals_of_the_reference_and_of_the_positions(errors: pl.DataFrame, positions: pl.DataFrame) -> None:
+    chart = plots.interval_over_chainage(errors)
+    np.testing.assert_array_equal(layer(chart, Points, "on the map").x, [20.0, 30.0, 50.0])
+    np.testing.assert_array_equal(layer(chart, Points, "on the map").y, [10.0, 10.0, 20.0])
+    np.testing.assert_array_equal(layer(chart, Points, "conventional").y, [10.0, 20.0, 10.0])
+    alone = plots.interval_over_chainage(positions)
+    np.testing.assert_array_equal(layer(alone, Points, "conventional").y, [11.0, 18.0, 11.0])
+    assert "Without a reference" in alone.caption
+    bars = layer(plots.interval_distribution(errors), Bars, "on the map")
+    # classes of 0.5 m; the positions on the map have the right half of each
+    filled = bars.height > 0
+    assert bars.left[filled].tolist() == [10.25, 20.25]
+    assert bars.height[filled].tolist() == [2.0, 1.0]
+
+
+def test_time_an_epoch() -> None:
+    chunks = {
+        "first_epoch_gpst": [str(t) for t in times([0.0, 60.0])],
+        "epochs": [100, 50],
+        "positioning_s": [0.2, 0.3],
+    }
+    chart = plots.processing_time(chunks)
+    np.testing.assert_allclose(layer(chart, Points).y, [2.0, 6.0])
+    np.testing.assert_allclose(layer(chart, Points).x, [0.0, 60.0])
+    assert "3.333 ms an epoch" in chart.caption
+
+
+def test_cn0_over_elevation(observations: pl.DataFrame) -> None:
+    charts = plots.cn0_over_elevation(observations, limits=Cn0Limits(floor_dbhz=30.0), mask_deg=20.0)
+    assert sorted(chart.title for chart in charts) == [
+        "C/N0 over elevation: GPS, 1C",
+        "C/N0 over elevation: Galileo, 1C",
+    ]
+    (gps,) = [chart for chart in charts if "GPS" in chart.title]
+    counts = layer(gps, Cells).counts
+    assert counts.sum() == counts[40, 70] == 2
+    assert {one.label for one in gps.layers} >= {"floor 30 dB-Hz", "mask 20 deg", "observations"}
+
+
+def test_sky_has_each_satellite_once(observations: pl.DataFrame) -> None:
+    sky = plots.sky_epochs(observations)
+    assert sky.epoch_s.tolist() == [0.0, 1.0]
+    assert sky.first.tolist() == [0, 3, 6]
+    rows = slice(0, 3)
+    assert dict(zip(sky.satellite[rows].tolist(), sky.signal[rows].tolist(), strict=True)) == {
+        "E05": "1C", "G01": "1C", "J02": "1C",
+    }  # fmt: skip
+    reasons = dict(zip(sky.satellite[rows].tolist(), sky.reason[rows].tolist(), strict=True))
+    assert reasons == {"E05": "elevation_mask", "G01": "used", "J02": "used"}
+    axes = plots.draw_sky(sky, times(0.8))
+    assert "03:10:01" in axes.get_title()
+    assert {text.get_text().split("\n")[0] for text in axes.texts} == {"E05", "G01", "J02"}
+
+
+def test_sky_is_thinned_and_keeps_the_epochs_that_are_wanted(observations: pl.DataFrame) -> None:
+    many = pl.concat([observations.head(4).with_columns(pl.lit(t).alias("time_gpst")) for t in times(np.arange(100.0))])
+    sky = plots.sky_epochs(many, epochs=20, wanted=times([33.0, 77.0]))
+    assert 18 <= len(sky.epoch_s) <= 20
+    assert {0.0, 33.0, 77.0, 99.0} <= set(sky.epoch_s.tolist())
+    assert "of 100 epochs" in sky.caption
+    nothing = plots.sky_epochs(observations.clear())
+    assert nothing.empty
+    with pytest.raises(ValueError, match="no satellites"):
+        plots.draw_sky(nothing, START)
+
+
+@pytest.mark.parametrize("thin", [extremes, spread])
+def test_thinning_keeps_the_extremes(thin: Callable[..., np.ndarray]) -> None:
+    random = np.random.default_rng(7)
+    x, y = np.sort(random.uniform(0.0, 1000.0, 50_000)), random.normal(size=50_000)
+    y[[123, 40_000]] = [-90.0, 80.0]
+    y[::7] = np.nan
+    y[[123, 40_000]] = [-90.0, 80.0]
+    rows = thin(x, y, points=3000)
+    assert len(rows) <= 3000
+    assert np.isfinite(y[rows]).all()
+    assert (np.diff(rows) > 0).all()
+    assert {123, 40_000} <= set(rows.tolist())
+    # the largest of every hundredth of the span is among what is left
+    for piece in range(100):
+        inside = np.flatnonzero((x >= 10.0 * piece) & (x < 10.0 * (piece + 1)) & np.isfinite(y))
+        assert y[np.intersect1d(rows, inside)].max() == y[inside].max()
+    few = thin(x[:100], y[:100])
+    np.testing.assert_array_equal(few, np.flatnonzero(np.isfinite(y[:100])))
+
+
+def test_one_a_cell_leaves_no_cell_empty() -> None:
+    random = np.random.default_rng(8)
+    x, y = random.uniform(-5.0, 5.0, (2, 20_000))
+    rows = one_a_cell(x, y, cell=1.0, points=150)
+    assert 100 <= len(rows) <= 150
+    cells = {(int(a), int(b)) for a, b in zip((x[rows] - x.min()) // 1.0, (y[rows] - y.min()) // 1.0, strict=True)}
+    assert len(cells) == len(rows) == 100
+    assert len(one_a_cell(np.array([np.nan]), np.array([1.0]), cell=1.0)) == 0
+
+
+@pytest.mark.parametrize(("rough", "nice"), [(0.9, 1.0), (1.0, 1.0), (1.1, 2.0), (23.0, 50.0), (0.03, 0.05)])
+def test_nice_steps(rough: float, nice: float) -> None:
+    assert nice_step(rough) == pytest.approx(nice)
+
+
+def test_layers_of_unequal_length_are_refused() -> None:
+    with pytest.raises(ValueError, match="lengths"):
+        Points(label="a", colour="#000000", x=np.zeros(2), y=np.zeros(3))
+    with pytest.raises(ValueError, match="shape"):
+        Cells(label="a", colour="#000000", x_edges=np.arange(3.0), y_edges=np.arange(3.0), counts=np.zeros((3, 2), int))
+
+
+def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, observations: pl.DataFrame) -> None:
+    chunks = {"first_epoch_gpst": [str(START)], "epochs": [100], "positioning_s": [0.2]}
+    figures: list[Figure] = [
+        plots.plot_plan(positions),
+        plots.plot_error_over_time(errors),
+        plots.plot_error_over_chainage(errors),
+        plots.plot_error_ranges({"run": errors}),
+        plots.plot_stanford([1.0, 2.0], [3.0, 4.0], 20.0),
+        plots.plot_interval_over_chainage(errors),
+        plots.plot_interval_distribution(errors),
+        plots.plot_satellites_over_time(positions),
+        plots.plot_processing_time(chunks),
+        *(plots.draw_figure(chart) for chart in plots.cn0_over_elevation(observations)),
+    ]
+    for figure in figures:
+        (axes,) = figure.axes
+        assert axes.get_title()
+        assert axes.has_data()
+        written = BytesIO()
+        figure.savefig(written, format="png")
+        assert written.getvalue().startswith(b"\x89PNG")
+
+
+def test_the_axes_of_a_drawing_hold_the_numbers_of_the_chart(errors: pl.DataFrame) -> None:
+    (axes,) = plots.plot_error_over_time(errors).axes
+    (on_map,) = [line for line in axes.lines if line.get_label() == "on the map"]
+    np.testing.assert_array_equal(on_map.get_ydata(), [0.5, -1.0, 2.0])
+    np.testing.assert_array_equal(np.asarray(on_map.get_xdata()), times([0.0, 1.0, 2.0]))
+
+
+def test_sky_epochs_are_of_their_type(observations: pl.DataFrame) -> None:
+    sky = plots.sky_epochs(observations, start=START - np.timedelta64(10, "s"))
+    assert isinstance(sky, SkyEpochs)
+    assert sky.epoch_s.tolist() == [10.0, 11.0]
