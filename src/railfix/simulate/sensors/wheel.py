@@ -85,7 +85,9 @@ def pulse_times_s(
     -------
     ndarray, shape (P,) [s]
     """
-    node = np.append(np.arange(0.0, duration_s, _STEP_S), duration_s)
+    # The motion's own corners are nodes too, so that without slips nothing is approximate.
+    corner = motion.time_s[(motion.time_s > 0.0) & (motion.time_s < duration_s)]
+    node = np.unique(np.concatenate([np.arange(0.0, duration_s, _STEP_S), corner, [duration_s]]))
     chainage, speed = motion.at(node)
     step = np.diff(node)
     surplus = np.abs(speed) * slip_ratio(slips, node)
