@@ -43,6 +43,7 @@ from railfix.errors import InputFileError, SettingsError
 from railfix.measurement import CodeNoise, NominalErrors
 from railfix.protection import RiskBudget
 from railfix.raim import RaimLimits
+from railfix.sbas import SbasLimits
 from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
 from railfix.section import SectionLimits
 from railfix.spp import SinglePointLimits
@@ -65,6 +66,7 @@ SCREENS: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenn
 ROOMS: Final = (
     "noise",
     "nominal",
+    "sbas_limits",
     "risk",
     "elevation",
     "cn0",
@@ -148,6 +150,10 @@ class Config(BaseModel):
     sbas : tuple of path
         Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
         one are refused. None: no SBAS.
+    sbas_prn : int or "best"
+        GEO whose messages are used; "best" is the one with the most usable fast corrections.
+    sbas_limits : SbasLimits
+        Time-outs, message type 0, what to do where degradation data are missing.
     error_model : path or None
         Errors by direction and C/N0 (``railfix error-model``): their overbounds take the place of `noise` as weights,
         and the protection level rests on them. Without it the level rests on `noise` times the scale estimated
@@ -202,6 +208,8 @@ class Config(BaseModel):
     antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
     raim: RaimLimits = Field(default_factory=RaimLimits)
     sbas: tuple[Path, ...] = ()
+    sbas_prn: int | Literal["best"] = "best"
+    sbas_limits: SbasLimits = Field(default_factory=SbasLimits)
     error_model: Path | None = None
     nominal: NominalErrors = Field(default_factory=NominalErrors)
     protection: Literal["on", "off"] = "on"

@@ -25,6 +25,7 @@ from railfix.config import Config
 from railfix.constants import CLOCK_GROUP
 from railfix.epochs import Observations
 from railfix.error_model import read_error_model
+from railfix.errors import SettingsError
 from railfix.fault_free import fault_free, protected
 from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
@@ -37,6 +38,7 @@ from railfix.raim import Outcome
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.refusals import alone_on_their_clocks, satellites_refused, whole_reason
 from railfix.results import AntennaResult, AntennaState, Floats, Protection, Raim, Result, State
+from railfix.sbas import SbasCorrections, read_sbas
 from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
 from railfix.section import SearchIndex
 from railfix.spp import SinglePoint, single_point
@@ -72,9 +74,11 @@ class EpochProcessor:
         self._channels = ChannelBook(config, navigation)
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._error_model = None if config.error_model is None else read_error_model(config.error_model)
+        self._sbas = None if not config.sbas else _opened_sbas(config)
         self._cn0_curve = None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve)
         self._klobuchar, notes = self._ionosphere()
-        self.notes = (*notes, *self._what_screens_lack())
+        said = () if self._sbas is None else self._sbas.notes
+        self.notes = (*notes, *said, *self._what_screens_lack())
         dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
         #: By status: whether coordinates come with it.
         self._has_coordinates = np.array([status in POSITIONED and status not in dropped for status in sorted(Status)])
@@ -82,6 +86,9 @@ class EpochProcessor:
 
     def _ionosphere(self) -> tuple[Floats | None, tuple[str, ...]]:
         """Klobuchar coefficients to use, and what there is to say about them."""
+        if self.config.sbas:
+            asked = f"ionosphere: {self.config.ionosphere}, troposphere: {self.config.troposphere}"
+            return None, (f"{asked} asked for, those of SBAS used in their place",)
         if self.config.ionosphere == "off":
             return None, ()
         for letter, name in (("G", "GPS"), ("J", "QZSS"), ("C", "BeiDou")):
@@ -149,7 +156,14 @@ class EpochProcessor:
         """Corrected ranges of one antenna, and what the screens of one antenna refuse."""
         channels = self._channels.of(obs)
         one = prepare(
-            obs, channels, self.config, self.navigation, self._index[name], self._klobuchar, self._error_model
+            obs,
+            channels,
+            self.config,
+            self.navigation,
+            self._index[name],
+            self._klobuchar,
+            error_model=self._error_model,
+            sbas=self._sbas,
         )
         if "elevation" in self.config.screens:
             verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)
@@ -354,6 +368,15 @@ class EpochProcessor:
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,
         )
+
+
+def _opened_sbas(config: Config) -> SbasCorrections:
+    """The corrections that the settings ask for."""
+    log = read_sbas(list(config.sbas))
+    try:
+        return SbasCorrections(log, prn=config.sbas_prn, limits=config.sbas_limits)
+    except ValueError as error:
+        raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)

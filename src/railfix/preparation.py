@@ -20,6 +20,8 @@ from railfix.measurement import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.navigation import Navigation
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import Reason
+from railfix.sbas import SbasCorrections
+from railfix.sbas_use import corrected_satellites, sbas_delays
 from railfix.screens import Screened
 from railfix.section import SearchIndex, search
 from railfix.spp import single_point
@@ -133,7 +135,9 @@ def prepare(
     navigation: Navigation,
     index: SearchIndex,
     klobuchar: Floats | None,
+    *,
     error_model: ErrorModel | None = None,
+    sbas: SbasCorrections | None = None,
 ) -> Prepared:
     """Find the satellites of the channels, correct their codes, weigh them.
 
@@ -150,6 +154,9 @@ def prepare(
         Ionospheric coefficients; None leaves the ionosphere uncorrected.
     error_model : ErrorModel, optional
         Gives the weights in place of ``config.noise``.
+    sbas : SbasCorrections, optional
+        Corrects satellites, ionosphere and troposphere in place of the models; what it has no valid
+        correction for is refused.
 
     Returns
     -------
@@ -159,7 +166,19 @@ def prepare(
     columns, satellite, signal, groups = channels.columns, channels.satellite, channels.signal, channels.groups
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
     reason = _reasons_of_codes(satellite, code)
-    states = satellite_states(obs.time, satellite, signal, code, navigation, max_age_s=config.max_ephemeris_age_s)
+    fixes = None if sbas is None else sbas.satellites(obs.time, satellite, navigation)
+    states = satellite_states(
+        obs.time,
+        satellite,
+        signal,
+        code,
+        navigation,
+        max_age_s=config.max_ephemeris_age_s,
+        record=None if fixes is None else fixes.record,
+    )
+    if fixes is not None:
+        states, refused = corrected_satellites(states, fixes)
+        reason |= np.where(reason & Reason.NOT_OBSERVED, 0, refused)
     observed = (reason & Reason.NOT_OBSERVED) == 0
     for mask, bit in (
         (states.no_record, Reason.NO_EPHEMERIS),
@@ -168,6 +187,8 @@ def prepare(
     ):
         reason[observed & mask] |= bit
     clean = code + states.clock_m - states.group_delay_m
+    if fixes is not None:
+        clean = clean + np.nan_to_num(fixes.fast_m)
     anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
     latitude, longitude, height = geodetic_from_ecef(anchor)
@@ -178,11 +199,19 @@ def prepare(
         )
     if config.troposphere == "saastamoinen":
         troposphere = saastamoinen_delay_m(latitude, height, elevation)
+    sbas_sigma = np.zeros(code.shape)
+    if sbas is not None and fixes is not None:
+        air = sbas_delays(sbas, fixes, obs.time, anchor, states.position_ecef_m, channels.frequency_hz)
+        ionosphere, troposphere, sbas_sigma = air.ionosphere_m, air.troposphere_m, air.sigma_m
+        reason |= np.where(reason & Reason.NOT_OBSERVED, 0, air.reason)
     clean = clean - ionosphere - troposphere
     if error_model is None:
         sigma, bias = code_sigma_m(cn0, elevation, noise=config.noise), np.zeros(code.shape)
     else:
-        sigma, bias = _modelled(error_model, index, anchor, elevation, azimuth, cn0, config)
+        sigma, bias = _modelled(error_model, index, anchor, elevation, azimuth, cn0)
+        if error_model.covers == "local" and sbas is None:
+            sigma = np.hypot(sigma, config.nominal.sigma_m(elevation))
+    sigma = np.hypot(sigma, sbas_sigma)
     reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
     return Prepared(
         observations=obs,
@@ -210,13 +239,10 @@ def _modelled(
     elevation: Floats,
     azimuth: Floats,
     cn0: Floats,
-    config: Config,
 ) -> tuple[Floats, Floats]:
-    """Sigma and bias of the ranges by an error model, shapes (T, K); what it does not cover comes on top."""
+    """Sigma and bias of the ranges by an error model, shapes (T, K)."""
     arc, _ = index.trajectory.nearest(anchor)
     sigma, bias = model.at(elevation, azimuth - index.trajectory.body_azimuth_deg(arc)[:, None], cn0)
-    if model.covers == "local":
-        sigma = np.hypot(sigma, config.nominal.sigma_m(elevation))
     return sigma, np.nan_to_num(bias)
 
 

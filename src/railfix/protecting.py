@@ -89,11 +89,18 @@ def protect(
         model,
         [name[0] for name in one.satellite.tolist()],
         risk=risk_of(config),
-        scale=scale if config.error_model is None else 1.0,
+        scale=_level_scale(scale, config),
         bias_m=one.bias_m,
         n_excluded=raim.excluded.sum(axis=1),
     )
     return _judged(level, config)
+
+
+def _level_scale(scale: Floats, config: Config) -> Floats | float:
+    """What the sigmas of the ranges are multiplied by: those of a model stand, those of SBAS never shrink."""
+    if config.error_model is not None:
+        return 1.0
+    return np.maximum(scale, 1.0) if config.sbas else scale
 
 
 def _judged(level: ProtectionLevel, config: Config) -> Protection:

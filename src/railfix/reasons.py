@@ -37,16 +37,26 @@ class Reason(IntFlag):
     ALONE_ON_ITS_CLOCK = 1 << 8
     #: A correction of its signal is unknown: its group delay is not broadcast, or it stands at the horizon.
     NO_CORRECTION = 1 << 9
+    #: SBAS: its mask does not have the satellite.
+    SBAS_NOT_COVERED = 1 << 10
+    #: SBAS: a fast or long-term correction, its degradation, or the issue of data that it is for is missing.
+    SBAS_NO_CORRECTION = 1 << 11
+    #: SBAS: the corrections are too old.
+    SBAS_TIMED_OUT = 1 << 12
+    #: SBAS: do not use, not monitored, too uncertain, or the GEO itself says that it must not be used.
+    SBAS_DO_NOT_USE = 1 << 13
+    #: SBAS: the ionosphere where the signal passes is not known.
+    SBAS_NO_IONOSPHERE = 1 << 14
     #: Weaker than the absolute floor of C/N0.
-    CN0_FLOOR = 1 << 10
+    CN0_FLOOR = 1 << 15
     #: Weaker than an open sky gives at its elevation.
-    CN0_CURVE = 1 << 11
+    CN0_CURVE = 1 << 16
     #: The code changed otherwise than its Doppler says.
-    DOPPLER = 1 << 12
+    DOPPLER = 1 << 17
     #: The codes of the two antennas differ otherwise than their spacing says.
-    ANTENNA_PAIR = 1 << 13
+    ANTENNA_PAIR = 1 << 18
     #: Excluded by RAIM: its own error against all others is over the limit.
-    FAULT_EXCLUDED = 1 << 14
+    FAULT_EXCLUDED = 1 << 19
 
 
 class Status(IntEnum):

@@ -113,7 +113,7 @@ def satellite_states(
     max_age_s : float, optional
         Tighter limit on the distance from toe than the records' own validity [s].
     record : ndarray of int, shape (T, M), optional
-        Rows of `navigation.kepler` to take instead of choosing, -1 for none at all: corrections
+        Rows of `navigation.kepler` to take instead of choosing, -1 to choose as ever: corrections
         hold for one issue of data (`issues.issue_records`). GLONASS is not concerned.
 
     Returns
@@ -187,18 +187,19 @@ def _fill_kepler(
 ) -> None:
     """Fill in the channels of GPS, QZSS, Galileo and BeiDou."""
     limit = _limit(table.validity, max_age_s)
-    if record is None:
-        rows, valid, future = table.lookup.find(plan.preferred, time, limit)
-    else:
-        rows = record[:, plan.kepler].T
-        valid = (rows >= 0) & (np.abs(time - table.lookup.toe[rows]) <= limit[rows])
-        future = (rows >= 0) & (table.lookup.available[rows] > time)
-    if record is None and plan.any_other:
+    rows, valid, future = table.lookup.find(plan.preferred, time, limit)
+    if plan.any_other:
         others, other_valid, other_future = table.lookup.find(plan.other, time, limit)
         # What was on the air goes before what is right after the fact.
         better = other_valid & (~valid | (future & ~other_future))
         rows, future, valid = np.where(better, others, rows), np.where(better, other_future, future), valid | better
     channels = plan.kepler
+    if record is not None:
+        asked = record[:, channels].T
+        given = asked >= 0
+        valid = np.where(given, np.abs(time - table.lookup.toe[asked]) <= limit[asked], valid)
+        future = np.where(given, table.lookup.available[asked] > time, future)
+        rows = np.where(given, asked, rows)
     found.record[:, channels] = rows.T
     found.no_record[:, channels] = (rows < 0).T
     seen = observed[:, channels].T & (rows >= 0)

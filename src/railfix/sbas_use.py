@@ -1,0 +1,127 @@
+"""What the positioning does with SBAS: corrected satellites, delays with their sigma, reasons for refusals.
+
+The sum of the variances is that of DO-229D (J.2.2), without the airborne receiver's: ``sigma_flt^2 +
+sigma_UIRE^2 + sigma_tropo^2``. What multipath and receiver add on a railway comes from elsewhere (P1 2.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.orbits import SatelliteStates
+from railfix.reasons import Reason
+from railfix.sbas import (
+    IonosphereState,
+    SatelliteCorrections,
+    SatelliteState,
+    SbasCorrections,
+    sigma_tropo_m,
+    troposphere_m,
+)
+
+Floats = NDArray[np.float64]
+Bits = NDArray[np.int64]
+
+_REASON_OF: Final = {
+    SatelliteState.OK: Reason.USED,
+    SatelliteState.GEO_STOPPED: Reason.SBAS_DO_NOT_USE,
+    SatelliteState.NO_MASK: Reason.SBAS_NO_CORRECTION,
+    SatelliteState.NOT_IN_MASK: Reason.SBAS_NOT_COVERED,
+    SatelliteState.NO_FAST: Reason.SBAS_NO_CORRECTION,
+    SatelliteState.DO_NOT_USE: Reason.SBAS_DO_NOT_USE,
+    SatelliteState.NOT_MONITORED: Reason.SBAS_DO_NOT_USE,
+    SatelliteState.TIMED_OUT: Reason.SBAS_TIMED_OUT,
+    SatelliteState.UDREI_TOO_LARGE: Reason.SBAS_DO_NOT_USE,
+    SatelliteState.NO_LONG_TERM: Reason.SBAS_NO_CORRECTION,
+    SatelliteState.IODE_MISMATCH: Reason.SBAS_NO_CORRECTION,
+    SatelliteState.NO_DEGRADATION: Reason.SBAS_NO_CORRECTION,
+    SatelliteState.NO_RANGE_RATE: Reason.SBAS_NO_CORRECTION,
+}
+#: Reason of each state of a satellite, by its number.
+REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SbasDelays:
+    """Delays and uncertainty of T epochs by K channels.
+
+    Attributes
+    ----------
+    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
+        On the channel's own carrier; NaN where unknown.
+    sigma_m : ndarray, shape (T, K) [m]
+        Root of ``sigma_flt^2 + sigma_UIRE^2 + sigma_tropo^2``; NaN where one of them is unknown.
+    reason : ndarray of int64, shape (T, K)
+    """
+
+    ionosphere_m: Floats
+    troposphere_m: Floats
+    sigma_m: Floats
+    reason: Bits
+
+
+def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
+    """Satellites moved and their clocks set by long-term corrections, and the reasons of those without.
+
+    Parameters
+    ----------
+    states : SatelliteStates
+        Of the records that the corrections are for.
+    fixes : SatelliteCorrections
+
+    Returns
+    -------
+    SatelliteStates
+    ndarray of int64, shape (T, K)
+    """
+    moved = states.position_ecef_m + np.nan_to_num(fixes.position_m)
+    clock = states.clock_m + SPEED_OF_LIGHT * np.nan_to_num(fixes.clock_s)
+    return replace(states, position_ecef_m=moved, clock_m=clock), REASONS[fixes.state]
+
+
+def sbas_delays(
+    sbas: SbasCorrections,
+    fixes: SatelliteCorrections,
+    time: NDArray[np.datetime64],
+    receiver_ecef_m: Floats,
+    satellite_ecef_m: Floats,
+    frequency_hz: Floats,
+) -> SbasDelays:
+    """Delays of the air by the grid and by DO-229D's troposphere, and the sigma of the corrected codes.
+
+    Parameters
+    ----------
+    sbas : SbasCorrections
+    fixes : SatelliteCorrections
+    time : ndarray of datetime64[ns], shape (T,)
+    receiver_ecef_m : ndarray, shape (T, 3) [m]
+        Good to some hundred metres.
+    satellite_ecef_m : ndarray, shape (T, K, 3) [m]
+    frequency_hz : ndarray, shape (K,) [Hz]
+
+    Returns
+    -------
+    SbasDelays
+    """
+    latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
+    elevation, azimuth = elevation_azimuth(satellite_ecef_m, receiver_ecef_m)
+    grid = sbas.ionosphere(time, latitude, longitude, elevation, azimuth)
+    sight = satellite_ecef_m - receiver_ecef_m[:, None, :]
+    sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
+    flt = fixes.sigma_flt_m(sbas.delta_udre(time, fixes, sight, latitude, longitude))
+    scale = (FREQUENCY_L1 / frequency_hz) ** 2
+    known = (grid.state == IonosphereState.OK) & np.isfinite(grid.sigma_uire_m)
+    variance = flt**2 + (scale * grid.sigma_uire_m) ** 2 + sigma_tropo_m(elevation) ** 2
+    unknown = np.where(known, 0, int(Reason.SBAS_NO_IONOSPHERE))
+    return SbasDelays(
+        ionosphere_m=scale * np.where(known, grid.delay_m, np.nan),
+        troposphere_m=troposphere_m(time, latitude, height, elevation),
+        sigma_m=np.sqrt(variance),
+        reason=np.where(fixes.state == SatelliteState.OK, unknown, 0).astype(np.int64),
+    )
