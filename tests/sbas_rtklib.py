@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pyrtklib5 as rtk
-from pyrtklib_orbits import instant, satellite_number
 
+from pyrtklib_orbits import instant, satellite_number
 from railfix.sbas import SbasLog
 from railfix.timescale import to_week
 
