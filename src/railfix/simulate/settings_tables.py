@@ -158,7 +158,8 @@ def _plain(value: Any) -> str:
     if value is None:
         return '"none"'
     if isinstance(value, np.datetime64):
-        return str(value.astype("datetime64[us]" if value == value.astype("datetime64[us]") else "datetime64[ns]"))
+        whole = value == value.astype("datetime64[us]")
+        return str(value.astype("datetime64[us]")) if whole else f'"{value}"'
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
