@@ -218,18 +218,6 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
     assert np.isnan(nothing.level_m[0])
 
 
-def test_pair_that_only_vouches_for_itself_has_no_effect():
-    """Two satellites of a clock of their own: alone each is useless without the other."""
-    seven = oracle.made(ARC, "GGGGGGEE", seed=6)
-    model = constrained_model(seven, oracle.LINE, ARC)
-    got = along_track_level(model, list("GGGGGGEE"), risk=HAND)
-    case = oracle.problem_on_line(seven, 0, ARC[0])
-    solved = protection_oracle.Resolved(case, 1.0)
-    pair, single = solved.without((6, 7)), solved.without((6,))
-    assert pair.sigma_m == pytest.approx(single.sigma_m, rel=1e-9)
-    assert np.isfinite(got.level_m[0])
-
-
 def test_excluded_satellites_raise_the_level():
     ranges = oracle.made(ARC, "GGGGGEEEE", seed=5)
     model = constrained_model(ranges, oracle.LINE, ARC)

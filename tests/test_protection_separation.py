@@ -1,0 +1,118 @@
+"""Every subset left out, one by one against solving again: position, sigma, distance, biases; noise scales, ties."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import protection_oracle
+import raim_oracle as oracle
+from railfix.clock_elimination import UNTIED_M
+from railfix.protection import RiskBudget, along_track_level
+from railfix.protection.separation import Separations, whole, without_constellation, without_one, without_two
+from railfix.raim import constrained_model
+
+pytestmark = pytest.mark.requirement("C2")
+
+ARC = np.array([731.0])
+SYSTEMS = [
+    ("GGGG", None),
+    ("GGGGGEEE", None),
+    ("GGGGGGEE", None),
+    ("GGGEEC", None),
+    ("GGGGEE", (0.0, 1.0)),
+    ("GGGEECC", (0.0, 0.5, UNTIED_M)),
+    ("GGGEEECCC", (0.0, 2.0, 0.7)),
+]
+
+
+def compare(
+    got: Separations,
+    column: int,
+    members: tuple[int, ...],
+    solved: protection_oracle.Resolved,
+    bias_m: np.ndarray,
+) -> bool:
+    """One subset against least squares of what is left; True where nothing determines the position."""
+    case, answer = solved.case, solved.without(members)
+    if not answer.determined:
+        assert np.isinf(got.sigma_m[0, column])
+        return True
+    distance, sigma = solved.apart(answer)
+    if answer.sigma_m > 100.0 * solved.all.sigma_m:
+        return False  # at the edge of what is determined
+    assert got.sigma_m[0, column] == pytest.approx(answer.sigma_m, rel=1e-6)
+    # A variance of the distance is a difference: it keeps half the digits.
+    assert got.separation_sigma_m[0, column] == pytest.approx(sigma, rel=1e-5, abs=1e-6)
+    assert got.moved_m[0, column] == pytest.approx(distance, rel=1e-5, abs=1e-6)
+    bias = float((np.abs(answer.operator[: len(case.channels)]) * bias_m[case.channels] / case.sigma_m).sum())
+    assert got.bias_m[0, column] == pytest.approx(bias, rel=1e-5, abs=1e-6)
+    return False
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    system=st.sampled_from(SYSTEMS),
+    scale=st.sampled_from([1.0, 0.5, 3.0]),
+    fault=st.floats(-30.0, 30.0),
+)
+@settings(max_examples=120, deadline=None)
+def test_every_subset_equals_solving_without_it(seed, system, scale, fault):
+    systems, ties = system
+    ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault, len(systems) - 1: 2.0})
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    solved = protection_oracle.Resolved(oracle.problem_on_line(ranges, 0, ARC[0]), scale)
+    n, bias = len(systems), np.random.default_rng(seed).uniform(0.0, 1.0, len(systems))
+    if solved.all.sigma_m > 50.0:
+        return
+    all_of = whole(model, np.array([scale]), bias[None])
+    assert all_of.sigma_m[0] == pytest.approx(solved.all.sigma_m, rel=1e-7)
+    singles = without_one(all_of)
+    for c in range(n):
+        compare(singles, c, (c,), solved, bias)
+    first, second = np.triu_indices(n, 1)
+    twos = without_two(all_of, first, second)
+    for k, pair in enumerate(combinations(range(n), 2)):
+        compare(twos, k, pair, solved, bias)
+    for letter in set(systems):
+        members = np.array([s == letter for s in systems])
+        got = without_constellation(model, members, all_of, bias[None])
+        compare(got, 0, tuple(np.flatnonzero(members).tolist()), solved, bias)
+
+
+def test_subsets_that_leave_no_position_are_found():
+    """Three of one clock: without two of them one is left."""
+    bias = np.zeros(3)
+    ranges = oracle.made(ARC, "GGG", seed=4)
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    solved = protection_oracle.Resolved(oracle.problem_on_line(ranges, 0, ARC[0]), 1.0)
+    first, second = np.triu_indices(3, 1)
+    twos = without_two(whole(model, np.ones(1), None), first, second)
+    assert [compare(twos, k, pair, solved, bias) for k, pair in enumerate(combinations(range(3), 2))] == [True] * 3
+
+
+def test_pair_of_a_clock_of_its_own_is_left_out_whole():
+    """Each of the two is useless without the other: both gone is the same as one gone."""
+    ranges = oracle.made(ARC, "GGGGGGEE", seed=6, faults_m={7: 25.0})
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    all_of = whole(model, np.ones(1), None)
+    pair = without_two(all_of, np.array([6]), np.array([7]))
+    one = without_one(all_of)
+    assert pair.moved_m[0, 0] == pytest.approx(one.moved_m[0, 6], rel=1e-9)
+    assert pair.sigma_m[0, 0] == pytest.approx(one.sigma_m[0, 7], rel=1e-9)
+    assert abs(pair.moved_m[0, 0]) > 0.1
+    assert np.isfinite(along_track_level(model, list("GGGGGGEE")).level_m[0])
+
+
+def test_excluded_satellites_count_among_those_that_may_be_faulty():
+    model = constrained_model(oracle.made(ARC, "GGGGGEEEE", seed=5), oracle.LINE, ARC)
+    risk = RiskBudget()
+    spent = [along_track_level(model, list("GGGGGEEEE"), risk=risk, n_excluded=e).unchecked_risk[0] for e in (0, 1, 2)]
+    prior = risk.prior(list("GGGGGEEEE"))
+    for e, value in enumerate(spent):
+        everyone = [*prior, *[prior.max()] * e]
+        assert value == pytest.approx(sum(a * b * c for a, b, c in combinations(everyone, 3)), rel=1e-9)
