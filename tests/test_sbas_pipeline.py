@@ -1,0 +1,207 @@
+"""Positions with SBAS corrections: what is corrected, what is refused and why, what the level rests on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from railfix.antenna import Trajectory
+from railfix.atmosphere import saastamoinen_delay_m
+from railfix.cli import app
+from railfix.config import Config, parse_config
+from railfix.constants import SPEED_OF_LIGHT
+from railfix.epochs import Observations
+from railfix.errors import SettingsError
+from railfix.fault_free import fault_free
+from railfix.geodesy import geodetic_from_ecef
+from railfix.navigation import Navigation
+from railfix.orbits import satellite_states
+from railfix.pipeline import AntennaResult, EpochProcessor
+from railfix.placing import place_on_line
+from railfix.protecting import level_facts, protect
+from railfix.reasons import Reason, Status
+from railfix.results import AntennaState, State
+from railfix.rinex import read_navigation, read_observations
+from railfix.sbas import SatelliteState, SbasCorrections, read_sbas
+from railfix.sbas_use import REASONS
+from railfix.spp import single_point
+from railfix.track_map import Track, write_track_csv
+from recordings_score import straight_line
+
+pytestmark = pytest.mark.requirement("C1")
+SETTINGS = {"elevation": {"mask_deg": 10.0}, "sbas_prn": 137}
+
+
+class Recording:
+    """The log of 2008 with its messages, and a level line through where it was parked."""
+
+    def __init__(self, folder: Path) -> None:
+        self.sbas = folder / "cres_20080526.bin.sbs"
+        self.front = folder / "cres_20080526.bin.obs"
+        self.nav = folder / "cres_20080526.bin.nav"
+        self.observations: Observations = read_observations(self.front)
+        self.navigation: Navigation = read_navigation([self.nav])
+        without = EpochProcessor(parse_config({}), self.navigation, {"front": self.line_at(None)})
+        found = without.process({"front": self.observations[:200]})[0].antennas["front"]
+        self.parked = np.nanmedian(found.conventional_ecef_m, axis=0)
+        self.line = self.line_at(self.parked)
+
+    def line_at(self, place: np.ndarray | None) -> Trajectory:
+        return straight_line(self.observations.header.approximate_ecef_m if place is None else place, 45.0)
+
+    def config(self, **settings: object) -> Config:
+        return parse_config({**SETTINGS, "sbas": [str(self.sbas)], **settings})
+
+    def process(self, config: Config, observations: Observations | None = None) -> AntennaResult:
+        processor = EpochProcessor(config, self.navigation, {"front": self.line})
+        return processor.process({"front": observations or self.observations})[0].antennas["front"]
+
+
+@pytest.fixture(scope="module")
+def recording(recordings: Path) -> Recording:
+    return Recording(recordings / "sbas" / "msas_20080526_crescent")
+
+
+@pytest.fixture(scope="module")
+def corrected(recording: Recording) -> AntennaResult:
+    return recording.process(recording.config())
+
+
+def test_every_state_of_a_satellite_has_a_reason() -> None:
+    assert len(REASONS) == len(SatelliteState)
+    assert [int(state) for state in SatelliteState if REASONS[state] == 0] == [SatelliteState.OK]
+
+
+def test_a_satellite_is_used_or_refused_as_its_corrections_are(recording: Recording, corrected: AntennaResult) -> None:
+    engine = SbasCorrections(read_sbas([recording.sbas]), prn=137)
+    satellite = corrected.satellite[corrected.columns]
+    fixes = engine.satellites(corrected.time, satellite, recording.navigation)
+    reason = corrected.reason[:, corrected.columns]
+    observed = (reason & Reason.NOT_OBSERVED) == 0
+    of_sbas = Reason.SBAS_NOT_COVERED | Reason.SBAS_NO_CORRECTION | Reason.SBAS_TIMED_OUT | Reason.SBAS_DO_NOT_USE
+    np.testing.assert_array_equal((reason & of_sbas)[observed], REASONS[fixes.state][observed])
+    assert (fixes.state[reason == 0] == SatelliteState.OK).all()
+    # The log begins in the middle of things: until mask, corrections and grid had come nothing could be used.
+    first = int(np.argmax((reason == 0).any(axis=1)))
+    assert 60 < first < 200
+    assert (corrected.status[:first] == Status.TOO_FEW_SATELLITES).all()
+    assert {int(r) for r in np.unique(reason & ~int(Reason.ELEVATION_MASK | Reason.FAULT_EXCLUDED))} >= {
+        0,
+        int(Reason.SBAS_NO_CORRECTION),
+        int(Reason.SBAS_DO_NOT_USE),
+        int(Reason.SBAS_NO_IONOSPHERE),
+    }
+
+
+def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, corrected: AntennaResult) -> None:
+    engine = SbasCorrections(read_sbas([recording.sbas]), prn=137)
+    columns = corrected.columns
+    satellite, code = corrected.satellite[columns], recording.observations.code_m[:, columns]
+    fixes = engine.satellites(corrected.time, satellite, recording.navigation)
+    states = satellite_states(
+        corrected.time, satellite, corrected.signal[columns], code, recording.navigation, record=fixes.record
+    )
+    place = corrected.conventional_ecef_m
+    latitude, longitude, height = geodetic_from_ecef(np.where(np.isnan(place), recording.parked, place))
+    elevation, azimuth = corrected.elevation_deg[:, columns], corrected.azimuth_deg[:, columns]
+    grid = engine.ionosphere(corrected.time, latitude, longitude, elevation, azimuth)
+    used = corrected.reason[:, columns] == 0
+    by_hand = code + states.clock_m - states.group_delay_m + fixes.fast_m + SPEED_OF_LIGHT * fixes.clock_s
+    by_hand -= grid.delay_m
+    troposphere = by_hand - corrected.corrected_code_m[:, columns]
+    # What is left is DO-229D's troposphere, within 4 % of Saastamoinen's of the same place.
+    other = saastamoinen_delay_m(latitude, height, elevation)
+    assert used.sum() > 500
+    np.testing.assert_allclose(troposphere[used], other[used], rtol=0.04, atol=0.02)
+
+
+def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResult) -> None:
+    processor = EpochProcessor(recording.config(), recording.navigation, {"front": recording.line})
+    for size in (1, 7):
+        state, parts = State(), []
+        for first in range(140, 200, size):
+            result, state = processor.process({"front": recording.observations[first : first + size]}, state)
+            parts.append(result.antennas["front"])
+        together = np.concatenate([p.corrected_code_m[:, p.columns] for p in parts])[:60]
+        np.testing.assert_allclose(
+            together, corrected.corrected_code_m[140:200][:, corrected.columns], rtol=0, atol=1e-6
+        )
+        reasons = np.concatenate([p.reason[:, p.columns] for p in parts])[:60]
+        sbas = int(sum(r for r in Reason if r.name.startswith("SBAS_")))
+        np.testing.assert_array_equal(reasons & sbas, corrected.reason[140:200][:, corrected.columns] & sbas)
+
+
+def test_the_parked_antenna_stays_where_it_is(recording: Recording, corrected: AntennaResult) -> None:
+    """Corrections of metres move a position by metres, not by more: it agrees with the uncorrected one within 15 m."""
+    plain = recording.process(parse_config({"elevation": {"mask_deg": 10.0}}))
+    both = np.isfinite(corrected.conventional_ecef_m[:, 0]) & (np.arange(len(plain)) < 200)
+    moved = np.linalg.norm(corrected.conventional_ecef_m - plain.conventional_ecef_m, axis=1)[both]
+    assert both.sum() > 20
+    assert 0.1 < np.median(moved) < 15.0
+
+
+@pytest.mark.requirement("C2")
+def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
+    recording: Recording,
+) -> None:
+    config = recording.config()
+    assert level_facts(config)["kind"] == "sbas"
+    assert set(level_facts(config)["satellite_prior"].values()) == {0.0}
+    assert level_facts(parse_config({}))["kind"] == "separation"
+    processor = EpochProcessor(config, recording.navigation, {"front": recording.line})
+    one, _ = processor._screened("front", recording.observations[180:200], AntennaState())
+    ranges = one.ranges()
+    point = single_point(ranges, one.anchor_ecef_m)
+    index = processor._index["front"]
+    place = place_on_line(ranges, index, point, config)
+    scale = np.ones(len(ranges))
+    ranges, place, raim = fault_free(ranges, index, place, scale, config.model_copy(update={"screens": ()}))
+
+    def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
+        return protect(one, ranges, index.trajectory, place.constrained, raim, scale, settings).level.level_m
+
+    has = np.isfinite(levels(scale, config))
+    assert has.any()
+    np.testing.assert_array_equal(levels(0.3 * scale, config), levels(scale, config))
+    assert (levels(3.0 * scale, config)[has] > levels(scale, config)[has]).all()
+    plain = config.model_copy(update={"sbas": ()})
+    assert (levels(0.3 * scale, plain)[has] < levels(scale, plain)[has]).all()
+    assert np.nanmin(one.sigma_m[one.reason == 0]) > 1.0
+
+
+def test_a_geo_that_the_log_does_not_have_is_refused(recording: Recording) -> None:
+    with pytest.raises(SettingsError, match="sbas_prn = 120"):
+        EpochProcessor(recording.config(sbas_prn=120), recording.navigation, {"front": recording.line})
+
+
+def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording, tmp_path: Path) -> None:
+    latitude, longitude, height = geodetic_from_ecef(recording.line.ecef_m)
+    write_track_csv(Track.from_geodetic(latitude, longitude, height, name="parked"), tmp_path / "line.csv")
+    command = [
+        "run",
+        "--front",
+        str(recording.front),
+        "--nav",
+        str(recording.nav),
+        "--track",
+        str(tmp_path / "line.csv"),
+    ]
+    command += ["--set", "elevation.mask_deg=10"]
+    done = CliRunner().invoke(app, [*command, "--sbas", str(recording.sbas), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 0, done.output
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["settings_asked"]["sbas"] == [str(recording.sbas)]
+    assert {entry["input"] for entry in record["inputs"]} == {"front", "nav", "track", "sbas"}
+    assert record["protection"]["kind"] == "sbas"
+    said = " ".join(record["notes"])
+    assert "klobuchar, troposphere: saastamoinen asked for, those of SBAS used in their place" in said
+    assert "best SBAS PRN by usable fast corrections: 137" in said
+    assert record["antennas"]["front"]["observations_refused_by_first_reason"]["sbas_no_correction"] > 1000
+    missing = CliRunner().invoke(app, [*command, "--sbas", "nowhere.sbs", "--out", str(tmp_path / "other")])
+    assert missing.exit_code == 3
+    assert "nowhere.sbs" in missing.output
+    assert not (tmp_path / "other").exists()
