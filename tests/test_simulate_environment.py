@@ -348,6 +348,70 @@ def test_a_bridge_covers_what_is_overhead() -> None:
     assert got.cn0_db[1, 0] == pytest.approx(0.0, abs=0.01)
 
 
+def test_a_shadowed_signal_comes_round_the_edge() -> None:
+    """1 m in the shadow at 20 m: the way over the edge is 1 / (2 * 20) m = 25 mm longer, v = 0.725, 12 dB weaker."""
+    elevation = 30.0
+    height = 4.0 + 20.0 * np.sin(np.radians(elevation)) + 1.0 / np.cos(np.radians(elevation))
+    row = wall("right", 20.0 * np.cos(np.radians(elevation)), height, reflection=0.0)
+    got = environment(row)(seen(500.0, elevation, 90.0))
+    assert got.code_m[0, 0] == pytest.approx(0.025, abs=0.002)
+    assert got.cn0_db[0, 0] == pytest.approx(float(decibel(edge_amplitude(np.array(0.725)))), abs=0.1)
+    assert -13.0 < got.cn0_db[0, 0] < -11.0
+
+
+def test_too_weak_a_signal_is_lost() -> None:
+    """Clear 34 + 16 sin 20 = 39.5 dB-Hz; 20 dB less through a roof is tracked at 15 dB-Hz, not at 25."""
+    roof = RoofSettings(sides="right", length_m=(1e5, 1e5), gap_m=(0.0, 0.0), loss_db=20.0)
+    for threshold, lost in ((15.0, False), (25.0, True)):
+        settings = replace(
+            BARE, sections=(section(roofs=(roof,)),), receiver=CorrelatorSettings(tracking_cn0_dbhz=threshold)
+        )
+        got = Environment(settings, line_length_m=LINE_M, seed=1)(seen(500.0, [20.0, 20.0], [90.0, -90.0]))
+        assert np.isnan(got.code_m[0]).tolist() == [lost, False]
+
+
+def test_a_house_in_front_hides_the_reflection_of_a_tower_behind() -> None:
+    """A tower 40 m off reflects at 40 m up (45 deg); a house 10 m off stands in the way if it is over 14 m high."""
+    tower = wall("right", 40.0, 100.0, reflection=0.5)
+    for height, heard in ((10.0, True), (30.0, False)):
+        house = replace(wall("right", 10.0, height), reflection=(0.0, 0.0))
+        got = environment(house, tower)(seen(500.0, 45.0, -90.0))
+        assert (abs(got.cn0_db[0, 0]) > 0.3) == heard
+
+
+def test_the_ground_reflects_from_below() -> None:
+    """2 h sin el: 8 m sin 10 = 1.389 m from ballast, 2 * 2.9 sin 10 = 1.007 m from a platform; 0.5 by 6 dB."""
+    receiver = CorrelatorSettings(backward_db=6.0206)
+    for kind, extra in (("open", 1.389), ("station", 1.007)):
+        only = SectionSettings(from_m=0.0, to_m=LINE_M, kind=kind, rows=(), roofs=())  # type: ignore[arg-type]
+        settings = EnvironmentSettings(
+            sections=(only,), ground_reflection=0.5, ground_roughness_m=0.0, receiver=receiver
+        )
+        got = Environment(settings, line_length_m=LINE_M, seed=1)(seen(500.0, 10.0, 90.0))
+        field = 1.0 - 0.25 * np.exp(-2j * np.pi * extra / WAVE)
+        # 1 mm of the extra path is 0.07 dB at most.
+        assert got.cn0_db[0, 0] == pytest.approx(float(decibel(field)), abs=0.1)
+        # Shorter than half the spacing: c D / (1 + c), c in phase with the sum.
+        phase = np.real(np.conj(field) * (field - 1.0)) / np.real(np.conj(field))
+        assert got.code_m[0, 0] == pytest.approx(phase * extra, abs=0.02)
+
+
+def test_faster_codes_suffer_less() -> None:
+    """A reflection 57 m late lies beyond a chip of 29.3 m (BeiDou B3I), not beyond one of 293 m (GPS C/A)."""
+    geometry = seen(500.0, [45.0, 45.0], [-90.0, -90.0])
+    named = replace(geometry, satellite=np.array(["G01", "C21"]), signal=np.array(["1C", "6I"]))
+    got = environment(wall("right", 40.0, 100.0, reflection=0.6))(named)
+    assert abs(got.code_m[0, 0]) > 0.5
+    assert got.code_m[0, 1] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_rough_face_reflects_less() -> None:
+    """2 cm uneven, hit at 45 deg: g = 4 pi 0.02 cos 45 / 0.1903 = 0.934, amplitude exp(-0.436) = 0.647."""
+    rough = replace(wall("right", 20.0, 100.0), roughness_m=(0.02, 0.02))
+    row = built((section(rough),), LINE_M, 1).faces[0]
+    assert mirrored(row, rays(500.0, 45.0, -90.0)).amplitude[0] == pytest.approx(0.8 * 0.647, abs=1e-3)
+
+
 # Masts, beams, wires -------------------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""Edges and strips in the way of a plane wave (ITU-R P.526-15, section 4; Born & Wolf, 8.3 and 8.7)."""
+"""Edges and strips in the way of a plane wave (ITU-R P.526-15, section 4.1; Born & Wolf, chapter 8)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scipy.special import fresnel
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-#: Below this the loss of an edge is 0 by ITU-R P.526-15, equation (31).
+#: Below this the loss of an edge is 0 by the formula of ITU-R P.526-15, 4.1.
 CLEAR_V: Final = -0.78
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Fresnel parameter of a clearance of 1 m, the source infinitely far (P.526-15, equation (26)).
+    """Fresnel parameter of a clearance of 1 m, the source infinitely far (P.526-15, 4.1).
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
 
 
 def edge_amplitude(v: Floats) -> Floats:
-    """Amplitude behind a knife edge of Fresnel parameter v, positive in the shadow (P.526-15, equation (31)).
+    """Amplitude behind a knife edge of Fresnel parameter v, positive in the shadow (P.526-15, 4.1).
 
     ``J(v) = 6.9 + 20 log10(sqrt((v - 0.1)^2 + 1) + v - 0.1)`` dB above v = -0.78, else none.
     """
@@ -61,7 +61,7 @@ def strip_field(v: Floats, width_v: Floats) -> Complexes:
 def roughness_loss(roughness_m: Floats, cosine: Floats, wavelength_m: Floats) -> Floats:
     """Amplitude of the mirrored wave left by an uneven face: exp(-g^2/2), g = 4 pi sigma cos(incidence)/lambda.
 
-    ITU-R P.526-15 has it for the ground (Ament 1953).
+    Ament (1953), Proc. IRE 41, 142; the criterion of Rayleigh is g of about 1.6.
     """
     g = 4.0 * np.pi * roughness_m * cosine / wavelength_m
     return np.exp(-0.5 * g * g)

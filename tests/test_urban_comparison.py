@@ -1,0 +1,63 @@
+"""The simulated cities stay in the class of the recorded ones: figures within stated bounds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from urban_comparison import Sample, cn0_by_elevation, figures, simulated, weighted_median
+from urban_comparison import recordings as recorded_cities
+
+pytestmark = pytest.mark.requirement("D4")
+
+
+@pytest.fixture(scope="module")
+def urban() -> Sample:
+    return simulated("urban")
+
+
+def test_the_urban_railway_keeps_its_figures(urban: Sample) -> None:
+    """docs/simulator-multipath.md prints them: 0.9 m, 33 m, 9 % over 20 m, nearly all of them late, 94 % tracked."""
+    f = figures(urban)
+    assert f.codes > 50_000
+    assert 0.7 < f.p50_m < 1.2
+    assert 20.0 < f.p95_m < 45.0
+    assert 0.06 < f.over_20_m < 0.13
+    assert f.late_over_20_m > 8.0 * f.early_over_20_m
+    assert 0.90 < f.tracked < 0.97
+
+
+def test_c_n0_falls_by_blockage_more_at_low_elevations(urban: Sample) -> None:
+    clear, city = cn0_by_elevation(simulated("none")), cn0_by_elevation(urban)
+    loss = clear - city
+    # Mean loss at 20 to 30 deg and at 60 to 70 deg; the weakest twentieth at 20 to 30 deg.
+    assert 3.0 < loss[2, 0] < 8.0
+    assert 0.2 < loss[6, 0] < 3.0
+    assert 14.0 < loss[2, 1] < 22.0
+
+
+def test_kinds_differ_as_their_names_say(urban: Sample) -> None:
+    none, suburban, canyon = (figures(simulated(kind)) for kind in ("none", "suburban", "canyon"))
+    assert none.over_20_m < 0.001
+    assert none.tracked == 1.0
+    assert none.over_20_m < suburban.over_20_m < 0.02
+    assert canyon.p50_m > 1.5 * figures(urban).p50_m
+    assert canyon.tracked < figures(urban).tracked < suburban.tracked
+
+
+def test_it_is_the_class_of_the_recorded_cities(urban: Sample, recordings: Path) -> None:
+    """Share of codes over 20 m: within a factor of two of Hong Kong's, and as one-sided."""
+    ours = figures(urban)
+    for sample in recorded_cities(recordings)[:2]:
+        theirs = figures(sample)
+        assert 0.5 < theirs.over_20_m / ours.over_20_m < 2.0
+        assert 0.5 < theirs.p95_m / ours.p95_m < 2.5
+        assert theirs.late_over_20_m > 8.0 * theirs.early_over_20_m
+
+
+def test_the_weighted_median_is_the_middle_by_weight() -> None:
+    value = np.array([[3.0, 1.0, np.nan, 10.0], [np.nan] * 4, [5.0, 6.0, 7.0, 100.0]])
+    weight = np.array([[1.0, 1.0, 9.0, 3.0], [1.0] * 4, [1.0, 1.0, 1.0, np.nan]])
+    assert weighted_median(value, weight) == pytest.approx([10.0, np.nan, 6.0], nan_ok=True)
