@@ -13,10 +13,16 @@ import pytest
 from typer.testing import CliRunner
 
 import synthetic
+from conftest import ROOT
 from railfix.antenna import Trajectory
 from railfix.cli import app
+from railfix.demonstration import demo_inputs
 from railfix.errors import InputFileError, MismatchError, SettingsError
 from railfix.evaluate import (
+    EPOCH_COLUMNS,
+    FIGURE_COLUMNS,
+    INTERVAL_COLUMNS,
+    LEVEL_COLUMNS,
     EvaluationOptions,
     RunAndReference,
     TrackFiles,
@@ -27,6 +33,7 @@ from railfix.evaluate.blocks import block_limits
 from railfix.evaluate.epochs import travelled, with_missing
 from railfix.evaluate.sections import read_sections
 from railfix.reference_log import AntennaReference, write_reference
+from railfix.run import run_files
 from railfix.timescale import timedelta
 from railfix.track_map import Track, read_track, write_track_csv
 
@@ -382,11 +389,15 @@ def test_a_campaign_by_configuration(tmp_path: Path):
         assert found.figure("std_m", **where) == pytest.approx(1.0, abs=1e-6)
         assert found.figure("lowest_m", **where) == pytest.approx(lowest, abs=1e-6)
         assert found.figure("highest_m", **where) == pytest.approx(highest, abs=1e-6)
-    assert found.figure("epochs", grouping="line") == 400
-    assert found.figure("mean_m", run="all") == pytest.approx(2.5, abs=1e-6)
+    for grouping, group in (("line", "straight"), ("environment", "unknown"), ("speed", "20 to 60 km/h")):
+        where = {"grouping": grouping, "group": group, "run": "all", "configuration": "p1; systems: G J"}
+        assert found.figure("epochs", **where) == 200
+        assert found.figure("mean_m", **where) == pytest.approx(2.0, abs=1e-6)
+    # Nothing is told of different configurations together: they may be of one log.
+    assert found.figures.filter(run="all", configuration="all").is_empty()
     assert found.figure("mean_m", run="day1/G") == pytest.approx(4.0, abs=1e-6)
     # Blocks of different runs are different blocks, though they have the same times.
-    assert found.figure("blocks", run="all") == 8
+    assert found.figure("blocks", grouping="configuration", group="p1; systems: G") == 4
     pooled = found.intervals.filter(run="all", configuration="p1; systems: G", position="constrained")
     assert pooled["intervals"].item() == 198  # nothing from one run to the next
     assert pooled["interval_max_m"].item() == pytest.approx(10.0, abs=1e-6)
@@ -425,7 +436,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
         arguments += ["--reference", str(file)]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    assert "By configuration, all runs" in result.output
+    assert "By configuration, its runs together" in result.output
     assert "65.80" in result.output
     assert "+3.00" in result.output
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
@@ -521,3 +532,24 @@ def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
     write_reference(log.parent / "truth.csv", reference(time, 10.0 * time))
     with pytest.raises(InputFileError, match=r"truth\.csv and reference\.csv"):
         evaluate_run(run)
+
+
+def test_the_document_names_every_column():
+    text = (ROOT / "docs" / "evaluation.md").read_text()
+    for columns in (EPOCH_COLUMNS, FIGURE_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS):
+        for name, meaning in columns.items():
+            assert f"| `{name}` | {meaning} |" in text
+
+
+def test_the_document_shows_what_the_demonstration_gives(tmp_path: Path):
+    run_files(demo_inputs(), out=tmp_path / "run")
+    found = evaluate_run(tmp_path / "run")
+    text = (ROOT / "docs" / "evaluation.md").read_text()
+    for antenna in ("front", "rear"):
+        for position, name in (("constrained", "on the map"), ("conventional", "conventional")):
+            rate, mean, *others = (
+                found.figure(figure, antenna=antenna, position=position)
+                for figure in ("rate", "mean_m", "std_m", "p50_m", "p95_m", "max_m")
+            )
+            told = " | ".join([f"{100 * rate:.2f} %", f"{mean:+.2f}", *(f"{value:.2f}" for value in others)])
+            assert f"| {antenna} | {name} | {told} |" in text

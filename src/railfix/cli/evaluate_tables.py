@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -15,16 +16,16 @@ from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
-#: Width that the tables need; longer lines are for a wider window.
-_WIDTH: Final = 140
+#: Width that the tables need, beside the names of runs and configurations.
+_WIDTH: Final = 150
 _NAMES: Final = {
     "constrained": "on the map",
     "constrained_ok": "  of status ok",
     "conventional": "conventional",
 }
 _GROUPINGS: Final = {
-    "configuration": "By configuration, all runs",
-    "line": "By line, all runs",
+    "configuration": "By configuration, its runs together",
+    "line": "By line, the runs of a configuration together",
     "environment": "By environment",
     "speed": "By speed",
     "satellites": "By satellites used",
@@ -38,7 +39,8 @@ _MOST_SECTIONS: Final = 20
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: Literal["nothing", "p1"]) -> None:
     """Figures of each run, then by groups, then where the files are."""
     console = Console(highlight=False)
-    console.width = max(console.width, _WIDTH)
+    names = evaluation.figures.select(pl.col("configuration", "group").str.len_chars().max()).row(0)
+    console.width = max(console.width, _WIDTH + sum(names))
     for run in evaluation.runs:
         console.print(f"{run.name}: {run.configuration}; line {run.line}", markup=False, soft_wrap=True)
         for antenna, method in run.method.items():
@@ -50,19 +52,25 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
             )
         for note in run.notes:
             console.print(f"  note: {note}", markup=False, soft_wrap=True)
-    console.print(
-        "\nErrors along the line in metres, + toward its end; [..] limits of 95 % confidence".replace(
-            "95 %", f"{100 * evaluation.options.confidence:g} %"
-        ),
-        markup=False,
-    )
-    console.print(_whole(evaluation.figures.filter(pl.col("grouping") == "all")))
+    console.print("\nErrors along the line in metres, + toward its end")
+    several = len(evaluation.runs) > 1
+    whole = evaluation.figures.filter(pl.col("grouping") == "all")
+    if several and "all" in whole["antenna"]:
+        whole = whole.filter(pl.col("antenna") == "all")
+    console.print(_whole(whole))
+    if whole["mean_low_m"].is_not_null().any():
+        options = evaluation.options
+        console.print(
+            f"Limits of {100 * options.confidence:g} % confidence, from blocks of {options.block_s:g} s drawn "
+            f"{options.replicates:,} times"
+        )
+        console.print(_limits(whole))
     console.print("Metres run and seconds passed between two positions")
-    console.print(_intervals(evaluation.intervals))
+    intervals = evaluation.intervals
+    console.print(_intervals(intervals.filter(pl.col("run") == "all") if several else intervals))
     if evaluation.levels is not None:
         console.print("Protection levels")
         console.print(_levels(evaluation.levels))
-    several = len(evaluation.runs) > 1
     for grouping, head in _GROUPINGS.items():
         rows = evaluation.figures.filter(pl.col("grouping") == grouping, pl.col("epochs_of") == "own")
         if several and grouping in ("environment", "speed"):
@@ -83,41 +91,60 @@ def _table(*heads: str, text: int) -> Table:
     """A table whose first columns are text and the others numbers."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for number, head in enumerate(heads):
-        table.add_column(head, justify="left" if number < text else "right", no_wrap=number >= text)
+        table.add_column(head, justify="left" if number < text else "right", no_wrap=True, overflow="fold")
     return table
 
 
 def _whole(rows: pl.DataFrame) -> Table:
     heads = ("epochs", "rate %", "of run %", "mean", "std", "rms", "p50", "p95", "p99", "max", "at", "wrong", "/sigma")
     table = _table("run", "antenna", "position", *heads, text=3)
+    for row in _in_order(rows):
+        table.add_row(
+            row["run"],
+            row["antenna"],
+            _NAMES[row["position"]] + (", epochs of both" if row["epochs_of"] == "common" else ""),
+            f"{row['observed'] if row['epochs_of'] == 'own' else row['positions']:,}",
+            _percent(row["rate"]),
+            _percent(row["rate_of_run"]),
+            _metres(row["mean_m"], sign="+"),
+            *(_metres(row[name]) for name in ("std_m", "rms_m", "p50_m", "p95_m", "p99_m", "max_m")),
+            _place(row["max_at_chainage_m"]),
+            f"{row['wrong_places']:,}",
+            _metres(row["normalised_rms"]),
+        )
+    return table
+
+
+def _in_order(rows: pl.DataFrame) -> Iterator[dict[str, Any]]:
+    """Rows of each run and antenna, those on common epochs only where they are not every one's own."""
     order = {name: number for number, name in enumerate(_NAMES)}
-    rows = rows.with_columns(_order=pl.col("position").replace_strict(order))
-    for run, antenna in rows.select("run", "antenna").unique(maintain_order=True).iter_rows():
-        mine = rows.filter(pl.col("run") == run, pl.col("antenna") == antenna).sort("epochs_of", descending=True)
-        for row in mine.sort("epochs_of", "_order", descending=[True, False]).iter_rows(named=True):
-            name = _NAMES[row["position"]] + (", epochs of both" if row["epochs_of"] == "common" else "")
-            table.add_row(
-                run,
-                antenna,
-                name,
-                f"{row['observed'] if row['epochs_of'] == 'own' else row['positions']:,}",
-                _percent(row["rate"]) + _limits(row, "rate", 100.0, 1),
-                _percent(row["rate_of_run"]),
-                _metres(row["mean_m"], sign="+") + _limits(row, "mean", 1.0, 2),
-                *(_metres(row[name]) for name in ("std_m", "rms_m", "p50_m")),
-                _metres(row["p95_m"]) + _limits(row, "p95", 1.0, 1),
-                *(_metres(row[name]) for name in ("p99_m", "max_m")),
-                "-" if row["max_at_chainage_m"] is None else f"{row['max_at_chainage_m']:.0f} m",
-                f"{row['wrong_places']:,}",
-                _metres(row["normalised_rms"]),
-            )
+    for mine in rows.partition_by("run", "antenna", maintain_order=True):
+        both = mine.filter(pl.col("position") != "constrained_ok")
+        if both["positions"].n_unique() == 1:
+            mine = mine.filter(pl.col("epochs_of") == "own")
+        ranked = mine.with_columns(_order=pl.col("position").replace_strict(order))
+        yield from ranked.sort("epochs_of", "_order", descending=[True, False]).iter_rows(named=True)
+
+
+def _limits(rows: pl.DataFrame) -> Table:
+    table = _table("run", "antenna", "position", "blocks", "rate %", "mean", "p95", text=3)
+    for row in _in_order(rows.filter(pl.col("mean_low_m").is_not_null())):
+        table.add_row(
+            row["run"],
+            row["antenna"],
+            _NAMES[row["position"]],
+            f"{row['blocks']:,}",
+            f"{_percent(row['rate_low'])} to {_percent(row['rate_high'])}",
+            f"{_metres(row['mean_low_m'], sign='+')} to {_metres(row['mean_high_m'], sign='+')}",
+            f"{_metres(row['p95_low_m'])} to {_metres(row['p95_high_m'])}",
+        )
     return table
 
 
 def _grouped(rows: pl.DataFrame) -> Table:
     """Constrained and conventional of each group in one row."""
     heads = ("epochs", "rate %", "mean", "std", "p50", "p95", "max")
-    table = _table("run", "group", "antenna", *heads, *(f"conv.\n{head}" for head in heads[1:]), text=3)
+    table = _table("of", "group", "antenna", *heads, *(f"conv.\n{head}" for head in heads[1:]), text=3)
     keys = ["run", "configuration", "line", "antenna", "group"]
     left = rows.filter(pl.col("position") == "constrained")
     right = rows.filter(pl.col("position") == "conventional")
@@ -133,22 +160,22 @@ def _grouped(rows: pl.DataFrame) -> Table:
             cells.append(_percent(row[f"rate{suffix}"]))
             cells.append(_metres(row[f"mean_m{suffix}"], sign="+"))
             cells += [_metres(row[f"{name}{suffix}"]) for name in ("std_m", "p50_m", "p95_m", "max_m")]
-        table.add_row(row["run"], row["group"], row["antenna"], *cells)
+        table.add_row(_of(row), row["group"], row["antenna"], *cells)
     return table
 
 
 def _intervals(rows: pl.DataFrame) -> Table:
     heads = ("intervals", "standing", "p50 m", "p95 m", "largest m", "at", "p95 s", "longest s")
-    table = _table("run", "antenna", "position", *heads, text=3)
+    table = _table("of", "antenna", "position", *heads, text=3)
     for row in rows.iter_rows(named=True):
         table.add_row(
-            row["run"] if row["run"] != "all" else row["configuration"],
+            _of(row),
             row["antenna"],
             _NAMES[row["position"]].strip(),
             f"{row['intervals']:,}",
             f"{row['standing']:,}",
             *(_metres(row[name]) for name in ("interval_p50_m", "interval_p95_m", "interval_max_m")),
-            "-" if row["interval_max_chainage_m"] is None else f"{row['interval_max_chainage_m']:.0f} m",
+            _place(row["interval_max_chainage_m"]),
             *(_metres(row[name]) for name in ("gap_p95_s", "gap_max_s")),
         )
     return table
@@ -192,6 +219,11 @@ def _show_p1(console: Console) -> None:
     console.print(table)
 
 
+def _of(row: dict[str, Any]) -> str:
+    """The run, or the configuration whose runs are together."""
+    return str(row["run"] if row["run"] != "all" else row["configuration"])
+
+
 def _percent(value: Any) -> str:
     return "-" if value is None else f"{100 * value:.2f}"
 
@@ -200,8 +232,5 @@ def _metres(value: Any, *, sign: str = "") -> str:
     return "-" if value is None else f"{value:{sign}.2f}"
 
 
-def _limits(row: dict[str, Any], name: str, factor: float, decimals: int) -> str:
-    """`` [low..high]``, nothing where there are none."""
-    unit = "" if name == "rate" else "_m"
-    low, high = row[f"{name}_low{unit}"], row[f"{name}_high{unit}"]
-    return "" if low is None else f" [{factor * low:.{decimals}f}..{factor * high:.{decimals}f}]"
+def _place(value: Any) -> str:
+    return "-" if value is None else f"{value:.0f} m"

@@ -23,8 +23,6 @@ from railfix.reference_log import AntennaReference, read_reference
 
 #: Names of a reference that is looked for beside the log of a run.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
-#: What names a run apart from the others.
-_OF_RUN: Final = ("run", "configuration", "line")
 #: Blocks of one run are numbered apart from those of the next.
 _BLOCKS_APART: Final = 10**9
 
@@ -329,15 +327,21 @@ def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Every grouping of every run, and of all runs together where there are several."""
+    """Every grouping of every run; of several also the runs of each configuration together.
+
+    Runs of different configurations are never put together: they may be of the same log.
+    """
     both = _with_all(classed(epochs, options))
     tables = [figures_by(both, ("all", "section", "environment", "speed", "satellites", "status"), options)]
     if epochs["run"].n_unique() > 1:
-        for grouping in ("configuration", "line"):
-            named = both.with_columns(pl.col(grouping).alias(f"{grouping}_group"), pl.lit(0).alias(f"{grouping}_rank"))
-            together = [key for key in _OF_RUN if key != grouping]
-            tables.append(figures_by(_as_one(named, together), (grouping,), options))
-        tables.append(figures_by(_as_one(both, _OF_RUN), ("all", "environment", "speed"), options))
+        named = both.with_columns(
+            pl.col("configuration").alias("configuration_group"),
+            pl.col("line").alias("line_group"),
+            configuration_rank=pl.lit(0),
+            line_rank=pl.lit(0),
+        )
+        tables.append(figures_by(_as_one(named, ["run", "line"]), ("configuration", "environment", "speed"), options))
+        tables.append(figures_by(_as_one(named, ["run"]), ("line",), options))
     return pl.concat(tables)
 
 

@@ -29,7 +29,7 @@ ALL: Final = "all"
 #: Columns of the table of figures, with their unit and meaning.
 FIGURE_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `status`; of several runs also "
-    "`configuration` and `line`",
+    "`configuration` and `line`: the runs of one configuration together",
     "group": "which of them",
     "run": "name of the run; `all` of several together",
     "configuration": "settings of the run",
