@@ -32,8 +32,8 @@ Floats = NDArray[np.float64]
 
 LENGTHS_S: Final = (5, 10, 20, 30, 60)
 PHASES: Final = 4
-#: Uncertain instants are judged too.
-SETTINGS: Final = ReferenceSettings(max_sigma_m=1e6, max_gap_s=90.0)
+#: Gaps of a minute are a little longer where a fix is missing beside them.
+SETTINGS: Final = ReferenceSettings(max_gap_s=90.0)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 `build_references` works on arrays, `reference_files` on files.
 """
 
-from railfix.reference.build import Built, Gap, ReferenceData, build_references
+from railfix.reference.assemble import Built, Gap
+from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.fixes import Fixes, Refusal
 from railfix.reference.sensors import Acceleration, Pulses, read_acceleration, read_pulses
 from railfix.reference.settings import ReferenceSettings

@@ -20,13 +20,22 @@ from railfix.antenna import Trajectory
 from railfix.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.errors import MismatchError, NoPositionError
 from railfix.position_log import PositionLog
+from railfix.reference.assemble import Built, assembled
 from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel
 from railfix.reference.sensors import Acceleration, Pulses
 from railfix.reference.settings import ReferenceSettings
-from railfix.reference.smoother import Evidence, Smoothed, lasting_error_mps, smooth
+from railfix.reference.smoother import (
+    WINDOWS,
+    Closings,
+    Evidence,
+    Smoothed,
+    closings,
+    lasting_error_mps,
+    slip_m,
+    smooth,
+)
 from railfix.reference.ways import LONGEST_STEP_S, Speeds, fused, instants, nearest
 from railfix.reference.wheel import Wheel, wheel_of
-from railfix.reference_log import AntennaReference
 from railfix.timescale import seconds
 
 Floats = NDArray[np.float64]
@@ -66,42 +75,6 @@ class ReferenceData:
     acceleration: Acceleration | None = None
     facing: int = 1
     distance_m: float = float("nan")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Gap:
-    """A stretch between two good fixes that are further apart than the log's usual step."""
-
-    start: np.datetime64
-    end: np.datetime64
-    length_s: float
-    bridged: bool
-
-
-@dataclass(frozen=True, kw_only=True)
-class Built:
-    """The reference of one antenna, and what it came from.
-
-    Attributes
-    ----------
-    reference : AntennaReference
-    fixes : Fixes
-        Every row of the log of positions with its refusal.
-    gaps : tuple of Gap
-    left_out : dict of str to int
-        Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
-    bridged_by : dict of str to int
-        Bridged instants by the sensors that measured there.
-    facts : dict
-        Plain values: what was estimated and used.
-    """
-
-    reference: AntennaReference
-    fixes: Fixes
-    gaps: tuple[Gap, ...]
-    left_out: dict[str, int]
-    bridged_by: dict[str, int]
-    facts: dict[str, Any]
 
 
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
@@ -151,31 +124,94 @@ class _Builder:
         fixes = judge_place(fixes, self.trajectory, self.settings)
         good = self._good(fixes)
         speeds = self._speeds(fixes.time[good], fixes.arc_m[good])
-        wheel = None
-        if self.data.pulses is not None:
-            _check_time(self.data.pulses.path, self.data.pulses.time, fixes.time[good])
-            wheel = wheel_of(self.data.pulses, self.settings.pulse_m, fixes.time[good], fixes.arc_m[good])
+        wheel = self._wheel(fixes.time[good], fixes.arc_m[good])
         if self.data.acceleration is not None:
             _check_time(self.data.acceleration.path, self.data.acceleration.time, fixes.time[good])
-        lasting, windows = self._lasting(speeds, fixes, good)
-        judged = fixes
-        fixes = judge_travel(judged, lambda time: self._travelled(time, speeds, wheel, judged, lasting), self.settings)
+        judged, (settings, _) = fixes, self._calibrated(speeds, wheel, fixes)
+        fixes = judge_travel(judged, lambda time: self._travelled(time, speeds, wheel, judged, settings), settings)
         good = self._good(fixes)
         span = fixes.time[(fixes.time >= fixes.time[good[0]]) & (fixes.time <= fixes.time[good[-1]])]
         time = instants(np.unique(span), [d.time for d in self._sources().values()])
         at = np.searchsorted(time, fixes.time[good])
         place = np.interp(_since(time, time), _since(fixes.time[good], time), fixes.arc_m[good])
-        smoothed = None
         for _ in range(_ROUNDS if self.data.dopplers else 1):
             speeds = self._speeds(time, place)
-            lasting, windows = self._lasting(speeds, fixes, good)
+            settings, told = self._calibrated(speeds, wheel, fixes)
             evidence = self._evidence(time, at, fixes, good, speeds, wheel, place)
-            smoothed = smooth(evidence, self.settings, doppler_bias_mps=lasting)
+            smoothed = smooth(evidence, settings)
             place = np.clip(smoothed.arc_m, 0.0, self.trajectory.arc_m[-1])
-        if smoothed is None:
-            raise AssertionError("at least one round is made")
-        facts = self._facts(speeds, lasting, windows, wheel, smoothed)
-        return self._result(time, at, fixes, good, evidence, replace(smoothed, arc_m=place), facts)
+        facts = self._facts(speeds, wheel, smoothed, told)
+        excess = self._excess(speeds, wheel, smoothed, time, fixes, settings)
+        return assembled(
+            evidence,
+            replace(smoothed, arc_m=place),
+            fixes,
+            excess,
+            trajectory=self.trajectory,
+            settings=self.settings,
+            facts=facts,
+        )
+
+    def _excess(
+        self,
+        speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
+        wheel: Wheel | None,
+        smoothed: Smoothed,
+        time: Datetimes,
+        fixes: Fixes,
+        settings: ReferenceSettings,
+    ) -> Floats:
+        """How many of its standard deviations the best way misses the next fix by, at least 1; from fix to fix."""
+        good = fixes.good
+        fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])
+        variance = np.full(len(moved), np.inf)
+        closing = np.zeros(len(moved))
+        duration, both = seconds(np.diff(fix_time)), fixes.sigma_m[good[1:]] ** 2 + fixes.sigma_m[good[:-1]] ** 2
+        joined = self._joined(speeds)
+        if joined is not None and len(joined.time) > 1:
+            way, white = (np.diff(part) for part in joined.way(fix_time))
+            tau = settings.doppler_bias_s
+            lasting = 2.0 * tau**2 * (duration / tau - 1.0 + np.exp(-duration / tau)) * settings.doppler_bias_mps**2
+            variance, closing = np.nan_to_num(white + lasting + both, nan=np.inf), np.nan_to_num(way - moved)
+        if wheel is not None:
+            scale = np.interp(_since(fix_time, time), _since(time, time), smoothed.wheel_scale)[1:]
+            way = np.diff(wheel.distance_m(fix_time, self._hint(fix_time, joined, fixes))) * (1.0 - scale)
+            own = settings.slip_m**2 * np.abs(way) + 2.0 * wheel.reading_sigma_m**2 + both
+            better = own < variance
+            closing = np.where(better, way - moved, closing)
+            variance = np.where(better, own, variance)
+        return np.asarray(np.maximum(np.abs(closing) / np.sqrt(variance), 1.0))
+
+    def _wheel(self, time: Datetimes, arc_m: Floats) -> Wheel | None:
+        pulses = self.data.pulses
+        if pulses is None:
+            return None
+        _check_time(pulses.path, pulses.time, time)
+        return wheel_of(pulses, self.settings.pulse_m, time, arc_m)
+
+    def _calibrated(
+        self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], wheel: Wheel | None, fixes: Fixes
+    ) -> tuple[ReferenceSettings, dict[str, Any]]:
+        """The settings with the errors that the log's own fixes tell of Dopplers and wheel, and how they came."""
+        settings, told, good = self.settings, {}, fixes.good
+        joined = self._joined(speeds)
+        if joined is not None and len(joined.time) > 1:
+            found = self._closings(fixes, *joined.way(fixes.time[good]))
+            settings = replace(settings, doppler_bias_mps=lasting_error_mps(found, settings))
+            told["doppler"] = {"lasting_error_mps": settings.doppler_bias_mps, "lasting_error_from": _told_by(found)}
+        if wheel is not None:
+            way = wheel.distance_m(fixes.time[good], self._hint(fixes.time[good], joined, fixes))
+            found = self._closings(fixes, way, np.full(len(way), 0.0), reading_m=wheel.reading_sigma_m)
+            settings = replace(settings, slip_m=slip_m(found, settings))
+            told["pulses"] = {"slip_m": settings.slip_m, "slip_from": _told_by(found)}
+        return settings, told
+
+    def _closings(self, fixes: Fixes, way: Floats, variance: Floats, *, reading_m: float = 0.0) -> Closings:
+        good = fixes.good
+        sigma = np.hypot(fixes.sigma_m[good], reading_m)
+        return closings(
+            fixes.time[good], way, variance, fixes.arc_m[good], sigma, window_s=self.settings.doppler_bias_s
+        )
 
     def _good(self, fixes: Fixes) -> Indices:
         good = fixes.good
@@ -227,24 +263,24 @@ class _Builder:
         speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
         wheel: Wheel | None,
         fixes: Fixes,
-        lasting_mps: float,
+        settings: ReferenceSettings,
     ) -> tuple[Floats, Floats]:
         """Way travelled up to instants and its variance: by the wheel where there is one, else by Dopplers."""
         joined = self._joined(speeds)
-        settings = self.settings
         if wheel is not None:
-            good = fixes.good
-            way = wheel.distance_m(time, self._hint(time, joined, fixes.time[good], fixes.arc_m[good]))
+            way = wheel.distance_m(time, self._hint(time, joined, fixes))
             step = np.abs(np.diff(way, prepend=way[:1]))
             return way, np.cumsum(settings.slip_m**2 * np.nan_to_num(step))
         if joined is None:
             return np.full(len(time), np.nan), np.full(len(time), np.nan)
         way, white = joined.way(time)
-        lasting = 2.0 * settings.doppler_bias_s * lasting_mps**2 * _since(time, time)
+        lasting = 2.0 * settings.doppler_bias_s * settings.doppler_bias_mps**2 * _since(time, time)
         return way, white + lasting
 
-    def _hint(self, time: Datetimes, joined: Speeds | None, fix_time: Datetimes, fix_m: Floats) -> Floats:
+    def _hint(self, time: Datetimes, joined: Speeds | None, fixes: Fixes) -> Floats:
         """Speeds that tell the direction of the wheel: Dopplers, else fixes that follow each other closely."""
+        good = fixes.good
+        fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))
         slope = np.where(step <= LONGEST_STEP_S, np.diff(fix_m) / step, np.nan)
         section = np.searchsorted(fix_time, time, side="right") - 1
@@ -254,15 +290,6 @@ class _Builder:
             row = nearest(joined.time, time)
             hint = np.where(row >= 0, joined.speed_mps[np.maximum(row, 0)], hint)
         return np.asarray(hint)
-
-    def _lasting(
-        self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], fixes: Fixes, good: Indices
-    ) -> tuple[float, int]:
-        joined = self._joined(speeds)
-        if joined is None or len(joined.time) < 2:
-            return self.settings.doppler_bias_mps, 0
-        way, white = joined.way(fixes.time[good])
-        return lasting_error_mps(fixes.time[good], way, white, fixes.arc_m[good], fixes.sigma_m[good], self.settings)
 
     def _evidence(
         self,
@@ -279,8 +306,7 @@ class _Builder:
         fix[at], sigma[at] = fixes.arc_m[good], fixes.sigma_m[good]
         doppler, doppler_sigma = fused(time, [part for part, _ in speeds.values()])
         if wheel is not None:
-            hint = self._hint(time, self._joined(speeds), fixes.time[good], fixes.arc_m[good])
-            way = wheel.distance_m(time, hint)
+            way = wheel.distance_m(time, self._hint(time, self._joined(speeds), fixes))
         acceleration = np.full(len(time) - 1, np.nan)
         if self.data.acceleration is not None:
             acceleration = self.data.facing * self.data.acceleration.mean_over(time)
@@ -303,10 +329,9 @@ class _Builder:
     def _facts(
         self,
         speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
-        lasting: float,
-        windows: int,
         wheel: Wheel | None,
         smoothed: Smoothed,
+        told: Mapping[str, Mapping[str, Any]],
     ) -> dict[str, Any]:
         """What was estimated, as plain values."""
         facts: dict[str, Any] = {"doppler": None, "pulses": None, "acceleration": None}
@@ -322,8 +347,7 @@ class _Builder:
                     }
                     for name, (part, solved) in speeds.items()
                 },
-                "lasting_error_mps": lasting,
-                "lasting_error_from": f"{windows} windows between fixes" if windows >= 20 else "settings",
+                **told.get("doppler", {}),
             }
         if wheel is not None:
             facts["pulses"] = {
@@ -332,84 +356,15 @@ class _Builder:
                 "kind": wheel.pulses.kind,
                 "direction": "from the table" if wheel.pulses.signed else "from Dopplers and fixes",
                 "scale_correction": -float(smoothed.wheel_scale[-1]),
+                **told["pulses"],
             }
         if self.data.acceleration is not None:
             facts["acceleration"] = {"kind": self.data.acceleration.kind, "facing": self.data.facing}
         return facts
 
-    def _result(
-        self,
-        time: Datetimes,
-        at: Indices,
-        fixes: Fixes,
-        good: Indices,
-        evidence: Evidence,
-        smoothed: Smoothed,
-        facts: dict[str, Any],
-    ) -> Built:
-        settings, trajectory = self.settings, self.trajectory
-        is_fix = np.zeros(len(time), dtype=np.bool_)
-        is_fix[at] = True
-        after = np.clip(np.searchsorted(at, np.arange(len(time))), 1, len(at) - 1)
-        length = seconds(time[at[after]] - time[at[after - 1]])
-        # Errors that fixes have in common the smoother cannot see: a bridged instant has them too.
-        t = _since(time, time)
-        common = np.interp(t, t[at], fixes.sigma_m[good])
-        sigma = np.where(is_fix, common, np.hypot(smoothed.sigma_m, common))
-        arc = smoothed.arc_m.copy()
-        arc[at] = fixes.arc_m[good]
-        long = ~is_fix & (length > settings.max_gap_s)
-        uncertain = ~is_fix & ~long & (sigma > settings.max_sigma_m)
-        keep = np.flatnonzero(~long & ~uncertain)
-        reference = AntennaReference(
-            time=time[keep],
-            ecef_m=trajectory.at_arc(arc[keep]),
-            chainage_m=trajectory.chainage_at(arc[keep]),
-            speed_mps=smoothed.speed_mps[keep],
-            sigma_m=sigma[keep],
-            source=np.where(is_fix[keep], "rtk", "bridged"),
-            environment=np.full(len(keep), ""),
-        )
-        usual = float(np.median(seconds(np.diff(time))))
-        gap = seconds(np.diff(fixes.time[good]))
-        gaps = tuple(
-            Gap(
-                start=fixes.time[good[i]],
-                end=fixes.time[good[i + 1]],
-                length_s=float(gap[i]),
-                bridged=bool(gap[i] <= settings.max_gap_s),
-            )
-            for i in np.flatnonzero(gap > 1.5 * usual).tolist()
-        )
-        left_out = {
-            "before_first_fix": int((fixes.time < fixes.time[good[0]]).sum()),
-            "after_last_fix": int((fixes.time > fixes.time[good[-1]]).sum()),
-            "long_gap": int(long.sum()),
-            "uncertain": int(uncertain.sum()),
-        }
-        bridged = keep[~is_fix[keep]]
-        return Built(
-            reference=reference,
-            fixes=fixes,
-            gaps=gaps,
-            left_out=left_out,
-            bridged_by=_bridged_by(evidence, bridged),
-            facts=facts,
-        )
 
-
-def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Bridged instants by the sensors that have a number there."""
-    has = {
-        "doppler": np.isfinite(evidence.doppler_mps)[rows],
-        "pulses": np.isfinite(evidence.wheel_m)[rows],
-        "acceleration": np.isfinite(evidence.acceleration_mps2)[np.minimum(rows, len(evidence.acceleration_mps2) - 1)],
-    }
-    code = sum(mask.astype(np.int64) << i for i, mask in enumerate(has.values()))
-    names = {
-        c: " and ".join(name for i, name in enumerate(has) if c >> i & 1) or "nothing" for c in range(1 << len(has))
-    }
-    return {names[int(c)]: int((code == c).sum()) for c in np.unique(code)}
+def _told_by(found: Closings) -> str:
+    return f"{len(found)} windows between fixes" if len(found) >= WINDOWS else "settings"
 
 
 def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:

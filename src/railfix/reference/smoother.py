@@ -102,7 +102,7 @@ class _Unknowns:
         return self.count - 1
 
 
-def smooth(evidence: Evidence, settings: ReferenceSettings, *, doppler_bias_mps: float) -> Smoothed:
+def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
     """Place and speed at every instant from all evidence at once.
 
     Parameters
@@ -110,8 +110,7 @@ def smooth(evidence: Evidence, settings: ReferenceSettings, *, doppler_bias_mps:
     evidence : Evidence
         With at least one fix.
     settings : ReferenceSettings
-    doppler_bias_mps : float [m/s]
-        Standard deviation of the lasting part of the Doppler speed's error.
+        Its `doppler_bias_mps` and `slip_m` are those of the log, where it tells them.
 
     Returns
     -------
@@ -128,7 +127,7 @@ def smooth(evidence: Evidence, settings: ReferenceSettings, *, doppler_bias_mps:
         _add_motion(chain, unknowns, evidence, np.diff(t), np.diff(nominal), settings)
         row = _one(unknowns, unknowns.place)
         chain.add_single(fixed, row, (evidence.fix_m - nominal)[fixed], evidence.fix_sigma_m[fixed] ** -2.0)
-        _add_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings, doppler_bias_mps)
+        _add_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings)
         _add_wheel(chain, unknowns, evidence, np.diff(t), nominal, settings)
         _add_offset(chain, unknowns, np.diff(t), settings)
         value, covariance = chain.solve()
@@ -176,13 +175,12 @@ def _add_doppler(
     seen: Indices,
     relief: Floats,
     settings: ReferenceSettings,
-    bias_mps: float,
 ) -> None:
     """Doppler speed = speed + lasting error + noise; the lasting error is a first-order Gauss-Markov process."""
     if unknowns.doppler < 0:
         return
     kept = np.exp(-dt / settings.doppler_bias_s)
-    variance = bias_mps**2
+    variance = settings.doppler_bias_mps**2
     chain.add_single(np.array([0]), _one(unknowns, unknowns.doppler), np.zeros(1), np.full(1, 1.0 / variance))
     _add_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
     row = _one(unknowns, unknowns.speed) + _one(unknowns, unknowns.doppler)
@@ -234,51 +232,99 @@ def _one(unknowns: _Unknowns, unknown: int) -> Floats:
     return row
 
 
-def lasting_error_mps(
+@dataclass(frozen=True, kw_only=True)
+class Closings:
+    """What a way fails to close by between fixes, over W windows.
+
+    Attributes
+    ----------
+    error_m : ndarray, shape (W,) [m]
+        Way measured less way between the fixes.
+    white_m2 : ndarray, shape (W,) [m2]
+        Variance that single readings and the fixes explain.
+    duration_s : ndarray, shape (W,) [s]
+    way_m : ndarray, shape (W,) [m]
+    """
+
+    error_m: Floats
+    white_m2: Floats
+    duration_s: Floats
+    way_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.error_m)
+
+    def excess_m2(self) -> float:
+        """Variance beyond what is explained, from the 80th percentile of the squared errors [m2]."""
+        return max(float(np.quantile(self.error_m**2, 0.8)) / _CHI2_80 - float(np.median(self.white_m2)), 0.0)
+
+
+def closings(
     time: NDArray[np.datetime64],
     way_m: Floats,
     variance_m2: Floats,
     fix_m: Floats,
     fix_sigma_m: Floats,
-    settings: ReferenceSettings,
-) -> tuple[float, int]:
-    """Size of the lasting part of the Doppler speed's error, from what it fails to close by between fixes.
-
-    Over windows as long as its time of correlation the way by Doppler is compared with the fixes'. What the
-    noise of single speeds and of the fixes does not explain is the lasting part.
+    *,
+    window_s: float,
+) -> Closings:
+    """Compare a measured way with that between fixes, over windows of about a length.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (F,)
         Of the fixes.
     way_m, variance_m2 : ndarray, shape (F,)
-        Way by Doppler up to each fix, and the variance of its white part since the start; NaN where unknown.
+        Way up to each fix, and the variance of its white part since the start; NaN where unknown.
     fix_m, fix_sigma_m : ndarray, shape (F,) [m]
-
-    Returns
-    -------
-    float
-        Standard deviation [m/s]; that of the settings where fewer than `_WINDOWS` windows are there.
-    int
-        Number of windows.
+    window_s : float [s]
     """
     t = seconds(time - time[0])
+    end = np.searchsorted(t, t + window_s - 0.5)
+    start = np.flatnonzero(end < len(t))
+    start = start[t[end[start]] - t[start] <= 1.5 * window_s]
+    end = end[start]
+    error = (way_m[end] - way_m[start]) - (fix_m[end] - fix_m[start])
+    white = variance_m2[end] - variance_m2[start] + fix_sigma_m[end] ** 2 + fix_sigma_m[start] ** 2
+    usable = np.isfinite(error) & (white < 1e4)
+    start, end = start[usable], end[usable]
+    return Closings(
+        error_m=error[usable], white_m2=white[usable], duration_s=t[end] - t[start], way_m=fix_m[end] - fix_m[start]
+    )
+
+
+def lasting_error_mps(found: Closings, settings: ReferenceSettings) -> float:
+    """Size of the lasting part of the Doppler speed's error [m/s], from what it fails to close by.
+
+    What the noise of single speeds and of the fixes does not explain is the lasting part. That of the settings
+    where fewer than `WINDOWS` windows are there.
+    """
+    if len(found) < WINDOWS:
+        return settings.doppler_bias_mps
     tau = settings.doppler_bias_s
-    end = np.searchsorted(t, t + tau - 0.5)
-    inside = np.flatnonzero(end < len(t))
-    inside = inside[t[end[inside]] - t[inside] <= 1.5 * tau]
-    end = end[inside]
-    closing = (way_m[end] - way_m[inside]) - (fix_m[end] - fix_m[inside])
-    white = variance_m2[end] - variance_m2[inside] + fix_sigma_m[end] ** 2 + fix_sigma_m[inside] ** 2
-    usable = np.isfinite(closing) & (white < 1e4)
-    if usable.sum() < _WINDOWS:
-        return settings.doppler_bias_mps, int(usable.sum())
-    ratio = (t[end] - t[inside])[usable] / tau
+    ratio = float(np.median(found.duration_s)) / tau
     gain = 2.0 * tau**2 * (ratio - 1.0 + np.exp(-ratio))
-    # Median of a squared normal variable: 0.455.
-    left = np.median(closing[usable] ** 2) / 0.455 - np.median(white[usable])
-    return float(np.sqrt(max(left / float(np.median(gain)), _LEAST_LASTING_MPS**2))), int(usable.sum())
+    return float(np.sqrt(max(found.excess_m2() / gain, _LEAST_LASTING_MPS**2)))
 
 
-_WINDOWS: Final = 20
+def slip_m(found: Closings, settings: ReferenceSettings) -> float:
+    """Random error of the wheel [m per square root of m], from what it fails to close by.
+
+    Its scale is taken off first. That of the settings where fewer than `WINDOWS` windows in motion are there.
+    """
+    moving = np.abs(found.way_m) > 1.0
+    if moving.sum() < WINDOWS:
+        return settings.slip_m
+    error, way = found.error_m[moving], found.way_m[moving]
+    error = error - float(np.median(error / way)) * way
+    excess = float(np.quantile(error**2 / np.abs(way), 0.8)) / _CHI2_80
+    excess -= float(np.median(found.white_m2[moving] / np.abs(way)))
+    return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
+
+
+#: Windows that an estimate needs.
+WINDOWS: Final = 20
+#: 80th percentile of a squared standard normal variable.
+_CHI2_80: Final = 1.6424
 _LEAST_LASTING_MPS: Final = 1e-3
+_LEAST_SLIP_M: Final = 1e-3

@@ -1,0 +1,148 @@
+"""From the smoothed way to the reference that is given out: what is kept, how certain it is, what is left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.antenna import Trajectory
+from railfix.reference.fixes import Fixes
+from railfix.reference.settings import ReferenceSettings
+from railfix.reference.smoother import Evidence, Smoothed
+from railfix.reference_log import AntennaReference
+from railfix.timescale import seconds
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gap:
+    """A stretch between two good fixes that are further apart than the log's usual step."""
+
+    start: np.datetime64
+    end: np.datetime64
+    length_s: float
+    bridged: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class Built:
+    """The reference of one antenna, and what it came from.
+
+    Attributes
+    ----------
+    reference : AntennaReference
+    fixes : Fixes
+        Every row of the log of positions with its refusal.
+    gaps : tuple of Gap
+    left_out : dict of str to int
+        Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
+    bridged_by : dict of str to int
+        Bridged instants by the sensors that measured there.
+    facts : dict
+        Plain values: what was estimated and used.
+    """
+
+    reference: AntennaReference
+    fixes: Fixes
+    gaps: tuple[Gap, ...]
+    left_out: dict[str, int]
+    bridged_by: dict[str, int]
+    facts: dict[str, Any]
+
+
+def assembled(
+    evidence: Evidence,
+    smoothed: Smoothed,
+    fixes: Fixes,
+    excess: Floats,
+    *,
+    trajectory: Trajectory,
+    settings: ReferenceSettings,
+    facts: dict[str, Any],
+) -> Built:
+    """The reference of one antenna from everything known of it.
+
+    At a fix the reference is the fix's own place on the track; between fixes it is the smoothed one. Errors
+    that fixes have in common the smoother cannot see, so a bridged instant has them on top of its own; and
+    where a gap does not close within its standard deviation, the larger counts.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    smoothed : Smoothed
+    fixes : Fixes
+    excess : ndarray, shape (G - 1,)
+        From each of the G good fixes to the next: closing error over its standard deviation, at least 1.
+    trajectory : Trajectory
+    settings : ReferenceSettings
+    facts : dict
+    """
+    time, good = evidence.time, fixes.good
+    at = np.flatnonzero(np.isfinite(evidence.fix_m))
+    is_fix = np.zeros(len(time), dtype=np.bool_)
+    is_fix[at] = True
+    after = np.clip(np.searchsorted(at, np.arange(len(time))), 1, len(at) - 1)
+    length = seconds(time[at[after]] - time[at[after - 1]])
+    t = seconds(time - time[0])
+    common = np.interp(t, t[at], evidence.fix_sigma_m[at])
+    sigma = np.where(is_fix, common, np.hypot(smoothed.sigma_m * excess[after - 1], common))
+    arc = np.where(is_fix, evidence.fix_m, smoothed.arc_m)
+    long = ~is_fix & (length > settings.max_gap_s)
+    uncertain = ~is_fix & ~long & (sigma > settings.max_sigma_m)
+    keep = np.flatnonzero(~long & ~uncertain)
+    reference = AntennaReference(
+        time=time[keep],
+        ecef_m=trajectory.at_arc(arc[keep]),
+        chainage_m=trajectory.chainage_at(arc[keep]),
+        speed_mps=smoothed.speed_mps[keep],
+        sigma_m=sigma[keep],
+        source=np.where(is_fix[keep], "rtk", "bridged"),
+        environment=np.full(len(keep), ""),
+    )
+    usual = float(np.median(np.diff(t)))
+    step = seconds(np.diff(fixes.time[good]))
+    gaps = tuple(
+        Gap(
+            start=fixes.time[good[i]],
+            end=fixes.time[good[i + 1]],
+            length_s=float(step[i]),
+            bridged=bool(step[i] <= settings.max_gap_s),
+        )
+        for i in np.flatnonzero(step > 1.5 * usual).tolist()
+    )
+    return Built(
+        reference=reference,
+        fixes=fixes,
+        gaps=gaps,
+        left_out={
+            "before_first_fix": int((fixes.time < time[0]).sum()),
+            "after_last_fix": int((fixes.time > time[-1]).sum()),
+            "long_gap": int(long.sum()),
+            "uncertain": int(uncertain.sum()),
+        },
+        bridged_by=_bridged_by(evidence, keep[~is_fix[keep]]),
+        facts=facts,
+    )
+
+
+def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
+    """Bridged instants by the sensors that have a number there."""
+    steps = np.minimum(rows, len(evidence.acceleration_mps2) - 1)
+    has = {
+        "doppler": np.isfinite(evidence.doppler_mps)[rows],
+        "pulses": np.isfinite(evidence.wheel_m)[rows],
+        "acceleration": np.isfinite(evidence.acceleration_mps2)[steps],
+    }
+    code = np.zeros(len(rows), dtype=np.int64)
+    for i, mask in enumerate(has.values()):
+        code |= mask.astype(np.int64) << i
+    found = {}
+    for c in np.unique(code).tolist():
+        name = " and ".join(name for i, name in enumerate(has) if c >> i & 1) or "nothing"
+        found[name] = int((code == c).sum())
+    return found
