@@ -249,6 +249,42 @@ def test_everything_switched_on_is_cut_anyhow() -> None:
         np.testing.assert_array_equal(getattr(joined, name), getattr(expected, name))
 
 
+def test_the_files_are_the_same_bytes_by_any_cutting(tmp_path: Path) -> None:
+    simulation = Simulation(Scenario(duration_s=20.0))
+    for size in (7, 64, 200):
+        pieces = (piece.observations for piece in simulation.pieces("rear", chunk_epochs=size))
+        write.write_observations(pieces, tmp_path / f"{size}.rnx")
+    assert len({(tmp_path / f"{size}.rnx").read_bytes() for size in (7, 64, 200)}) == 1
+
+
+def test_the_truth_tells_acceleration_and_what_stands_along_the_line(tmp_path: Path) -> None:
+    sections = (
+        SectionSettings(from_m=60.0, to_m=200.0, kind="urban"),
+        SectionSettings(from_m=200.0, to_m=300.0, kind="tunnel"),
+    )
+    scenario = Scenario(duration_s=60.0, environment=EnvironmentSettings(sections=sections))
+    files = write_run(scenario, tmp_path, packing="plain")
+    assert pl.read_csv(files["sections"]).rows() == [
+        (0.0, pytest.approx(60.0, abs=0.01), "open"),
+        (pytest.approx(60.0, abs=0.01), pytest.approx(200.0, abs=0.01), "urban"),
+        (pytest.approx(200.0, abs=0.01), pytest.approx(300.0, abs=0.01), "tunnel"),
+        (pytest.approx(300.0, abs=0.01), pytest.approx(756.0, abs=0.01), "open"),
+    ]
+    truth = pl.read_csv(files["truth"]).filter(pl.col("antenna") == "front")
+    chainage, kind = truth["chainage_m"].to_numpy(), truth["environment"].to_numpy()
+    assert (kind[(chainage > 60.1) & (chainage < 199.9)] == "urban").all()
+    assert (kind[(chainage > 200.1) & (chainage < 299.9)] == "tunnel").all()
+    assert (kind[(chainage < 59.9) | (chainage > 300.1)] == "open").all()
+    assert {"urban", "tunnel", "open"} == set(kind)
+    speed, acceleration = truth["speed_mps"].to_numpy(), truth["acceleration_mps2"].to_numpy()
+    even = acceleration[1:] == acceleration[:-1]
+    assert np.diff(speed)[even] / 0.1 == pytest.approx(acceleration[:-1][even], abs=2e-3)
+    assert set(acceleration) >= {0.0, 0.7}
+    observed = whole(scenario).observations
+    assert np.isnan(observed.code_m[kind == "tunnel"]).all()
+    assert np.isfinite(observed.code_m[kind == "open"]).any(axis=1).all()
+
+
 # ---------------------------------------------------------------- sky of a file
 
 
