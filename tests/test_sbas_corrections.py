@@ -64,7 +64,8 @@ def test_corrections_are_those_sent() -> None:
     assert found.clock_s[0, 0] == 8 * 2.0**-31
     assert found.iode.tolist() == [[48, 49, -1]]
     assert found.udrei.tolist() == [[3, 4, -1]]
-    assert np.isnan(found.fast_m[0, 2]) and np.isnan(found.position_m[0, 2]).all()
+    assert np.isnan(found.fast_m[0, 2])
+    assert np.isnan(found.position_m[0, 2]).all()
     assert found.sigma_flt_m()[0, :2] == pytest.approx(np.sqrt([0.2830, 0.4678]))
 
 
@@ -122,7 +123,7 @@ def test_type_6_of_the_same_issue_renews_the_correction_of_another_does_not() ->
 
 
 def test_an_alarm_stops_a_satellite_at_once() -> None:
-    rows = base() + [(11.0, 0, made.integrity(11, [15, 14], (3, 3, 3, 3)))]
+    rows = [*base(), (11.0, 0, made.integrity(11, [15, 14], (3, 3, 3, 3)))]
     found = engine(rows).satellites(at(10.9, 11.0, 16.0), SATELLITE)
     assert found.state[:, 0].tolist() == [OK, SatelliteState.DO_NOT_USE, OK]
     assert found.state[:, 1].tolist() == [OK, SatelliteState.NOT_MONITORED, OK]
@@ -207,7 +208,7 @@ def test_degradation_by_hand() -> None:
     rate = (0.0002 * 78.0 / 4.0 + 0.04 / 6.0) * 7.0
     long = 2 * 0.3
     for squares in (0, 1):
-        said = dict(brrc=20, cltc_v0=150, iltc_v0=7, rss_udre=squares)
+        said = {"brrc": 20, "cltc_v0": 150, "iltc_v0": 7, "rss_udre": squares}
         found = engine([*rows, (2, 0, made.parameters(2, **said))], SbasLimits()).satellites(at(16.0), SATELLITE)
         assert found.fast_growth_m[0, 0] == pytest.approx(fast)
         assert found.rate_growth_m[0, 0] == pytest.approx(rate)

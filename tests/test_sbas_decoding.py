@@ -1,0 +1,128 @@
+"""Decoded SBAS messages against two other decoders, over the whole recorded hour."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sbas_made as made
+from railfix.sbas import SbasLog, decode, decode_service, read_sbas
+
+pytestmark = pytest.mark.requirement("C1")
+
+
+@pytest.fixture(scope="module")
+def log(recordings: Path) -> SbasLog:
+    return read_sbas(recordings / "sbas" / "msas_20250215" / "046r_sbas_prn137.txt")
+
+
+def sidereon_message(log: SbasLog, row: int) -> Any:
+    sidereon = pytest.importorskip("sidereon", reason="sidereon (the oracle) is not installed")
+    body = bytes([*log.bits[row, :28].tolist(), int(log.bits[row, 28]) & 0xC0])
+    return sidereon.decode_sbas_block(body, sidereon.SbasWireForm.BODY226).message
+
+
+def test_geo_navigation_is_that_of_sidereon(log: SbasLog) -> None:
+    """Its fields are the numbers of the message; the units are those of DO-229D, table A-12."""
+    ours = decode_service.geo_navigation(log)
+    assert len(ours.row) == 59
+    units = {"m": (0.08, 0.08, 0.4), "rate_m_s": (0.000625, 0.000625, 0.004), "accel_m_s2": (1.25e-5, 1.25e-5, 6.25e-5)}
+    tables = (ours.position_ecef_m, ours.velocity_ecef_mps, ours.acceleration_ecef_mps2)
+    for i, row in enumerate(ours.row.tolist()):
+        theirs = sidereon_message(log, row).geo_nav
+        for table, (name, unit) in zip(tables, units.items(), strict=True):
+            expected = [getattr(theirs, f"{axis}_{name}") * u for axis, u in zip("xyz", unit, strict=True)]
+            assert table[i] == pytest.approx(expected)
+        assert ours.clock_s[i] == pytest.approx(theirs.a_gf0_s * 2.0**-31, abs=1e-18)
+        assert ours.clock_rate[i] == pytest.approx(theirs.a_gf1_s_s * 2.0**-40, abs=1e-18)
+        assert ours.accuracy[i] == theirs.ura
+        of_day = ours.reference[i] - ours.reference[i].astype("datetime64[D]")
+        assert of_day / np.timedelta64(1, "s") == theirs.time_of_day_s * 16.0
+        assert abs(ours.reference[i] - log.time[row]) < np.timedelta64(300, "s")
+    radius = np.linalg.norm(ours.position_ecef_m, axis=1)
+    assert np.abs(radius - 42_164e3).max() < 100e3
+
+
+def test_degradation_factors_and_masks_are_those_of_sidereon(log: SbasLog) -> None:
+    factors, masks = decode.fast_degradation(log), decode.grid_masks(log)
+    for i, row in enumerate(factors.row.tolist()):
+        theirs = sidereon_message(log, row).fast_degradation
+        assert factors.indicator[i].tolist() == list(theirs.ai)[:51]
+        assert (factors.latency_s[i], factors.iodp[i]) == (theirs.system_latency_s, theirs.iodp)
+    for i, row in enumerate(masks.row.tolist()):
+        theirs = sidereon_message(log, row).igp_mask
+        assert (masks.band[i], masks.iodi[i]) == (theirs.band_number, theirs.iodi)
+
+
+def test_delays_are_those_of_sidereon(log: SbasLog) -> None:
+    ours = decode.grid_delays(log)
+    assert len(ours.row) == 236
+    for i, row in enumerate(ours.row.tolist()):
+        theirs = sidereon_message(log, row).iono_delays
+        assert (ours.band[i], ours.block[i], ours.iodi[i]) == (theirs.band_number, theirs.block_id, theirs.iodi)
+        assert ours.givei[i].tolist() == [entry.givei for entry in theirs.entries]
+        raw = np.array([entry.vertical_delay for entry in theirs.entries])
+        assert np.array_equal(ours.delay_m[i], np.where(raw == 511, np.nan, raw * 0.125), equal_nan=True)
+
+
+def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasLog) -> None:
+    """cssrlib writes E23 in place of E24 and C_ltc_v1 ten times too large: those two are left out."""
+    sbas = pytest.importorskip("cssrlib.sbas", reason="cssrlib (the oracle) is not installed")
+    ten, cover = decode_service.degradation(log), decode_service.covariance(log)
+    decoder = sbas.sbasDec()
+    for i, row in enumerate(ten.row.tolist()):
+        decoder.decode_sbas_degradation_param(log.bits[row].tobytes(), 14)
+        theirs = decoder.deg_prm
+        ours = [
+            ten.range_rate_m, ten.long_term_step_m, None, ten.long_term_interval_s, ten.still_step_m,
+            ten.still_interval_s, ten.geo_step_m, ten.geo_rate_mps, ten.geo_interval_s, ten.en_route_m,
+            ten.iono_step_m, ten.iono_interval_s, ten.iono_rate_mps, ten.rss_udre, ten.rss_iono, ten.covariance,
+        ]  # fmt: skip
+        for number, values in enumerate(ours):
+            assert values is None or float(values[i]) == pytest.approx(float(theirs[number])), number
+    row, fields = decode.of_types(log, 28)
+    compared = 0
+    for start in (16, 121):
+        for i in np.flatnonzero(fields.unsigned(start, 6))[::5].tolist():
+            _, theirs = decoder.decode_cov(log.bits[row[i]].tobytes(), start + 6)
+            slot = fields.unsigned(start, 6)[i] - 1
+            (at,) = np.flatnonzero((cover.row == row[i]) & (cover.slot == slot))
+            ours_matrix = cover.factor[at].T @ cover.factor[at]
+            assert ours_matrix[:3, :3] == pytest.approx(np.asarray(theirs)[:3, :3])
+            compared += 1
+    assert len(cover.row) == 463
+    assert compared > 90
+
+
+def test_almanacs_agree_with_the_navigation_message(log: SbasLog) -> None:
+    """The sender's almanac lies within its resolution (2.6 km, and 26 km in z) of its navigation message."""
+    almanac, navigation = decode_service.geo_almanacs(log), decode_service.geo_navigation(log)
+    own = np.flatnonzero(almanac.prn == 137)
+    assert len(own) == 23
+    precise, _ = navigation.state(np.full(len(own), 30), almanac.reference[own])
+    assert (np.abs(almanac.position_ecef_m[own] - precise) < (8_000.0, 8_000.0, 40_000.0)).all()
+    assert set(almanac.prn.tolist()) <= set(range(120, 159)) | set(range(183, 203))
+
+
+def test_network_time_by_hand() -> None:
+    fields = [(-5, 24), (123_456, 32), (30, 8), (49, 8), (18, 8), (137, 8), (7, 8), (18, 8), (3, 3), (302_400, 20),
+              (305, 10)]  # fmt: skip
+    found = decode_service.network_time(made.made([(0, 0, made.message(12, 0, *fields))]))
+    shown = SimpleNamespace(**{name: value[0] for name, value in vars(found).items()})
+    assert (shown.drift, shown.offset_s) == (-5 * 2.0**-50, 123_456 * 2.0**-30)
+    assert (shown.reference_s, shown.reference_week, shown.leap_s) == (30 * 4096.0, 49, 18)
+    assert (shown.leap_week, shown.leap_day, shown.next_leap_s) == (137, 7, 18)
+    assert (shown.utc_standard, shown.time_of_week_s, shown.week) == (3, 302_400.0, 305)
+
+
+def test_reference_times_cross_midnight() -> None:
+    """A time of day of the other side of midnight is of the day that lies nearer."""
+    bits = made.moving(0, 1, 48, (0.0, 0.0, 0.0), (0, 0, 0), 0, 0, 86_384)
+    midnight = np.datetime64("2025-02-16T00:00:10", "ns")
+    base = made.made([(0, 0, bits)])
+    log = SbasLog(**{**vars(base), "time": np.array([midnight])})
+    assert decode.long_term(log).reference[0] == np.datetime64("2025-02-15T23:59:44")
