@@ -72,6 +72,8 @@ class AntennaEpochs:
         Epochs of the log outside the reference.
     step_s : float [s]
         Step of the log.
+    from_sections : int
+        Epochs inside the reference whose environment the sections told.
     """
 
     table: pl.DataFrame
@@ -79,6 +81,7 @@ class AntennaEpochs:
     speed_from: str
     outside: int
     step_s: float
+    from_sections: int
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
@@ -211,6 +214,8 @@ def antenna_epochs(
     sigma = at.of(reference.sigma_m)
     status = np.append(mine["status"].to_numpy().astype(str), NOT_LOGGED)[rows]
     clock = seconds(time - time[0])
+    told_place = np.where(known, reference.environment[at.nearest], "")
+    environment = _environment(told_place, sections, errors.reference_chainage_m)
     columns: dict[str, Any] = {
         "time_gpst": time,
         "antenna": np.full(len(time), antenna),
@@ -221,7 +226,7 @@ def antenna_epochs(
         "chainage_m": errors.reference_chainage_m,
         "speed_mps": np.where(known, speed, np.nan),
         "moved_m": moved,
-        "environment": _environment(reference.environment[at.nearest], known, sections, errors.reference_chainage_m),
+        "environment": environment,
         "reference_sigma_m": sigma,
         "reference_source": np.where(known, reference.source[at.nearest], ""),
         "n_used": column("n_used"),
@@ -244,6 +249,7 @@ def antenna_epochs(
         speed_from="reference" if np.isfinite(told[known]).all() else "places",
         outside=int((logged & ~known).sum()),
         step_s=step_s,
+        from_sections=int((known & (told_place == "") & (environment != UNKNOWN)).sum()),
     )
 
 
@@ -265,11 +271,7 @@ def _own_speed(time: Datetimes, step_m: Floats, known: NDArray[np.bool_]) -> Flo
     return speed
 
 
-def _environment(
-    told: NDArray[np.str_], known: NDArray[np.bool_], sections: Sections | None, chainage_m: Floats
-) -> NDArray[np.str_]:
+def _environment(told: NDArray[np.str_], sections: Sections | None, chainage_m: Floats) -> NDArray[np.str_]:
     """What the reference tells, else what the sections tell."""
-    words = np.where(known, told, "")
-    if sections is not None:
-        words = np.where(words == "", sections.at(chainage_m), words)
+    words = told if sections is None else np.where(told == "", sections.at(chainage_m), told)
     return np.where(words == "", UNKNOWN, words)

@@ -253,6 +253,12 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
         for entry in entries
         if entry["sha256"] not in recorded
     ]
+    if stretches is not None:
+        notes += [
+            f"{name}: the sections tell the environment of {found.from_sections} of "
+            f"{int(found.table['in_reference'].sum())} epochs, the reference comes before them"
+            for name, found in antennas.items()
+        ]
     said = [note for antenna in antennas.values() for note in antenna.errors.notes]
     return _Part(
         folder=folder,
