@@ -24,7 +24,7 @@ from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import ClockWalk
 from railfix.simulate.motion import Motion, Sway, made_motion
 from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
-from railfix.simulate.satellites import links
+from railfix.simulate.satellites import SatelliteTable, links
 from railfix.simulate.scenario import ANTENNAS, Scenario
 from railfix.timescale import seconds
 
@@ -169,6 +169,11 @@ class Simulation:
         return tuple(sorted({name for name, _ in self.channels}))
 
     @cached_property
+    def satellite_table(self) -> SatelliteTable:
+        """States of `satellites` over the run."""
+        return SatelliteTable(self.navigation.kepler, self.satellites, self.scenario.start, self.time()[-1])
+
+    @cached_property
     def common_errors(self) -> CommonErrors:
         """Errors of satellites and atmosphere."""
         scenario = self.scenario
@@ -263,13 +268,11 @@ class _Instant:
     ionosphere_error_m: Floats
 
 
-def _instant(
-    simulation: Simulation, time: Times, late_s: Floats, antenna_ecef_m: Floats, satellites: NDArray[np.str_]
-) -> _Instant:
-    """Signals that arrive at the antenna `late_s` before the tags."""
+def _instant(simulation: Simulation, time: Times, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
+    """Signals of `Simulation.satellites` that arrive at the antenna `late_s` before the tags."""
     scale, navigation = simulation.scenario.sky, simulation.navigation
-    found = [links(navigation.kepler, name, time, late_s, antenna_ecef_m) for name in satellites.tolist()]
-    sky = np.stack([link.satellite_ecef_m for link in found], axis=1)
+    found = simulation.satellite_table.links(time, late_s, antenna_ecef_m)
+    sky = found.satellite_ecef_m
     elevation, azimuth = elevation_azimuth(sky, antenna_ecef_m)
     latitude, longitude, height = (part[:, None] for part in geodetic_from_ecef(antenna_ecef_m))
     # Far below the horizon nothing is tracked; the formulas only have to stay finite there.
@@ -284,7 +287,7 @@ def _instant(
         azimuth,
         frequency_hz=FREQUENCY_L1,
     )
-    distance = np.stack([link.range_m - SPEED_OF_LIGHT * link.clock_s for link in found], axis=1)
+    distance = found.range_m - SPEED_OF_LIGHT * found.clock_s
     errors = simulation.common_errors
     path_error, ionosphere_error = np.zeros((2, *distance.shape))
     if errors.active:
@@ -303,26 +306,24 @@ def _instant(
     )
 
 
-def _geometry(
-    simulation: Simulation, antenna: str, time: Times, satellites: NDArray[np.str_]
-) -> tuple[Geometry, _Instant, Floats, Floats]:
+def _geometry(simulation: Simulation, antenna: str, time: Times) -> tuple[Geometry, _Instant, Floats, Floats]:
     """Geometry by satellite, the instant of the epochs, and the rates of path and ionosphere [m/s].
 
     Rates are differences over a hundredth of a second of the true motion; the clock's steps are left out.
     """
     late = simulation.clock_s(antenna, tags := seconds(time - simulation.scenario.start))
     truth, speed = simulation.truth(antenna, tags - late)
-    now = _instant(simulation, time, late, truth.ecef_m, satellites)
+    now = _instant(simulation, time, late, truth.ecef_m)
     before, after = (
-        _instant(simulation, time, late - d, simulation.truth(antenna, tags - late + d)[0].ecef_m, satellites)
+        _instant(simulation, time, late - d, simulation.truth(antenna, tags - late + d)[0].ecef_m)
         for d in (-_RATE_S, _RATE_S)
     )
     _, heading = elevation_azimuth((truth.ecef_m + truth.forward)[:, None, :], truth.ecef_m)
     geometry = Geometry(
         antenna=antenna,
         time=time,
-        satellite=satellites,
-        signal=np.full(len(satellites), ""),
+        satellite=np.array(simulation.satellites),
+        signal=np.full(len(simulation.satellites), ""),
         chainage_m=truth.chainage_m,
         speed_mps=speed,
         antenna_ecef_m=truth.ecef_m,
@@ -337,9 +338,7 @@ def _geometry(
 def _piece(simulation: Simulation, receiver: Receiver, time: Times) -> Piece:
     """The next epochs of a receiver."""
     scenario, settings = simulation.scenario, simulation.scenario.receiver
-    by_satellite, now, path_rate, ionosphere_rate = _geometry(
-        simulation, receiver.antenna, time, np.array(simulation.satellites)
-    )
+    by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, receiver.antenna, time)
     column, scale, wavelength = receiver.column, receiver.scale, receiver.wavelength_m
     geometry = replace(
         by_satellite,
