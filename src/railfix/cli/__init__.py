@@ -18,6 +18,7 @@ from railfix.cli.error_model import error_model as error_model_command
 from railfix.cli.evaluate import evaluate as evaluate_command
 from railfix.cli.map import map_app
 from railfix.cli.plot_screens import plot_screens as plot_screens_command
+from railfix.cli.reference import reference as reference_command
 from railfix.cli.report import report as report_command
 from railfix.cli.run import run as run_command
 from railfix.cli.simulate import simulate as simulate_command
@@ -95,6 +96,7 @@ app.command("run")(run_command)
 app.command("demo")(demo_command)
 app.command("ablate")(ablate_command)
 app.command("evaluate")(evaluate_command)
+app.command("reference")(reference_command)
 app.command("cn0-curve")(cn0_curve_command)
 app.command("error-model")(error_model_command)
 app.command("plot-screens")(plot_screens_command)

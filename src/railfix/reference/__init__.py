@@ -5,7 +5,9 @@
 
 from railfix.reference.assemble import Built, Gap
 from railfix.reference.build import ReferenceData, build_references
+from railfix.reference.driver import ReferenceSummary, reference_files
 from railfix.reference.fixes import Fixes, Refusal
+from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
 from railfix.reference.sensors import Acceleration, Pulses, read_acceleration, read_pulses
 from railfix.reference.settings import ReferenceSettings
 
@@ -16,9 +18,13 @@ __all__ = [
     "Gap",
     "Pulses",
     "ReferenceData",
+    "ReferenceInputs",
+    "ReferenceOptions",
     "ReferenceSettings",
+    "ReferenceSummary",
     "Refusal",
     "build_references",
     "read_acceleration",
     "read_pulses",
+    "reference_files",
 ]

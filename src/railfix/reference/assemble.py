@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -131,18 +131,31 @@ def assembled(
 
 
 def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
-    """Bridged instants by the sensors that have a number there."""
-    steps = np.minimum(rows, len(evidence.acceleration_mps2) - 1)
-    has = {
-        "doppler": np.isfinite(evidence.doppler_mps)[rows],
-        "pulses": np.isfinite(evidence.wheel_m)[rows],
-        "acceleration": np.isfinite(evidence.acceleration_mps2)[steps],
+    """Bridged instants by the sensors that have a number there, or a second or so from there."""
+    t = seconds(evidence.time - evidence.time[0])
+    measured = {
+        "doppler": np.isfinite(evidence.doppler_mps),
+        "pulses": np.isfinite(evidence.wheel_m),
+        "acceleration": np.append(np.isfinite(evidence.acceleration_mps2), np.False_),
     }
     code = np.zeros(len(rows), dtype=np.int64)
-    for i, mask in enumerate(has.values()):
-        code |= mask.astype(np.int64) << i
+    for i, mask in enumerate(measured.values()):
+        code |= _near(t[mask], t[rows]).astype(np.int64) << i
     found = {}
     for c in np.unique(code).tolist():
-        name = " and ".join(name for i, name in enumerate(has) if c >> i & 1) or "nothing"
+        name = " and ".join(name for i, name in enumerate(measured) if c >> i & 1) or "nothing"
         found[name] = int((code == c).sum())
     return found
+
+
+def _near(known_s: Floats, at_s: Floats) -> NDArray[np.bool_]:
+    """Whether one of the known instants, rising, is within `_NEAR_S` of each."""
+    if not len(known_s):
+        return np.zeros(len(at_s), dtype=np.bool_)
+    after = np.clip(np.searchsorted(known_s, at_s), 0, len(known_s) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.asarray(np.minimum(np.abs(known_s[after] - at_s), np.abs(known_s[before] - at_s)) <= _NEAR_S)
+
+
+#: Sensors of 1 Hz measure everywhere, up to a missing epoch [s].
+_NEAR_S: Final = 1.5

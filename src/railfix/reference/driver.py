@@ -1,0 +1,191 @@
+"""Files in, ``reference.csv``, ``fixes.csv`` and ``reference.json`` out."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time as clock
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from railfix import __version__
+from railfix.config import DEFAULT_SIGNALS
+from railfix.doppler_speed import Dopplers, dopplers_of_log
+from railfix.epochs import concatenate
+from railfix.errors import InputFileError
+from railfix.navigation import Navigation
+from railfix.nmea import read_any_positions
+from railfix.position_log import PositionLog
+from railfix.reference.assemble import Built
+from railfix.reference.build import ReferenceData, build_references
+from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
+from railfix.reference.record import antenna_record, fixes_table, reference_table
+from railfix.reference.sensors import read_acceleration, read_pulses
+from railfix.reference.settings import ReferenceSettings
+from railfix.rinex import read_navigation
+from railfix.run.inputs import Antenna
+from railfix.run.output import OutputFolder
+from railfix.run.sources import Line, Log, open_line
+
+#: Constellations whose Dopplers are used.
+SYSTEMS: Final = ("G", "J", "E", "C", "R")
+#: Epochs of an observation log read at once.
+_CHUNK: Final = 3000
+#: Gaps named in the notes at most.
+_NAMED: Final = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceSummary:
+    """What a reference came to.
+
+    Attributes
+    ----------
+    built : mapping of str to Built
+        By antenna.
+    notes : tuple of str
+    files : mapping of str to Path
+    """
+
+    built: Mapping[str, Built]
+    notes: tuple[str, ...]
+    files: Mapping[str, Path]
+
+
+def reference_files(
+    inputs: ReferenceInputs,
+    settings: ReferenceSettings | None = None,
+    *,
+    out: Path,
+    options: ReferenceOptions | None = None,
+    asked: Mapping[str, Any] | None = None,
+) -> ReferenceSummary:
+    """Make the reference of a run and write it.
+
+    ================== ======================================================================
+    reference.csv      `railfix.reference_log`, one row an instant and antenna
+    fixes.csv          every row of the logs of positions, with what was refused and why
+    reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
+    ================== ======================================================================
+
+    Parameters
+    ----------
+    inputs : ReferenceInputs
+    settings : ReferenceSettings, optional
+    out : Path
+        Folder for the results.
+    options : ReferenceOptions, optional
+    asked : mapping, optional
+        Settings that were asked for, as opposed to defaults.
+
+    Returns
+    -------
+    ReferenceSummary
+
+    Raises
+    ------
+    RailfixError
+        See `railfix.errors`; nothing is left in `out` then.
+    """
+    began = clock.perf_counter()
+    settings, options = settings or ReferenceSettings(), options or ReferenceOptions()
+    inputs.check()
+    with OutputFolder(out, overwrite=options.overwrite) as folder:
+        wanted: tuple[Antenna, ...] = ("front", "rear")
+        antennas = tuple(name for name in wanted if name in inputs.positions or name in inputs.logs)
+        line = open_line(inputs.track, inputs.vehicle, antennas=antennas, reading=options.track)
+        data, notes = _read(inputs, line, options)
+        built = build_references(data, settings)
+        for name, part in built.items():
+            notes += _notes(name, part, settings)
+        notes = list(dict.fromkeys([*line.notes, *notes]))
+        folder.append_csv("reference.csv", reference_table({name: part.reference for name, part in built.items()}))
+        for name, part in built.items():
+            folder.append_csv("fixes.csv", fixes_table(name, part, line.trajectories[name]))
+        record = {
+            "versions": {"railfix": __version__, "python": platform.python_version()},
+            "command": list(sys.argv),
+            "inputs": inputs.fingerprints(),
+            "settings_asked": dict(asked or {}),
+            "settings_used": settings.as_dict(),
+            "line": line.facts,
+            "notes": notes,
+            "antennas": {name: antenna_record(part) for name, part in built.items()},
+            "wall_s": round(clock.perf_counter() - began, 3),
+        }
+        folder.write_json("reference.json", record)
+        files = folder.commit({})
+    return ReferenceSummary(built=built, notes=tuple(notes), files=files)
+
+
+def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
+    """All files but those of the line."""
+    strictness: Literal["strict", "lenient"] = "strict" if options.broken_lines == "stop" else "lenient"
+    logs: dict[str, PositionLog] = {
+        name: read_any_positions(path, on_error=strictness, date=options.date)
+        for name, path in inputs.positions.items()
+    }
+    notes = [note for log in logs.values() for note in log.notes]
+    notes += [
+        f"{log.path}: tells no quality, every row is taken as fixed" for log in logs.values() if not log.has_quality
+    ]
+    dopplers: dict[str, Dopplers] = {}
+    if inputs.logs:
+        navigation = read_navigation(inputs.nav, on_error=strictness)
+        for name, paths in inputs.logs.items():
+            log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines)
+            dopplers[name] = _dopplers(log, navigation)
+            notes += log.problems
+    vehicle = line.vehicle
+    distance, facing = float("nan"), 1
+    if vehicle is not None:
+        facing = 1 if vehicle.facing == "rising" else -1
+        if len(vehicle.antennas) == 2:
+            one, other = (np.array([a.along_m, a.across_m, a.up_m]) for a in vehicle.antennas.values())
+            distance = float(np.linalg.norm(one - other))
+    elif inputs.acceleration is not None:
+        notes.append("no vehicle file: the accelerometer's front is taken to point to rising chainage")
+    data = ReferenceData(
+        logs=logs,
+        trajectories=line.trajectories,
+        dopplers=dopplers,
+        pulses=None if inputs.pulses is None else read_pulses(inputs.pulses),
+        acceleration=None if inputs.acceleration is None else read_acceleration(inputs.acceleration),
+        facing=facing,
+        distance_m=distance,
+    )
+    return data, notes
+
+
+def _dopplers(log: Log, navigation: Navigation) -> Dopplers:
+    obs = concatenate(list(log.parts()))
+    found = dopplers_of_log(obs, navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS)
+    if not np.isfinite(found.rate_mps).any():
+        raise InputFileError(
+            log.paths[0],
+            "there is no Doppler with a satellite's orbit; a log with D observations and its navigation were expected",
+        )
+    return found
+
+
+def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
+    """What a reader must know: gaps left out, instants too uncertain, positions that were never checked."""
+    notes = []
+    long = [gap for gap in part.gaps if not gap.bridged]
+    if long:
+        total = sum(gap.length_s for gap in long)
+        named = [f"{np.datetime_as_string(gap.start, unit='s')} ({gap.length_s:.0f} s)" for gap in long[:_NAMED]]
+        more = [f"{len(long) - _NAMED} more"] if len(long) > _NAMED else []
+        limit = f"{len(long)} gaps of over {settings.max_gap_s:g} s are left out, {total:.0f} s together"
+        notes.append(f"{name}: {limit}: {', '.join(named + more)}")
+    if count := part.left_out["uncertain"]:
+        notes.append(f"{name}: {count} bridged instants less certain than {settings.max_sigma_m:g} m are left out")
+    if alone := part.bridged_by.get("nothing"):
+        notes.append(f"{name}: {alone} instants are bridged by an even run alone, no sensor measured there")
+    if np.isnan(part.fixes.travel_m).all():
+        notes.append(f"{name}: no sensor measured the way between fixes, so it was not checked")
+    return notes

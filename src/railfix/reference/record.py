@@ -1,0 +1,89 @@
+"""The tables and the record of a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from railfix.antenna import Trajectory
+from railfix.reference.assemble import Built
+from railfix.reference.fixes import Refusal
+from railfix.reference_log import COLUMNS, AntennaReference
+
+
+def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
+    """Rows of reference.csv, by time and then antenna."""
+    tables = [
+        pl.DataFrame(
+            {
+                "time_gpst": part.time,
+                "antenna": np.full(len(part), name),
+                "chainage_m": part.chainage_m,
+                **{axis: part.ecef_m[:, i] for i, axis in enumerate(("x_m", "y_m", "z_m"))},
+                "speed_mps": part.speed_mps,
+                "sigma_m": part.sigma_m,
+                "source": part.source,
+                "environment": part.environment,
+            }
+        )
+        for name, part in references.items()
+    ]
+    told = pl.when(pl.col("environment") != "").then(pl.col("environment")).alias("environment")
+    return _rounded(pl.concat(tables).sort("time_gpst", maintain_order=True).select(COLUMNS).with_columns(told))
+
+
+def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
+    """Rows of fixes.csv of one antenna."""
+    fixes = part.fixes
+    words = {int(code): Refusal(int(code)).text or "good" for code in np.unique(fixes.refusal)}
+    return _rounded(
+        pl.DataFrame(
+            {
+                "time_gpst": fixes.time,
+                "antenna": np.full(len(fixes), name),
+                "verdict": [words[code] for code in fixes.refusal.tolist()],
+                "quality": fixes.quality,
+                "ratio": fixes.ratio,
+                "chainage_m": trajectory.chainage_at(fixes.arc_m),
+                "lateral_m": fixes.lateral_m,
+                "height_m": fixes.height_m,
+                "spacing_m": fixes.spacing_m,
+                "travel_m": fixes.travel_m,
+                "sigma_m": fixes.sigma_m,
+            }
+        )
+    )
+
+
+def _rounded(table: pl.DataFrame) -> pl.DataFrame:
+    """Tenths of millimetres, and blank where there is no number."""
+    return table.with_columns(pl.col(pl.Float64).round(4).fill_nan(None))
+
+
+def antenna_record(part: Built) -> dict[str, Any]:
+    """One antenna as plain values."""
+    reference = part.reference
+    sigma = reference.sigma_m[reference.source == "bridged"]
+    return {
+        "positions": len(part.fixes),
+        "verdicts": part.fixes.counts(),
+        "instants": {source: int((reference.source == source).sum()) for source in ("rtk", "bridged")},
+        "left_out": part.left_out,
+        "bridged_by": part.bridged_by,
+        "bridged_sigma_m": None
+        if not len(sigma)
+        else {"p50": float(np.median(sigma)), "p95": float(np.percentile(sigma, 95)), "max": float(sigma.max())},
+        "gaps": [
+            {
+                "start": np.datetime_as_string(gap.start, unit="ms"),
+                "end": np.datetime_as_string(gap.end, unit="ms"),
+                "length_s": gap.length_s,
+                "bridged": gap.bridged,
+            }
+            for gap in part.gaps
+        ],
+        **part.facts,
+    }
