@@ -1,0 +1,310 @@
+"""The report as a file: what it holds, that it says what is absent, that nothing in it is fetched or unescaped."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from railfix.cli import app
+from railfix.config import parse_config
+from railfix.demonstration import demo_inputs, demo_truth
+from railfix.report import read_runs, report_page, write_report
+from railfix.report.encode import packed, script_json
+from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
+from railfix.report.html import number, share, table
+from railfix.run import RunOptions, RunSummary, run_files
+from report_page import Page, fetched
+
+pytestmark = pytest.mark.requirement("D3")
+
+RUNNER = CliRunner(env={"COLUMNS": "150", "TERM": "dumb", "NO_COLOR": "1"})
+STRANGE = "a<b>&'run'"
+
+
+@pytest.fixture(scope="module")
+def summary(tmp_path_factory: pytest.TempPathFactory) -> RunSummary:
+    """The first minute of the demonstration, in a folder whose name is no HTML."""
+    first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
+    asked = {"preset": "p1", "raim": {"false_alarm": 0.01}}
+    options = RunOptions(observations="write", chunk_epochs=200, end=first + timedelta(seconds=60))
+    out = tmp_path_factory.mktemp("run") / STRANGE
+    return run_files(demo_inputs(), parse_config(dict(asked)), out=out, options=options, asked=asked)
+
+
+@pytest.fixture(scope="module")
+def folder(summary: RunSummary) -> Path:
+    return summary.files["run.json"].parent
+
+
+@pytest.fixture(scope="module")
+def document(folder: Path) -> str:
+    runs, evaluation = read_runs([folder], [demo_truth()])
+    return report_page(runs, evaluation)
+
+
+@pytest.fixture(scope="module")
+def page(document: str) -> Page:
+    return Page(document)
+
+
+def unpacked(text: str) -> np.ndarray:
+    """Arrays of the page, by the letter that they begin with."""
+    return np.frombuffer(base64.b64decode(text[1:]), dtype={"f": "<f4", "h": "<u2", "i": "<u4"}[text[0]])
+
+
+def chart(page: Page, name: str, at: int = 0) -> dict[str, Any]:
+    """Numbers behind a picture."""
+    figure = [found for found in page.figures if found["data-name"] == name][at]
+    loaded: dict[str, Any] = json.loads(page.text[figure["data-chart"]])
+    return loaded
+
+
+def layer_of(values: dict[str, Any], label: str) -> dict[str, Any]:
+    return next(layer for layer in values["layers"] if layer["label"] == label)
+
+
+def test_errors_in_the_page_are_those_of_the_positions(page: Page, folder: Path) -> None:
+    truth = pl.read_csv(demo_truth(), schema_overrides={"time_gpst": pl.Datetime("ns")})
+    rows = pl.read_parquet(folder / "positions.parquet").with_columns(pl.col("antenna").cast(pl.String))
+    rows = rows.join(truth.select("time_gpst", "antenna", true_m="chainage_m"), on=["time_gpst", "antenna"])
+    for at, antenna in enumerate(("front", "rear")):
+        mine = rows.filter(antenna=antenna).sort("time_gpst")
+        for label, column in (("on the map", "chainage_m"), ("conventional", "conventional_chainage_m")):
+            expected = (mine[column] - mine["true_m"]).drop_nulls().to_numpy()
+            over_time = layer_of(chart(page, "error-time", at), label)
+            np.testing.assert_allclose(unpacked(over_time["y"]), expected, atol=1e-3)
+            over_chainage = layer_of(chart(page, "error-chainage", at), label)
+            place = mine.filter(pl.col(column).is_not_null())["true_m"].to_numpy()
+            np.testing.assert_allclose(unpacked(over_chainage["x"]), place, atol=1e-3)
+
+
+def test_the_sky_in_the_page_is_that_of_the_observations(page: Page, folder: Path) -> None:
+    sky = chart(page, "sky")
+    first = unpacked(sky["first"])
+    k = len(first) // 2
+    time = np.datetime64(0, "ns") + np.timedelta64(round((sky["start"] + float(unpacked(sky["epoch"])[k])) * 1e3), "ms")
+    rows = pl.read_parquet(folder / "observations.parquet").filter(
+        pl.col("antenna").cast(pl.String) == "front", pl.col("time_gpst") == pl.lit(time)
+    )
+    inside = slice(int(first[k]), int(first[k + 1]))
+    names = [sky["names"][i] for i in unpacked(sky["satellite"])[inside]]
+    assert sorted(names) == sorted(rows["satellite"].to_list())
+    for at, name in enumerate(names, start=inside.start):
+        (row,) = rows.filter(satellite=name).to_dicts()
+        assert unpacked(sky["elevation"])[at] / 100.0 == pytest.approx(row["elevation_deg"], abs=0.006)
+        assert unpacked(sky["azimuth"])[at] / 100.0 == pytest.approx(row["azimuth_deg"] % 360.0, abs=0.006)
+        assert unpacked(sky["cn0"])[at] / 100.0 == pytest.approx(row["cn0_dbhz"], abs=0.006)
+        assert row["reason_text"].split("+")[0] == sky["reasons"][unpacked(sky["reason"])[at]]
+
+
+def test_every_picture_of_the_paper_is_there(page: Page) -> None:
+    names = [figure["data-name"] for figure in page.figures]
+    both = ("plan", "error-time", "error-chainage", "interval-chainage", "interval-distribution", "satellites", "sky")
+    assert all(names.count(name) == 2 for name in both)
+    assert names.count("error-ranges") == names.count("processing-time") == 1
+    assert names.count("cn0-g-1c") == 2
+    # doppler, antenna pair, RAIM, its level, spacing, elevation and C/N0 floor, each over time and over chainage
+    assert names.count("time") == names.count("chainage") >= 12
+    assert len({figure["data-chart"] for figure in page.figures}) == len(names)
+    for figure in page.figures:
+        assert json.loads(page.text[figure["data-chart"]])
+        assert figure.get("data-sky", "sky0-0") in {found.get("id") for found in page.figures}
+
+
+def test_the_head_tells_what_was_run(document: str, folder: Path) -> None:
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    for entry in record["inputs"]:
+        assert entry["sha256"] in document
+    assert record["versions"]["numpy"] in document
+    assert '<th scope="row">raim.false_alarm</th><td>0.01</td><td>0.01</td>' in document
+    assert document.count("<tr class=asked>") == 2
+    facts = record["antennas"]["front"]
+    for reason, count in facts["observations_refused_by_first_reason"].items():
+        assert f'<th scope="row">  {reason}</th><td class="n">{count:,}</td>' in document
+    assert f"{100 * facts['positioning_rate']:.2f} %" in document
+    for note in record["notes"]:
+        assert note in document
+
+
+def test_figures_of_merit_are_the_evaluations(document: str, folder: Path) -> None:
+    _, evaluation = read_runs([folder], [demo_truth()])
+    assert evaluation is not None
+    for antenna in ("front", "rear"):
+        largest = evaluation.figure("max_m", antenna=antenna)
+        conventional = evaluation.figure("p95_m", antenna=antenna, position="conventional")
+        assert f'<td class="n">{largest:.2f} m</td>' in document
+        assert f'<td class="n">{conventional:.2f} m</td>' in document
+    assert NO_REFERENCE not in document
+
+
+def test_nothing_is_fetched_and_nothing_unescaped(document: str, page: Page) -> None:
+    assert fetched(document) == []
+    assert not [tag for tag, _ in page.elements if tag in ("link", "img", "iframe", "object", "embed", "base")]
+    policy = next(found for tag, found in page.elements if tag == "meta" and "http-equiv" in found)
+    assert policy["content"].startswith("default-src 'none'")
+    assert STRANGE not in document
+    assert "a&lt;b&gt;&amp;" in document
+    assert "b" not in {tag for tag, _ in page.elements}
+
+
+def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:
+    attack = "</script><script>alert(1)</script><!--"
+    mine = tmp_path / "run"
+    shutil.copytree(folder, mine)
+    record = json.loads((mine / "run.json").read_text(encoding="utf-8"))
+    record["notes"] = [attack]
+    record["command"] = ["railfix", attack]
+    record["line"]["track"]["name"] = attack
+    record["inputs"][0]["path"] = attack
+    (mine / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    observations = pl.read_parquet(mine / "observations.parquet").with_columns(signal=pl.lit(attack))
+    observations.write_parquet(mine / "observations.parquet")
+    runs, _ = read_runs([mine])
+    document = report_page(runs, None, title=attack)
+    assert "alert(1)</script>" not in document
+    assert "<!--" not in document
+    clean = report_page(read_runs([folder])[0], None)
+    assert document.count("<script") == clean.count("<script") - 2 * _signals_lost(folder)
+    assert document.count("&lt;script&gt;alert(1)") >= 5
+
+
+def _signals_lost(folder: Path) -> int:
+    """Pictures of C/N0 over elevation that become one where a kind of satellite has one signal only."""
+    rows = pl.read_parquet(folder / "observations.parquet").with_columns(kind=pl.col("satellite").str.head(1))
+    kinds = rows.filter(pl.col("cn0_dbhz").is_not_null())
+    return kinds.select("kind", "signal").unique().height - kinds["kind"].n_unique()
+
+
+def test_without_a_reference_the_page_says_so(folder: Path) -> None:
+    runs, evaluation = read_runs([folder])
+    assert evaluation is None
+    document = report_page(runs, evaluation)
+    names = {figure["data-name"] for figure in Page(document).figures}
+    assert NO_REFERENCE in document
+    assert not {"error-time", "error-chainage", "error-ranges", "stanford"} & names
+    assert {"plan", "interval-chainage", "sky"} <= names
+    assert "Figures of merit" not in document
+
+
+def test_without_observations_and_times_the_page_says_so(folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "positions.parquet", tmp_path)
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    del record["chunks"]
+    (tmp_path / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    runs, evaluation = read_runs([tmp_path], [demo_truth()])
+    document = report_page(runs, evaluation)
+    names = {figure["data-name"] for figure in Page(document).figures}
+    assert NO_OBSERVATIONS in document
+    assert NO_TIMES in document
+    assert not {"sky", "time", "processing-time"} & names
+    assert {"error-time", "plan"} <= names
+
+
+def test_several_runs_have_a_summary_and_a_part_each(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    page = tmp_path / "report.html"
+    arguments = ["report", str(folder), str(other), "--reference", str(demo_truth()), "--out", str(page)]
+    result = RUNNER.invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    document = page.read_text(encoding="utf-8")
+    read = Page(document)
+    ranges = chart(read, "error-ranges")
+    assert len(ranges["layers"][0]["names"]) == 8
+    assert ranges["layers"][0]["names"][-1] == "other, rear, conventional"
+    assert {"run0", "run1", "run0-0", "run1-1"} <= {found.get("id") for _, found in read.elements}
+    assert document.count('<th scope="row">other</th>') == 2
+    assert [figure["data-name"] for figure in read.figures].count("plan") == 4
+
+
+def test_the_run_tells_how_long_its_chunks_took(summary: RunSummary, page: Page) -> None:
+    record = json.loads(summary.files["run.json"].read_text(encoding="utf-8"))
+    chunks = record["chunks"]
+    assert sum(chunks["epochs"]) == summary.tally.epochs == 1200
+    assert len(chunks["epochs"]) == len(chunks["positioning_s"]) == 3
+    assert chunks["first_epoch_gpst"][0] == record["antennas"]["front"]["first_epoch_gpst"]
+    assert 0.0 < sum(chunks["positioning_s"]) < record["wall_s"]
+    drawn = layer_of(chart(page, "processing-time"), "mean of a chunk")
+    expected = 1e3 * np.array(chunks["positioning_s"]) / np.array(chunks["epochs"])
+    np.testing.assert_allclose(unpacked(drawn["y"]), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["{run}", "--out", "{tmp}/none/report.html"], 8, "cannot be written"),
+        (["{tmp}/nowhere", "--out", "{tmp}/report.html"], 3, "there is no such folder"),
+        (["{tmp}", "--out", "{tmp}/report.html"], 3, "positions"),
+        (["{run}", "{run}", "--out", "{tmp}/report.html"], 4, "given twice"),
+        (["{run}", "--reference", "{truth}", "--reference", "{truth}", "--out", "{tmp}/report.html"], 4, "references"),
+        (["{run}", "--reference", "{tmp}/truth.csv", "--out", "{tmp}/report.html"], 3, "truth.csv"),
+        (["{run}"], 2, "--out"),
+    ],
+)
+def test_what_is_wrong_is_told(folder: Path, tmp_path: Path, arguments: list[str], code: int, said: str) -> None:
+    words = [a.format(run=folder, tmp=tmp_path, truth=demo_truth()) for a in arguments]
+    result = RUNNER.invoke(app, ["report", *words])
+    assert result.exit_code == code, result.output
+    assert said in result.output
+    assert "Traceback" not in result.output
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("broken", ["{", "[]", "{}", '{"settings_used": {"colour": "red"}}'])
+def test_a_record_that_is_none(folder: Path, tmp_path: Path, broken: str) -> None:
+    shutil.copy(folder / "positions.parquet", tmp_path)
+    (tmp_path / "run.json").write_text(broken)
+    result = RUNNER.invoke(app, ["report", str(tmp_path), "--out", str(tmp_path / "report.html")])
+    assert result.exit_code in (3, 4)
+    assert "run.json" in result.output
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_observations_that_are_no_table(folder: Path, tmp_path: Path) -> None:
+    for name in ("run.json", "positions.parquet"):
+        shutil.copy(folder / name, tmp_path)
+    (tmp_path / "observations.parquet").write_text("no table")
+    result = RUNNER.invoke(app, ["report", str(tmp_path), "--out", str(tmp_path / "report.html")])
+    assert result.exit_code == 3
+    assert "observations.parquet" in result.output
+
+
+def test_an_earlier_page_is_replaced_and_an_error_leaves_it(folder: Path, tmp_path: Path) -> None:
+    page = tmp_path / "report.html"
+    page.write_text("old")
+    assert RUNNER.invoke(app, ["report", str(tmp_path), "--out", str(page)]).exit_code == 3
+    assert page.read_text() == "old"
+    assert write_report([folder], page).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_pieces_of_html() -> None:
+    assert script_json({"a": "</script>\u2028"}) == '{"a":"\\u003c/script\\u003e\\u2028"}'
+    with pytest.raises(ValueError, match="JSON"):
+        script_json({"a": float("nan")})
+    np.testing.assert_array_equal(unpacked(packed(np.array([1.5, np.nan, -np.inf]))), [1.5, np.nan, -np.inf])
+    assert unpacked(packed(np.array([0, 70_000]), "i")).tolist() == [0, 70_000]
+    assert number(-1234.5) == "−1,234.50"
+    assert number(None) == number(float("nan")) == share(None) == "–"
+    assert '<td class="n">&lt;1&gt;</td>' in table(["a", "b"], [["x", "<1>"]], right=[1])
+
+
+def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> None:
+    result = RUNNER.invoke(app, ["demo", "--out", str(tmp_path / "demo")])
+    assert result.exit_code == 0, result.output
+    last = result.output.strip().splitlines()[-1]
+    assert last.endswith("report.html")
+    assert "conventional" in result.output
+    written = sorted(path.name for path in (tmp_path / "demo").iterdir())
+    assert written == ["observations.parquet", "positions.csv", "positions.parquet", "report.html", "run.json"]
+    names = [figure["data-name"] for figure in Page((tmp_path / "demo" / "report.html").read_text()).figures]
+    assert names.count("error-time") == 2

@@ -1,0 +1,154 @@
+"""The report in a browser: no error of its script, every picture drawn, no network, legible in print."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections import Counter
+from datetime import timedelta
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from railfix.demonstration import demo_inputs, demo_truth
+from railfix.report import write_report
+from railfix.run import RunOptions, run_files
+from report_page import Page, browser, opened, run_browser, timing_ms
+
+pytestmark = [
+    pytest.mark.requirement("D3"),
+    pytest.mark.skipif(browser() is None, reason="no chromium is installed"),
+]
+
+#: Goes through every picture: draws it, points at it, enlarges it, shows all again, hides a layer and clicks.
+EXERCISE = """
+<script>
+(function () {
+  const said = document.createElement("div");
+  said.id = "exercise";
+  document.body.append(said);
+  let tips = 0, skies = 0, zooms = 0;
+  const fire = (canvas, kind, x, y) => {
+    const place = canvas.getBoundingClientRect();
+    canvas.dispatchEvent(new PointerEvent(kind, { clientX: place.left + x, clientY: place.top + y, button: 0,
+      pointerType: "mouse", pointerId: 1, bubbles: true }));
+  };
+  for (const figure of document.querySelectorAll("figure[data-chart]")) {
+    const plot = figure.plot, canvas = figure.querySelector("canvas");
+    plot.draw();
+    if (figure.classList.contains("skyplot")) {
+      const slider = figure.querySelector("input");
+      slider.value = slider.max;
+      slider.dispatchEvent(new Event("input"));
+      continue;
+    }
+    const layer = plot.chart.layers.filter(l => l.kind === "points" && l.x.length).pop();
+    const i = layer ? Math.floor(layer.x.length / 2) : 0;
+    const x = layer ? plot.box.px(layer.x[i]) : 200, y = layer ? plot.box.py(layer.y[i]) : 100;
+    fire(canvas, "pointermove", x, y);
+    if (!figure.querySelector(".tip").hidden) tips++;
+    const sky = document.getElementById(figure.dataset.sky || "none");
+    const before = sky ? sky.querySelector("output").textContent : "";
+    fire(canvas, "pointerdown", x, y);
+    fire(canvas, "pointerup", x, y);
+    if (sky && sky.querySelector("output").textContent !== before) skies++;
+    const whole = plot.box.x.slice();
+    const left = plot.box.left + 30, top = plot.box.top + 20;
+    fire(canvas, "pointerdown", left, top);
+    fire(canvas, "pointermove", left + 80, top + 50);
+    fire(canvas, "pointerup", left + 80, top + 50);
+    if (plot.box.x[0] > whole[0] && plot.box.x[1] < whole[1]) zooms++;
+    canvas.dispatchEvent(new MouseEvent("dblclick"));
+    if (plot.box.x[0] !== whole[0]) zooms -= 1000;
+    for (const key of ["+", "ArrowRight", "-", "0"]) canvas.dispatchEvent(new KeyboardEvent("keydown", { key }));
+    const button = figure.querySelector(".legend button");
+    button.click();
+    button.click();
+  }
+  said.dataset.tips = tips;
+  said.dataset.skies = skies;
+  said.dataset.zooms = zooms;
+})();
+</script></body>"""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
+    options = RunOptions(observations="write", chunk_epochs=200, end=first + timedelta(seconds=60))
+    folder = tmp_path_factory.mktemp("browser")
+    run_files(demo_inputs(), out=folder / "run", options=options)
+    return write_report([folder / "run"], folder / "report.html", references=[demo_truth()])
+
+
+def test_it_opens_with_its_first_pictures_and_without_an_error(page: Path) -> None:
+    document = opened(page)
+    read = Page(document)
+    assert read.text.get("railfix-errors", "") == ""
+    drawn = [figure for figure in read.figures if "data-drawn" in figure]
+    assert 0 < len(drawn) < len(read.figures)
+    assert all(int(figure["data-drawn"]) > 0 for figure in drawn)
+    found = timing_ms(document)
+    assert found["drawn"] > 0.0
+    assert found["load"] > 0.0
+
+
+@pytest.mark.slow
+def test_every_picture_is_drawn_in_a_window_that_holds_them_all(page: Path) -> None:
+    read = Page(opened(page, height=30_000))
+    assert read.text.get("railfix-errors", "") == ""
+    assert {figure["data-name"]: int(figure.get("data-drawn", 0)) > 0 for figure in read.figures} == {
+        figure["data-name"]: True for figure in read.figures
+    }
+    assert len(read.figures) > 30
+
+
+def test_pictures_can_be_pointed_at_enlarged_and_clicked(page: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "exercise.html"
+    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", EXERCISE), encoding="utf-8")
+    read = Page(opened(copy))
+    assert read.text.get("railfix-errors", "") == ""
+    said = read.by_id("exercise")
+    charts = [figure for figure in read.figures if "skyplot" not in figure["class"]]
+    linked = [figure for figure in charts if "data-sky" in figure]
+    with_points = [figure for figure in charts if figure["data-name"] not in ("error-ranges", "stanford")]
+    with_points = [f for f in with_points if f["data-name"] != "interval-distribution"]
+    assert int(said["data-tips"]) >= len(with_points) > 20
+    assert int(said["data-zooms"]) == len(charts)
+    # the first click on each antenna's sky leaves its first epoch, later ones may meet the one that is shown
+    assert 2 <= int(said["data-skies"]) <= len(linked)
+
+
+def test_an_error_of_the_script_would_be_seen(page: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "broken.html"
+    broken = "<script>console.error('told'); nowhere();</script></body>"
+    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", broken), encoding="utf-8")
+    said = Page(opened(copy)).text["railfix-errors"]
+    assert "told" in said
+    assert "nowhere" in said
+
+
+@pytest.mark.slow
+def test_it_prints_whole(page: Path, tmp_path: Path) -> None:
+    paper = tmp_path / "report.pdf"
+    run_browser(page, f"--print-to-pdf={paper}")
+    assert paper.read_bytes().startswith(b"%PDF")
+    if shutil.which("pdftotext") is None or shutil.which("pdfinfo") is None:
+        pytest.skip("no pdftotext and pdfinfo to look into the printed page")
+
+    def told(*command: str) -> str:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    text = " ".join(told("pdftotext", "-layout", str(paper), "-").split())
+    for words in ("Figures of merit", "Settings asked for and used", "min_satellites", "SHA-256", "rear antenna"):
+        assert words in text
+    # what is written along the axes of the pictures is text on paper too: every one is there
+    read = Page(page.read_text(encoding="utf-8"))
+    charts = [json.loads(read.text[f["data-chart"]]) for f in read.figures if "skyplot" not in f["class"]]
+    labels = Counter(values["x_label"] for values in charts)
+    assert labels["GPS time"] > 10
+    for label, count in labels.items():
+        assert text.count(f"{label}, 2024-03-05" if label == "GPS time" else label) >= count, label
+    assert "A4" in told("pdfinfo", str(paper)).split("Page size:")[1].splitlines()[0]
