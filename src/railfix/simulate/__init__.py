@@ -13,6 +13,7 @@ from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.constellation import made_navigation
 from railfix.simulate.demo_data import DEMO_FILES, demo_files, demo_folder
 from railfix.simulate.disturbance import Disturbance, Disturbances, Geometry
+from railfix.simulate.errors import ErrorSettings
 from railfix.simulate.line_settings import (
     Element,
     GeneratedLine,
@@ -35,6 +36,8 @@ from railfix.simulate.scenario import (
     VehicleSettings,
 )
 from railfix.simulate.scenario_file import Recipe, load_recipe, load_scenario, scenario_toml, shipped_scenarios
+from railfix.simulate.sensors import SensorSettings
+from railfix.simulate.sensors.tables import sensor_tables
 from railfix.simulate.signals import Piece, Simulation
 
 __all__ = [
@@ -45,6 +48,7 @@ __all__ = [
     "Disturbance",
     "Disturbances",
     "Element",
+    "ErrorSettings",
     "GeneratedLine",
     "Geometry",
     "Gradient",
@@ -57,6 +61,7 @@ __all__ = [
     "Recipe",
     "RunSettings",
     "Scenario",
+    "SensorSettings",
     "Simulation",
     "SkySettings",
     "SpeedLimit",
@@ -74,6 +79,7 @@ __all__ = [
     "run_curve",
     "scenario_toml",
     "section_table",
+    "sensor_tables",
     "shipped_scenarios",
     "shuttle",
     "truth_table",
