@@ -62,8 +62,11 @@ class MaskTable:
         self.number, self.time = masks.number[order], time[order]
         self._by_issue = Timeline(masks.iodp[order], self.time)
         self._by_time = Timeline(np.zeros(len(time), dtype=np.int64), time)
-        self._in_time = masks.number
         self._time_in_time = time
+        member = np.zeros((len(time), 256), dtype=bool)
+        np.put_along_axis(member, masks.number, True, axis=1)
+        member[:, 0] = False
+        self._member = member
         self._limit = limits.timeout_s("mask")
         self._stops = stops
 
@@ -94,10 +97,7 @@ class MaskTable:
             return nothing, np.zeros((len(time), len(number)), dtype=bool)
         received = self._time_in_time[row]
         known = (row >= 0) & (seconds(time - received) <= self._limit) & (received > self._stops.last(time))
-        member = np.zeros((len(self._in_time), 256), dtype=bool)
-        np.put_along_axis(member, self._in_time, True, axis=1)
-        member[:, 0] = False
-        return known, member[row][:, np.maximum(number, 0)] & known[:, None]
+        return known, self._member[row][:, np.maximum(number, 0)] & known[:, None]
 
 
 @dataclass(frozen=True, kw_only=True)
