@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def evaluate(
     *,
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folder that `railfix run` wrote.")],
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folder that `railfix run` wrote.")],
     reference: Annotated[
         list[str],
         typer.Option(

@@ -240,7 +240,8 @@ def antenna_epochs(
         # Over gaps of the reference the way is shared out by time, so that positions there count.
         columns[f"{prefix}interval_m"] = since_last(moved, np.isfinite(answered))
         columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
-    columns["block"] = (clock // options.block_s).astype(np.int64)
+    first = run.positions["time_gpst"].to_numpy().min()
+    columns["block"] = (seconds(time - first) // options.block_s).astype(np.int64)
     columns |= {name: column(name) for name in level_columns(mine)}
     table = pl.DataFrame(columns, nan_to_null=True).with_columns(pl.col("n_used").cast(pl.Int64))
     return AntennaEpochs(
