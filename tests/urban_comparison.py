@@ -2,7 +2,7 @@
 
 Run ``python tests/urban_comparison.py`` with the recordings beside the checkout; without them only the
 simulated columns are printed. Nothing is fitted: the kinds of `railfix.simulate.environment.kinds` are
-chosen from what such places look like.
+chosen from what such places look like. ``python tests/urban_comparison.py speed`` prints what they cost.
 """
 
 from __future__ import annotations
@@ -10,7 +10,9 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +25,9 @@ from railfix.geodesy import range_with_rotation
 from railfix.measurement import CodeNoise, code_sigma_m
 from railfix.pipeline import AntennaResult
 from railfix.reasons import Reason
-from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings
+from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings, write_run
 from railfix.simulate.environment import ElectrificationSettings, Environment, EnvironmentSettings, SectionSettings
+from railfix.simulate.environment.settings import Kind
 
 Floats = NDArray[np.float64]
 
@@ -127,15 +130,19 @@ def cn0_by_elevation(sample: Sample) -> Floats:
     return table
 
 
-def simulated(kind: str, *, seeds: tuple[int, ...] = SEEDS, duration_s: float = 780.0) -> Sample:
+def environment(kind: Kind, *, seed: int) -> Environment:
+    """An electrified line that is of one kind from end to end."""
+    settings = EnvironmentSettings(
+        electrification=ElectrificationSettings(),
+        sections=(SectionSettings(from_m=0.0, to_m=LENGTH_M, kind=kind),),
+    )
+    return Environment(settings, line_length_m=LENGTH_M, seed=seed)
+
+
+def simulated(kind: Kind | Literal["none"], *, seeds: tuple[int, ...] = SEEDS, duration_s: float = 780.0) -> Sample:
     """A train at 40 km/h at most, 1 Hz, on a line that is of one kind from end to end."""
     parts = []
     for seed in seeds:
-        settings = EnvironmentSettings(
-            electrification=ElectrificationSettings(),
-            sections=(SectionSettings(from_m=0.0, to_m=LENGTH_M, kind=kind),) if kind != "none" else (),
-        )
-        place = Environment(settings, line_length_m=LENGTH_M, seed=seed)
         scenario = Scenario(
             seed=seed,
             # Another sky for each seed.
@@ -145,7 +152,7 @@ def simulated(kind: str, *, seeds: tuple[int, ...] = SEEDS, duration_s: float = 
             line=LineSettings(length_m=LENGTH_M),
             run=RunSettings(cruise_mps=CRUISE_MPS, stand_s=30.0),
             sky=SkySettings(systems=SYSTEMS),
-            multipath=() if kind == "none" else (place,),
+            multipath=() if kind == "none" else (environment(kind, seed=seed),),
         )
         for piece in Simulation(scenario).pieces("front"):
             observed = piece.observations
@@ -238,7 +245,28 @@ def print_tables(samples: list[Sample]) -> None:
         print(f"| {sample.name} | " + " | ".join(cells) + " |")
 
 
+def print_speed() -> None:
+    """Processor time of a run's files without surroundings, and of the surroundings alone."""
+    scenario = Scenario(duration_s=400.0, line=LineSettings(length_m=LENGTH_M), sky=SkySettings(systems=SYSTEMS))
+    simulation = Simulation(scenario)
+    (piece, *_) = simulation.pieces("front", chunk_epochs=scenario.epochs)
+    signals = 2 * piece.geometry.elevation_deg.size
+    began = process_time()
+    with TemporaryDirectory() as folder:
+        write_run(scenario, folder)
+    whole = process_time() - began
+    print(f"files of a clean run: {1e6 * whole / signals:.1f} us a channel and epoch")
+    for kind in ("open", "suburban", "urban"):
+        began = process_time()
+        environment(kind, seed=1)(piece.geometry)
+        alone = 2.0 * (process_time() - began)
+        print(f"{kind}: {1e6 * alone / signals:.1f} us more, {100 * alone / whole:.0f} %")
+
+
 def main() -> int:
+    if sys.argv[1:] == ["speed"]:
+        print_speed()
+        return 0
     samples = [simulated(kind) for kind in ("none", "open", "suburban", "urban", "station", "canyon")]
     data = Path(__file__).resolve().parents[2] / "shared" / "data"
     if data.is_dir():
