@@ -298,6 +298,13 @@ def test_a_run_that_lasts_longer_begins_the_same() -> None:
         short.at(np.array([100.0]))
 
 
+@pytest.mark.parametrize("bias_s", [9.9e-3, -9.9e-3])
+def test_a_clock_that_is_far_off_asks_for_instants_outside_of_the_run(bias_s: float) -> None:
+    errors = ErrorSettings(troposphere=TroposphereErrorSettings(zenith_sigma_m=0.1, zenith_time_s=0.05))
+    piece = whole(Scenario(duration_s=1.0, receiver=replace(QUIET, clock_bias_s=bias_s), errors=errors))
+    assert np.abs(piece.error_m).max() > 0.1
+
+
 def test_rates_are_those_of_the_values() -> None:
     process = GaussMarkov([(5,)], sigma=1.0, time_s=30.0, duration_s=100.0)
     when = np.linspace(0.0, 99.0, 1234)

@@ -18,8 +18,10 @@ Floats = NDArray[np.float64]
 
 #: Nodes in one correlation time.
 _NODES_A_TIME: Final = 32
-#: Nodes before the start of the run.
+#: Least number of nodes before the start of the run, and least room before and after it [s]: a receiver's
+#: clock that is late or early asks for instants outside.
 _BEFORE: Final = 3
+_ROOM_S: Final = (0.1, 1.0)
 
 
 def satellite_key(satellite: str) -> tuple[int, int]:
@@ -33,16 +35,17 @@ class Interpolated:
     Parameters
     ----------
     nodes : ndarray, shape (K, C)
-        Values at ``(k - 3) * spacing_s``.
+        Values at ``(k - nodes_before(spacing_s)) * spacing_s``.
     spacing_s : float
     """
 
     def __init__(self, nodes: Floats, spacing_s: float) -> None:
         self._nodes = nodes
         self._spacing_s = spacing_s
+        self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[NDArray[np.intp], Floats]:
-        place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + _BEFORE
+        place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
             raise ValueError("a time is outside of the run that the errors were made for")
@@ -64,9 +67,14 @@ class Interpolated:
         return np.asarray(slope / 2.0 / self._spacing_s)
 
 
+def nodes_before(spacing_s: float) -> int:
+    """Nodes before second 0."""
+    return max(_BEFORE, int(np.ceil(_ROOM_S[0] / spacing_s)) + 1)
+
+
 def node_count(duration_s: float, spacing_s: float) -> int:
-    """Nodes that a run of a duration needs, with some room after its end."""
-    return int(np.ceil((duration_s + 1.0) / spacing_s)) + _BEFORE + 4
+    """Nodes that a run of a duration needs, with the room before and after it."""
+    return nodes_before(spacing_s) + int(np.ceil((duration_s + _ROOM_S[1]) / spacing_s)) + 4
 
 
 class GaussMarkov(Interpolated):
@@ -121,10 +129,11 @@ class ClockWalk(Interpolated):
     ) -> None:
         count = node_count(duration_s, interval_s)
         white = np.random.default_rng(list(key)).standard_normal((count, 2)) * np.sqrt(interval_s)
+        start = nodes_before(interval_s)
         drift = np.cumsum(frequency_walk * white[:, 0])
         bias = np.cumsum(walk * white[:, 1])
-        drift, bias = drift - drift[_BEFORE], bias - bias[_BEFORE]
+        drift, bias = drift - drift[start], bias - bias[start]
         # The trapezoid rule: the drift goes evenly from node to node.
         turned = np.concatenate([[0.0], np.cumsum((drift[1:] + drift[:-1]) / 2.0)]) * interval_s
-        bias = bias + turned - turned[_BEFORE]
+        bias = bias + turned - turned[start]
         super().__init__(bias[:, None], interval_s)
