@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import tomllib
@@ -13,6 +14,7 @@ import numpy as np
 import polars as pl
 import pytest
 
+from conftest import ROOT
 from railfix.epochs import concatenate
 from railfix.errors import InputFileError, MismatchError, SettingsError
 from railfix.rinex import read_navigation, write
@@ -399,3 +401,17 @@ def test_georinex_reads_the_files(tmp_path: Path) -> None:
 def test_tables_of_settings_tell_what_is_known() -> None:
     with pytest.raises(SettingsError, match=r"known are .*bogie_distance_m"):
         from_table(Scenario, tomllib.loads("[vehicle]\nbogie = 3"), where="", source="here")
+
+
+def test_the_files_of_the_document_are_scenarios(tmp_path: Path) -> None:
+    text = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
+    one, many = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    scenario = load_scenario(write_text(tmp_path, one))
+    assert scenario.duration_s > 60.0
+    assert Simulation(scenario).line.length_m == pytest.approx(1000.0)
+    assert [load_recipe(write_text(tmp_path, many)).scenario(k).run.direction for k in range(2)] == [
+        "rising",
+        "falling",
+    ]
+    for name in shipped_scenarios():
+        assert f"| `{name}` |" in text
