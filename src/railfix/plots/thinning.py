@@ -35,11 +35,15 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     pieces = max(points // 2, 1)
     low, high = float(x[rows].min()), float(x[rows].max())
     piece = np.minimum((pieces * ((x[rows] - low) / ((high - low) or 1.0))).astype(np.intp), pieces - 1)
-    order = np.lexsort((y[rows], piece))
-    edge = np.flatnonzero(np.diff(piece[order])) + 1
-    least = order[np.r_[0, edge]]
-    greatest = order[np.r_[edge, len(order)] - 1]
-    return np.asarray(np.unique(rows[np.r_[least, greatest]]), dtype=np.intp)
+    order = np.argsort(piece.astype(np.uint16 if pieces < 65536 else np.intp), kind="stable")
+    value, owner = y[rows][order], piece[order]
+    first = np.flatnonzero(np.r_[True, np.diff(owner) > 0])
+    of_piece = np.repeat(np.arange(len(first)), np.diff(np.r_[first, len(order)]))
+    kept = []
+    for extreme in (np.minimum.reduceat(value, first), np.maximum.reduceat(value, first)):
+        equal = np.flatnonzero(value == extreme[of_piece])
+        kept.append(equal[np.flatnonzero(np.r_[True, np.diff(of_piece[equal]) > 0])])
+    return np.asarray(np.unique(rows[order[np.concatenate(kept)]]), dtype=np.intp)
 
 
 def one_a_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
