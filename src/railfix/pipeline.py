@@ -33,7 +33,7 @@ from railfix.noise_scale import noise_scale, own_sigma_m
 from railfix.pairing import AntennaPair, pair_antennas, screen_antenna_pair
 from railfix.placing import Place, place_on_line, redundancy_of
 from railfix.preparation import Prepared, prepare
-from railfix.protecting import protect, with_coordinates
+from railfix.protecting import judged, protect
 from railfix.raim import Outcome
 from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.refusals import alone_on_their_clocks, satellites_refused, whole_reason
@@ -363,7 +363,7 @@ class EpochProcessor:
             constrained=constrained,
             phase=found.phase,
             raim=replace(found.raim, protection_level_m=np.where(has, found.raim.protection_level_m, np.nan)),
-            protection=None if found.protection is None else with_coordinates(found.protection, has, self.config),
+            protection=None if found.protection is None else judged(found.protection, found.status, has, self.config),
             clocks=one.clocks,
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,

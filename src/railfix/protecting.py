@@ -14,7 +14,9 @@ from railfix.config import Config
 from railfix.constrained import Constrained
 from railfix.preparation import Prepared
 from railfix.protection import ProtectionLevel, RiskBudget, along_track_level, availability
+from railfix.protection import Status as LevelStatus
 from railfix.raim import Outcome, constrained_model
+from railfix.reasons import CHECK_FAILED, Status
 from railfix.results import Protection, Raim
 
 Floats = NDArray[np.float64]
@@ -93,7 +95,9 @@ def protect(
         bias_m=one.bias_m,
         n_excluded=raim.excluded.sum(axis=1),
     )
-    return _judged(level, config)
+    return Protection(
+        level=level, status=availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    )
 
 
 def _level_scale(scale: Floats, config: Config) -> Floats | float:
@@ -103,16 +107,28 @@ def _level_scale(scale: Floats, config: Config) -> Floats | float:
     return np.maximum(scale, 1.0) if config.sbas else scale
 
 
-def _judged(level: ProtectionLevel, config: Config) -> Protection:
-    return Protection(
-        level=level, status=availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    )
+def judged(protection: Protection, status: NDArray[np.int8], has: NDArray[np.bool_], config: Config) -> Protection:
+    """Levels beside the verdicts on the positions.
 
+    A level stands for the place that the ranges were linearised at. Where another place explains them as
+    well, or the position is off the map, it is of no use: unavailable. Where a check has failed: alarm.
 
-def with_coordinates(protection: Protection, has: NDArray[np.bool_], config: Config) -> Protection:
-    """The same without the levels of positions that are dropped."""
+    Parameters
+    ----------
+    protection : Protection
+    status : ndarray of int8, shape (T,)
+        `reasons.Status`.
+    has : ndarray of bool, shape (T,)
+        Epochs that keep their coordinates; the others lose the level, too.
+    config : Config
+    """
     values = {}
     for item in fields(ProtectionLevel):
         value = getattr(protection.level, item.name)
         values[item.name] = np.where(has, value, np.nan) if value.dtype == np.float64 else value
-    return _judged(ProtectionLevel(**values), config)
+    level = ProtectionLevel(**values)
+    verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
+    doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP])
+    verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
+    return Protection(level=level, status=verdict.astype(np.int8))
