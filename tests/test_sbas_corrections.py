@@ -151,6 +151,14 @@ def test_corrections_of_another_mask_are_not_used() -> None:
     assert found.udrei[1].tolist() == [3, 1, 2]
 
 
+def test_a_fast_correction_goes_with_its_mask() -> None:
+    """The long-term correction is of the new mask already, the fast one still of the old, which times out first."""
+    rows = [row for row in base(until=620, but=["mask"]) if row[2][1] >> 2 != 2 or row[0] < 599]
+    rows.append((590.0, 0, made.mask(590, NUMBERS, 1)))
+    rows.append((599.0, 0, made.long_term(599, [(1, 48, (1.0, -2.0, 3.0), 8)], 1)))
+    assert states(rows, 600.0, 600.001) == [OK, TIMED_OUT]
+
+
 def test_type_24_corrects_like_types_2_and_25() -> None:
     rows = [row for row in base(until=20, but=["long", "fast"]) if row[0] not in (3, 4)]
     rows.append((5.0, 0, made.mixed(5, [1.5, -2.0], [3, 4], [(1, 48, (1.0, -2.0, 3.0), 8), (2, 49, (0.5, 0, 0), 0)])))
@@ -182,6 +190,46 @@ def test_the_rate_is_that_of_two_corrections() -> None:
     assert engine(rows, SbasLimits(range_rate="off")).satellites(at(13.0), SATELLITE).fast_m[0, 0] == 2.5
     steady = [row for row in base(until=5, indicator=0) if row[0] != 4] + rows[-2:]
     assert engine(steady, limits).satellites(at(9.0, 13.0), SATELLITE).fast_m[:, 0].tolist() == [1.5, 2.5]
+
+
+@pytest.mark.parametrize(("first", "second", "grows"), [(0, 1, False), (1, 2, False), (2, 0, False), (1, 0, True),
+                                                        (2, 1, True), (0, 2, True), (1, 1, True)])  # fmt: skip
+def test_a_rate_grows_where_the_issues_do_not_follow_each_other(first: int, second: int, grows: bool) -> None:
+    rows = [row for row in base(until=5, indicator=5) if row[0] != 4]
+    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=first)), (10.0, 0, made.fast(10, [2.5], [3], iodf=second))]
+    found = engine(rows, SbasLimits()).satellites(at(13.0), SATELLITE)
+    assert found.rate_growth_m[0, 0] == pytest.approx(0.0002 * 78.0 / 4.0 * 4.0 if grows else 0.0)
+
+
+def test_after_an_alarm_the_rate_is_over_half_the_time_out() -> None:
+    """a = 0.0006 (time-out 42 s), IODF 3 at 34 s: 10 and 16 s are equally near to 34 - 21 s, the later one is taken."""
+    rows = [row for row in base(until=5, indicator=8) if row[0] != 4]
+    sent = {4: 0.0, 10: 1.0, 16: 5.0, 22: 6.0, 28: 6.5}
+    rows += [(s, 0, made.fast(s, [v], [3], iodf=(s // 6) % 3)) for s, v in sent.items()]
+    rows.append((34, 0, made.fast(34, [8.0], [3], iodf=3)))
+    found = engine(rows, SbasLimits()).satellites(at(36.0), SATELLITE)
+    assert found.rate_mps[0, 0] == pytest.approx((8.0 - 5.0) / 18.0)
+    assert found.rate_growth_m[0, 0] == pytest.approx(0.0006 * 3.0 / 2.0 * 3.0)
+    one = [row for row in rows if row[0] != 16]
+    assert engine(one, SbasLimits()).satellites(at(36.0), SATELLITE).rate_mps[0, 0] == pytest.approx(7.0 / 24.0)
+
+
+def test_a_rate_carries_no_further_than_eight_times_its_base() -> None:
+    """Two corrections 6 s apart carry 48 s from the first bit; alarms keep the UDREI alive meanwhile."""
+    rows = [row for row in base(until=5, indicator=5) if row[0] != 4]
+    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=0)), (10.0, 0, made.fast(10, [2.5], [3], iodf=1))]
+    rows += [(s, 0, made.integrity(s, [3, 4], (3, 3, 3, 3))) for s in range(12, 70, 6)]
+    assert states(rows, 57.0, 57.001, limits=SbasLimits()) == [OK, SatelliteState.NO_RANGE_RATE]
+
+
+def test_a_rate_is_not_made_of_corrections_too_far_apart() -> None:
+    """The shortest time-out of the mask counts: 18 s of the other satellite's ai 13."""
+    rows = [row for row in base(until=5) if row[0] not in (1, 4)]
+    rows.append((1.0, 0, made.factors(1, [5, 13])))
+    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=0)), (22.0, 0, made.fast(22, [2.5], [3], iodf=1))]
+    assert states(rows, 22.0, limits=SbasLimits()) == [OK]
+    rows[-1] = (23.0, 0, made.fast(23, [2.5], [3], iodf=1))
+    assert states(rows, 23.0, limits=SbasLimits()) == [SatelliteState.NO_RANGE_RATE]
 
 
 def test_a_rate_is_not_made_across_a_pause_of_monitoring() -> None:
@@ -396,6 +444,35 @@ def test_nothing_of_the_future_and_nothing_of_other_epochs(recordings: Path) -> 
             alone = engine_.ionosphere(one, *(v[:1] for v in place), *(v[:1] for v in sky))
             assert np.array_equal(alone.delay_m[0], delays.delay_m[i], equal_nan=True)
             assert np.array_equal(alone.sigma_uire_m[0], delays.sigma_uire_m[i], equal_nan=True)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_bits_give_corrections_or_a_reason(seed: int) -> None:
+    """Messages of random content: what is OK has all its numbers, what is not has none."""
+    random = np.random.default_rng(seed)
+    rows = base(until=900)
+    for second in range(900):
+        kind = int(random.choice([1, 2, 3, 6, 7, 10, 18, 24, 25, 26, 27, 28, 9, 12, 17, 40, 63]))
+        bits = np.packbits(random.integers(0, 2, 256, dtype=np.uint8))
+        bits[1] = kind << 2 | bits[1] & 3
+        rows.append((second + 0.5, 0, bits))
+    time = at(*np.arange(0.0, 950.0, 7.3))
+    satellite = np.array([*(f"G{i:02d}" for i in range(1, 33)), "R07", "S37", "J02", "E01"])
+    for limits in (SbasLimits(), SbasLimits(mode="en_route", incomplete="inflate", type0="as_type2")):
+        ours = engine(rows, limits)
+        found = ours.satellites(time, satellite)
+        ok = found.state == OK
+        assert ok.any()
+        for values in (found.fast_m, found.clock_s, found.position_m.sum(axis=-1), found.sigma_flt_m()):
+            assert np.isfinite(values[ok]).all()
+            assert np.isnan(values[~ok]).all()
+        place = np.full(len(time), 36.0), np.full(len(time), 138.0)
+        sky = np.full((len(time), 4), 30.0), np.tile([0.0, 90.0, 180.0, 270.0], (len(time), 1))
+        air = ours.ionosphere(time, *place, *sky)
+        assert np.isfinite(air.sigma_uire_m[air.state == 0]).all()
+        assert np.isnan(air.sigma_uire_m[air.state != 0]).all()
+        line = np.broadcast_to([0.0, 0.6, 0.8], (*found.state.shape, 3))
+        assert ours.delta_udre(time, found, line, *place).shape == found.state.shape
 
 
 def test_a_log_without_corrections_refuses_everything() -> None:

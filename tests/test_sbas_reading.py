@@ -137,6 +137,26 @@ def test_formats_say_the_same(tmp_path: Path, write: Callable[[SbasLog], str]) -
     assert read.notes == ()
 
 
+def test_old_rinex_writes_less(tmp_path: Path) -> None:
+    """No band and length, and the satellite as PRN less 100, as before 2004."""
+    text = as_rinex(a_log()).replace("  L1   32     1    NOV", "").replace("\n124 ", "\n 24 ")
+    path = tmp_path / "old.05b"
+    path.write_text(text)
+    read = read_sbas(path)
+    assert (read.prn == 124).all()
+    assert (read.bits == a_log().bits).all()
+
+
+def test_a_broken_record_of_rinex_takes_no_other_with_it(tmp_path: Path) -> None:
+    lines = as_rinex(a_log()).splitlines()
+    lines[3] = lines[3].replace("  1 ", " XY ", 1)
+    path = tmp_path / "broken.b"
+    path.write_text("\n".join([*lines[:5], "what is this", *lines[5:]]))
+    read = read_sbas(path, on_error="lenient")
+    assert read.refused["line"] == 2
+    assert read.type.tolist() == [2, 63, 62, 10]
+
+
 def test_a_cut_message_says_that_it_has_no_parity(tmp_path: Path) -> None:
     log = a_log()
     path = tmp_path / "cut.sbs"

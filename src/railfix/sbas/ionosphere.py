@@ -235,7 +235,10 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Weights of the corners (M, 4), and where they may be used (M,): four good ones, or three around the place."""
+    """Weights of the corners (M, 4), and where they do (M,): four good ones, or three around the place.
+
+    That a corner which says do not use forbids the delay is judged apart.
+    """
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)
@@ -243,8 +246,6 @@ def _weights(
         rest = [corner for corner in range(4) if corner != missing]
         three = triangle_weights(x, y, missing)
         fits = good[:, rest].all(axis=1) & ~good[:, missing] & ~polar & (three >= 0.0).all(axis=1)
-        # A corner that says do not use forbids the cell; one that is missing or not monitored does not.
-        fits &= state[:, missing] != IonosphereState.DO_NOT_USE
         weights = np.where(fits[:, None], three, weights)
         used |= fits
     return weights, used & (point >= 0).any(axis=1)
