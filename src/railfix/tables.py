@@ -69,8 +69,8 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
     "protection_cause": "what sets the level: "
     "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
-    "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about the "
-    "place; `alarm`: the ranges contradict the level, or a check has failed",
+    "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
+    "the place; `alarm`: the ranges contradict the level, or a check has failed",
     "metric_antenna_spacing_m": "screen `antenna_spacing`: distance of the two positions less that of the antennas",
     "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
     "conventional_offset_m": "distance of the 3-D single point from that point",
