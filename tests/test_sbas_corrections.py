@@ -80,6 +80,11 @@ def test_a_message_counts_from_its_reception(first: int) -> None:
     assert states(rows, last - 1e-9, last)[0] != OK
 
 
+def test_parts_of_a_millisecond_are_no_way_into_the_past() -> None:
+    rows = [(s if s != 4 else 4.0004, p, b) for s, p, b in base(until=5)]
+    assert states(rows, 4.0003, 4.002) == [SatelliteState.NO_FAST, OK]
+
+
 TIMEOUTS = [
     ("mask", 0, 600, 600, SatelliteState.NO_MASK),
     ("factors", 1, 240, 360, SatelliteState.NO_DEGRADATION),

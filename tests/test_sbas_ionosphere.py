@@ -235,6 +235,17 @@ def test_delays_of_another_mask_are_not_used() -> None:
     assert overhead(rows, 35.0, 135.0).delay_m.item() == 7.0
 
 
+def test_a_delay_goes_with_its_mask() -> None:
+    """The points are in the new mask already, the delays still of the old, which times out first."""
+    rows = grid(square(*[(2.0, 2)] * 4))
+    rows += [(1100 + s, p, b) for s, p, b in rows if b[1] >> 2 in (10, 26)]
+    rows += [
+        (1110, 0, made.grid_mask(1110, band, bits_of(band, [(35, o), (40, o)]), 1)) for band, o in ((7, 135), (8, 140))
+    ]
+    assert overhead(rows, 37.5, 137.5, 1201.0).state.item() == OK
+    assert overhead(rows, 37.5, 137.5, 1201.001).state.item() == IonosphereState.TIMED_OUT
+
+
 def test_type_0_stops_the_grid_too() -> None:
     rows = [*grid(square(*FOUR)), (20, 0, made.message(0, 20))]
     assert overhead(rows, 38.0, 136.0, 19.0).state.item() == OK

@@ -151,7 +151,7 @@ def test_a_broken_record_of_rinex_takes_no_other_with_it(tmp_path: Path) -> None
     lines = as_rinex(a_log()).splitlines()
     lines[3] = lines[3].replace("  1 ", " XY ", 1)
     path = tmp_path / "broken.b"
-    path.write_text("\n".join([*lines[:5], "what is this", *lines[5:]]))
+    path.write_text("\n".join([*lines[:8], "what is this", *lines[8:]]))
     read = read_sbas(path, on_error="lenient")
     assert read.refused["line"] == 2
     assert read.type.tolist() == [2, 63, 62, 10]
