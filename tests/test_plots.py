@@ -18,6 +18,7 @@ from railfix.plots.columns import nice_step
 from railfix.plots.thinning import extremes, one_a_cell, spread
 from railfix.reasons import Reason
 from railfix.screens import Cn0Limits
+from railfix.stanford import stanford as sorted_epochs
 
 pytestmark = pytest.mark.requirement("D3")
 
@@ -130,18 +131,37 @@ def test_ranges_of_runs(errors: pl.DataFrame) -> None:
 def test_stanford_counts_by_hand() -> None:
     error = [1.0, -5.0, 12.0, 3.0, 25.0, np.nan, 1.0]
     level = [4.0, 4.0, 30.0, np.inf, 8.0, 5.0, np.nan]
-    chart = plots.stanford(error, level, 20.0)
-    assert layer(chart, Cells).counts.sum() == 5
+    chart = plots.stanford(sorted_epochs(times(np.arange(7)), error, level, alarm_limit_m=20.0))
+    counts = layer(chart, Cells).counts
+    assert counts.sum() == 6
     for part in (
-        "5 epochs with a level",
-        "available 3 (60.000 %)",
-        "level over the alarm limit 2",
-        "misleading: error over the level 2",
-        "hazardous: error over the alarm limit, level under it 1",
+        "6 epochs with an error",
+        "nominal 1 (16.667 %)",
+        "misleading 1 (",
+        "hazardous 1 (",
+        "unavailable 3 (50.000 %)",
+        "Available 57.14 % of all epochs",
     ):
         assert part in chart.caption
-    # 1 m error under a level of 4 m: fifth cell across, seventeenth up, of cells 0.25 m wide
-    assert layer(chart, Cells).counts[4, 16] == 1
+    # cells of 0.4 m: 1 m under 4 m; infinite levels in the last row, which ends at 40 m
+    assert counts[2, 10] == 1
+    assert counts[:, -1].sum() == 2
+    assert layer(chart, Cells).x_edges[-1] == pytest.approx(40.0)
+
+
+def test_levels_over_time(positions: pl.DataFrame) -> None:
+    told = positions.with_columns(
+        protection_level_m=pl.Series([5.0, np.inf, 7.0, None, 6.0]),
+        protection_fault_free_m=pl.Series([4.0, 4.0, 4.0, None, 4.0]),
+        protection_two_faults_m=pl.Series([0.0, 0.0, 0.0, None, 0.0]),
+        protection_status=pl.Series(["available", "unavailable", "available", "alarm", "available"]),
+    )
+    chart = plots.levels_over_time(told, 20.0)
+    np.testing.assert_array_equal(layer(chart, Points, "level").y, [5.0, 7.0, 6.0])
+    np.testing.assert_array_equal(layer(chart, Points, "level").x, [0.0, 2.0, 4.0])
+    assert {one.label for one in chart.layers} == {"level", "fault-free part", "alarm limit 20 m"}
+    assert "Epochs: available 3, unavailable 1, alarm 1." in chart.caption
+    assert plots.levels_over_time(positions, 20.0).empty
 
 
 def test_plan_in_metres(positions: pl.DataFrame) -> None:
@@ -279,7 +299,8 @@ def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, o
         plots.plot_error_over_time(errors),
         plots.plot_error_over_chainage(errors),
         plots.plot_error_ranges({"run": errors}),
-        plots.plot_stanford([1.0, 2.0], [3.0, 4.0], 20.0),
+        plots.plot_stanford(sorted_epochs(times([0.0, 1.0]), [1.0, 2.0], [3.0, 4.0], alarm_limit_m=20.0)),
+        plots.plot_levels_over_time(positions.with_columns(protection_level_m=5.0), 20.0),
         plots.plot_interval_over_chainage(errors),
         plots.plot_interval_distribution(errors),
         plots.plot_satellites_over_time(positions),

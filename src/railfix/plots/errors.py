@@ -1,4 +1,4 @@
-"""Charts of the error along the line (P1 figures 7, 8, 10, 11) and of the levels that bound it.
+"""Charts of the error along the line (P1 figures 7, 8, 10, 11).
 
 The tables have one row an epoch of one antenna, as `railfix.evaluate.Evaluation.epochs` has them:
 ``time_gpst``, ``chainage_m`` (where the antenna was), ``error_m`` and ``conventional_error_m`` (+ toward
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from railfix.plots.chart import (
     BLACK,
@@ -23,7 +23,6 @@ from railfix.plots.chart import (
     GREY,
     PURPLE,
     Band,
-    Cells,
     Chart,
     Layer,
     Line,
@@ -214,58 +213,4 @@ def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the
         x_label=_ERROR_LABEL,
         y_label="",
         layers=tuple(layers),
-    )
-
-
-def stanford(error_m: ArrayLike, level_m: ArrayLike, alarm_limit_m: float, *, title: str = "Stanford diagram") -> Chart:
-    """Protection level over the size of the error, counted in cells.
-
-    Parameters
-    ----------
-    error_m, level_m : array_like, shape (T,) [m]
-        Signed error along the line and the level meant to bound it; epochs without either are left out.
-    alarm_limit_m : float [m]
-    title : str
-
-    Returns
-    -------
-    Chart
-        The axes end at one and a half times the alarm limit; what is beyond counts in the last cells.
-    """
-    error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
-    known = np.isfinite(error) & ~np.isnan(level)
-    error, level = error[known], level[known]
-    top = 1.5 * alarm_limit_m
-    edges = np.linspace(0.0, top, 121)
-    inside = np.nextafter(top, 0.0)
-    counts, _, _ = np.histogram2d(np.minimum(error, inside), np.minimum(level, inside), bins=(edges, edges))
-    usable = level <= alarm_limit_m
-    missed = error > level
-    hazard = usable & (error > alarm_limit_m)
-    whole = max(len(error), 1)
-    parts = (
-        ("available", usable),
-        ("level over the alarm limit", ~usable),
-        ("misleading: error over the level", missed),
-        ("hazardous: error over the alarm limit, level under it", hazard),
-    )
-    said = "; ".join(f"{name} {int(mask.sum()):,} ({100 * mask.sum() / whole:.3f} %)" for name, mask in parts)
-    line = np.array([0.0, top])
-    limit = np.array([alarm_limit_m, alarm_limit_m])
-    return Chart(
-        name="stanford",
-        title=title,
-        caption=f"{len(error):,} epochs with a level: {said}. Below the diagonal the error was larger than the level. "
-        f"Values beyond {top:g} m, infinite levels among them, stand in the last cells.",
-        x_label="size of the error along the line [m]",
-        y_label="protection level [m]",
-        layers=(
-            Cells(label="epochs", colour=BLACK, x_edges=edges, y_edges=edges, counts=counts.astype(np.int64)),
-            Line(label="error = level", colour=GREY, x=line, y=line),
-            Line(label="alarm limit", colour=CONVENTIONAL, x=line, y=limit, dash="dashed"),
-            Line(label="", colour=CONVENTIONAL, x=limit, y=line, dash="dashed"),
-        ),
-        x_range=(0.0, top),
-        y_range=(0.0, top),
-        width="half",
     )

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from railfix.plots.chart import Chart, SkyEpochs
 from railfix.plots.columns import floats, start_of
-from railfix.plots.errors import error_over_chainage, error_over_time, good_errors, level_columns, stanford
+from railfix.plots.errors import error_over_chainage, error_over_time, good_errors, level_columns
+from railfix.plots.levels import levels_over_time, stanford
 from railfix.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
 from railfix.plots.run_screens import screens_of
 from railfix.plots.screens import screen_over_chainage, screen_over_time
 from railfix.plots.signals import cn0_over_elevation, sky_epochs
 from railfix.plots.timing import processing_time
 from railfix.report.runs import ReportedRun
+from railfix.stanford import stanford as sorted_epochs
 
 #: Largest errors whose epochs are surely among those of the sky.
 _WORST: Final = 200
@@ -74,6 +76,9 @@ def antenna_groups(run: ReportedRun, antenna: str) -> Iterator[Group]:
         yield Group(title="Errors", charts=_kept(*charts), start=start_of(errors))
     else:
         yield Group(title="Errors", charts=(), start=start, absent=(NO_REFERENCE,))
+    levels = _kept(levels_over_time(positions, run.config.alarm_limit_m))
+    absent = () if levels else ("The run worked out no protection levels, so there is no picture of them.",)
+    yield Group(title="Protection levels", charts=levels, start=start, absent=absent)
     table = positions if errors is None else errors
     charts = (interval_over_chainage(table), interval_distribution(table), satellites_over_time(positions))
     yield Group(title="Positioning interval and satellites", charts=_kept(*charts), start=start)
@@ -124,11 +129,10 @@ def _kept(*charts: Chart) -> tuple[Chart, ...]:
 
 def _stanford(run: ReportedRun, errors: pl.DataFrame) -> Iterator[Chart]:
     for column in level_columns(errors):
-        level = floats(errors, column)
-        name = column.removesuffix("_m").replace("_", " ")
-        yield stanford(
-            good_errors(errors, "error_m"), level, run.config.raim.alarm_limit_m, title=f"Stanford diagram: {name}"
-        )
+        time = errors["time_gpst"].to_numpy()
+        error, level = good_errors(errors, "error_m"), floats(errors, column)
+        diagram = sorted_epochs(time, error, level, alarm_limit_m=run.config.alarm_limit_m)
+        yield stanford(diagram, title=f"Stanford diagram: {column.removesuffix('_m').replace('_', ' ')}")
 
 
 def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> NDArray[np.float64]:

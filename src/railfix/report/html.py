@@ -18,7 +18,7 @@ def number(value: float | None, digits: int = 2, unit: str = "") -> str:
     """A number with thousands apart; an en dash where there is none."""
     if value is None or value != value:
         return "–"
-    return f"{value:,.{digits}f}{unit}".replace("-", "−")
+    return f"{round(value, digits) + 0.0:,.{digits}f}{unit}".replace("-", "−")
 
 
 def share(part: float | None, digits: int = 2) -> str:

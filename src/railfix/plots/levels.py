@@ -1,0 +1,130 @@
+"""Charts of protection levels: against the error (Stanford diagram), and over time with what they are made of."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from railfix.plots.chart import BLACK, BLUE, CYCLE, GREY, RED, Cells, Chart, Layer, Line, Points
+from railfix.plots.columns import floats, since, start_of, words
+from railfix.plots.thinning import spread, told
+from railfix.stanford import Region, Stanford
+
+Floats = NDArray[np.float64]
+
+#: Parts of the level, and the level itself.
+_PARTS: Final = (
+    ("fault-free part", "protection_fault_free_m"),
+    ("part of one fault", "protection_one_fault_m"),
+    ("part of two faults", "protection_two_faults_m"),
+    ("RAIM's level", "raim_level_m"),
+    ("level", "protection_level_m"),
+)
+
+
+def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
+    """Protection level over the size of the error, counted in cells.
+
+    Parameters
+    ----------
+    diagram : Stanford
+        Of `railfix.stanford.stanford`.
+    title : str
+
+    Returns
+    -------
+    Chart
+        Values beyond the axes stand in their last cells.
+    """
+    width = diagram.edges_m[1] - diagram.edges_m[0]
+    edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
+    top, limit = float(edges[-1]), diagram.alarm_limit_m
+    judged = int(diagram.histogram.sum())
+    regions = (Region.NOMINAL, Region.MISLEADING, Region.HAZARDOUS, Region.UNAVAILABLE, Region.UNAVAILABLE_MISLEADING)
+    said = ", ".join(
+        f"{region.name.lower().replace('_', ' and ')} {diagram.counts[region]:,}"
+        f" ({100 * diagram.counts[region] / max(judged, 1):.3f} %)"
+        for region in regions
+    )
+    kept = "; ".join(
+        f"{c.window_s:g} s {100 * c.probability:.2f} %" for c in diagram.continuity if np.isfinite(c.probability)
+    )
+    line, across = np.array([0.0, top]), np.array([limit, limit])
+    return Chart(
+        name="stanford",
+        title=title,
+        caption=f"{judged:,} epochs with an error: {said}. Available {100 * diagram.available_rate:.2f} % of all epochs"
+        f"{'; it stays so over ' + kept if kept else ''}. Right of the diagonal the error is larger than the level. "
+        f"What is beyond {top:g} m, infinite levels among it, stands in the last cells.",
+        x_label="size of the error along the line [m]",
+        y_label="protection level [m]",
+        layers=(
+            Cells(label="epochs", colour=BLACK, x_edges=edges, y_edges=edges, counts=diagram.histogram),
+            Line(label="error = level", colour=GREY, x=line, y=line),
+            Line(label=f"alarm limit {limit:g} m", colour=RED, x=line, y=across, dash="dashed"),
+            Line(label="", colour=RED, x=across, y=line, dash="dashed"),
+        ),
+        x_range=(0.0, top),
+        y_range=(0.0, top),
+        width="half",
+    )
+
+
+def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: str = "Protection level") -> Chart:
+    """Protection level and its parts over time, against the alarm limit.
+
+    Parameters
+    ----------
+    positions : polars.DataFrame
+        Of one antenna, columns of `railfix.tables.POSITION_COLUMNS`.
+    alarm_limit_m : float [m]
+    title : str
+
+    Returns
+    -------
+    Chart
+        Empty where the run has no levels.
+    """
+    start = start_of(positions)
+    x = since(positions, start)
+    layers: list[Layer] = []
+    shown = whole = 0
+    largest = alarm_limit_m
+    for (label, column), colour in zip(_PARTS, (*CYCLE[2:6], BLUE), strict=True):
+        level = floats(positions, column)
+        level[np.isinf(level)] = np.nan
+        rows = spread(x, level)
+        if not len(rows) or not (level[rows] > 0.0).any():
+            continue
+        shown, whole = shown + len(rows), whole + int(np.isfinite(level).sum())
+        largest = max(largest, float(np.percentile(level[rows], 98.0)))
+        layers.append(Points(label=label, colour=colour, x=x[rows], y=level[rows], size=2.5, epoch_s=x[rows]))
+    if layers:
+        line = np.array([x.min(), x.max()])
+        limit = np.full(2, alarm_limit_m)
+        layers.append(Line(label=f"alarm limit {alarm_limit_m:g} m", colour=RED, x=line, y=limit, dash="dashed"))
+    return Chart(
+        name="levels",
+        title=title,
+        caption=f"{_counted(positions)} Values beyond {1.2 * largest:.1f} m are cut off.{told(shown, whole)}".strip(),
+        x_label="GPS time",
+        y_label="protection level [m]",
+        layers=tuple(layers),
+        start=start,
+        y_range=(0.0, 1.2 * largest),
+    )
+
+
+def _counted(positions: pl.DataFrame) -> str:
+    """Epochs by status and cause of the level, in words."""
+    said = []
+    for column, what in (("protection_status", "Epochs"), ("protection_cause", "What sets the level")):
+        if column in positions.columns:
+            counts = Counter(words(positions, column).tolist())
+            told_of = ", ".join(f"{word or 'none'} {count:,}" for word, count in counts.most_common())
+            said.append(f"{what}: {told_of}.")
+    return " ".join(said)
