@@ -23,6 +23,7 @@ COMMANDS = [
     ["ablate"],
     ["cn0-curve"],
     ["plot-screens"],
+    ["simulate"],
     ["map"],
     ["map", "check"],
     ["map", "from-positions"],

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from railfix.cli import app
 from railfix.rinex import read_observations
-from railfix.simulate import load_scenario, shipped_scenarios
+from railfix.simulate import demo_files, load_scenario, shipped_scenarios
 from railfix.track_map import read_track
 
 pytestmark = pytest.mark.requirement("D4")
@@ -112,6 +112,7 @@ def test_exit_codes(tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text("sede = 1")
     (tmp_path / "no_nav.toml").write_text('[sky]\nnav = "none.nav"\nunhealthy = []')
     out = tmp_path / "out"
+    past = ("--set", "sky.unhealthy=[]", "--set", "start=2024-01-01T00:00:00")
     cases = [
         (8, ("demo", "--out", tmp_path / "file", "--seconds", 1), "file"),
         (8, ("demo", "--out", tmp_path / "full"), "not empty"),
@@ -124,6 +125,7 @@ def test_exit_codes(tmp_path: Path) -> None:
         (3, (tmp_path / "broken.toml", "--out", out), "TOML"),
         (3, ("nothing", "--out", out), "shipped are"),
         (3, (tmp_path / "no_nav.toml", "--out", out), str(tmp_path / "none.nav")),
+        (5, ("demo", "--out", out, "--set", f"sky.nav={demo_files()['nav']}", *past), "no satellite of"),
         (2, ("demo",), "--out"),
         (2, ("--unknown",), "unknown"),
     ]
