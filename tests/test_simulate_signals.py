@@ -27,6 +27,7 @@ from railfix.simulate import (
     SkySettings,
     write_run,
 )
+from railfix.simulate.satellites import Links, links
 from synthetic import travelled_range
 
 pytestmark = pytest.mark.requirement("D4")
@@ -202,6 +203,38 @@ def test_residual_atmosphere_is_what_the_scale_leaves() -> None:
     )
     seen = np.isfinite(plain.observations.code_m)
     np.testing.assert_allclose((more.clean_code_m - plain.clean_code_m)[seen], expected[seen], atol=1e-3)
+
+
+class _Exact:
+    """In place of the table: every satellite by its formulas at every instant."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+
+    def links(self, tag: np.ndarray, late_s: np.ndarray, receiver_ecef_m: np.ndarray) -> Links:
+        records = self._simulation.navigation.kepler
+        found = [links(records, name, tag, late_s, receiver_ecef_m) for name in self._simulation.satellites]
+        return Links(
+            range_m=np.stack([one.range_m for one in found], axis=1),
+            satellite_ecef_m=np.stack([one.satellite_ecef_m for one in found], axis=1),
+            clock_s=np.stack([one.clock_s for one in found], axis=1),
+        )
+
+
+def test_satellites_from_the_table_change_no_digit_that_is_written() -> None:
+    """Against every satellite worked out at every instant, over a change of records: 1e-6 m, 1e-4 Hz."""
+    start = np.datetime64("2024-03-05T03:59:00", "ns")
+    scenario = Scenario(start=start, duration_s=120.0, sky=SkySettings(systems="GJEC"), receiver=QUIET)
+    table = whole(scenario)
+    simulation = Simulation(scenario)
+    simulation.__dict__["satellite_table"] = _Exact(simulation)
+    (exact,) = simulation.pieces("front", chunk_epochs=scenario.epochs)
+    assert np.abs(table.clean_code_m - exact.clean_code_m).max() < 1e-6
+    a, b = table.observations, exact.observations
+    length = SPEED_OF_LIGHT / carrier_frequency_hz(a.satellite, a.signal)
+    assert np.nanmax(np.abs((a.phase_cycles - b.phase_cycles) * length)) < 1e-6
+    assert np.nanmax(np.abs(a.doppler_hz - b.doppler_hz)) < 1e-4
+    np.testing.assert_array_equal(a.cn0_dbhz, b.cn0_dbhz)
 
 
 @pytest.mark.parametrize("size", [1, 7, 64])
