@@ -71,10 +71,11 @@ class Recording:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of bridged places along the map, by gap length."""
+    """Errors of bridged places along the map; and the share of the instants in gaps that are given out."""
 
     error_m: Floats
     sigma_m: Floats
+    share: float
 
     @property
     def ratio(self) -> float:
@@ -154,7 +155,7 @@ RECORDINGS: Final = {"gsdc": (gsdc, "doppler"), "urbannav": (urbannav, "doppler"
 
 def bridged(recording: Recording, length_s: float, bridge: str, settings: ReferenceSettings = SETTINGS) -> Errors:
     """Errors of the bridged instants of one gap length, all phases together."""
-    parts = []
+    parts, given, asked = [], 0, 0
     t = seconds(recording.log.time - recording.log.time[0])
     for phase in range(PHASES):
         shifted = t + phase * 2.0 * length_s / PHASES
@@ -162,14 +163,17 @@ def bridged(recording: Recording, length_s: float, bridge: str, settings: Refere
         if bridge == "interpolation":
             parts.append(_interpolated(recording, keep))
             continue
-        reference = build_references(recording.data(keep, bridge), settings)["front"].reference
+        built = build_references(recording.data(keep, bridge), settings)["front"]
+        reference = built.reference
         rows = np.flatnonzero(reference.source == "bridged")
         arc = recording.trajectory.arc_at_chainage(reference.chainage_m[rows])
         error = along_track_error(arc, recording.true(reference.time[rows]), recording.trajectory)
         seen = np.isfinite(error)
         parts.append(np.stack([error[seen], reference.sigma_m[rows][seen]]))
+        given += len(rows)
+        asked += len(rows) + built.left_out["long_gap"] + built.left_out["uncertain"]
     error, sigma = np.concatenate(parts, axis=1)
-    return Errors(error, sigma)
+    return Errors(error, sigma, given / asked if asked else 1.0)
 
 
 def _interpolated(recording: Recording, keep: NDArray[np.bool_]) -> Floats:
@@ -199,11 +203,9 @@ def row(recording: Recording, length_s: int, bridge: str) -> str:
     """One line of the table."""
     errors = bridged(recording, length_s, bridge)
     size = np.abs(errors.error_m)
-    told = f"{np.median(errors.sigma_m):8.2f} {errors.ratio:6.2f}" if np.isfinite(errors.sigma_m).all() else " " * 15
-    return (
-        f"{recording.name:9s} {length_s:4d} {bridge:13s} {len(size):6d} {np.median(size):8.3f} "
-        f"{np.percentile(size, 95):8.3f} {size.max():8.2f} {told}"
-    )
+    told = f"{np.median(errors.sigma_m):8.2f} {errors.ratio:12.2f}" if np.isfinite(errors.sigma_m).all() else ""
+    what = f"{recording.name:9s} {length_s:4d} {bridge:13s} {len(size):6d} {100 * errors.share:6.1f}"
+    return f"{what} {np.median(size):8.3f} {np.percentile(size, 95):8.3f} {size.max():8.2f} {told}".rstrip()
 
 
 def main(arguments: Sequence[str] = ()) -> int:
@@ -211,7 +213,7 @@ def main(arguments: Sequence[str] = ()) -> int:
     if not data.is_dir():
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
-    print("recording gap s bridge         epochs    p50 m    p95 m    max m  sigma m  error/sigma")
+    print("recording gap s bridge         epochs given % p50 m    p95 m    max m  sigma m  error/sigma")
     for name, (make, bridge) in RECORDINGS.items():
         if arguments and name not in arguments:
             continue

@@ -40,6 +40,8 @@ _STEP_S: Final = 1.0
 _NORMAL_MEDIAN: Final = 0.6745
 #: Fits with the scale of the one before; the first takes the limits' own noise.
 _PASSES: Final = 3
+#: Mean squares of residuals within this many standard deviations of 1 are what noise makes.
+_TELLING: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,8 +196,8 @@ def doppler_speed(
 
     Outliers go one by one, the largest first, as long as enough satellites are left. What counts as large
     is measured by the log itself: its residuals' median gives the scale of the noise, so that neither a
-    phone nor a surveying receiver needs settings. An epoch whose residuals are larger than that gets a
-    larger standard deviation.
+    phone nor a surveying receiver needs settings. An epoch whose residuals are clearly larger than that
+    gets a larger standard deviation.
 
     Parameters
     ----------
@@ -229,7 +231,9 @@ def doppler_speed(
         used, fit = _without_outliers(measured, slope, sigma, offered, scale, limits)
     count = used.sum(axis=1)
     solved = (count >= limits.min_satellites) & np.isfinite(fit.variance)
-    excess = np.maximum(fit.wsse / scale**2 / np.maximum(count - 2, 1), 1.0)
+    freedom = np.maximum(count - 2, 1)
+    excess = fit.wsse / scale**2 / freedom
+    excess = np.where(excess > 1.0 + _TELLING * np.sqrt(2.0 / freedom), excess, 1.0)
     own = scale * np.sqrt(np.where(solved, fit.variance * excess, np.nan))
     return DopplerSpeed(
         speed_mps=np.where(solved, fit.speed, np.nan),

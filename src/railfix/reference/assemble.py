@@ -77,7 +77,8 @@ def assembled(
     smoothed : Smoothed
     fixes : Fixes
     excess : ndarray, shape (G - 1,)
-        From each of the G good fixes to the next: closing error over its standard deviation, at least 1.
+        From each of the G good fixes to the next: closing error over its standard deviation; 1 where noise
+        explains it.
     trajectory : Trajectory
     settings : ReferenceSettings
     facts : dict
@@ -104,7 +105,7 @@ def assembled(
         source=np.where(is_fix[keep], "rtk", "bridged"),
         environment=np.full(len(keep), ""),
     )
-    usual = float(np.median(np.diff(t)))
+    usual = float(np.median(seconds(np.diff(fixes.time))))
     step = seconds(np.diff(fixes.time[good]))
     gaps = tuple(
         Gap(

@@ -46,6 +46,8 @@ Datetimes = NDArray[np.datetime64]
 GRAVITY_MPS2: Final = 9.80665
 #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
 _ROUNDS: Final = 3
+#: Closing errors below this many standard deviations are what noise makes.
+_TELLING: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +163,7 @@ class _Builder:
         fixes: Fixes,
         settings: ReferenceSettings,
     ) -> Floats:
-        """How many of its standard deviations the best way misses the next fix by, at least 1; from fix to fix."""
+        """By how many of its standard deviations the best way misses the next fix, from fix to fix; 1 where few."""
         good = fixes.good
         fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])
         variance = np.full(len(moved), np.inf)
@@ -180,7 +182,8 @@ class _Builder:
             better = own < variance
             closing = np.where(better, way - moved, closing)
             variance = np.where(better, own, variance)
-        return np.asarray(np.maximum(np.abs(closing) / np.sqrt(variance), 1.0))
+        missed = np.abs(closing) / np.sqrt(variance)
+        return np.where(missed > _TELLING, missed, 1.0)
 
     def _wheel(self, time: Datetimes, arc_m: Floats) -> Wheel | None:
         pulses = self.data.pulses

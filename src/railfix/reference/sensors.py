@@ -117,23 +117,27 @@ def read_pulses(path: str | PathLike[str]) -> Pulses:
 
 
 def read_acceleration(path: str | PathLike[str]) -> Acceleration:
-    """Read a table of accelerations: CSV with ``time_gpst`` and one of two columns, toward the vehicle's front.
+    """Read a table of accelerations: CSV with ``time_gpst`` and one other column, toward the vehicle's front.
 
-    ``specific_force_mps2`` is what an accelerometer measures (gravity on gradients is taken off by the map);
-    ``acceleration_mps2`` is that of the motion alone.
+    ``specific_force_mps2`` is what an accelerometer measures (gravity on gradients is taken off by the map), and
+    so is ``force_forward_mps2`` of the simulator; ``acceleration_mps2`` is that of the motion alone.
 
     Raises
     ------
     InputFileError
-        Neither or both columns, or times that do not rise.
+        None or several of the columns, or times that do not rise.
     """
     table = _table(path)
-    kinds = {"specific_force_mps2": "specific_force", "acceleration_mps2": "motion"}
+    kinds = {
+        "specific_force_mps2": "specific_force",
+        "force_forward_mps2": "specific_force",
+        "acceleration_mps2": "motion",
+    }
     found = [name for name in kinds if name in table]
     if len(found) != 1:
         raise InputFileError(
             path,
-            f"one column of {' and '.join(kinds)} was expected; the columns are {', '.join(table.cells)}",
+            f"one column of {', '.join(kinds)} was expected; the columns are {', '.join(table.cells)}",
             line=table.header_line,
         )
     return Acceleration(

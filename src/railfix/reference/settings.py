@@ -36,9 +36,9 @@ class ReferenceSettings:
         Bridged instants that are less certain are left out.
     fix_sigma_m, fix_floor_m : float [m]
         Standard deviation of a fix along the track where the log has none; and the least that is believed.
-    free_mps2 : float [m/s2 per square root of Hz]
-        Accelerations that nothing measures, as white noise: after a second without sensors the speed is off
-        by this much.
+    motion_mps2, motion_s : float [m/s2], [s]
+        Standard deviation of the train's acceleration, and how long one lasts (R. A. Singer, 1970): trains
+        accelerate and brake by 0.5 to 1 m/s2 for some seconds.
     doppler : DopplerSpeedLimits
     doppler_bias_mps, doppler_bias_s : float [m/s], [s]
         Part of the Doppler speed's error that lasts, with its time of correlation. The size is taken from the
@@ -66,7 +66,8 @@ class ReferenceSettings:
     max_sigma_m: float = 1.0
     fix_sigma_m: float = 0.03
     fix_floor_m: float = 0.01
-    free_mps2: float = 0.5
+    motion_mps2: float = 0.5
+    motion_s: float = 5.0
     doppler: DopplerSpeedLimits = field(default_factory=DopplerSpeedLimits)
     doppler_bias_mps: float = 0.02
     doppler_bias_s: float = 10.0

@@ -89,7 +89,7 @@ class _Unknowns:
     """Column of each unknown."""
 
     def __init__(self, evidence: Evidence) -> None:
-        self.place, self.speed, self.count = 0, 1, 2
+        self.place, self.speed, self.acceleration, self.count = 0, 1, 2, 3
         self.doppler = self._next(np.isfinite(evidence.doppler_mps).any())
         self.difference = self._next(np.isfinite(evidence.wheel_m).any())
         self.scale = self._next(self.difference >= 0)
@@ -147,24 +147,59 @@ def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
 def _add_motion(
     chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, moved: Floats, settings: ReferenceSettings
 ) -> None:
-    """Speed is the change of place; its own change is measured, or white noise."""
-    chain.add_single(np.array([0]), _one(unknowns, unknowns.speed), np.zeros(1), np.full(1, _ANY_SPEED_MPS**-2))
+    """Place, speed and an acceleration that lasts a while (Singer's model); and what measures its change of speed."""
+    first = np.array([0])
+    for unknown, sigma in ((unknowns.speed, _ANY_SPEED_MPS), (unknowns.acceleration, settings.motion_mps2)):
+        chain.add_single(first, _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
+    turn, noise = singer(dt, settings.motion_mps2, settings.motion_s)
+    before, after = np.zeros((2, len(dt), 3, unknowns.count))
+    before[:, :, :3], after[:, :, :3] = -turn, np.eye(3)
+    value = np.zeros((len(dt), 3))
+    value[:, 0] = -moved
+    noise[:, [0, 1], [0, 1]] += _LEAST_STEP_M**2
+    chain.add_steps(before, after, value, np.asarray(np.linalg.inv(noise)))
     measured = np.isfinite(evidence.acceleration_mps2)
-    acceleration = np.where(measured, evidence.acceleration_mps2, 0.0)
-    density = np.where(measured, settings.acceleration_mps2, settings.free_mps2) ** 2
-    before, after = np.zeros((2, len(dt), 2, unknowns.count))
-    after[:, 0, unknowns.place] = after[:, 1, unknowns.speed] = 1.0
-    before[:, 0, unknowns.place] = before[:, 1, unknowns.speed] = -1.0
-    before[:, 0, unknowns.speed] = -dt
-    if unknowns.offset >= 0:
-        before[:, 0, unknowns.offset] = np.where(measured, dt**2 / 2.0, 0.0)
-        before[:, 1, unknowns.offset] = np.where(measured, dt, 0.0)
-    value = np.stack([acceleration * dt**2 / 2.0 - moved, acceleration * dt], axis=1)
-    # Inverse of density [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]].
-    weight = np.empty((len(dt), 2, 2))
-    weight[:, 0, 0], weight[:, 1, 1] = 12.0 / dt**3, 4.0 / dt
-    weight[:, 0, 1] = weight[:, 1, 0] = -6.0 / dt**2
-    chain.add_steps(before, after, value, weight / density[:, None, None])
+    if measured.any():
+        before, after = np.zeros((2, len(dt), 1, unknowns.count))
+        after[:, 0, unknowns.speed], before[:, 0, unknowns.speed] = 1.0, -1.0
+        before[:, 0, unknowns.offset] = dt
+        gained = np.where(measured, evidence.acceleration_mps2, 0.0) * dt
+        weight = np.where(measured, 1.0 / (settings.acceleration_mps2**2 * dt), 0.0)
+        chain.add_steps(before, after, gained[:, None], weight[:, None, None])
+
+
+def singer(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
+    """Step of place, speed and acceleration, and the covariance of its noise, shapes (K, 3, 3).
+
+    The acceleration is a first-order Gauss-Markov process (R. A. Singer, Estimating optimal tracking filter
+    performance for manned maneuvering targets, 1970, doi:10.1109/TAES.1970.310128). Steps of less than a tenth
+    of the time of correlation take the limit of white jerk, for the full expressions cancel there.
+
+    Parameters
+    ----------
+    dt : ndarray, shape (K,) [s]
+    sigma_mps2, tau_s : float [m/s2], [s]
+    """
+    x = dt / tau_s
+    once, twice = np.exp(-x), np.exp(-2.0 * x)
+    step = np.zeros((len(dt), 3, 3))
+    step[:, [0, 1], [0, 1]] = 1.0
+    step[:, 0, 1], step[:, 2, 2] = dt, once
+    step[:, 0, 2], step[:, 1, 2] = tau_s**2 * (x - 1.0 + once), tau_s * (1.0 - once)
+    density = 2.0 * sigma_mps2**2 / tau_s
+    full = {
+        (0, 0): tau_s**5 * (1.0 - twice + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * once),
+        (0, 1): tau_s**4 * (twice + 1.0 - 2.0 * once + 2.0 * x * once - 2.0 * x + x**2),
+        (0, 2): tau_s**3 * (1.0 - twice - 2.0 * x * once),
+        (1, 1): tau_s**3 * (4.0 * once - 3.0 - twice + 2.0 * x),
+        (1, 2): tau_s**2 * (twice + 1.0 - 2.0 * once),
+        (2, 2): tau_s * (1.0 - twice),
+    }
+    limit = {(0, 0): dt**5 / 20, (0, 1): dt**4 / 8, (0, 2): dt**3 / 6, (1, 1): dt**3 / 3, (1, 2): dt**2 / 2, (2, 2): dt}
+    noise = np.empty((len(dt), 3, 3))
+    for (i, j), value in full.items():
+        noise[:, i, j] = noise[:, j, i] = density * np.where(x < 0.1, limit[i, j], value / 2.0)
+    return step, noise
 
 
 def _add_doppler(
