@@ -17,7 +17,7 @@ from railfix.plots.levels import levels_over_time, stanford
 from railfix.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
 from railfix.plots.run_screens import screens_of
 from railfix.plots.screens import screen_over_chainage, screen_over_time
-from railfix.plots.signals import cn0_over_elevation, sky_epochs
+from railfix.plots.signals import SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.plots.timing import processing_time
 from railfix.report.runs import ReportedRun
 from railfix.stanford import stanford as sorted_epochs
@@ -55,13 +55,15 @@ class Group:
     absent: tuple[str, ...] = ()
 
 
-def antenna_groups(run: ReportedRun, antenna: str) -> Iterator[Group]:
+def antenna_groups(run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS) -> Iterator[Group]:
     """Charts of one antenna of a run.
 
     Parameters
     ----------
     run : ReportedRun
     antenna : str
+    sky : int
+        Epochs of the sky at most.
 
     Yields
     ------
@@ -85,8 +87,8 @@ def antenna_groups(run: ReportedRun, antenna: str) -> Iterator[Group]:
     if observations is None:
         yield Group(title="Signals", charts=(), start=start, absent=(NO_OBSERVATIONS,))
         return
-    sky = sky_epochs(observations, wanted=_worst(errors), title=f"Sky over the {antenna} antenna")
-    yield Group(title="Sky", charts=() if sky.empty else (sky,), start=start)
+    seen = sky_epochs(observations, wanted=_worst(errors), epochs=sky, title=f"Sky over the {antenna} antenna")
+    yield Group(title="Sky", charts=() if seen.empty else (seen,), start=start)
     curves = cn0_over_elevation(
         observations,
         limits=run.config.cn0 if "cn0" in run.config.screens else None,

@@ -15,12 +15,15 @@ from railfix.errors import OutputError
 from railfix.evaluate import Evaluation
 from railfix.plots.chart import Chart, Points, SkyEpochs
 from railfix.plots.errors import error_ranges
+from railfix.plots.signals import SKY_EPOCHS
 from railfix.report import tables
 from railfix.report.encode import chart_values, script_json, sky_values
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, run_group
 from railfix.report.html import absent, text
 from railfix.report.runs import ReportedRun, read_runs
 
+#: Epochs of the sky that every antenna has.
+_LEAST_SKY: Final = 200
 #: Nothing is fetched: what the page may load, said to the browser.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
@@ -77,6 +80,8 @@ def report_page(runs: Sequence[ReportedRun], evaluation: Evaluation | None, *, t
     title : str
     """
     numbers = count()
+    # together the antennas of many runs weigh no more in this than those of a few
+    epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // max(sum(len(r.folder.antennas) for r in runs), 1)))
     names = ", ".join(run.name for run in runs)
     heading = title or f"railfix report: {names}"
     when = datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -86,7 +91,7 @@ def report_page(runs: Sequence[ReportedRun], evaluation: Evaluation | None, *, t
         f"{text(__version__)}; all that it shows is in this file.</p>",
         _navigation(runs),
         _overview(runs, evaluation, numbers),
-        *(_run(run, evaluation, number, numbers) for number, run in enumerate(runs)),
+        *(_run(run, evaluation, number, numbers, sky=epochs) for number, run in enumerate(runs)),
     ]
     return "\n".join(
         [
@@ -142,7 +147,7 @@ def _overview(runs: Sequence[ReportedRun], evaluation: Evaluation | None, number
     return "\n".join(parts)
 
 
-def _run(run: ReportedRun, evaluation: Evaluation | None, k: int, numbers: Iterator[int]) -> str:
+def _run(run: ReportedRun, evaluation: Evaluation | None, k: int, numbers: Iterator[int], *, sky: int) -> str:
     parts = [f'<h2 id="run{k}">Run {text(run.name)}</h2>', tables.what_was_run(run), tables.settings(run)]
     parts += ["<h3>What became of epochs and pseudoranges</h3>", tables.budget(run)]
     if evaluation is not None:
@@ -150,8 +155,8 @@ def _run(run: ReportedRun, evaluation: Evaluation | None, k: int, numbers: Itera
     parts.append(_group(run_group(run), numbers, ""))
     for i, antenna in enumerate(run.folder.antennas):
         parts.append(f'<h2 id="run{k}-{i}">{text(run.name)}: {text(antenna)} antenna</h2>')
-        sky = f"sky{k}-{i}" if run.observations is not None else ""
-        parts += [_group(group, numbers, sky) for group in antenna_groups(run, antenna)]
+        place = f"sky{k}-{i}" if run.observations is not None else ""
+        parts += [_group(group, numbers, place) for group in antenna_groups(run, antenna, sky=sky)]
     return "\n".join(parts)
 
 

@@ -19,31 +19,35 @@ _POSITION_NAMES = {"constrained": "on the map", "constrained_ok": "on the map, o
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> str:
     """One row a run and antenna: rates and, with a reference, errors."""
-    head = ["run", "antenna", "preset", "epochs", "with position", "rate", "ok", "sigma p95"]
+    head = ["run", "antenna", "settings", "epochs", "rate", "ok", "sigma p95"]
     judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
     rows = []
     for run in runs:
+        asked = flattened(run.record.get("settings_asked") or {})
+        told = [run.config.preset, *(f"{name} {_word(value)}" for name, value in asked.items() if name != "preset")]
         for antenna, facts in _antennas(run).items():
             sigma = facts.get("along_sigma_m") or {}
             row = [
                 run.name,
                 antenna,
-                run.config.preset,
+                "; ".join(told),
                 number(facts.get("epochs"), 0),
-                number(facts.get("epochs_with_position"), 0),
                 share(facts.get("positioning_rate")),
                 share(facts.get("ok_rate")),
-                number(_plain(sigma.get("p95_m")), 2, " m"),
+                number(_plain(sigma.get("p95_m"))),
             ]
             if evaluation:
                 found = {p: _figures(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
-                row += [number(found["constrained"].get(k), 2, " m") for k in ("mean_m", "std_m", "p95_m", "max_m")]
-                row += [number(found["conventional"].get(k), 2, " m") for k in ("p95_m", "max_m")]
+                row += [number(found["constrained"].get(k)) for k in ("mean_m", "std_m", "p95_m", "max_m")]
+                row += [number(found["conventional"].get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
-    caption = "rate: of the epochs with observations; sigma p95: standard deviation along the line that railfix states"
+    caption = (
+        "settings: preset, then what was asked for; rate: positions of the epochs with observations; sigma p95: "
+        "standard deviation along the line that railfix states, in metres"
+    )
     if evaluation:
-        caption += "; errors along the line, mean and std with sign, p95 and largest of the size"
-    return table(head + judged, rows, caption=caption, right=range(3, 14))
+        caption += "; errors along the line in metres, mean and std with sign, p95 and largest of the size"
+    return table([*head, *judged], rows, caption=caption, right=range(3, len(head) + len(judged)))
 
 
 def _figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
