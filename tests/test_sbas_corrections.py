@@ -85,6 +85,18 @@ def test_parts_of_a_millisecond_are_no_way_into_the_past() -> None:
     assert states(rows, 4.0003, 4.002) == [SatelliteState.NO_FAST, OK]
 
 
+@pytest.mark.parametrize("year", [1998, 2014, 2034, 2060])
+def test_any_year_will_do(year: int) -> None:
+    log = made.made(base())
+    shift = np.datetime64(f"{year}-06-01", "ns") - made.START
+    ours = SbasCorrections(replace(log, time=log.time + shift), limits=OFF)
+    assert ours.satellites(at(3.9, 10.0, 29.0) + shift, SATELLITE).state[:, 0].tolist() == [
+        SatelliteState.NO_FAST,
+        OK,
+        TIMED_OUT,
+    ]
+
+
 TIMEOUTS = [
     ("mask", 0, 600, 600, SatelliteState.NO_MASK),
     ("factors", 1, 240, 360, SatelliteState.NO_DEGRADATION),
@@ -350,6 +362,30 @@ def test_regions_of_service_by_hand() -> None:
     )
 
 
+@pytest.mark.parametrize(("first", "second"), [(4, 7), (7, 4)])
+def test_of_regions_of_equal_priority_the_smaller_factor_counts(first: int, second: int) -> None:
+    regions = [(40, 130, 30, 140, 1)]
+    rows = base()
+    rows += [(5.0, 0, made.service(5, inside=first, outside=15, regions=regions, messages=2, number=1, priority=2)),
+             (11.0, 0, made.service(11, inside=second, outside=15, regions=regions, messages=2, number=2,
+                                    priority=2))]  # fmt: skip
+    ours = engine(rows)
+    found = ours.satellites(at(12.0), SATELLITE)
+    assert ours.delta_udre(at(12.0), found, sight(), np.array([35.0]), np.array([135.0]))[0, 0] == 2.0
+
+
+def test_a_new_issue_of_regions_counts_when_it_is_whole() -> None:
+    """Until then the old one does."""
+    old = made.service(5, inside=4, outside=15, regions=[(40, 130, 30, 140, 1)], issue=1)
+    new = [made.service(s, inside=7, outside=15, regions=[(40, 130, 30, 140, 1)], issue=2, messages=2, number=n)
+           for s, n in ((9, 1), (11, 2))]  # fmt: skip
+    rows = [*base(), (5.0, 0, old), (9.0, 0, new[0]), (11.0, 0, new[1])]
+    ours, time = engine(rows), at(10.0, 11.0)
+    found = ours.satellites(time, SATELLITE)
+    line = np.broadcast_to(sight(), (2, 3, 3))
+    assert ours.delta_udre(time, found, line, np.full(2, 35.0), np.full(2, 135.0))[:, 0].tolist() == [2.0, 5.0]
+
+
 def test_type_0_stops_the_geo_for_a_minute_and_clears_what_it_said() -> None:
     rows = [*base(until=200), (30.5, 0, made.message(0, 30))]
     stopped = SatelliteState.GEO_STOPPED
@@ -423,6 +459,12 @@ def test_an_older_issue_serves_where_the_newest_has_no_record(recordings: Path) 
     found = ours.satellites(at(10.0) + shift, SATELLITE, navigation)
     assert (found.state[0, 0], found.iode[0, 0], found.position_m[0, 0, 0]) == (OK, 48, 1.0)
     assert ours.satellites(at(10.0) + shift, SATELLITE).iode[0, 0] == 99
+    later = [(s, p, b) for s, p, b in base(until=260) if b[1] >> 2 != 25]
+    later += [rows[-2], *((s, 0, made.long_term(s, [(1, 99, (2.0, 0.0, 0.0), 0)])) for s in (9, 100, 200))]
+    log = made.made(later)
+    ours = SbasCorrections(replace(log, time=log.time + shift), limits=OFF)
+    found = ours.satellites(at(243.0, 243.001) + shift, SATELLITE, navigation)
+    assert found.state[:, 0].tolist() == [OK, SatelliteState.IODE_MISMATCH]
 
 
 def test_nothing_of_the_future_and_nothing_of_other_epochs(recordings: Path) -> None:

@@ -27,7 +27,7 @@ def sidereon_message(log: SbasLog, row: int) -> Any:
 
 
 def test_geo_navigation_is_that_of_sidereon(log: SbasLog) -> None:
-    """Its fields are the numbers of the message; the units are those of DO-229D, table A-12."""
+    """Its fields are the numbers of the message; the units are those of DO-229D, A.4.4.11."""
     ours = decode_service.geo_navigation(log)
     assert len(ours.row) == 59
     units = {"m": (0.08, 0.08, 0.4), "rate_m_s": (0.000625, 0.000625, 0.004), "accel_m_s2": (1.25e-5, 1.25e-5, 6.25e-5)}

@@ -124,6 +124,13 @@ def test_a_large_cell_serves_where_the_mask_has_no_small_one() -> None:
     assert overhead(grid({7: points | small}), 36.0, 122.0).state.item() == IonosphereState.NOT_MONITORED
 
 
+def test_large_cells_may_begin_at_any_point() -> None:
+    points = {(35, 125): (1.0, 0), (45, 125): (2.0, 0), (35, 135): (3.0, 0), (45, 135): (5.0, 0)}
+    found = overhead(grid({7: points}), 41.0, 127.0)
+    weights = np.array([0.8 * 0.4, 0.8 * 0.6, 0.2 * 0.4, 0.2 * 0.6])
+    assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
+
+
 def test_cells_are_wider_north_of_60_degrees() -> None:
     points = {(65, 0): (1.0, 0), (70, 0): (2.0, 0), (65, 10): (3.0, 0), (70, 10): (5.0, 0)}
     found = overhead(grid({9: points}), 67.0, 4.0)
@@ -137,6 +144,10 @@ def test_points_near_the_pole_are_interpolated_along_it_first() -> None:
     found = overhead(grid({9: points}), 79.0, 46.0)
     upper = 3.0 + 3.0 * 16.0 / 30.0
     assert found.delay_m.item() == pytest.approx(0.6 * (0.4 * 1.0 + 0.6 * 2.0) + 0.4 * upper, abs=1e-9)
+    # Without the polar band the points at 85 degrees are 90 apart.
+    wide = {5: {(75, 40): (1.0, 0), (75, 50): (2.0, 0)}, 4: {(85, 0): (3.0, 0)}, 6: {(85, 90): (6.0, 0)}}
+    found = overhead(grid(wide), 79.0, 46.0)
+    assert found.delay_m.item() == pytest.approx(0.6 * 1.6 + 0.4 * (3.0 + 3.0 * 46.0 / 90.0), abs=1e-9)
     south = {(-75, 40): (1.0, 0), (-75, 50): (2.0, 0), (-85, 40): (3.0, 0), (-85, 70): (6.0, 0)}
     found = overhead(grid({10: south}), -79.0, 46.0)
     assert found.delay_m.item() == pytest.approx(0.6 * (0.4 * 1.0 + 0.6 * 2.0) + 0.4 * (3.0 + 0.6), abs=1e-9)

@@ -17,7 +17,8 @@ Datetimes = NDArray[np.datetime64]
 
 #: Issues of data told apart: 8 bits in the records of GPS and QZSS, and in corrections.
 _ISSUES: Final = 256
-_SPAN: Final = np.int64(2**40)
+#: Longest time that is told apart [ms]: 278 years.
+_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 _MS: Final = np.timedelta64(1, "ms")
 

@@ -30,8 +30,8 @@ TYPE_NAMES: Final = {
     62: "internal test",
     63: "null",
 }
-#: Types that QZSS sends beside those of SBAS: L1-SAIF (IS-QZSS 1.8, 5.4.3) and L1S, which took its
-#: place (IS-QZSS-L1S-007, 4.1.2; IS-QZSS-DCR-013).
+#: Types that QZSS sends beside those of SBAS: L1-SAIF (IS-QZSS), and L1S, which took its place
+#: (IS-QZSS-L1S, IS-QZSS-DCR).
 QZSS_TYPE_NAMES: Final = {
     43: "L1S disaster report of the Japan Meteorological Agency",
     44: "L1S disaster report of other organisations",

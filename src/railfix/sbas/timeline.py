@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 Integers = NDArray[np.int64]
 Datetimes = NDArray[np.datetime64]
 
-#: Longest time that is told apart [ms]: 34 years.
-_SPAN: Final = np.int64(2**40)
-_ORIGIN: Final = np.datetime64("1999-08-22T00:00:00", "ns")
+#: Longest time that is told apart [ms]: 278 years, all that `datetime64[ns]` reaches.
+_SPAN: Final = np.int64(2**43)
+_ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 _MS: Final = np.int64(1_000_000)
 
 

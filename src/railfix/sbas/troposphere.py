@@ -38,7 +38,7 @@ _LOWEST_DEG: Final = 2.0
 
 
 def mapping(elevation_deg: Floats) -> Floats:
-    """Slant over vertical delay (equation A-10a), any shape; NaN below 2 degrees."""
+    """Slant over vertical delay (A.4.2.4), any shape; NaN below 2 degrees."""
     elevation = np.where(elevation_deg >= _LOWEST_DEG, elevation_deg, np.nan)
     low = 1.0 + 0.015 * np.maximum(0.0, 4.0 - elevation) ** 2
     return np.asarray(1.001 / np.sqrt(0.002001 + np.sin(np.radians(elevation)) ** 2) * low)
