@@ -23,6 +23,7 @@ COMMANDS = [
     ["ablate"],
     ["cn0-curve"],
     ["plot-screens"],
+    ["report"],
     ["simulate"],
     ["map"],
     ["map", "check"],
