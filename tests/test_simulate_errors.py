@@ -125,6 +125,12 @@ def test_satellite_clocks_give_their_sigma_and_correlation_time_back() -> None:
     assert np.nanmax(np.abs(code[:, system == "J"])) == 0.0
     np.testing.assert_allclose(phase, code, atol=1e-6)
     np.testing.assert_allclose(on.error_m[np.isfinite(code)], code[np.isfinite(code)], atol=1e-7)
+    # A clock that is ahead shortens the code.
+    when = (on.observations.time - Scenario().start) / np.timedelta64(1, "s") - on.clock_m / SPEED_OF_LIGHT
+    simulation = Simulation(Scenario(**LONG | {"duration_s": 7200.0}, errors=errors))  # type: ignore[arg-type]
+    column = [simulation.satellites.index(name) for name in on.observations.satellite]
+    ahead = simulation.common_errors.clock_error_m(when)[:, column]
+    np.testing.assert_allclose(code[np.isfinite(code)], -ahead[np.isfinite(code)], atol=1e-6)
     # From satellite to satellite nothing is alike: 450 independent samples.
     table = code[:, np.isfinite(code).all(axis=0) & (system != "J")]
     apart = np.corrcoef(table.T)[np.triu_indices(table.shape[1], 1)]
