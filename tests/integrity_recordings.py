@@ -31,7 +31,7 @@ from railfix.pipeline import AntennaResult, EpochProcessor
 from railfix.preparation import SOMEWHERE_ABOVE_M
 from railfix.raim import constrained_model
 from railfix.range_errors import ModelInputs, error_model_from_runs, range_errors
-from railfix.reasons import CHECK_FAILED, Status
+from railfix.reasons import CHECK_FAILED, Reason, Status
 from railfix.reference_log import AntennaReference, read_reference
 from railfix.rinex import read_navigation, read_observations
 from railfix.run.driver import open_inputs
@@ -273,7 +273,7 @@ def judged(one: Recording, model: str, file: Path | None, *, since: np.datetime6
         observed=observed,
         error_m=error,
         range_error_m=by_range,
-        from_ranges_m=(share * misfit).sum(axis=1),
+        from_ranges_m=np.where(used, share * misfit, 0.0).sum(axis=1),
         share=share,
         outside=(np.abs(np.where(np.isnan(by_range), misfit, by_range)) - bias) / sigma,
         misfit_m=misfit,
@@ -317,11 +317,11 @@ def _moved(one: Recording, result: AntennaResult, used: np.ndarray, place: np.nd
     if ranges.ties is not None:
         for g, group in enumerate(ranges.groups):
             offset[:, group] = np.where(ranges.ties.sigma_m[:, g] < 1e5, ranges.ties.offset_m[:, g], 0.0)[:, None]
-    distance, _ = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
-    misfit = np.where(used & np.isfinite(distance), ranges.code_m - distance - offset, np.nan)
-    some = np.isfinite(misfit).any(axis=1)
-    misfit[some] -= np.nanmedian(misfit[some], axis=1, keepdims=True)
-    misfit = np.nan_to_num(misfit)
+    distance, _ = range_with_rotation(result.satellites.position_ecef_m, place[:, None, :])
+    misfit = result.corrected_code_m[:, result.columns] - distance - offset
+    says = np.where(used, misfit, np.nan)
+    some = np.isfinite(says).any(axis=1)
+    misfit[some] -= np.nanmedian(says[some], axis=1, keepdims=True)
     return gain, misfit
 
 
@@ -373,16 +373,17 @@ def _in_gap(known: np.ndarray, time: np.datetime64) -> bool:
 
 
 def _ranges_text(one: Judged, t: int) -> str:
-    """The used satellites: error, over the model's sigma, and what it did to the position."""
+    """The satellites used or excluded: error, over the model's sigma, and what it did to the position."""
     result, words = one.result, []
     columns = result.columns
-    error = np.where(np.isnan(one.range_error_m[t]), one.misfit_m[t], one.range_error_m[t])
-    for k in np.flatnonzero(result.reason[t, columns] == 0):
+    of_clock = one.range_error_m[t]
+    error = np.where(np.isnan(of_clock), one.misfit_m[t], of_clock)
+    for k in np.flatnonzero((result.reason[t, columns] & ~int(Reason.FAULT_EXCLUDED)) == 0):
         c = columns[k]
+        done = f"moved it {one.share[t, k] * error[k]:+.1f}" if result.reason[t, c] == 0 else "excluded"
         words.append(
-            f"{result.satellite[c]} {error[k]:+.1f} ({one.outside[t, k]:.1f}) "
-            f"el {result.elevation_deg[t, c]:.0f} az {result.azimuth_deg[t, c]:.0f} cn0 {result.cn0_dbhz[t, c]:.0f} "
-            f"-> {one.share[t, k] * error[k]:+.1f}"
+            f"{result.satellite[c]} {error[k]:+.1f} ({one.outside[t, k]:.1f} sigma) "
+            f"el {result.elevation_deg[t, c]:.0f} az {result.azimuth_deg[t, c]:.0f} cn0 {result.cn0_dbhz[t, c]:.0f} {done}"
         )
     return "; ".join(words)
 
