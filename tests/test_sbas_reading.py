@@ -165,7 +165,29 @@ def test_a_cut_message_says_that_it_has_no_parity(tmp_path: Path) -> None:
     path.write_text("".join(f"2353 {i} 124 {log.type[i]} : {digits(zeroed[i], 58)}\n" for i in range(len(log))))
     read = read_sbas(path)
     assert set(read.parity_bits.tolist()) == {0}
+    assert (read.bits[:, :28] == log.bits[:, :28]).all()
     assert read.notes == (f"{path}: 5 messages carry no parity; errors of reception cannot be seen",)
+
+
+def test_six_bits_that_are_no_parity_are_not_taken_for_one(tmp_path: Path) -> None:
+    log = a_log()
+    path = tmp_path / "filled.sbs"
+    filled = log.bits.copy()
+    filled[:, 28] ^= 0x15
+    path.write_text("".join(f"2353 {i} 124 {log.type[i]} : {digits(filled[i], 58)}\n" for i in range(len(log))))
+    assert set(read_sbas(path).parity_bits.tolist()) == {0}
+
+
+def test_a_damaged_message_among_cut_ones_is_refused(tmp_path: Path) -> None:
+    log = a_log()
+    path = tmp_path / "six.sbs"
+    damaged = log.bits.copy()
+    damaged[1, 10] ^= 0x10
+    path.write_text("".join(f"2353 {i} 124 {log.type[i]} : {digits(damaged[i], 58)}\n" for i in range(len(log))))
+    read = read_sbas(path)
+    assert set(read.parity_bits.tolist()) == {6}
+    assert read.refused["parity"] == 1
+    assert read.type.tolist() == [1, 63, 62, 10]
 
 
 def test_a_wrong_preamble_is_counted(tmp_path: Path) -> None:

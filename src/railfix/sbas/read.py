@@ -133,13 +133,14 @@ def _carried_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> In
     """Bits of parity that each message carries: 24 in whole messages, in cut ones 6 or none.
 
     A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as
-    they came; a file where any of them is set is one of the latter.
+    they came: in a file of the latter most of them are the first of the parity, by chance 1 in 64.
     """
     carried = np.full(len(digits), 24, dtype=np.int64)
     short = digits == _SHORT
     for number in np.unique(source[short]):
         of_file = short & (source == number)
-        carried[of_file] = 6 if (bits[of_file, 28] & 0x3F).any() else 0
+        first_six = message_parity(bits[of_file]) >> 18
+        carried[of_file] = 6 if (first_six == bits[of_file, 28] & 0x3F).mean() > 0.5 else 0
     return carried
 
 
