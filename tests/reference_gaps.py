@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 import recordings_truth
 from railfix.antenna import Trajectory
 from railfix.config import DEFAULT_SIGNALS
-from railfix.doppler_speed import Dopplers, dopplers_of_log
+from railfix.doppler_speed import Dopplers, doppler_speed, dopplers_of_log
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.position_log import PositionLog
 from railfix.reference import Pulses, ReferenceData, ReferenceSettings, build_references
+from railfix.reference.matching import match
 from railfix.rinex import read_navigation, read_observations
 from railfix.timescale import seconds, timedelta
 from recordings_score import trajectory_of
@@ -208,12 +209,41 @@ def row(recording: Recording, length_s: int, bridge: str) -> str:
     return f"{what} {np.median(size):8.3f} {np.percentile(size, 95):8.3f} {size.max():8.2f} {told}".rstrip()
 
 
+def truth_steps(recording: Recording, *, over_m: float = 0.2) -> tuple[int, int, float]:
+    """Epochs at which the inertial reference steps against the odometer, of how many, and the largest step [m]."""
+    time, ecef = recording.truth
+    limits = {"lateral_m": 1.0, "height_m": 2.0, "max_speed_mps": 50.0}
+    arc = match(time, ecef, recording.trajectory, **limits).arc_m
+    if recording.pulses is None:
+        raise ValueError(f"{recording.name} has no odometer")
+    step = np.abs(np.diff(arc - recording.pulses.at(time)))
+    return int((step > over_m).sum()), len(step), float(np.nanmax(step))
+
+
+def speed_errors(recording: Recording) -> tuple[Floats, Floats]:
+    """Errors of the Doppler speeds of a recording in motion [m/s], and their standard deviations.
+
+    Against the inertial reference's positions, differenced; the direction is that reference's own motion.
+    """
+    if recording.dopplers is None:
+        raise ValueError(f"{recording.name} has no Dopplers")
+    time, ecef = recording.truth
+    at = recording.dopplers.time
+    velocity = interpolate_reference(at, time, np.gradient(ecef, seconds(time - time[0]), axis=0))
+    speed = np.linalg.norm(velocity, axis=1)
+    tangent = np.where((speed > 1.0)[:, None], velocity / np.maximum(speed, 1.0)[:, None], np.nan)
+    found = doppler_speed(recording.dopplers, recording.true(at), tangent)
+    seen = np.isfinite(found.speed_mps)
+    return (found.speed_mps - speed)[seen], found.sigma_mps[seen]
+
+
 def main(arguments: Sequence[str] = ()) -> int:
     data = Path(__file__).resolve().parents[2] / "shared" / "data"
     if not data.is_dir():
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
     print("recording gap s bridge         epochs given % p50 m    p95 m    max m  sigma m  error/sigma")
+    notes: list[str] = []
     for name, (make, bridge) in RECORDINGS.items():
         if arguments and name not in arguments:
             continue
@@ -221,6 +251,16 @@ def main(arguments: Sequence[str] = ()) -> int:
         for length in LENGTHS_S:
             for way in (bridge, "nothing", "interpolation"):
                 print(row(recording, length, way), flush=True)
+        if recording.pulses is not None:
+            count, of, largest = truth_steps(recording)
+            told = f"steps against the odometer by over 0.2 m at {count} of {of} epochs, by {largest:.2f} m at most"
+            notes.append(f"{name}: the inertial reference {told}")
+        if recording.dopplers is not None:
+            error, sigma = speed_errors(recording)
+            size = np.abs(error)
+            told = f"p50 {np.median(size):.3f} p95 {np.percentile(size, 95):.3f} max {size.max():.2f} m/s"
+            notes.append(f"{name}: Doppler speed in motion, {len(size)} epochs: {told}, sigma {np.median(sigma):.3f}")
+    print("\n".join(notes))
     return 0
 
 

@@ -63,8 +63,9 @@ def test_the_table_of_the_document_is_what_the_script_prints(
     assert block is not None
     shown = [line.rstrip() for line in block.group(1).splitlines()]
     assert [_words(line) for line in shown[:1]] == [_words(line) for line in printed[:1]]
-    assert len(shown) == len(printed) == 46
-    for a, b in zip(shown[1:], printed[1:], strict=True):
+    assert len(shown) == len(printed) == 49
+    assert shown[46:] == printed[46:]
+    for a, b in zip(shown[1:46], printed[1:46], strict=True):
         assert _words(a)[:3] == _words(b)[:3]
         ours, theirs = (np.array(_words(line)[3:], dtype=np.float64) for line in (a, b))
         # Another processor may round a sum otherwise, and a satellite more or less go.

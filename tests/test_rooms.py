@@ -47,7 +47,18 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "sbas_use",
         "pipeline",
     ),
-    6: ("range_errors", "simulate", "evaluate", "tables", "reference", "plots", "report", "run", "demonstration", "cli"),
+    6: (
+        "range_errors",
+        "simulate",
+        "evaluate",
+        "tables",
+        "reference",
+        "plots",
+        "report",
+        "run",
+        "demonstration",
+        "cli",
+    ),
 }
 FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 
