@@ -361,6 +361,25 @@ def test_two_antennas_must_be_as_far_apart_as_on_the_vehicle() -> None:
         build_references(replace(data, distance_m=float("nan")))
 
 
+def test_tags_a_little_apart_are_no_distance() -> None:
+    """The rear receiver tags 3 ms later: 7.5 cm at 25 m/s."""
+    run = Run.shuttling(100.0)
+    front = run.log()
+    front = replace(front, ecef_m=run.trajectory.at_arc(run.arc_m[::5]))
+    later, _ = run.motion.at(seconds(front.time - START) + 0.003)
+    rear = replace(
+        front, time=front.time + np.timedelta64(3, "ms"), ecef_m=run.trajectory.at_arc(np.asarray(later) - 18.2)
+    )
+    data = ReferenceData(
+        logs={"front": front, "rear": rear},
+        trajectories={"front": run.trajectory, "rear": run.trajectory},
+        distance_m=18.2,
+    )
+    fixes = build_references(data)["front"].fixes
+    assert fixes.counts()["good"] == 100
+    assert np.abs(fixes.spacing_m).max() < 0.01
+
+
 def test_a_sensor_that_jumps_does_not_cost_the_fixes() -> None:
     """The wheel loses 3 m at once: long stretches on both sides stay."""
     run = Run.shuttling(200.0)

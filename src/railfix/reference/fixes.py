@@ -159,13 +159,23 @@ def judge_pair(one: Fixes, other: Fixes, distance_m: float, settings: ReferenceS
         before = np.maximum(after - 1, 0)
         nearest = np.where(np.abs(there[before] - here) <= np.abs(there[after] - here), before, after)
         paired = (np.abs(there[nearest] - here) <= SAME_INSTANT_NS) & (refusal == 0)
-        apart = np.linalg.norm(one.ecef_m - other.ecef_m[rows[nearest]], axis=1) - distance_m
+        # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other one is moved to the same instant.
+        late_s = (here - there[nearest]) / 1e9
+        moved = other.ecef_m[rows[nearest]] + late_s[:, None] * _velocity(other.time[rows], other.ecef_m[rows])[nearest]
+        apart = np.linalg.norm(one.ecef_m - moved, axis=1) - distance_m
         spacing = np.where(paired, apart, np.nan)
     if settings.unpaired == "refuse":
         _refuse(refusal, ~paired, Refusal.UNPAIRED)
     with np.errstate(invalid="ignore"):
         _refuse(refusal, np.abs(spacing) > settings.spacing_m, Refusal.SPACING)
     return replace(one, refusal=refusal, spacing_m=spacing)
+
+
+def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
+    """Velocities by differences of neighbours, shape (n, 3) [m/s]; 0 for a single position."""
+    if len(time) < 2:
+        return np.zeros_like(ecef_m)
+    return np.asarray(np.gradient(ecef_m, seconds(time - time[0]), axis=0))
 
 
 #: The other antenna's row counts in a pair whatever this very check said of it.
