@@ -383,7 +383,8 @@ def _ranges_text(one: Judged, t: int) -> str:
         done = f"moved it {one.share[t, k] * error[k]:+.1f}" if result.reason[t, c] == 0 else "excluded"
         words.append(
             f"{result.satellite[c]} {error[k]:+.1f} ({one.outside[t, k]:.1f} sigma) "
-            f"el {result.elevation_deg[t, c]:.0f} az {result.azimuth_deg[t, c]:.0f} cn0 {result.cn0_dbhz[t, c]:.0f} {done}"
+            f"el {result.elevation_deg[t, c]:.0f} az {result.azimuth_deg[t, c]:.0f} "
+            f"cn0 {result.cn0_dbhz[t, c]:.0f} {done}"
         )
     return "; ".join(words)
 
