@@ -69,7 +69,8 @@ def test_the_truth_of_the_simulator_is_a_reference(packed: str, tmp_path: Path) 
     np.testing.assert_array_equal(found.chainage_m, rear["chainage_m"].to_numpy())
     np.testing.assert_array_equal(found.speed_mps, rear["speed_mps"].to_numpy())
     assert set(found.source.tolist()) == {"truth"}
-    assert set(found.environment.tolist()) == {""}
+    np.testing.assert_array_equal(found.environment, rear["environment"].to_numpy())
+    assert {"tunnel", "urban"} <= set(found.environment.tolist())
     assert np.isnan(found.sigma_m).all()
 
 

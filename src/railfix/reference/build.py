@@ -46,6 +46,8 @@ Datetimes = NDArray[np.datetime64]
 GRAVITY_MPS2: Final = 9.80665
 #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
 _ROUNDS: Final = 3
+#: Fixes tell a direction when they are this many standard deviations apart.
+_MOVED: Final = 4.0
 #: Closing errors below this many standard deviations are what noise makes.
 _TELLING: Final = 2.0
 
@@ -285,7 +287,8 @@ class _Builder:
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))
-        slope = np.where(step <= LONGEST_STEP_S, np.diff(fix_m) / step, np.nan)
+        moved, both = np.diff(fix_m), np.hypot(fixes.sigma_m[good[1:]], fixes.sigma_m[good[:-1]])
+        slope = np.where((step <= LONGEST_STEP_S) & (np.abs(moved) > _MOVED * both), moved / step, np.nan)
         section = np.searchsorted(fix_time, time, side="right") - 1
         inside = (section >= 0) & (section < len(slope))
         hint = np.where(inside, slope[np.clip(section, 0, len(slope) - 1)], np.nan)
