@@ -188,6 +188,7 @@ def test_residual_ionosphere_is_vertical_delay_times_mapping() -> None:
     assert np.nanmax(np.nanmax(vertical, axis=1) - np.nanmin(vertical, axis=1)) < 1e-6
     check_process(np.nanmean(vertical, axis=1)[:, None], 0.5, 1.0)
     np.testing.assert_allclose(phase, -code, atol=1e-6)
+    np.testing.assert_allclose(on.error_m[np.isfinite(code)], code[np.isfinite(code)], atol=1e-6)
 
 
 def test_ionospheric_gradient_grows_with_the_pierce_point() -> None:
@@ -424,6 +425,14 @@ def test_carried_noise_of_two_receivers_is_apart() -> None:
         for k in (0, 1)
     )
     assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 4.0 / np.sqrt(5000 * 20 / 20)
+
+
+def test_carried_noise_is_in_force_from_the_first_epoch_on() -> None:
+    settings = NoiseSettings(code_correlated_share=1.0, cn0_wander_sigma_db=2.0)
+    carried = CarriedNoise(settings, key=(7,), channels=10_000, interval_s=0.1)
+    assert carried.code(np.zeros((1, 10_000))).std() == pytest.approx(1.0, rel=0.03)
+    first = carried.cn0_db(1)
+    assert np.std(first) == pytest.approx(2.0, rel=0.03)
 
 
 def weaker(geometry: Geometry) -> Disturbance:
