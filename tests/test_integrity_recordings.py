@@ -1,0 +1,134 @@
+"""Protection levels on real recordings: what error models of other recordings hold, and what they cost.
+
+``python tests/integrity_recordings.py FOLDER`` prints the tables that the bounds here are of.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import integrity_recordings
+from integrity_recordings import ALARM_LIMITS_M, Group
+from railfix.raim import constrained_model
+from railfix.reasons import Status
+from railfix.stanford import Region
+
+pytestmark = [pytest.mark.requirement("C2"), pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def groups(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], Group]:
+    names = list(integrity_recordings.MODELS)
+    found = integrity_recordings.everything(recordings, tmp_path_factory.mktemp("integrity"), names)
+    keys = [(name, model) for name in names for model in integrity_recordings.MODELS[name]]
+    return dict(zip(keys, found, strict=True))
+
+
+def over(group: Group) -> int:
+    return sum(int((np.abs(one.error_m) > one.level_m).sum()) for one in group)
+
+
+def available(group: Group, limit_m: float) -> float:
+    return float(np.mean(np.concatenate([(one.level_m <= limit_m)[one.observed] for one in group])))
+
+
+def median_level(group: Group) -> float:
+    level = np.concatenate([one.level_m[one.observed] for one in group])
+    return float(np.median(level[np.isfinite(level)]))
+
+
+def test_no_error_passes_its_level_but_one_on_another_piece_of_the_line(groups):
+    """M8T, one second: codes of two satellites 500 m early put it onto another street, status uncertain."""
+    total = 0
+    for (name, model), group in groups.items():
+        found = [epoch for one in group for epoch in integrity_recordings.over_level(one)]
+        total += sum(int(np.isfinite(one.level_m).sum()) for one in group)
+        assert len(found) <= (name == "urbannav_m8t"), (name, model)
+        for epoch in found:
+            assert epoch.why.startswith("another place of the line"), epoch
+            assert epoch.status == Status.UNCERTAIN.text
+    assert total > 12_000
+
+
+@pytest.mark.requirement("C4")
+def test_the_verdict_never_lets_an_error_pass(groups):
+    """What the run calls available: misleading at no alarm limit, with no model, not even one that is too narrow."""
+    counts: Counter[Region] = Counter()
+    for group in groups.values():
+        for one in group:
+            for limit in ALARM_LIMITS_M:
+                counts.update(one.diagram(limit, one.verdict_m).counts)
+    assert counts[Region.MISLEADING] + counts[Region.HAZARDOUS] + counts[Region.UNAVAILABLE_MISLEADING] == 0
+    assert counts[Region.NOMINAL] > 3000
+
+
+@pytest.mark.requirement("C4")
+@pytest.mark.parametrize(
+    ("name", "model", "median_m", "limit_m", "rate"),
+    [
+        ("urbannav_f9p", "none", 45.0, 40.0, 0.45),
+        ("urbannav_f9p", "all others", 80.0, 40.0, 0.10),
+        ("urbannav_m8t", "none", 60.0, 40.0, 0.35),
+        ("urbannav_m8t", "all others", 90.0, 40.0, 0.10),
+        ("gsdc", "none", 95.0, 40.0, 0.08),
+        ("gsdc", "all others", 120.0, 40.0, 0.07),
+        ("japan", "none", 4.0, 10.0, 0.98),
+        ("japan", "all others", 80.0, 40.0, 0.05),
+        ("japan", "own first half", 6.0, 10.0, 0.98),
+        ("japan", "own first half, base", 13.0, 10.0, 0.80),
+        ("geonet2005", "none", 13.0, 20.0, 0.90),
+        ("geonet2005", "same, no C/N0", 65.0, 40.0, 0.15),
+    ],
+)
+def test_levels_and_availability(groups, name, model, median_m, limit_m, rate):
+    """By levels alone: on courses that pass a place twice the verdict calls all of them ambiguous."""
+    group = groups[name, model]
+    assert 0.5 * median_m < median_level(group) < median_m
+    assert available(group, limit_m) > rate
+
+
+@pytest.mark.requirement("C3")
+def test_a_model_of_open_sky_is_found_out_in_a_city(groups):
+    """Far too narrow there: the separations contradict each other instead of errors passing levels."""
+    for name, least in (("urbannav_f9p", 0.35), ("urbannav_m8t", 0.35), ("gsdc", 0.03)):
+        (one,) = groups[name, "open sky, base"]
+        assert one.alarms.sum() > least * one.observed.sum(), name
+        (other,) = groups[name, "all others"]
+        assert other.alarms.sum() < 0.02 * other.observed.sum(), name
+
+
+@pytest.mark.requirement("C3")
+def test_levels_are_not_empty_of_meaning(groups):
+    """Where they are sharpest, errors come to half of them: a tenth narrower and they would be passed."""
+    (one,) = groups["japan", "none"]
+    ratio = np.abs(one.error_m) / one.level_m
+    assert 0.4 < np.nanmax(ratio[np.isfinite(one.level_m)]) < 1.0
+
+
+@pytest.mark.requirement("C3")
+@pytest.mark.parametrize("name", ["urbannav_f9p", "gsdc", "japan"])
+def test_errors_of_positions_are_what_the_errors_of_ranges_do(groups, name):
+    """Gains of the model that the level rests on, times true errors of the ranges, against the reference."""
+    (one,) = groups[name, "all others"]
+    both = np.isfinite(one.error_m) & np.isfinite(one.from_ranges_m) & (np.abs(one.error_m) < 30.0)
+    assert both.sum() > 300
+    # Left over: the curve of the line between truth and answer, and the map's own error.
+    assert np.median(np.abs(np.abs(one.from_ranges_m[both]) - np.abs(one.error_m[both]))) < 0.35
+
+
+def test_the_level_follows_from_what_the_result_tells(groups):
+    """Sigma of the position once more from sigmas, satellites and clocks in the result."""
+    (one,) = groups["urbannav_f9p", "all others"]
+    result = one.result
+    arc = np.where(np.isfinite(result.arc_m), result.constrained.arc_m, np.nan)
+    model = constrained_model(
+        integrity_recordings.ranges_of(result), one.trajectory, arc, section=np.maximum(result.constrained.section, 0)
+    )
+    level = result.protection.level
+    has = np.isfinite(level.sigma_m) & np.isfinite(result.arc_m)
+    assert has.sum() > 600
+    assert np.sqrt(model.covariance_m2[has, 0, 0]) == pytest.approx(level.sigma_m[has], rel=1e-6)
