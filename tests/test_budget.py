@@ -132,7 +132,7 @@ def test_reasons_of_too_few_satellites_by_hand() -> None:
 def test_the_screen_shows_the_budget(bench: Bench, tmp_path: Path) -> None:
     files = ["--front", bench.front, "--rear", bench.rear, "--nav", bench.nav, "--track", bench.track]
     command = ["run", *map(str, files), "--vehicle", str(bench.vehicle), "--out", str(tmp_path / "out")]
-    result = RUNNER.invoke(app, [*command, "--set", "min_satellites=14", "--set", "antenna_pair.limit_m=2.5"])
+    result = RUNNER.invoke(app, [*command, "--set", "min_satellites=12", "--set", "antenna_pair.limit_m=2.5"])
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "out" / "run.json").read_text())["antennas"]["front"]
     first = told["too_few_satellites_by_first_reason"]["antenna_pair"]

@@ -31,7 +31,7 @@ from railfix.reference_log import AntennaReference, read_reference
 from railfix.rinex import read_navigation, read_observations
 from railfix.run import RunOptions, past_run, run_files
 from railfix.run.driver import open_inputs
-from railfix.simulate import demo_files
+from railfix.simulate import Scenario, Simulation, demo_files
 from railfix.track_map import from_positions
 
 pytestmark = pytest.mark.requirement("C3")
@@ -104,17 +104,28 @@ def test_an_error_put_into_a_code_comes_back_and_touches_no_other_satellite() ->
     assert np.abs(np.median(changed[~itself])) < 1.0
 
 
-def test_the_errors_of_the_simulated_run_have_the_noise_that_was_put_in() -> None:
-    config = parse_config({"screens": ["elevation"]})
-    processor, obs, reference = _demo(config)
-    result, _ = processor.process({"front": obs})
-    antenna = result.antennas["front"]
-    errors = range_errors(antenna, processor.trajectories["front"], reference)
+def test_the_errors_of_a_simulated_run_have_the_noise_that_was_put_in() -> None:
+    made = Simulation(Scenario(duration_s=60.0))
+    (piece,) = made.pieces("front", chunk_epochs=600)
+    path = Trajectory.from_track(made.line.track())
+    processor = EpochProcessor(parse_config({"screens": ["elevation"]}), made.navigation, {"front": path})
+    result, _ = processor.process({"front": piece.observations})
+    blank, words = np.full(600, np.nan), np.full(600, "")
+    reference = AntennaReference(
+        time=piece.observations.time,
+        ecef_m=piece.geometry.antenna_ecef_m,
+        chainage_m=blank,
+        speed_mps=blank,
+        sigma_m=blank,
+        source=words,
+        environment=words,
+    )
+    errors = range_errors(result.antennas["front"], path, reference)
     sample = errors.samples
     expected = 0.5 * 10.0 ** ((45.0 - np.minimum(sample.cn0_dbhz, 50.0)) / 20.0)
     expected /= np.sin(np.radians(sample.elevation_deg))
     score = sample.error_m[sample.used] / expected[sample.used]
-    assert errors.epochs == len(obs)
+    assert errors.epochs == 600
     assert score.std() == pytest.approx(1.0, abs=0.05)
     assert abs(score.mean()) < 0.05
 

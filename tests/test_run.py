@@ -19,7 +19,7 @@ from railfix.demonstration import demo_inputs, demo_truth
 from railfix.errors import MismatchError, NoPositionError
 from railfix.evaluate import evaluate_run
 from railfix.pipeline import EpochProcessor, Result
-from railfix.reasons import POSITIONED, Reason, Status, reason_text
+from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reason_text
 from railfix.rinex import read_navigation, read_observations, scan_observations
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table, to_xarray
@@ -132,7 +132,10 @@ def test_the_record_names_what_was_read(record: dict[str, Any]) -> None:
     assert record["versions"]["railfix"]
     assert record["versions"]["numpy"] == np.__version__
     assert record["settings_used"] == Config().as_dict()
-    assert record["positioning_rate"] == 1.0
+    positioned = sum(antenna["epochs_with_position"] for antenna in record["antennas"].values())
+    observed = sum(antenna["epochs_with_observations"] for antenna in record["antennas"].values())
+    assert record["positioning_rate"] == positioned / observed
+    assert 0.98 < record["positioning_rate"] < 1.0
     assert record["line"]["vehicle"]["bogie_distance_m"] == 13.8
     assert record["line"]["track"]["points"] == 189
 
@@ -297,14 +300,17 @@ def test_xarray_has_named_axes(result: Result) -> None:
     assert (used.values == float(Reason.UNHEALTHY)).all()
 
 
-def test_the_demo_is_as_good_as_its_noise_allows(whole: RunSummary) -> None:
+def test_the_demo_is_as_good_as_its_errors_allow(whole: RunSummary) -> None:
+    """Satellites and air are metres off in the made town, so the mean is; what a tunnel takes is no position."""
     evaluation = evaluate_run(whole.files["run.json"].parent, demo_truth())
     for antenna in ("front", "rear"):
-        assert evaluation.figure("rate", antenna=antenna) == 1.0
-        assert abs(evaluation.figure("mean_m", antenna=antenna)) < 0.1
-        assert evaluation.figure("p95_m", antenna=antenna) < 1.2
-        conventional = evaluation.figure("std_m", antenna=antenna, position="conventional")
-        assert evaluation.figure("std_m", antenna=antenna) < conventional
+        assert evaluation.figure("rate", antenna=antenna) > 0.98
+        assert 0.90 < evaluation.figure("rate_of_run", antenna=antenna) < 0.95
+        assert abs(evaluation.figure("mean_m", antenna=antenna)) < 1.0
+        assert evaluation.figure("p95_m", antenna=antenna) < 2.2
+        ok = evaluation.figure("max_m", antenna=antenna, position="constrained_ok")
+        assert ok < 5.0
+        assert ok <= evaluation.figure("max_m", antenna=antenna)
 
 
 def test_positions_are_those_of_the_statuses(whole: RunSummary) -> None:
@@ -320,4 +326,6 @@ def test_positions_that_failed_a_check_do_not_count_when_they_are_dropped(tmp_pa
     rows = pl.read_parquet(summary.files["positions.parquet"]).filter(antenna="front")
     front = summary.tally.antennas["front"]
     assert front.status["inconsistent"] > 10
-    assert front.positioned == rows["chainage_m"].count() == 2000 - front.status["inconsistent"]
+    dropped = [rows.filter(pl.col("status").cast(pl.String) == s.text).height for s in CHECK_FAILED]
+    without = sum(dropped) + sum(front.status[s] for s in ("no_observation", "too_few_satellites", "unobservable"))
+    assert front.positioned == rows["chainage_m"].count() == 2000 - without
