@@ -1,6 +1,6 @@
 """Errors drawn against the protection level: noise alone, and one and two faults of the size that hurts most.
 
-Run ``python tests/protection_brute_force.py`` for the tables of docs/protection-level.md (about two minutes).
+Run ``python tests/protection_brute_force.py`` for the tables of docs/protection-level.md (several minutes).
 
 Geometries are drawn (satellites, constellations, heading of the track, map error); their levels come from
 the code under test. The errors do not: every position, with all satellites and without each subset, is an
@@ -10,7 +10,7 @@ operator from its own normal matrix with a column a clock and a row a prior, app
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Final
 
@@ -53,6 +53,10 @@ BUDGETS: Final = {
     "1e-4, prior 3.8e-3": _budget(1e-4, 3.8e-3),
     "1e-5, prior 1.7e-3": _budget(1e-5, 1.7e-3),
 }
+
+
+#: The defaults, all constellations alike.
+HOURLY: Final = RiskBudget(satellite_prior=dict.fromkeys("GEC", 3e-5), exclusion_share=0.0)
 
 
 @dataclass(frozen=True)
@@ -263,6 +267,67 @@ def simulate(count: int, draws: int, seed: int, risk: RiskBudget) -> dict[str, C
     return counts
 
 
+@dataclass
+class Weighted:
+    """Risk found by drawing hypotheses more often than they are, each found epoch with its weight."""
+
+    epochs: int = 0
+    allowed: float = 0.0  # sum over epochs
+    found: np.ndarray = field(default_factory=lambda: np.zeros(1 + len(SHRUNK)))
+    squares: np.ndarray = field(default_factory=lambda: np.zeros(1 + len(SHRUNK)))
+
+    def share(self, which: int = 0) -> float:
+        """Risk over what is allowed; `which` counts the shrunk levels."""
+        return float(self.found[which] / self.allowed)
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of `share`."""
+        return float(np.sqrt(self.squares[0]) / self.allowed)
+
+
+def whole_risk(count: int, draws: int, seed: int, risk: RiskBudget) -> Weighted:
+    """All hypotheses together against the level: no fault, each single, each pair at the size that is its worst.
+
+    Each epoch draws one hypothesis with a probability in proportion to what it may contribute.
+    """
+    rng = np.random.default_rng(seed)
+    result = Weighted()
+    prior = risk.prior(["G"])[0]
+    for some in geometries(count, seed, risk):
+        level_m = np.broadcast_to(some.level.level_m[:, None], some.part_m.shape)
+        chance, moved = worst_sizes(some, level_m)
+        there = some.used[:, some.members[:, 0]] & some.used[:, some.members[:, 1]]
+        single = some.members[:, 1] < 0
+        weight = there * np.where(some.members[:, 0] < 0, 1.0, np.where(single, prior, prior**2))
+        limits_m, asked = some.level.k_false_alarm[:, None] * some.separation_sigma_m, some.asked
+        for t in range(len(some)):
+            result.epochs += draws
+            result.allowed += draws * float(risk.risk_per_sample - some.level.unchecked_risk[t])
+            likely = weight[t] * (chance[t] + 1e-9)
+            likely /= likely.sum()
+            picks = rng.multinomial(draws, likely)
+            tested = np.flatnonzero(asked[t])
+            apart, limit = some.operator[t, tested] - some.operator[t, 0], limits_m[t, tested]
+            for k in np.flatnonzero(picks):
+                noise = rng.standard_normal((picks[k], some.operator.shape[2]))
+                worth = weight[t, k] / likely[k]
+                if np.isnan(some.operator[t, k, 0]):  # nothing checks it: counted whole
+                    found = np.full(1 + len(SHRUNK), float(picks[k]))
+                else:
+                    shape = hidden_fault(some, t, k) * moved[t, k] if k else np.zeros(noise.shape[1])
+                    error = noise @ some.operator[t, 0] + (moved[t, k] if k else 0.0)
+                    over = np.flatnonzero(np.abs(error) > min(SHRUNK) * some.level.level_m[t])
+                    quiet = ~(np.abs((noise[over] + shape) @ apart.T) > limit).any(axis=1)
+                    size = np.abs(error[over[quiet]])
+                    found = np.array(
+                        [np.count_nonzero(size > f * some.level.level_m[t]) for f in (1.0, *SHRUNK)], dtype=float
+                    )
+                result.found += worth * found
+                result.squares += worth**2 * found
+    return result
+
+
 @dataclass(frozen=True)
 class Total:
     """Risk of geometries over what it may be: all hypotheses at their worst sizes, Gaussian tails."""
@@ -288,6 +353,28 @@ def analytic(count: int, seed: int, risk: RiskBudget, factor: float = 1.0) -> To
         ratios.append(spent / allowed)
     together = np.concatenate(ratios)
     return Total(len(together), float(np.median(together)), float(together.max()))
+
+
+def summed_levels(count: int, seed: int, risk: RiskBudget) -> np.ndarray:
+    """Level where all tails together are the risk, found by halving, over the product's and its parts', (T, 2)."""
+    ratios = []
+    prior = risk.prior(["G"])[0]
+    for some in geometries(count, seed, risk):
+        there = some.used[:, some.members[:, 0]] & some.used[:, some.members[:, 1]]
+        weight = there * np.where(some.members[:, 0] < 0, 2.0, np.where(some.members[:, 1] < 0, prior, prior**2))
+        whole = np.isfinite(some.sigma_m) | ~there  # every hypothesis is checked
+        good = whole.all(axis=1)
+        sigma = np.where(there, some.sigma_m, 1.0)[good]
+        limit = some.level.k_false_alarm[good, None] * np.where(there, some.separation_sigma_m, 0.0)[good]
+        allowed = (1.0 - 2.0 * risk.exclusion_share) * (risk.risk_per_sample - some.level.unchecked_risk[good])
+        low, high = np.zeros(good.sum()), some.level.level_m[good].copy()
+        for _ in range(50):
+            middle = (low + high) / 2.0
+            over = (weight[good] * ndtr((limit - middle[:, None]) / sigma)).sum(axis=1) > allowed
+            low, high = np.where(over, middle, low), np.where(over, high, middle)
+        parts = np.maximum(some.level.fault_free_m, np.maximum(some.level.one_fault_m, some.level.two_fault_m))[good]
+        ratios.append(np.stack([high / some.level.level_m[good], high / parts], axis=1))
+    return np.concatenate(ratios)
 
 
 @dataclass(frozen=True)
@@ -371,13 +458,31 @@ def print_drawn(count: int, draws: int) -> None:
             print(f"{kind:34s}{c.draws:11d}{c.allowed:11.1f}{c.found:9d}{c.most:9d}{tail}")
 
 
+def print_whole(count: int, draws: int) -> None:
+    print("\nall hypotheses at their worst sizes, drawn by importance: risk over what it may be")
+    print(f"{'risk':20s}{'epochs':>11s}{'level':>9s}{'+-':>9s}{'x 0.9':>9s}{'x 0.8':>9s}")
+    for number, (name, risk) in enumerate(BUDGETS.items()):
+        got = whole_risk(count, draws, 41 + number, risk)
+        tail = "".join(f"{got.share(k):9.3f}" for k in (1, 2))
+        print(f"{name:20s}{got.epochs:11d}{got.share():9.4f}{got.spread:9.4f}{tail}")
+
+
 def print_analytic(count: int) -> None:
-    risk = RiskBudget(satellite_prior=dict.fromkeys("GEC", 3e-5))
+    risk = HOURLY
     print("\nrisk of an hour 1e-7, all hypotheses at their worst sizes, over what it may be")
     print(f"{'level x':>8s}{'geometries':>12s}{'median':>12s}{'largest':>12s}")
     for factor in (1.0, *SHRUNK):
         total = analytic(count, 29, risk, factor)
         print(f"{factor:8.1f}{total.geometries:12d}{total.median:12.3g}{total.largest:12.3g}")
+
+
+def print_summed(count: int) -> None:
+    ratio = summed_levels(count, 29, HOURLY)
+    print(f"\nlevel where the tails are the risk (by halving), {len(ratio)} geometries")
+    print(f"{'over':24s}{'5 %':>8s}{'50 %':>8s}{'95 %':>8s}{'largest':>9s}")
+    for name, column in (("the level", ratio[:, 0]), ("the largest of parts", ratio[:, 1])):
+        low, middle, high = np.percentile(column, [5, 50, 95])
+        print(f"{name:24s}{low:8.3f}{middle:8.3f}{high:8.3f}{column.max():9.4f}")
 
 
 def print_excluding(draws: int) -> None:
@@ -393,5 +498,7 @@ def print_excluding(draws: int) -> None:
 
 if __name__ == "__main__":
     print_drawn(2400, 5000)
+    print_whole(2400, 5000)
     print_analytic(2400)
+    print_summed(2400)
     print_excluding(50_000)

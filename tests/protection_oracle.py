@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.stats import norm
 
 import raim_oracle
@@ -23,6 +24,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Level:
+    level_m: float
     fault_free_m: float
     one_fault_m: float
     two_fault_m: float
@@ -117,7 +119,24 @@ def level(
     one, ratio_one, worst_one = of(ones)
     two, ratio_two, worst_two = of(twos) if asked else (0.0, 0.0, ())
     fault_free = norm.isf(part / 2.0) * solved.all.sigma_m + np.abs(solved.all.operator) @ bias
+
+    def spent(level_m: float) -> float:
+        total = 2.0 * norm.sf((level_m - np.abs(solved.all.operator) @ bias) / solved.all.sigma_m)
+        for members, p in [*ones, *(twos if asked else [])]:
+            answer = solved.without(members)
+            if answer.determined:
+                offset = k_alarm * solved.apart(answer)[1] + np.abs(answer.operator) @ bias
+                total += p * norm.sf((level_m - offset) / answer.sigma_m)
+            else:
+                total += p
+        return float(total + (0.0 if asked else sum(p for _, p in twos)))
+
+    largest = max(float(fault_free), one, two)
+    whole = largest
+    if np.isfinite(largest) and largest < 1e4:
+        whole = float(brentq(lambda at: np.log(spent(at)) - np.log(3.0 * part), 0.0, largest, xtol=1e-9))
     return Level(
+        level_m=whole,
         fault_free_m=float(fault_free),
         one_fault_m=one,
         two_fault_m=two,

@@ -6,8 +6,19 @@ import numpy as np
 import pytest
 from scipy.stats import poisson
 
-from protection_brute_force import BUDGETS, OFTEN, SHRUNK, Count, analytic, excluding, simulate
-from railfix.protection import RiskBudget
+from protection_brute_force import (
+    BUDGETS,
+    HOURLY,
+    OFTEN,
+    SHRUNK,
+    Count,
+    Weighted,
+    analytic,
+    excluding,
+    simulate,
+    summed_levels,
+    whole_risk,
+)
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -41,11 +52,34 @@ def test_ten_million_drawn_errors_keep_within_the_level(name):
 
 def test_tails_at_the_risk_of_an_hour():
     """1e-7 cannot be drawn; the Gaussian probabilities of all hypotheses at their worst sizes can be added up."""
-    risk = RiskBudget(satellite_prior=dict.fromkeys("GEC", 3e-5))
-    total = analytic(250, 29, risk)
+    total = analytic(250, 29, HOURLY)
     assert total.geometries > 200
     assert total.largest <= 1.0
-    assert analytic(250, 29, risk, 0.8).largest > 1.0
+    assert analytic(250, 29, HOURLY, 0.9).median > 1.0
+
+
+def test_level_is_where_the_tails_are_the_risk():
+    over_level, over_parts = summed_levels(250, 29, HOURLY).T
+    assert over_level.max() <= 1.0 + 1e-9
+    assert over_level.min() > 0.998
+    assert np.median(over_parts) < 0.9  # what the sum saves against the largest of the parts
+
+
+def check_whole(got: Weighted) -> None:
+    assert got.share() + 4.0 * got.spread <= 1.0
+    assert got.share(1 + SHRUNK.index(0.8)) > 1.0
+
+
+def test_all_hypotheses_together_keep_within_the_risk():
+    check_whole(whole_risk(200, 800, 3, BUDGETS["1e-5, prior 1.7e-3"]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(BUDGETS)[1:])
+def test_ten_million_epochs_of_all_hypotheses_keep_within_the_risk(name):
+    got = whole_risk(2400, 5000, 23, BUDGETS[name])
+    assert got.epochs > 1e7
+    check_whole(got)
 
 
 def test_exclusion_at_work_keeps_within_the_risk():

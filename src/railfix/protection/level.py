@@ -1,13 +1,17 @@
 """Protection level along the track with fault hypotheses: solution separation over one and two satellites.
 
-The level is the largest of what each part of the risk asks for (EU-U.S. WG-C ARAIM; in one dimension):
+While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no
+part, and whose own error has the Gaussian tail of ``sigma_J``. The level L is where the tails of all
+hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+
+    ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
+
+Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. It is found from above: from the largest
+of three parts, each of which has its share of the risk,
 
 - no fault: ``K_ff sigma_0 + b_0``;
-- a fault in the subset J, for each: ``T_J + K sigma_J + b_J``. While ``|x_J - x| <= T_J`` the position is that far
-  at most from one without the fault, whose own error is over ``K sigma_J + b_J`` with the probability left.
-
-Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. A part's risk is divided in
-proportion to the priors of its hypotheses, so that all of one part share one K.
+- one fault, two faults: the largest ``T_J + K sigma_J + b_J``, the share divided in proportion to the priors, so
+  that all hypotheses of a part have one K.
 """
 
 from __future__ import annotations
@@ -23,19 +27,20 @@ from numpy.typing import ArrayLike, NDArray
 from railfix.protection.risk import MOST_EXCLUDED, RiskBudget, more_than_two, one_sided_k, pair_sum
 from railfix.protection.sbas import along_the_line
 from railfix.protection.separation import Separations, whole, without_constellation, without_one, without_two
+from railfix.protection.tails import Tails, least_level
 from railfix.raim import LinearModel
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 #: Numbers of a pair array that a block of epochs holds.
-_BLOCK_SIZE: Final = 40_000
+_BLOCK_SIZE: Final = 80_000
 #: Separation, over the sigma of the position, below which the two positions are the same.
 _SAME: Final = 1e-9
 
 
 class Cause(IntEnum):
-    """What sets the level of an epoch."""
+    """What uses up most of the risk of an epoch at its level, or why there is none."""
 
     #: The noise of the position without a fault.
     FAULT_FREE = 0
@@ -58,7 +63,8 @@ class ProtectionLevel:
     Attributes
     ----------
     level_m : ndarray, shape (T,) [m]
-        The largest of the three parts; infinite where `cause` says why.
+        Where all tails together keep within the risk; at most the largest of the three parts, which have shares
+        of it that need not be used up. Infinite where `cause` says why.
     fault_free_m, one_fault_m, two_fault_m : ndarray, shape (T,) [m]
         The parts. 0 where the part's hypotheses fit into its share of the risk unchecked.
     sigma_m : ndarray, shape (T,) [m]
@@ -124,6 +130,8 @@ class _Part:
     k: Floats
     worst: Indices  # hypothesis; -1
     separation: Floats
+    tails: Tails  # of what is checked
+    unchecked: Floats  # prior of what is not
 
 
 def along_track_level(
@@ -270,7 +278,11 @@ def _level_of_block(
         pair_prior = prior[:, first] * prior[:, second] * pairs[:, None]
         two = _part(without_two(all_of, first, second), pair_prior, plan.two[rows], k_false_alarm, sigma)
 
-    level = np.maximum(np.maximum(fault_free, one.level_m), two.level_m)
+    noise = Tails(offset_m=all_of.bias_m[:, None], sigma_m=sigma[:, None], weight=np.full((len(rows), 1), 2.0))
+    left = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] - one.unchecked - two.unchecked
+    left = left - np.where(pairs, 0.0, pair_sum(prior))
+    above = np.maximum(np.maximum(fault_free, one.level_m), two.level_m)
+    level, spender = least_level(above, [noise, one.tails, two.tails], left)
     result.level_m[rows], result.sigma_m[rows] = level, sigma
     result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = fault_free, one.level_m, two.level_m
     result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k_fault_free, one.k, two.k
@@ -286,10 +298,8 @@ def _level_of_block(
         places = np.stack([first, second], axis=1)[np.maximum(two.worst, 0)]
         found = np.take_along_axis(all_of.channel, places, axis=1)
         result.worst_two[rows] = np.where(two.worst[:, None] >= 0, found, -1)
-    cause = np.where(one.level_m > fault_free, Cause.ONE_FAULT, Cause.FAULT_FREE)
-    cause = np.where(two.level_m > np.maximum(fault_free, one.level_m), Cause.TWO_FAULTS, cause)
-    cause = np.where(np.isinf(level), np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET), cause)
-    result.cause[rows] = cause
+    infinite = np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET)
+    result.cause[rows] = np.where(np.isinf(level), infinite, spender)
     result.unchecked_risk[rows] = plan.beyond[rows]
 
 
@@ -301,8 +311,15 @@ def _beside(parts: list[Separations]) -> Separations:
 
 def _nothing(epochs: int) -> _Part:
     """A part without hypotheses."""
-    zero = np.zeros(epochs)
-    return _Part(level_m=zero, k=np.full(epochs, -np.inf), worst=np.full(epochs, -1, dtype=np.intp), separation=zero)
+    zero, empty = np.zeros(epochs), np.zeros((epochs, 0))
+    return _Part(
+        level_m=zero,
+        k=np.full(epochs, -np.inf),
+        worst=np.full(epochs, -1, dtype=np.intp),
+        separation=zero,
+        tails=Tails(offset_m=empty, sigma_m=empty, weight=empty),
+        unchecked=zero,
+    )
 
 
 def _part(apart: Separations, prior: Floats, budget: Floats, k_false_alarm: Floats, sigma: Floats) -> _Part:
@@ -320,8 +337,10 @@ def _part(apart: Separations, prior: Floats, budget: Floats, k_false_alarm: Floa
     k = np.where(needed & (left > 0) & (total == 0), -np.inf, k)
     usable = checked & np.isfinite(k)[:, None]
     threshold = k_false_alarm[:, None] * apart.separation_sigma_m
+    offset = np.where(blind, 0.0, threshold + apart.bias_m)
+    tails = Tails(offset_m=offset, sigma_m=np.where(blind, 1.0, apart.sigma_m), weight=prior * checked)
     with np.errstate(invalid="ignore"):
-        each = np.where(usable, threshold + k[:, None] * apart.sigma_m + apart.bias_m, -np.inf)
+        each = np.where(usable, offset + k[:, None] * tails.sigma_m, -np.inf)
     spent = needed & (left <= 0)
     culprits = np.where(np.any(blind, axis=1, keepdims=True), blind, checked)
     each = np.where(spent[:, None] & culprits, np.inf, each)
@@ -329,4 +348,11 @@ def _part(apart: Separations, prior: Floats, budget: Floats, k_false_alarm: Floa
     worst = np.where(each.max(axis=1) > -np.inf, np.argmax(each, axis=1), -1)
     moving = checked & (apart.separation_sigma_m > _SAME * sigma[:, None])
     ratio = np.where(moving, np.abs(apart.moved_m) / np.where(moving, threshold, 1.0), 0.0)
-    return _Part(level_m=level, k=k, worst=np.asarray(worst, dtype=np.intp), separation=ratio.max(axis=1))
+    return _Part(
+        level_m=level,
+        k=k,
+        worst=np.asarray(worst, dtype=np.intp),
+        separation=ratio.max(axis=1),
+        tails=tails,
+        unchecked=unchecked,
+    )

@@ -69,7 +69,7 @@ class Separations:
 
 def scaled(variance_m2: Floats, map_m: Floats, scale: Floats) -> Floats:
     """Variance with the noise scale, of one without (last axis of `map_m` is across and up)."""
-    from_map = (map_m**2).sum(axis=-1)
+    from_map = map_m[..., 0] ** 2 + map_m[..., 1] ** 2
     square = scale**2 if variance_m2.ndim == 1 else scale[:, None] ** 2
     return np.asarray(np.maximum(square * (variance_m2 - from_map) + from_map, 0.0))
 
