@@ -74,10 +74,12 @@ class EpochProcessor:
         self._channels = ChannelBook(config, navigation)
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._error_model = None if config.error_model is None else read_error_model(config.error_model)
-        self._sbas = None if not config.sbas else _opened_sbas(config)
+        if config.sbas and navigation.precise is not None:
+            raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
+        self.sbas = None if not config.sbas else _opened_sbas(config)
         self._cn0_curve = None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve)
         self._klobuchar, notes = self._ionosphere()
-        said = () if self._sbas is None else self._sbas.notes
+        said = () if self.sbas is None else self.sbas.notes
         self.notes = (*notes, *said, *self._what_screens_lack())
         dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
         #: By status: whether coordinates come with it.
@@ -163,7 +165,7 @@ class EpochProcessor:
             self._index[name],
             self._klobuchar,
             error_model=self._error_model,
-            sbas=self._sbas,
+            sbas=self.sbas,
         )
         if "elevation" in self.config.screens:
             verdict = elevation_screen(one.elevation_deg, limits=self.config.elevation)

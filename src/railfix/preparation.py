@@ -21,7 +21,7 @@ from railfix.navigation import Navigation
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import Reason
 from railfix.sbas import SbasCorrections
-from railfix.sbas_use import corrected_satellites, sbas_delays
+from railfix.sbas_use import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.screens import Screened
 from railfix.section import SearchIndex, search
 from railfix.spp import single_point
@@ -178,6 +178,7 @@ def prepare(
     )
     if fixes is not None:
         states, refused = corrected_satellites(states, fixes)
+        refused = np.where(signal == SBAS_SIGNAL, refused, int(Reason.SBAS_NOT_COVERED))
         reason |= np.where(reason & Reason.NOT_OBSERVED, 0, refused)
     observed = (reason & Reason.NOT_OBSERVED) == 0
     for mask, bit in (

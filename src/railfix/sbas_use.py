@@ -25,6 +25,8 @@ from railfix.sbas import (
     troposphere_m,
 )
 
+#: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.
+SBAS_SIGNAL: Final = "1C"
 Floats = NDArray[np.float64]
 Bits = NDArray[np.int64]
 

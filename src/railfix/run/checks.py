@@ -9,6 +9,7 @@ import numpy as np
 from railfix.errors import MismatchError, NoPositionError
 from railfix.navigation import Navigation
 from railfix.run.tally import AntennaTally, Tally
+from railfix.sbas import SbasCorrections
 
 #: A conventional position further from the trajectory than this belongs to another place [m].
 ANOTHER_PLACE_M: Final = 100_000.0
@@ -99,6 +100,24 @@ def check_same_time(tally: Tally) -> None:
     if latest_start > earliest_end:
         told = " and ".join(f"the {n} log covers {_period(*span)}" for n, span in spans.items())
         raise MismatchError(f"{told} (GPS time), expected logs of one run; give logs that overlap")
+
+
+def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
+    """Raise where not one message of the SBAS was received during a log.
+
+    Raises
+    ------
+    MismatchError
+    """
+    for name, antenna in tally.antennas.items():
+        if sbas is None or antenna.first is None or antenna.last is None:
+            continue
+        first, last = sbas.span
+        if antenna.first > last or antenna.last < first:
+            raise MismatchError(
+                f"the SBAS messages of {_period(first, last)} and the {name} log of "
+                f"{_period(antenna.first, antenna.last)} (GPS time) have no time in common; give those of that day"
+            )
 
 
 def check_positions(tally: Tally) -> None:

@@ -17,7 +17,14 @@ from railfix.navigation import Navigation
 from railfix.pipeline import EpochProcessor, State
 from railfix.protecting import level_facts
 from railfix.rinex import read_navigation
-from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
+from railfix.run.checks import (
+    RECORD_REACH,
+    check_positions,
+    check_same_day,
+    check_same_place,
+    check_same_time,
+    check_sbas_time,
+)
 from railfix.run.chunks import aligned
 from railfix.run.inputs import Antenna, RunInputs, collected
 from railfix.run.output import OutputFolder
@@ -140,6 +147,7 @@ def run_files(
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
+        check_sbas_time(processor.sbas, tally)
         check_positions(tally)
         sigma, found_levels = along_sigma(folder), levels(folder)
         notes = notes_of(line, navigation, tally, logs)

@@ -64,6 +64,8 @@ class SbasCorrections:
     limits : SbasLimits
     notes : tuple of str
         What was asked and what was used.
+    span : tuple of datetime64[ns]
+        Reception of the first and the last message of that GEO.
 
     Raises
     ------
@@ -75,6 +77,7 @@ class SbasCorrections:
         self.limits = limits or SbasLimits()
         self.prn, why = best_prn(log, prn, self.limits)
         of_prn = log.of(self.prn)
+        self.span: tuple[np.datetime64, np.datetime64] = (of_prn.time.min(), of_prn.time.max())
         self._tables = SatelliteTables(of_prn, self.limits)
         self._grid = GridTables(of_prn, self.limits, self._tables.stops)
         self._service = ServiceTable(of_prn, self.limits)
