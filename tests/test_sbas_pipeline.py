@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from railfix.results import AntennaState, State
 from railfix.rinex import read_navigation, read_observations
 from railfix.sbas import SatelliteState, SbasCorrections, read_sbas
 from railfix.sbas_use import REASONS
+from railfix.simulate import demo_files
 from railfix.spp import single_point
 from railfix.track_map import Track, write_track_csv
 from recordings_score import straight_line
@@ -205,3 +207,26 @@ def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording,
     assert missing.exit_code == 3
     assert "nowhere.sbs" in missing.output
     assert not (tmp_path / "other").exists()
+
+
+def test_messages_of_another_day_do_not_belong_to_the_log(recording: Recording, tmp_path: Path) -> None:
+    files = demo_files()
+    command = ["run", "--front", str(files["front"]), "--nav", str(files["nav"]), "--track", str(files["track"])]
+    done = CliRunner().invoke(app, [*command, "--sbas", str(recording.sbas), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 5
+    assert "have no time in common" in done.output
+
+
+def test_precise_orbits_are_not_what_sbas_corrects(recording: Recording) -> None:
+    # Never looked into: the refusal comes before.
+    navigation = replace(recording.navigation, precise=object())
+    with pytest.raises(SettingsError, match="give --sbas or --sp3"):
+        EpochProcessor(recording.config(), navigation, {"front": recording.line})
+
+
+def test_other_signals_than_l1_ca_are_not_corrected(recording: Recording) -> None:
+    renamed = replace(recording.observations, signal=np.full(len(recording.observations.signal), "1W"))
+    found = recording.process(recording.config(), renamed[180:200])
+    observed = (found.reason & Reason.NOT_OBSERVED) == 0
+    assert observed.any()
+    assert (found.reason[observed] & Reason.SBAS_NOT_COVERED).all()
