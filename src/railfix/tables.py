@@ -58,11 +58,12 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "raim_threshold": "what it is compared with; a fault is detected from there on",
     "raim_level_m": "P4's level: error by a fault that RAIM misses, and by noise; infinite where a satellite is "
     "unchecked, empty where a fault is left or `raim_protection` is off",
-    "protection_level_m": "along the line: the error exceeds it with the stated risk, the largest of its three parts; "
+    "protection_level_m": "along the line: the error exceeds it with the stated risk, all hypotheses together; "
     "infinite where `protection_cause` says why, empty where a fault is left",
-    "protection_fault_free_m": "part of it for noise without a fault",
-    "protection_one_fault_m": "part of it for a fault of one satellite; 0 where that is less likely than its share",
-    "protection_two_faults_m": "part of it for faults of two satellites; 0 where that is less likely than its share",
+    "protection_fault_free_m": "what noise without a fault asks for by itself, with a share of the risk; `protection_level_m` uses the whole "
+    "risk for the sum of all and may be smaller than a part",
+    "protection_one_fault_m": "the same for a fault of one satellite; 0 where that is less likely than its share",
+    "protection_two_faults_m": "the same for faults of two satellites; 0 where that is less likely than its share",
     "protection_k_fault_free": "sigmas that the first part stands for",
     "protection_k_one_fault": "sigmas that the second part stands for, beside its threshold",
     "protection_k_two_faults": "sigmas that the third part stands for, beside its threshold",
