@@ -60,8 +60,8 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "unchecked, empty where a fault is left or `raim_protection` is off",
     "protection_level_m": "along the line: the error exceeds it with the stated risk, all hypotheses together; "
     "infinite where `protection_cause` says why, empty where a fault is left",
-    "protection_fault_free_m": "what noise without a fault asks for by itself, with a share of the risk; `protection_level_m` uses the whole "
-    "risk for the sum of all and may be smaller than a part",
+    "protection_fault_free_m": "what noise without a fault asks for by itself, of its share of the risk; "
+    "`protection_level_m` spends the whole risk on the sum of all and may be smaller than a part",
     "protection_one_fault_m": "the same for a fault of one satellite; 0 where that is less likely than its share",
     "protection_two_faults_m": "the same for faults of two satellites; 0 where that is less likely than its share",
     "protection_k_fault_free": "sigmas that the first part stands for",
