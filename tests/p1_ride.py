@@ -1,0 +1,308 @@
+"""Simulated runs through several ways of positioning at once, in memory: what the parts of `p1_experiment` share."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
+from railfix.config import parse_config
+from railfix.pipeline import AntennaResult, EpochProcessor, State
+from railfix.reasons import CHECK_FAILED, Status
+from railfix.simulate import Scenario, Simulation
+from railfix.simulate.run import vehicle_toml
+from railfix.simulate.scenario import ANTENNAS, RunSettings
+from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.signals import Piece
+from railfix.vehicle import antenna_trajectory, read_vehicle
+
+Floats = NDArray[np.float64]
+Masks = NDArray[np.bool_]
+
+#: Errors along the line from here on are kept with the signals that made them.
+LARGE_M: Final = 10.0
+#: A code this far from the others (from their lower quartile: reflected codes are late) is one with multipath.
+LATE_M: Final = 5.0
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way of getting positions.
+
+    Attributes
+    ----------
+    name : str
+    settings : mapping
+        Of the run.
+    positions : {"conventional", "constrained", "checked", "ok"}
+        Which of its positions: 3-D at the nearest point of the line; on the line; of these the ones that no check
+        failed (``failed_checks = "drop"``); those of status ok alone.
+    largest_sigma_m : float
+        As `Config.largest_sigma_m` with failed checks dropped, put upon the results of a run with a wider limit.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    positions: Literal["conventional", "constrained", "checked", "ok"] = "constrained"
+    largest_sigma_m: float = np.inf
+
+
+@cache
+def cn0_curve(folder: Path) -> Path:
+    """P1 2.3(1): mean C/N0 over elevation, of a day of open sky standing, with the receivers of the commercial run."""
+    base = load_recipe("commercial-run").scenario()
+    day = replace(
+        Scenario(),
+        seed=230,
+        start=base.start,
+        duration_s=86_400.0,
+        rate_hz=0.1,
+        run=RunSettings(first_stand_s=1e6),
+        receiver=base.receiver,
+        errors=base.errors,
+    )
+    samples = Cn0Samples()
+    for piece in Simulation(day).pieces("front"):
+        observed = piece.observations
+        samples.add(observed.cn0_dbhz, piece.geometry.elevation_deg, observed.satellite, observed.signal)
+    path = folder / "cn0-curve.toml"
+    write_cn0_curve(fit_cn0_curve(samples), path)
+    return path
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passage:
+    """One antenna on one run: the truth of T epochs."""
+
+    run: str
+    antenna: str
+    time: NDArray[np.datetime64]
+    chainage_m: Floats
+    speed_mps: Floats
+    environment: NDArray[np.str_]
+    observed: Masks
+    ecef_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """What one way gave on one passage; `before_checks_m` also where the way leaves the position out."""
+
+    error_m: Floats
+    before_checks_m: Floats
+    status: NDArray[np.int8]
+    n_used: NDArray[np.int64]
+    own_sigma_m: Floats
+    horizontal_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Breaking:
+    """One epoch whose error is large, with the signals that made it.
+
+    Attributes
+    ----------
+    passage, epoch : int
+    error_m : float
+    dilution : float
+        Along the line [m/m].
+    late : int
+        Used codes whose true error is `LATE_M` off the lower quartile of the used ones.
+    signals : str
+        Each satellite used: elevation, azimuth from the body's front, C/N0, true error of its code.
+    """
+
+    passage: int
+    epoch: int
+    error_m: float
+    dilution: float
+    late: int
+    signals: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Campaign:
+    """All passages, and what every way of every choice of systems gave on each."""
+
+    passages: list[Passage]
+    found: dict[tuple[str, str], list[Found]]
+    breaking: dict[tuple[str, str], list[Breaking]]
+
+
+class Bench:
+    """A run's pieces through several processors at once."""
+
+    def __init__(
+        self, scenario: Scenario, name: str, ways: Sequence[Way], systems: Sequence[str], curve: Path | None
+    ) -> None:
+        self.simulation = Simulation(scenario)
+        self.name = name
+        line = self.simulation.line
+        track = line.track()
+        self.sampled, self.mapped = line.sampled_chainage_m(), track.chainage_m
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "vehicle.toml"
+            path.write_text(vehicle_toml(scenario.vehicle))
+            vehicle = read_vehicle(path)
+        self.trajectories = {a: antenna_trajectory(track, vehicle, a) for a in ANTENNAS}
+        self.ways, self.systems = ways, systems
+        #: One processor for settings that are the same, whichever of their results is looked at.
+        self.processors: dict[tuple[str, str], EpochProcessor] = {}
+        for letters in systems:
+            for way in ways:
+                common = {"systems": list(letters), "protection": "off", "cn0_curve": curve and str(curve)}
+                settings = {**way.settings, **common}
+                key = (letters, repr(way.settings))
+                if key not in self.processors:
+                    self.processors[key] = EpochProcessor(
+                        parse_config(settings), self.simulation.navigation, self.trajectories
+                    )
+
+    def pieces(self) -> Iterator[dict[str, Piece]]:
+        """Pieces of both antennas together."""
+        for parts in zip(*(self.simulation.pieces(a) for a in ANTENNAS), strict=True):
+            yield dict(zip(ANTENNAS, parts, strict=True))
+
+    def true_chainage_m(self, piece: Piece) -> Floats:
+        """Where the antenna truly is, as the map counts."""
+        return np.interp(piece.geometry.chainage_m, self.sampled, self.mapped)
+
+
+def ridden(bench: Bench) -> Campaign:
+    """One run: every way of every choice of systems, both antennas."""
+    states: dict[tuple[str, str], State | None] = dict.fromkeys(bench.processors)
+    truths: dict[str, list[Passage]] = {a: [] for a in ANTENNAS}
+    parts: dict[tuple[str, str, str], list[Found]] = {}
+    breaking: dict[tuple[str, str], list[Breaking]] = {}
+    before = 0
+    for piece in bench.pieces():
+        for antenna, one in piece.items():
+            geometry = one.geometry
+            truths[antenna].append(
+                Passage(
+                    run=bench.name,
+                    antenna=antenna,
+                    time=one.observations.time,
+                    chainage_m=bench.true_chainage_m(one),
+                    speed_mps=np.abs(geometry.speed_mps),
+                    environment=bench.simulation.environment.label_at(geometry.chainage_m),
+                    observed=np.isfinite(one.observations.code_m).any(axis=1),
+                    ecef_m=geometry.antenna_ecef_m,
+                )
+            )
+        for (letters, words), processor in bench.processors.items():
+            observations = {a: p.observations for a, p in piece.items()}
+            result, states[letters, words] = processor.process(observations, states[letters, words])
+            for way in bench.ways:
+                if repr(way.settings) != words:
+                    continue
+                for index, antenna in enumerate(ANTENNAS):
+                    got, truth = result.antennas[antenna], truths[antenna][-1]
+                    found = of_result(way, got, truth)
+                    parts.setdefault((letters, way.name, antenna), []).append(found)
+                    large = np.flatnonzero(np.abs(found.error_m) >= LARGE_M)
+                    breaking.setdefault((letters, way.name), []).extend(
+                        broken(piece[antenna], got, found, int(t), passage=index, before=before) for t in large
+                    )
+        before += len(piece[ANTENNAS[0]].observations)
+    return Campaign(
+        passages=[joined(truths[a]) for a in ANTENNAS],
+        found={
+            (letters, way.name): [joined(parts[letters, way.name, a]) for a in ANTENNAS]
+            for letters in bench.systems
+            for way in bench.ways
+        },
+        breaking=breaking,
+    )
+
+
+def of_result(way: Way, got: AntennaResult, truth: Passage) -> Found:
+    """Errors of one way out of a result."""
+    conventional = way.positions == "conventional"
+    chainage = got.conventional_chainage_m if conventional else got.chainage_m
+    place = got.conventional_ecef_m if conventional else got.ecef_m
+    kept = np.ones(len(chainage), dtype=np.bool_)
+    if way.positions == "checked":
+        kept = ~np.isin(got.status, CHECK_FAILED)
+    elif way.positions == "ok":
+        kept = got.status == Status.OK
+    kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP) | conventional
+    error = chainage - truth.chainage_m
+    away = place - truth.ecef_m
+    up = truth.ecef_m / np.linalg.norm(truth.ecef_m, axis=1, keepdims=True)
+    flat = away - np.einsum("ti,ti->t", away, up)[:, None] * up
+    return Found(
+        error_m=np.where(kept, error, np.nan),
+        before_checks_m=error,
+        status=got.status,
+        n_used=got.n_used,
+        own_sigma_m=got.own_sigma_m,
+        horizontal_m=np.linalg.norm(flat, axis=1),
+    )
+
+
+def broken(piece: Piece, got: AntennaResult, found: Found, t: int, *, passage: int, before: int) -> Breaking:
+    """What an epoch's large error is made of."""
+    used = np.flatnonzero(got.reason[t] == 0)
+    observed, geometry = piece.observations, piece.geometry
+    wrong = observed.code_m[t] - piece.clean_code_m[t] + piece.error_m[t]
+    around = (geometry.azimuth_deg[t] - geometry.heading_deg[t] + 180.0) % 360.0 - 180.0
+    return Breaking(
+        passage=passage,
+        epoch=before + t,
+        error_m=float(found.error_m[t]),
+        dilution=float(got.constrained.dilution[t]),
+        late=int(np.count_nonzero(np.abs(wrong[used] - np.quantile(wrong[used], 0.25)) > LATE_M)) if len(used) else 0,
+        signals=" ".join(
+            f"{observed.satellite[k]}({geometry.elevation_deg[t, k]:.0f},{around[k]:+.0f},"
+            f"{observed.cn0_dbhz[t, k]:.0f}){wrong[k]:+.1f}"
+            for k in used
+        ),
+    )
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """Pieces of one frozen table of arrays as a whole."""
+    first = parts[0]
+    values = {
+        name: np.concatenate([getattr(p, name) for p in parts]) if isinstance(value, np.ndarray) else value
+        for name, value in vars(first).items()
+    }
+    return type(first)(**values)
+
+
+def together(campaigns: Sequence[Campaign]) -> Campaign:
+    """Several runs as one."""
+    breaking: dict[tuple[str, str], list[Breaking]] = {}
+    found: dict[tuple[str, str], list[Found]] = {}
+    passages: list[Passage] = []
+    for one in campaigns:
+        for key, items in one.breaking.items():
+            breaking.setdefault(key, []).extend(replace(i, passage=i.passage + len(passages)) for i in items)
+        for key, founds in one.found.items():
+            found.setdefault(key, []).extend(founds)
+        passages += one.passages
+    return Campaign(passages=passages, found=found, breaking=breaking)
+
+
+def in_ways(chainage_m: Floats, ways: Sequence[tuple[float, float]]) -> Masks:
+    """Whether places lie in stretches of the line."""
+    return np.any([(chainage_m >= low) & (chainage_m < high) for low, high in ways], axis=0)
+
+
+def intervals_m(passage: Passage, found: Found, where: Masks) -> Floats:
+    """Metres run from one position to the next, standing left out (figure 12), both positions in part of the epochs."""
+    step = np.abs(np.diff(passage.chainage_m, prepend=passage.chainage_m[0]))
+    moved = np.cumsum(np.where(passage.speed_mps > 0.3, step, 0.0))
+    # what lies outside counts as a stretch of its own: no interval reaches over it
+    stretch = np.cumsum(np.diff(where, prepend=where[0]))
+    has = np.isfinite(found.error_m) & where
+    apart = np.diff(moved[has])
+    return np.asarray(apart[(apart > 0) & (np.diff(stretch[has]) == 0)])
