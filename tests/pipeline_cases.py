@@ -1,10 +1,14 @@
-"""The demonstration run, pieces of it, and results laid out flat for comparison."""
+"""A made run with noise alone and the demonstration, pieces of them, and results laid out flat for comparison."""
 
 from __future__ import annotations
 
+import atexit
+import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,7 @@ from railfix.epochs import Observations
 from railfix.navigation import Navigation
 from railfix.pipeline import AntennaResult, EpochProcessor, State
 from railfix.rinex import read_navigation, read_observations
+from railfix.simulate import Scenario, write_run
 from railfix.simulate.demo_data import demo_files
 from railfix.track_map import read_track
 from railfix.vehicle import antenna_trajectory, read_vehicle
@@ -24,28 +29,41 @@ ANTENNAS = ("front", "rear")
 
 
 @cache
+def clean_files() -> dict[str, Path]:
+    """The default scenario as files: the demonstration's line, train and sky, and no error but white noise."""
+    folder = mkdtemp(prefix="railfix-clean-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return write_run(Scenario(), folder)
+
+
+@cache
+def clean_observations() -> dict[str, Observations]:
+    return {name: read_observations(clean_files()[name]) for name in ANTENNAS}
+
+
+@cache
 def demo_observations() -> dict[str, Observations]:
     return {name: read_observations(demo_files()[name]) for name in ANTENNAS}
 
 
 @cache
-def demo_navigation() -> Navigation:
-    return read_navigation(demo_files()["nav"])
+def clean_navigation() -> Navigation:
+    return read_navigation(clean_files()["nav"])
 
 
 @cache
-def demo_trajectories() -> dict[str, Trajectory]:
-    track, vehicle = read_track(demo_files()["track"]), read_vehicle(demo_files()["vehicle"])
+def clean_trajectories() -> dict[str, Trajectory]:
+    track, vehicle = read_track(clean_files()["track"]), read_vehicle(clean_files()["vehicle"])
     return {name: antenna_trajectory(track, vehicle, name) for name in ANTENNAS}
 
 
 @cache
-def demo_truth() -> pl.DataFrame:
-    return pl.read_csv(demo_files()["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
+def clean_truth() -> pl.DataFrame:
+    return pl.read_csv(clean_files()["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
 
 
 def true_chainage(antenna: str) -> np.ndarray:
-    return demo_truth().filter(pl.col("antenna") == antenna)["chainage_m"].to_numpy()
+    return clean_truth().filter(pl.col("antenna") == antenna)["chainage_m"].to_numpy()
 
 
 def processor(
@@ -55,7 +73,7 @@ def processor(
     trajectories: Mapping[str, Trajectory] | None = None,
 ) -> EpochProcessor:
     config: Config = parse_config(dict(settings or {}))
-    return EpochProcessor(config, navigation or demo_navigation(), trajectories or demo_trajectories())
+    return EpochProcessor(config, navigation or clean_navigation(), trajectories or clean_trajectories())
 
 
 def front_alone(observations: Observations, settings: Mapping[str, Any] | None = None, **kwargs: Any) -> AntennaResult:

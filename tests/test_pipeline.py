@@ -16,8 +16,9 @@ import synthetic
 from pipeline_cases import (
     ANTENNAS,
     channel,
+    clean_observations,
+    clean_trajectories,
     demo_observations,
-    demo_trajectories,
     flat,
     front_alone,
     in_pieces,
@@ -96,17 +97,17 @@ def test_inputs_are_left_alone():
     before = {
         name: {k: v.tobytes() for k, v in vars(p).items() if isinstance(v, np.ndarray)} for name, p in parts.items()
     }
-    track = {name: t.ecef_m.tobytes() for name, t in demo_trajectories().items()}
+    track = {name: t.ecef_m.tobytes() for name, t in clean_trajectories().items()}
     processor().process(parts)
     for name, part in parts.items():
         assert before[name] == {k: v.tobytes() for k, v in vars(part).items() if isinstance(v, np.ndarray)}
-        assert track[name] == demo_trajectories()[name].ecef_m.tobytes()
+        assert track[name] == clean_trajectories()[name].ecef_m.tobytes()
 
 
 @pytest.mark.requirement("A4")
 @pytest.mark.parametrize("seed", [1, 2])
 def test_order_of_channels_changes_nothing(seed: int):
-    observations = demo_observations()["front"][400:600]
+    observations = clean_observations()["front"][400:600]
     order = np.random.default_rng(seed).permutation(len(observations.satellite))
     names = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
     shuffled = replace(
@@ -126,7 +127,7 @@ def test_order_of_channels_changes_nothing(seed: int):
 @pytest.mark.parametrize("told", ["by the tags", "by nothing"])
 def test_receiver_clock_steps_change_nothing(told: str):
     """Clocks put back or on by a millisecond: tag and code of the same instants, or codes of other instants."""
-    observations = demo_observations()["front"][300:700]
+    observations = clean_observations()["front"][300:700]
     rng = np.random.default_rng(5)
     at = rng.choice(np.arange(20, 390), 9, replace=False)
     jump = np.zeros(len(observations))
@@ -149,7 +150,7 @@ def test_receiver_clock_steps_change_nothing(told: str):
 
 @pytest.mark.requirement("A4")
 def test_error_over_its_own_sigma():
-    result, _ = processor().process(demo_observations())
+    result, _ = processor().process(clean_observations())
     for name, found in result.antennas.items():
         settled = np.arange(len(found)) > 100
         error = found.chainage_m - true_chainage(name)
@@ -165,7 +166,7 @@ def test_noise_scale_finds_the_receivers_noise():
     """The weights are made those of the simulator: noise of half a metre, so 0.5; and codes twice as noisy, so 1."""
     weights = {"zenith_sigma_m": 1.0, "floor_sigma_m": 0.0}
     settings_ = {"noise": weights, "screens": ["elevation"], "clock_offsets": {"stability_m": float("inf")}}
-    observations = demo_observations()["front"]
+    observations = clean_observations()["front"]
     found = front_alone(observations, settings_)
     assert found.noise_scale[0] == 1.0
     assert found.noise_scale[-1] == pytest.approx(0.5, rel=0.03)
@@ -184,7 +185,7 @@ def with_offsets(observations: Observations) -> Observations:
 
 @pytest.mark.requirement("A4")
 def test_offset_between_clocks_is_found():
-    found = front_alone(with_offsets(demo_observations()["front"]), {"screens": ["elevation"]})
+    found = front_alone(with_offsets(clean_observations()["front"]), {"screens": ["elevation"]})
     galileo, gps = found.clocks.index("E"), found.clocks.index("G")
     assert found.clock_offset_m[-1, gps] == 0.0
     assert found.clock_offset_m[-1, galileo] == pytest.approx(-4.0, abs=0.4)
@@ -197,7 +198,7 @@ def test_offset_between_clocks_is_found():
 @pytest.mark.requirement("A4")
 def test_known_offset_makes_one_satellite_count():
     """After a minute with all, one Galileo satellite beside three of GPS is used; without ties it is alone."""
-    observations = with_offsets(demo_observations()["front"])
+    observations = with_offsets(clean_observations()["front"])
     whole = front_alone(observations, {"screens": ["elevation"]})
     high = whole.satellite[np.argsort(-whole.elevation_deg[650])]
     few = only(observations, [*[s for s in high.tolist() if s[0] == "G"][:3], "E12"])
@@ -216,7 +217,7 @@ def test_known_offset_makes_one_satellite_count():
 def test_separate_clocks_equal_an_independent_solution():
     """`stability_m` infinite: one column a constellation, by a general optimiser in space."""
     settings_ = {"screens": ["elevation"], "clock_offsets": {"stability_m": float("inf")}}
-    found = front_alone(with_offsets(demo_observations()["front"])[::200], settings_)
+    found = front_alone(with_offsets(clean_observations()["front"])[::200], settings_)
     k = found.columns
     for t in range(len(found)):
         used = found.reason[t, k] == 0
@@ -231,17 +232,17 @@ def test_separate_clocks_equal_an_independent_solution():
         def jacobian(x: np.ndarray, residual=residual) -> np.ndarray:
             return np.stack([residual(x + e) - residual(x - e) for e in 0.5 * np.eye(5)], axis=1)
 
-        start = np.r_[demo_trajectories()["front"].ecef_m[0], 0.0, 0.0]
+        start = np.r_[clean_trajectories()["front"].ecef_m[0], 0.0, 0.0]
         place = least_squares(residual, start, jac=jacobian, x_scale="jac", xtol=1e-14, ftol=1e-14).x
         assert found.conventional_ecef_m[t] == pytest.approx(place[:3], abs=1e-3)
 
 
 @pytest.mark.requirement("B7")
 def test_reasons_and_statuses_add_up():
-    result, _ = processor().process(demo_observations())
+    result, _ = processor().process(clean_observations())
     for name, found in result.antennas.items():
         observed = (found.reason & Reason.NOT_OBSERVED) == 0
-        assert np.array_equal(observed, np.isfinite(demo_observations()[name].code_m))
+        assert np.array_equal(observed, np.isfinite(clean_observations()[name].code_m))
         assert np.all(found.reason[~observed] == Reason.NOT_OBSERVED)
         names, which = np.unique(found.satellite, return_inverse=True)
         for t in range(0, len(found), 97):

@@ -11,9 +11,9 @@ import pytest
 
 from pipeline_cases import (
     channel,
-    demo_navigation,
-    demo_observations,
-    demo_trajectories,
+    clean_navigation,
+    clean_observations,
+    clean_trajectories,
     front_alone,
     only,
     processor,
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.requirement("B7")
 
 MASK_ONLY = {"screens": ["elevation"]}
 #: Epochs of the made cases: the train runs, all satellites are there.
-FRONT = demo_observations()["front"][400:440]
+FRONT = clean_observations()["front"][400:440]
 WHOLE = front_alone(FRONT, MASK_ONLY)
 
 
@@ -92,8 +92,8 @@ def test_ambiguous_with_one_redundant_range():
 @pytest.mark.requirement("A3")
 def test_ambiguous_where_the_line_comes_by_twice():
     """The line and the same line beside it, 3 m away: no range can tell."""
-    there = demo_trajectories()["front"].ecef_m
-    aside = there + 3.0 * np.r_[demo_trajectories()["front"].up[:1], demo_trajectories()["front"].up]
+    there = clean_trajectories()["front"].ecef_m
+    aside = there + 3.0 * np.r_[clean_trajectories()["front"].up[:1], clean_trajectories()["front"].up]
     found = front_alone(FRONT, MASK_ONLY, trajectories=line(np.concatenate([there, aside[::-1]])))
     one = front_alone(FRONT, MASK_ONLY, trajectories=line(there))
     assert (found.status == Status.AMBIGUOUS).mean() > 0.5
@@ -101,15 +101,15 @@ def test_ambiguous_where_the_line_comes_by_twice():
 
 
 def test_off_map_beyond_the_end():
-    here = int(np.searchsorted(demo_trajectories()["front"].arc_m, WHOLE.arc_m.min()))
-    found = front_alone(FRONT, MASK_ONLY, trajectories=line(demo_trajectories()["front"].ecef_m[: here - 8]))
+    here = int(np.searchsorted(clean_trajectories()["front"].arc_m, WHOLE.arc_m.min()))
+    found = front_alone(FRONT, MASK_ONLY, trajectories=line(clean_trajectories()["front"].ecef_m[: here - 8]))
     all_are(found, Status.OFF_MAP)
     assert (found.constrained.overshoot_m > 5.0).all()
     assert np.all(found.arc_m == found.arc_m.max())
 
 
 def test_off_map_far_to_the_side():
-    trajectory = demo_trajectories()["front"]
+    trajectory = clean_trajectories()["front"]
     aside = trajectory.ecef_m + 5000.0 * trajectory.across[len(trajectory) // 2]
     all_are(front_alone(FRONT, MASK_ONLY, trajectories=line(aside)), Status.OFF_MAP)
 
@@ -146,7 +146,7 @@ def test_inconsistent():
 
 def test_antennas_disagree():
     """Each antenna's log given as the other's: 36 m from where they should be."""
-    parts = {name: whole[400:440] for name, whole in demo_observations().items()}
+    parts = {name: whole[400:440] for name, whole in clean_observations().items()}
     swapped = {"front": parts["rear"], "rear": parts["front"]}
     result, _ = processor({"screens": ["elevation", "antenna_spacing"]}).process(swapped)
     for found in result.antennas.values():
@@ -157,8 +157,8 @@ def test_antennas_disagree():
 
 
 def changed_records(name: str, **values: Any) -> Navigation:
-    """The demonstration's records, some fields of one satellite's changed."""
-    navigation = demo_navigation()
+    """The run's records, some fields of one satellite's changed."""
+    navigation = clean_navigation()
     mine = navigation.kepler.satellite == name
     fields = {key: np.where(mine, value, getattr(navigation.kepler, key)) for key, value in values.items()}
     return replace(navigation, kepler=replace(navigation.kepler, **fields))
@@ -247,7 +247,7 @@ def test_reason_is_given(reason: Reason):
 
 
 def test_antenna_pair_is_given():
-    parts = {name: whole[400:440] for name, whole in demo_observations().items()}
+    parts = {name: whole[400:440] for name, whole in clean_observations().items()}
     parts["front"] = one_wrong(40.0)
     result, _ = processor({"screens": ["elevation", "antenna_pair"]}).process(parts)
     for found in result.antennas.values():
