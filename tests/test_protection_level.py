@@ -12,40 +12,14 @@ from scipy.stats import norm
 
 import protection_oracle
 import raim_oracle as oracle
+from protection_hand_case import HAND, hand_model
 from railfix.clock_elimination import UNTIED_M
 from railfix.protection import Cause, ProtectionLevel, RiskBudget, Status, along_track_level, availability, sbas_level
-from railfix.raim import LinearModel, constrained_model, point_model
+from railfix.raim import constrained_model, point_model
 
 pytestmark = pytest.mark.requirement("C2")
 
 ARC = np.array([731.0])
-#: A risk whose parts are all asked for, and leave figures that can be followed.
-HAND = RiskBudget(
-    risk_per_hour=1e-4,
-    samples_per_hour=1.0,
-    exclusion_share=0.0,
-    false_alarm=0.01,
-    satellite_prior={"G": 0.008, "E": 0.006, "C": 0.009},
-    local_prior=0.002,
-)
-
-
-def hand_model(error_m: tuple[float, ...]) -> LinearModel:
-    """Five satellites of one clock, 1 m each, none sees the map error: docs/protection-level.md."""
-    cosine = np.array([0.8, -0.8, 0.4, -0.4, 0.0])
-    design = np.zeros((1, 5, 3))
-    design[0, :, 0] = cosine
-    return LinearModel(
-        root_weight=np.ones((1, 5)),
-        clock=np.zeros(5, dtype=np.intp),
-        clock_covariance_m2=np.full((1, 1, 1), 0.2),
-        design=design,
-        covariance_m2=np.diag([1.0 / 1.6, 0.09, 0.36])[None],
-        prior=np.diag([0.0, 1.0 / 0.09, 1.0 / 0.36]),
-        misfit=np.array([error_m]),
-        freedom=np.array([3]),
-        interest=1,
-    )
 
 
 def test_case_worked_by_hand():
@@ -230,6 +204,28 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
     assert small.k_one_fault[0] == -np.inf
     nothing = along_track_level(constrained_model(ranges, oracle.LINE, ARC), list("GGGEEE"))
     assert np.isnan(nothing.level_m[0])
+
+
+@pytest.mark.parametrize(
+    ("systems", "common"),
+    [
+        ("GGE", 1e-5),  # without either G no position: singles that nothing checks; E is likely, and useless
+        ("GGGE", 2e-3),  # without two G no position: pairs that nothing checks, beside likely ones that are
+    ],
+)
+def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
+    ranges = oracle.made(ARC, systems, seed=4)
+    model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
+    budget = replace(HAND, satellite_prior={"G": common, "E": 0.3}, local_prior=0.0)
+    expected = protection_oracle.level(
+        case,
+        dict(enumerate(budget.prior(list(systems)))),
+        risk_per_sample=1e-4,
+        share=1 / 3,
+        false_alarm=0.01,
+    )
+    got = along_track_level(model, list(systems), risk=budget)
+    assert expected.level_m * (1.0 - 1e-7) <= got.level_m[0] <= 1.003 * expected.level_m < np.inf
 
 
 def test_excluded_satellites_raise_the_level():
