@@ -21,6 +21,9 @@ SPEEDS = (20.0, 60.0, 100.0)
 SATELLITES = (4, 5, 6, 7, 8, 10, 12, 15, 20)
 BLOCK_S, DRAWS, SEED, CONFIDENCE = 20.0, 200, 0, 0.95
 NAN = math.nan
+ALARM_LIMITS = (10.0, 20.0, 40.0)
+BEYOND = ("misleading", "hazardously_misleading", "unavailable_misleading")
+REGIONS = ("nominal", *BEYOND, "unavailable", "unjudged", "no_position")
 
 
 def nanoseconds(text):
@@ -84,6 +87,7 @@ def epochs_of(positions, truth):
         one["n"] = number(row.get("n_used"))
         one["along"] = number(row.get("along_sigma_m"))
         one["level"] = number(row.get("protection_level_m"))
+        one["verdict"] = row.get("protection_status", "")
         answers = number(row.get("chainage_m")), number(row.get("conventional_chainage_m"))
         one["map"], one["3d"] = (answer - one["chainage"] for answer in answers)
         one["has map"], one["has 3d"] = (not math.isnan(answer) for answer in answers)
@@ -303,8 +307,7 @@ def levels(epochs, position):
         "positions": len(fixes),
         "infinite": sum(math.isinf(one["level"]) for one in fixes),
         "with_level": len(finite),
-        "available": len(finite),
-        "availability": len(finite) / observed,
+        "level_share": len(finite) / observed,
         "level_p50_m": statistics.median([one["level"] for one in finite]),
         "level_p95_m": percentile([one["level"] for one in finite], 0.95),
         "errors": len(judged),
@@ -313,8 +316,109 @@ def levels(epochs, position):
     }
 
 
+def bound(one, levels_of):
+    """What the error is held against; None without a position."""
+    if not one["has map"]:
+        return None
+    if levels_of == "vouched" and (one["status"] != "ok" or one["verdict"] == "alarm"):
+        return math.inf
+    return math.inf if math.isnan(one["level"]) else one["level"]
+
+
+def region(one, levels_of, limit):
+    level = bound(one, levels_of)
+    if level is None:
+        return "no_position"
+    if not one["good"]:
+        return "unjudged"
+    error = abs(one["map"])
+    if level > limit:
+        return "unavailable_misleading" if error > level else "unavailable"
+    if error <= level:
+        return "nominal"
+    return "misleading" if error <= limit else "hazardously_misleading"
+
+
+def available(one, levels_of, limit):
+    level = bound(one, levels_of)
+    return level is not None and level <= limit
+
+
+def windows(inside, fit, length_s):
+    """Windows from each fit epoch that the run covers, and those that stay fit without a gap, one by one."""
+    begun = kept = 0
+    times = [one["time"] for one in inside]
+    usual = statistics.median(b - a for a, b in pairwise(times))
+    for i, start in enumerate(times):
+        until = start + round(length_s * 1e9)
+        if not fit[i] or until > times[-1]:
+            continue
+        begun += 1
+        at, whole = i, True
+        while whole and times[at] < until:
+            whole = times[at + 1] - times[at] <= 1.5 * usual and (times[at + 1] > until or fit[at + 1])
+            at += 1
+        kept += whole
+    return begun, kept
+
+
+def stanford_counts(by_antenna):
+    """(grouping, group, antenna, levels, limit) to counts of the Stanford diagram; "all" antennas are their sums."""
+    found = {}
+    for antenna, epochs in by_antenna.items():
+        groups = {("all", "all"): [one for one in epochs if one["in"]]}
+        for one in groups["all", "all"]:
+            groups.setdefault(("environment", one["environment"]), []).append(one)
+        for (grouping, group), inside in groups.items():
+            for levels_of in ("vouched", "all"):
+                for limit in ALARM_LIMITS:
+                    fit = [available(one, levels_of, limit) for one in inside]
+                    where = [region(one, levels_of, limit) for one in inside]
+                    over = [one for one, name in zip(inside, where, strict=True) if name in BEYOND]
+                    out = {name: where.count(name) for name in REGIONS}
+                    out |= {
+                        "epochs": len(inside),
+                        "observed": sum(one["observed"] for one in inside),
+                        "judged": sum(one["has map"] and one["good"] for one in inside),
+                        "available": sum(fit),
+                        "beyond": len(over),
+                        "beyond_blocks": len(
+                            {(one["time"] - inside[0]["time"]) // round(BLOCK_S * 1e9) for one in over}
+                        ),
+                    }
+                    if grouping == "all":
+                        for length in (15, 60):
+                            out[f"windows_{length}_s"], out[f"kept_{length}_s"] = windows(inside, fit, length)
+                    found[grouping, group, antenna, levels_of, limit] = out
+    for (grouping, group, _, levels_of, limit), counts in list(found.items()):
+        both = found.setdefault((grouping, group, "all", levels_of, limit), {})
+        for name, value in counts.items():
+            both[name] = both.get(name, 0) + value
+    for counts in found.values():
+        shares = {
+            "availability": ("available", "epochs"),
+            "availability_of_observed": ("available", "observed"),
+            "beyond_share": ("beyond", "judged"),
+            "continuity_15_s": ("kept_15_s", "windows_15_s"),
+            "continuity_60_s": ("kept_60_s", "windows_60_s"),
+        }
+        for name, (above, below) in shares.items():
+            counts[name] = counts[above] / counts[below] if counts.get(below) else NAN
+    return found
+
+
+def beyond(by_antenna):
+    """(antenna, time) of the epochs whose error is over a finite level to error, level, and whether it was vouched."""
+    return {
+        (antenna, one["time"]): (one["map"], one["level"], bound(one, "vouched") < math.inf)
+        for antenna, epochs in by_antenna.items()
+        for one in epochs
+        if one["in"] and one["has map"] and one["good"] and abs(one["map"]) > one["level"]
+    }
+
+
 def evaluated(run, truth):
-    """Figures, intervals and levels of a run folder against a truth file."""
+    """Figures, intervals, levels, Stanford counts and epochs beyond of a run folder against a truth file."""
     positions, places = rows_of(Path(run) / "positions.csv"), rows_of(truth)
     by_antenna = {}
     for antenna in dict.fromkeys(row["antenna"] for row in positions):
@@ -329,6 +433,8 @@ def evaluated(run, truth):
         all_figures(by_antenna),
         {(a, p): intervals(epochs, p) for a, epochs in by_antenna.items() for p in kinds},
         {(a, p): levels(epochs, p) for a, epochs in by_antenna.items() for p in kinds[:2]},
+        stanford_counts(by_antenna),
+        beyond(by_antenna),
     )
 
 

@@ -19,10 +19,12 @@ from railfix.cli import app
 from railfix.demonstration import demo_inputs
 from railfix.errors import InputFileError, MismatchError, SettingsError
 from railfix.evaluate import (
+    BEYOND_COLUMNS,
     EPOCH_COLUMNS,
     FIGURE_COLUMNS,
     INTERVAL_COLUMNS,
     LEVEL_COLUMNS,
+    STANFORD_COLUMNS,
     EvaluationOptions,
     RunAndReference,
     TrackFiles,
@@ -356,12 +358,13 @@ def test_protection_levels_by_hand(tmp_path: Path):
     answer = place + np.array([1.0, 4.0, -4.0, 1.0, np.nan])
     level = np.array([3.0, 3.0, np.inf, 12.0, np.nan])
     run = write_run(tmp_path / "run", time, answer, along_protection_level_m=level)
-    found = evaluate_run(run, reference(time, place), options=EvaluationOptions(alarm_limit_m=10.0))
+    found = evaluate_run(run, reference(time, place))
     row = found.levels.filter(position="constrained").row(0, named=True)
     assert row["level"] == "along_protection_level_m"
-    counts = ("observed", "positions", "infinite", "with_level", "available", "errors", "over_level")
-    assert [row[name] for name in counts] == [5, 4, 1, 3, 2, 3, 1]
-    assert row["availability"] == pytest.approx(2 / 5)
+    counts = ("observed", "positions", "infinite", "with_level", "errors", "over_level")
+    assert [row[name] for name in counts] == [5, 4, 1, 3, 3, 1]
+    assert row["level_share"] == pytest.approx(3 / 5)
+    assert found.integrity == {}
     bare = evaluate_run(write_run(tmp_path / "bare", time, answer), reference(time, place))
     assert bare.levels is None
 
@@ -537,20 +540,165 @@ def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
 
 def test_the_document_names_every_column():
     text = (ROOT / "docs" / "evaluation.md").read_text()
-    for columns in (EPOCH_COLUMNS, FIGURE_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS):
+    every = (EPOCH_COLUMNS, FIGURE_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS, STANFORD_COLUMNS, BEYOND_COLUMNS)
+    for columns in every:
         for name, meaning in columns.items():
             assert f"| `{name}` | {meaning} |" in text
+
+
+def rows_of_document(antenna: str, columns: int) -> list[list[str]]:
+    """Cells of the rows of docs/evaluation.md that begin with an antenna, numbers without their units."""
+    lines = (ROOT / "docs" / "evaluation.md").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith(f"| {antenna} |")]
+    return [[cell.replace(",", "").removesuffix(" %") for cell in row] for row in rows if len(row) == columns]
 
 
 def test_the_document_shows_what_the_demonstration_gives(tmp_path: Path):
     run_files(demo_inputs(), out=tmp_path / "run")
     found = evaluate_run(tmp_path / "run")
-    text = (ROOT / "docs" / "evaluation.md").read_text()
+    names = {"on the map": "constrained", "of status ok": "constrained_ok", "conventional": "conventional"}
+    figures = ("mean_m", "std_m", "p50_m", "p95_m", "max_m")
     for antenna in ("front", "rear"):
-        for position, name in (("constrained", "on the map"), ("conventional", "conventional")):
-            rate, mean, *others = (
-                found.figure(figure, antenna=antenna, position=position)
-                for figure in ("rate", "mean_m", "std_m", "p50_m", "p95_m", "max_m")
-            )
-            told = " | ".join([f"{100 * rate:.2f} %", f"{mean:+.2f}", *(f"{value:.2f}" for value in others)])
-            assert f"| {antenna} | {name} | {told} |" in text
+        rows = rows_of_document(antenna, 8)
+        assert [row[1] for row in rows] == list(names)
+        for row, position in zip(rows, names.values(), strict=True):
+            rate = found.figure("rate", antenna=antenna, position=position)
+            assert float(row[2]) == pytest.approx(100 * rate, abs=0.1)  # two epochs of 2000
+            expected = [found.figure(figure, antenna=antenna, position=position) for figure in figures]
+            # what other processors and versions of numpy may move, in metres
+            assert [float(cell) for cell in row[3:]] == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.requirement("C4")
+def test_the_document_shows_the_levels_of_the_demonstration(tmp_path: Path):
+    run_files(demo_inputs(), out=tmp_path / "run")
+    table = evaluate_run(tmp_path / "run").integrity["separation"].stanford.filter(grouping="all", own_limit=True)
+    counts = ("epochs", "nominal", "misleading", "hazardously_misleading", "unavailable", "no_position")
+    for antenna in ("front", "rear"):
+        rows = rows_of_document(antenna, 9)
+        assert [row[1] for row in rows] == ["vouched", "all"]
+        for row in rows:
+            (mine,) = table.filter(antenna=antenna, levels_of=row[1]).iter_rows(named=True)
+            assert [int(cell) for cell in row[2:8]] == pytest.approx([mine[name] for name in counts], abs=3)
+            assert float(row[8]) == pytest.approx(100 * mine["availability"], abs=0.15)
+            assert mine["misleading"] == mine["hazardously_misleading"] == mine["unavailable_misleading"] == 0
+
+
+def levelled_run(folder: Path, kind: str = "sbas") -> tuple[Path, dict[str, AntennaReference]]:
+    """Eight epochs: one of each region at 12 m, two that the run does not vouch for, one without a position."""
+    time, place = np.arange(8.0), 100.0 + 10.0 * np.arange(8)
+    error = np.array([1.0, -4.0, 13.0, 5.0, 16.0, 9.0, -9.0, np.nan])
+    columns = {
+        "protection_level_m": np.array([3.0, 3.0, 12.0, 13.0, 15.0, 2.0, 4.0, np.nan]),
+        "protection_fault_free_m": np.full(8, 2.0),
+        "protection_one_fault_m": np.full(8, 3.5),
+        "protection_status": np.array(["available"] * 5 + ["unavailable", "alarm", "unavailable"]),
+        "protection_cause": np.array(["one_fault"] * 7 + ["no_position"]),
+    }
+    status = ["ok"] * 5 + ["ambiguous", "ok", "unobservable"]
+    run = write_run(folder, time, place + error, status=status, **columns)
+    record = json.loads((run / "run.json").read_text())
+    record["protection"] = {"kind": kind, "alarm_limit_m": 12.0, "sigmas": "made up"}
+    (run / "run.json").write_text(json.dumps(record))
+    return run, reference(time, place, environment=np.array(["open"] * 4 + ["urban"] * 4))
+
+
+@pytest.mark.requirement("C4")
+def test_stanford_counts_by_hand(tmp_path: Path):
+    run, truth = levelled_run(tmp_path / "run")
+    found = evaluate_run(run, truth, options=EvaluationOptions(alarm_limits_m=(14.0,)))
+    assert list(found.integrity) == ["sbas"]
+    whole = found.integrity["sbas"].stanford.filter(grouping="all")
+    assert whole.select("levels_of", "alarm_limit_m", "own_limit").rows() == [
+        ("vouched", 12.0, True),
+        ("vouched", 14.0, False),
+        ("all", 12.0, True),
+        ("all", 14.0, False),
+    ]
+    regions = [
+        *("nominal", "misleading", "hazardously_misleading", "unavailable", "unavailable_misleading", "no_position")
+    ]
+    assert whole.select(regions).rows() == [
+        (1, 1, 1, 3, 1, 1),  # the ambiguous one and the alarm are unavailable
+        (2, 2, 0, 2, 1, 1),
+        (1, 3, 1, 1, 1, 1),  # by levels alone they mislead
+        (2, 4, 0, 0, 1, 1),
+    ]
+    assert whole["available"].to_list() == [3, 4, 5, 6]
+    assert whole["availability"].to_list() == [3 / 8, 4 / 8, 5 / 8, 6 / 8]
+    assert whole["beyond"].to_list() == [3, 3, 5, 5]
+    urban = found.integrity["sbas"].stanford.filter(group="urban", levels_of="all", alarm_limit_m=12.0)
+    assert urban.select(regions).row(0) == (0, 2, 0, 0, 1, 1)
+    beyond = found.integrity["sbas"].beyond
+    assert (beyond["error_m"].abs() - beyond["sbas_level_m"]).to_list() == pytest.approx([7, 5, 1, 1, 1], abs=1e-6)
+    assert beyond["vouched"].to_list()[:2] == [False, False]
+    assert beyond["vouched"].sum() == 3
+    assert beyond["chainage_m"].to_list()[:2] == pytest.approx([150.0, 160.0], abs=1e-6)
+    assert beyond["environment"].to_list()[:2] == ["urban", "urban"]
+    assert beyond["sbas_one_fault_m"].to_list() == [3.5] * 5
+    assert beyond["sbas_two_faults_m"].null_count() == 5  # the run has no such column
+    assert beyond["sbas_cause"].to_list() == ["one_fault"] * 5
+
+
+@pytest.mark.requirement("C4")
+def test_levels_of_two_kinds_stay_apart(tmp_path: Path):
+    runs = []
+    for name, kind in (("a", "sbas"), ("b", "separation"), ("c", "separation")):
+        run, truth = levelled_run(tmp_path / name, kind)
+        runs.append(RunAndReference(run=run, reference=truth, configuration=kind))
+    time, place = np.arange(8.0), 100.0 + 10.0 * np.arange(8)
+    bare = write_run(tmp_path / "bare", time, place)
+    runs.append(RunAndReference(run=bare, reference=reference(time, place), configuration="none"))
+    found = evaluate_runs(runs)
+    assert list(found.integrity) == ["sbas", "separation"]
+    sbas, separation = (
+        found.integrity[kind].stanford.filter(grouping="all", levels_of="all", alarm_limit_m=12.0)
+        for kind in ("sbas", "separation")
+    )
+    assert sbas["run"].to_list() == ["a"]
+    assert separation.select("run", "epochs", "misleading").rows() == [("b", 8, 3), ("c", 8, 3), ("all", 16, 6)]
+    assert len(found.integrity["separation"].beyond) == 10
+    levels = {"sbas_protection_level_m", "separation_protection_level_m"}
+    assert levels <= set(found.epochs.columns)
+    assert found.epochs.filter(run="a")["separation_protection_level_m"].null_count() == 8
+    assert set(found.levels["level"]) == levels
+
+
+@pytest.mark.requirement("C4")
+def test_levels_go_into_files_named_by_what_they_rest_on(tmp_path: Path):
+    run, truth = levelled_run(tmp_path / "run")
+    write_reference(tmp_path / "truth.csv", truth)
+    out = tmp_path / "out"
+    arguments = ["evaluate", str(run), "--reference", str(tmp_path / "truth.csv"), "--out", str(out)]
+    result = CliRunner().invoke(app, [*arguments, "--alarm-limit", "5", "--alarm-limit", "30"])
+    assert result.exit_code == 0, result.output
+    assert "Errors over their level: 5, of them 3 vouched for; all are in beyond_sbas.csv" in result.output
+    assert "error +9.00 m, level 2.00 m (one_fault), status ambiguous" in result.output
+    counts = pl.read_csv(out / "stanford_sbas.csv").filter(grouping="all")
+    assert counts["alarm_limit_m"].to_list() == [5.0, 12.0, 30.0] * 2
+    beyond = pl.read_csv(out / "beyond_sbas.csv")
+    assert len(beyond) == 5
+    assert beyond.columns == [name.replace("KIND", "sbas") for name in BEYOND_COLUMNS]
+    record = json.loads((out / "evaluation.json").read_text())
+    assert record["beyond_counts"] == {"sbas": 5}
+    assert len(record["beyond_sbas"]) == 5
+    assert len(record["stanford_sbas"]) == 18  # two choices of levels, three limits, the whole and two environments
+    assert record["options"]["alarm_limits_m"] == [5.0, 30.0]
+    assert record["runs"][0]["protection"]["kind"] == "sbas"
+
+
+@pytest.mark.requirement("C4")
+def test_levels_whose_kind_is_not_told(tmp_path: Path):
+    run, truth = levelled_run(tmp_path / "run")
+    record = json.loads((run / "run.json").read_text())
+    for told in ({}, {"kind": "../../x", "alarm_limit_m": 20.0}):
+        (run / "run.json").write_text(json.dumps(record | {"protection": told}))
+        found = evaluate_run(run, truth)
+        assert list(found.integrity) == ["unknown"]
+        assert any("does not tell what the protection levels rest on" in note for note in found.runs[0].notes)
+    for wrong in (0.0, -1.0, "20", True):
+        (run / "run.json").write_text(json.dumps(record | {"protection": {"kind": "sbas", "alarm_limit_m": wrong}}))
+        with pytest.raises(InputFileError, match="alarm_limit_m"):
+            evaluate_run(run, truth)
+    with pytest.raises(SettingsError, match="alarm_limits_m"):
+        EvaluationOptions(alarm_limits_m=(10.0, float("inf")))

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from railfix.evaluate import Evaluation
 
 
@@ -53,17 +55,17 @@ def demo(
 
 
 def show_errors(evaluation: Evaluation) -> None:
-    """Errors along the line on the map, and of the conventional position."""
-    from rich.console import Console
+    """Errors along the line on the map, of those that no check has failed, and of the conventional position."""
+    from rich.console import Console as Terminal
     from rich.table import Table
 
-    console = Console(highlight=False)
+    console: Console = Terminal(highlight=False)
     console.print("Error along the line against the truth in metres, + toward its end")
     table = Table()
     for head in ("antenna", "position", "rate", "mean", "std", "p50", "p95", "largest"):
         table.add_column(head, justify="left" if head in ("antenna", "position") else "right")
     rows = evaluation.figures.filter(grouping="all", epochs_of="own").sort("antenna", maintain_order=True)
-    names = {"constrained": "on the map", "conventional": "conventional"}
+    names = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
     for row in rows.iter_rows(named=True):
         if row["antenna"] != "all" and row["position"] in names:
             lengths = (row[name] for name in ("mean_m", "std_m", "p50_m", "p95_m", "max_m"))
@@ -71,3 +73,30 @@ def show_errors(evaluation: Evaluation) -> None:
             rate = "-" if row["rate"] is None else f"{100 * row['rate']:.2f} %"
             table.add_row(row["antenna"], names[row["position"]], rate, *cells)
     console.print(table)
+    show_levels(evaluation, console)
+
+
+def show_levels(evaluation: Evaluation, console: Console) -> None:
+    """The protection level of each antenna: how wide, how often it serves, how often an error is over it."""
+    for kind, found in evaluation.integrity.items():
+        rows = found.stanford.filter(grouping="all", levels_of="vouched", own_limit=True)
+        for row in rows.filter(rows["antenna"] != "all").iter_rows(named=True):
+            median = median_level(evaluation, kind, row["antenna"])
+            over = found.beyond.filter(antenna=row["antenna"])
+            console.print(
+                f"protection level ({kind}), {row['antenna']}: median {'-' if median is None else f'{median:.2f} m'}, "
+                f"within the alarm limit of {row['alarm_limit_m']:g} m at "
+                f"{100 * (row['availability_of_observed'] or 0.0):.2f} % of the epochs with observations, errors over "
+                f"it: {int(over['vouched'].sum())} of {row['judged']:,}, and "
+                f"{int((~over['vouched']).sum())} where the run had raised an alarm or a doubt",
+                soft_wrap=True,
+            )
+
+
+def median_level(evaluation: Evaluation, kind: str, antenna: str) -> float | None:
+    """Median of the finite levels of the positions of status ok [m]; None where there is none."""
+    if evaluation.levels is None:
+        return None
+    wanted = {"antenna": antenna, "position": "constrained_ok", "level": f"{kind}_protection_level_m"}
+    found: float | None = evaluation.levels.filter(**wanted)["level_p50_m"].item()
+    return found

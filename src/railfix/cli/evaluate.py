@@ -82,9 +82,12 @@ def evaluate(
         float, typer.Option(metavar="M/S", rich_help_panel=CHOICES, help="Below this speed the train stands.")
     ] = 0.3,
     alarm_limit: Annotated[
-        float | None,
+        list[float] | None,
         typer.Option(
-            metavar="M", rich_help_panel=CHOICES, help="What a protection level must stay within to be available."
+            metavar="M",
+            rich_help_panel=CHOICES,
+            help="What a protection level must stay within to be available, beside each run's own limit; may be "
+            "repeated. 10, 20 and 40 by default.",
         ),
     ] = None,
     seed: Annotated[
@@ -105,7 +108,8 @@ def evaluate(
 
     Into DIR come `evaluation.json` (all figures, options, hashes of the inputs), `errors.parquet` (one
     row an epoch and antenna), `tables.csv`, `intervals.csv` and, where a run has protection levels,
-    `levels.csv`.
+    `levels.csv`, `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and
+    `beyond_KIND.csv` (every epoch whose error is over its level), with KIND `sbas` or `separation`.
 
     Example:
 
@@ -128,7 +132,7 @@ def evaluate(
         standing_mps=standing,
         section_m=section_length,
         speed_edges_kmh=_numbers("--speed-classes", speed_classes),
-        alarm_limit_m=alarm_limit,
+        alarm_limits_m=tuple(alarm_limit) if alarm_limit else EvaluationOptions.alarm_limits_m,
         seed=seed,
     )
     files = TrackFiles(track=tuple(track or ()), vehicle=vehicle, crs=crs, height_datum=height_datum, geoid=geoid)

@@ -11,6 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from railfix.cli.evaluate_levels import show_integrity
 from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
     if evaluation.levels is not None:
         console.print("Protection levels")
         console.print(_levels(evaluation.levels))
+        show_integrity(evaluation, console)
     for grouping, head in _GROUPINGS.items():
         rows = evaluation.figures.filter(pl.col("grouping") == grouping, pl.col("epochs_of") == "own")
         if several and grouping in ("environment", "speed"):
@@ -182,7 +184,7 @@ def _intervals(rows: pl.DataFrame) -> Table:
 
 
 def _levels(rows: pl.DataFrame) -> Table:
-    heads = ("positions", "available %", "p50 m", "p95 m", "errors", "over level")
+    heads = ("positions", "finite %", "p50 m", "p95 m", "errors", "over level")
     table = _table("run", "antenna", "position", "level", *heads, text=4)
     for row in rows.iter_rows(named=True):
         table.add_row(
@@ -191,7 +193,7 @@ def _levels(rows: pl.DataFrame) -> Table:
             _NAMES[row["position"]].strip(),
             row["level"],
             f"{row['positions']:,}",
-            _percent(row["availability"]),
+            _percent(row["level_share"]),
             _metres(row["level_p50_m"]),
             _metres(row["level_p95_m"]),
             f"{row['errors']:,}",

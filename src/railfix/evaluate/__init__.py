@@ -8,6 +8,7 @@ from railfix.evaluate.along_track import along_track_error, interpolate_referenc
 from railfix.evaluate.epochs import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_run, evaluate_runs
 from railfix.evaluate.figures import FIGURE_COLUMNS
+from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS, Integrity
 from railfix.evaluate.intervals import INTERVAL_COLUMNS
 from railfix.evaluate.levels import LEVEL_COLUMNS
 from railfix.evaluate.options import EvaluationOptions
@@ -16,14 +17,17 @@ from railfix.evaluate.place import TrackFiles
 from railfix.evaluate.scores import WRONG_PLACE_M, Score, score
 
 __all__ = [
+    "BEYOND_COLUMNS",
     "EPOCH_COLUMNS",
     "FIGURE_COLUMNS",
     "INTERVAL_COLUMNS",
     "LEVEL_COLUMNS",
+    "STANFORD_COLUMNS",
     "WRONG_PLACE_M",
     "EvaluatedRun",
     "Evaluation",
     "EvaluationOptions",
+    "Integrity",
     "RunAndReference",
     "Score",
     "TrackFiles",

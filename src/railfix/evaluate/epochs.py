@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from railfix.errors import MismatchError
 from railfix.evaluate.bracket import bracket
+from railfix.evaluate.integrity import PARTS, TOLD
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import Answers, Errors, TrackFiles, errors_of
 from railfix.evaluate.run_folder import RunFolder, floats
@@ -65,7 +66,7 @@ class AntennaEpochs:
     Attributes
     ----------
     table : polars.DataFrame
-        `EPOCH_COLUMNS` without run, configuration and line, and the run's protection levels.
+        `EPOCH_COLUMNS` without run, configuration and line, and the run's protection levels with their parts.
     errors : Errors
     speed_from : {"reference", "places"}
     outside : int
@@ -87,6 +88,13 @@ class AntennaEpochs:
 def level_columns(table: pl.DataFrame) -> list[str]:
     """Protection levels among the columns."""
     return [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
+
+
+def protection_columns(table: pl.DataFrame) -> list[str]:
+    """Protection levels and what else is told of them, the levels first."""
+    levels = level_columns(table)
+    told = [f"_protection_{name}" for name in (*PARTS, *TOLD)]
+    return levels + [name for name in table.columns if name.endswith(tuple(told))]
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, NDArray[np.bool_], float]:
@@ -242,7 +250,10 @@ def antenna_epochs(
         columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
     first = run.positions["time_gpst"].to_numpy().min()
     columns["block"] = (seconds(time - first) // options.block_s).astype(np.int64)
-    columns |= {name: column(name) for name in level_columns(mine)}
+    columns |= {run.column_of(name): column(name) for name in level_columns(mine)}
+    for name in (f"protection_{name}" for name in (*PARTS, *TOLD)):
+        if name in mine.columns and run.level_kind is not None:
+            columns[run.column_of(name)] = column(name) if name.endswith("_m") else _texts(mine, name, rows)
     table = pl.DataFrame(columns, nan_to_null=True).with_columns(pl.col("n_used").cast(pl.Int64))
     return AntennaEpochs(
         table=table,
@@ -252,6 +263,12 @@ def antenna_epochs(
         step_s=step_s,
         from_sections=int((known & (told_place == "") & (environment != UNKNOWN)).sum()),
     )
+
+
+def _texts(table: pl.DataFrame, name: str, rows: NDArray[np.intp]) -> pl.Series:
+    """A column of words, null where the log has no epoch."""
+    told = table[name].cast(pl.String)
+    return pl.concat([told, pl.Series([None], dtype=pl.String)])[rows]
 
 
 def _steps(values: Floats, known: NDArray[np.bool_]) -> Floats:

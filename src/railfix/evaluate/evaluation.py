@@ -11,13 +11,14 @@ from typing import Any, Final
 import polars as pl
 
 from railfix.errors import InputFileError, MismatchError, SettingsError
-from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, level_columns
+from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, protection_columns
 from railfix.evaluate.figures import ALL, KEYS, WORDS, classed, figures_by
+from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
 from railfix.evaluate.intervals import interval_table
 from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import TrackFiles
-from railfix.evaluate.run_folder import RunFolder, fingerprint, read_run
+from railfix.evaluate.run_folder import UNKNOWN_KIND, RunFolder, fingerprint, read_run
 from railfix.evaluate.sections import read_sections
 from railfix.reference_log import AntennaReference, read_reference
 
@@ -65,6 +66,8 @@ class EvaluatedRun:
         Epochs of the log outside the reference, by antenna.
     step_s : mapping of str to float
         Step of the log, by antenna.
+    protection : mapping
+        What its protection levels rest on, as ``run.json`` says.
     settings : mapping
     inputs : tuple of mapping
         Files that were read, with size and hash.
@@ -80,6 +83,7 @@ class EvaluatedRun:
     speed_from: Mapping[str, str]
     outside: Mapping[str, int]
     step_s: Mapping[str, float]
+    protection: Mapping[str, Any]
     settings: Mapping[str, Any]
     inputs: tuple[Mapping[str, Any], ...]
     notes: tuple[str, ...]
@@ -100,6 +104,8 @@ class Evaluation:
         `railfix.evaluate.INTERVAL_COLUMNS`.
     levels : polars.DataFrame or None
         `railfix.evaluate.LEVEL_COLUMNS`; None where no run has a protection level.
+    integrity : mapping of str to Integrity
+        Levels against errors, by what the levels rest on; empty where no run has a level.
     options : EvaluationOptions
     inputs : tuple of mapping
         Files of all runs, with size and hash.
@@ -110,6 +116,7 @@ class Evaluation:
     figures: pl.DataFrame
     intervals: pl.DataFrame
     levels: pl.DataFrame | None
+    integrity: Mapping[str, Integrity]
     options: EvaluationOptions
     inputs: tuple[Mapping[str, Any], ...] = ()
 
@@ -210,17 +217,26 @@ def evaluate_runs(
         )
         tables.append(whole)
     epochs = pl.concat(tables, how="diagonal")
-    epochs = epochs.select(*EPOCH_COLUMNS, *level_columns(epochs))
+    epochs = epochs.select(*EPOCH_COLUMNS, *protection_columns(epochs))
     evaluated = tuple(_evaluated(*item) for item in zip(parts, names, labels, strict=True))
     return Evaluation(
         runs=evaluated,
         epochs=epochs,
         figures=_figures(epochs, options),
         intervals=_intervals(epochs),
-        levels=level_table(epochs, list(KEYS), options),
+        levels=level_table(epochs, list(KEYS)),
+        integrity=integrity_of(epochs, [one for one in map(_levelled, parts, names) if one is not None], options),
         options=options,
         inputs=tuple({entry["path"]: entry for run in evaluated for entry in run.inputs}.values()),
     )
+
+
+def _levelled(part: _Part, name: str) -> LevelledRun | None:
+    """A run with its kind of levels; None without levels."""
+    kind = part.folder.level_kind
+    if kind is None or "protection_level_m" not in part.folder.positions.columns:
+        return None
+    return LevelledRun(name=name, kind=kind, alarm_limit_m=part.folder.alarm_limit_m)
 
 
 def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, options: EvaluationOptions) -> _Part:
@@ -259,6 +275,10 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
             f"{int(found.table['in_reference'].sum())} epochs, the reference comes before them"
             for name, found in antennas.items()
         ]
+    if folder.level_kind == UNKNOWN_KIND:
+        notes.append("run.json does not tell what the protection levels rest on; they are named unknown")
+    if folder.level_kind is not None and "protection_status" not in folder.positions.columns:
+        notes.append("the run has no protection_status: levels are taken as vouched for where the status is ok")
     said = [note for antenna in antennas.values() for note in antenna.errors.notes]
     return _Part(
         folder=folder,
@@ -326,6 +346,7 @@ def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
         speed_from={antenna: found.speed_from for antenna, found in part.antennas.items()},
         outside={antenna: found.outside for antenna, found in part.antennas.items()},
         step_s={antenna: found.step_s for antenna, found in part.antennas.items()},
+        protection=part.folder.protection,
         settings=part.folder.settings,
         inputs=tuple(part.inputs),
         notes=tuple(part.notes),

@@ -1,4 +1,4 @@
-"""What became of the protection levels of a run: how often there is one, how often an error exceeds it."""
+"""How wide the protection levels of a run are, and how many errors exceed them, whatever the verdict on them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import polars as pl
 
 from railfix.evaluate.epochs import level_columns
 from railfix.evaluate.figures import positioned
-from railfix.evaluate.options import EvaluationOptions
 
 #: Columns of the table of levels beside its keys, with their unit and meaning.
 LEVEL_COLUMNS: Final[dict[str, str]] = {
@@ -18,8 +17,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
     "positions": "epochs with a position",
     "infinite": "of the positions with an infinite level",
     "with_level": "of the positions with a finite level",
-    "available": "of the positions with a finite level, within the alarm limit where one is given",
-    "availability": "available / observed",
+    "level_share": "with_level / observed",
     "level_p50_m": "finite levels",
     "level_p95_m": "finite levels",
     "errors": "finite levels with an error: the reference is good",
@@ -28,7 +26,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
 }
 
 
-def level_table(epochs: pl.DataFrame, by: list[str], options: EvaluationOptions) -> pl.DataFrame | None:
+def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
     """Counts of every protection level; None where a run has none.
 
     Parameters
@@ -37,7 +35,6 @@ def level_table(epochs: pl.DataFrame, by: list[str], options: EvaluationOptions)
         `railfix.evaluate.epochs.EPOCH_COLUMNS` and the levels.
     by : list of str
         Columns whose values are kept apart.
-    options : EvaluationOptions
     """
     spanned = epochs.filter("in_reference")
     tables = []
@@ -49,11 +46,11 @@ def level_table(epochs: pl.DataFrame, by: list[str], options: EvaluationOptions)
             tables.append(
                 spanned.with_columns(has=has, finite=has & pl.col(level).is_finite().fill_null(value=False))
                 .group_by(by, maintain_order=True)
-                .agg(_counts(level, options))
+                .agg(_counts(level))
                 .with_columns(
                     level=pl.lit(level),
                     position=pl.lit(position),
-                    availability=pl.when(pl.col("observed") > 0).then(pl.col("available") / pl.col("observed")),
+                    level_share=pl.when(pl.col("observed") > 0).then(pl.col("with_level") / pl.col("observed")),
                     over_level_share=pl.when(pl.col("errors") > 0).then(pl.col("over_level") / pl.col("errors")),
                 )
                 .select(*by, *LEVEL_COLUMNS)
@@ -61,16 +58,14 @@ def level_table(epochs: pl.DataFrame, by: list[str], options: EvaluationOptions)
     return pl.concat(tables) if tables else None
 
 
-def _counts(level: str, options: EvaluationOptions) -> list[pl.Expr]:
+def _counts(level: str) -> list[pl.Expr]:
     value, has, finite = pl.col(level), pl.col("has"), pl.col("finite")
-    within = finite if options.alarm_limit_m is None else finite & (value <= options.alarm_limit_m)
     judged = finite & pl.col("reference_good")
     counts = {
         "observed": pl.col("observed"),
         "positions": has,
         "infinite": has & value.is_infinite(),
         "with_level": finite,
-        "available": within,
         "errors": judged,
         "over_level": judged & (pl.col("error_m").abs() > value),
     }

@@ -34,8 +34,9 @@ class EvaluationOptions:
         Where one class ends and the next begins.
     over_m : tuple of float
         Sizes of error whose shares are told.
-    alarm_limit_m : float or None
-        What the protection level must stay within for the position to be available.
+    alarm_limits_m : tuple of float
+        What the protection level must stay within for the position to be available; each run is also counted at
+        its own.
     block_s : float
         Length of the blocks that are drawn for the confidence.
     replicates, seed : int
@@ -52,7 +53,7 @@ class EvaluationOptions:
     speed_edges_kmh: tuple[float, ...] = (20.0, 60.0, 100.0)
     satellite_edges: tuple[int, ...] = (4, 5, 6, 7, 8, 10, 12, 15, 20)
     over_m: tuple[float, ...] = (5.0, 10.0, 20.0, 50.0)
-    alarm_limit_m: float | None = None
+    alarm_limits_m: tuple[float, ...] = (10.0, 20.0, 40.0)
     block_s: float = 60.0
     replicates: int = 1000
     seed: int = 0
@@ -68,12 +69,17 @@ class EvaluationOptions:
             if not (len(edges) and (edges > 0).all() and (np.diff(edges) > 0).all()):
                 told = ", ".join(f"{edge:g}" for edge in edges)
                 raise SettingsError(f"{name} is {told or 'empty'}; positive numbers that rise were expected")
-        if self.alarm_limit_m is not None and not self.alarm_limit_m > 0.0:
-            raise SettingsError(f"alarm_limit_m is {self.alarm_limit_m:g}; a positive number of metres was expected")
+        if wrong := [limit for limit in self.alarm_limits_m if not (limit > 0.0 and np.isfinite(limit))]:
+            raise SettingsError(f"alarm_limits_m has {wrong[0]:g}; positive numbers of metres were expected")
         if self.replicates < 1 or self.seed < 0:
             raise SettingsError("replicates must be at least 1 and seed not negative")
         if not 0.0 < self.confidence < 1.0:
             raise SettingsError(f"confidence is {self.confidence:g}; a part between 0 and 1 was expected")
+
+    @property
+    def windows_s(self) -> tuple[float, ...]:
+        """Windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next."""
+        return (15.0, 60.0)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""

@@ -15,6 +15,7 @@ from railfix import __version__
 from railfix.evaluate.epochs import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import Evaluation
 from railfix.evaluate.figures import FIGURE_COLUMNS
+from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS
 from railfix.evaluate.intervals import INTERVAL_COLUMNS
 from railfix.evaluate.levels import LEVEL_COLUMNS
 
@@ -28,6 +29,8 @@ P1_COMMERCIAL: Final = (
     {"position": "conventional", "rate": 0.867, "max_m": 65.8},
     {"position": "constrained, all screens", "rate": 0.846, "max_m": 10.2},
 )
+#: Epochs beyond their level in ``evaluation.json``, the worst; the CSV file has all.
+MOST_BEYOND: Final = 200
 
 
 class Folder(Protocol):
@@ -55,6 +58,8 @@ def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
     tables.csv           figures of every grouping, long form
     intervals.csv        distances and times between positions
     levels.csv           protection levels, where a run has any
+    stanford_KIND.csv    levels against errors, counted; KIND is what the levels rest on (sbas, separation)
+    beyond_KIND.csv      epochs whose error is over the level
     ==================== ================================================================
 
     Returns
@@ -72,6 +77,9 @@ def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
     folder.append_csv("intervals.csv", evaluation.intervals)
     if evaluation.levels is not None:
         folder.append_csv("levels.csv", evaluation.levels)
+    for kind, found in evaluation.integrity.items():
+        folder.append_csv(f"stanford_{kind}.csv", found.stanford)
+        folder.append_csv(f"beyond_{kind}.csv", found.beyond)
     folder.write_json("evaluation.json", as_record(evaluation))
     return folder.commit({"railfix": __version__, "runs": "; ".join(str(run.path) for run in evaluation.runs)})
 
@@ -83,6 +91,10 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
     if evaluation.levels is not None:
         tables["levels"] = evaluation.levels
         columns["levels"] = LEVEL_COLUMNS
+    for kind, found in evaluation.integrity.items():
+        tables |= {f"stanford_{kind}": found.stanford, f"beyond_{kind}": found.beyond.head(MOST_BEYOND)}
+        columns[f"stanford_{kind}"] = STANFORD_COLUMNS
+        columns[f"beyond_{kind}"] = {name.replace("KIND", kind): told for name, told in BEYOND_COLUMNS.items()}
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), "polars": pl.__version__},
         "command": list(sys.argv),
@@ -94,6 +106,7 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
         ],
         "units": "metres, seconds, metres a second as the names end (_m, _s, _mps); shares are parts of 1",
         "columns": columns,
+        "beyond_counts": {kind: len(found.beyond) for kind, found in evaluation.integrity.items()},
         **{name: _rows(table) for name, table in tables.items()},
     }
 

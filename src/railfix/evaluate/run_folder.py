@@ -14,12 +14,17 @@ import polars as pl
 from polars.exceptions import PolarsError
 
 from railfix.errors import InputFileError
+from railfix.protecting import KINDS
 
 #: Columns of the positions without which there is nothing to evaluate.
 NEEDED: Final = (
     "time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m", "n_used",
     "conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m",
 )  # fmt: skip
+
+
+#: Of protection levels whose run does not tell what they rest on.
+UNKNOWN_KIND: Final = "unknown"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +73,47 @@ class RunFolder:
         flat = flattened(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.record.get("inputs", ())}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
+
+    @property
+    def protection(self) -> Mapping[str, Any]:
+        """What the protection levels rest on; empty where they were off or the run tells nothing."""
+        found = self.record.get("protection")
+        return found if isinstance(found, Mapping) else {}
+
+    @property
+    def level_kind(self) -> str | None:
+        """What the protection levels rest on in a word, `UNKNOWN_KIND` where the run does not tell; None without."""
+        level = "protection_level_m"
+        if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
+            return None if not self.protection else self._kind
+        return self._kind
+
+    @property
+    def _kind(self) -> str:
+        kind = self.protection.get("kind")
+        return str(kind) if kind in KINDS else UNKNOWN_KIND
+
+    @property
+    def alarm_limit_m(self) -> float | None:
+        """Alarm limit of the run [m].
+
+        Raises
+        ------
+        InputFileError
+            It is no positive number.
+        """
+        limit = self.protection.get("alarm_limit_m")
+        if limit is None:
+            return None
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or not 0.0 < limit < float("inf"):
+            raise InputFileError(
+                self.path / "run.json", f"protection.alarm_limit_m is {limit!r}; a positive number was expected"
+            )
+        return float(limit)
+
+    def column_of(self, name: str) -> str:
+        """Name of a column of the positions in tables of several runs: levels say what they rest on."""
+        return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
     @property
     def _line(self) -> Mapping[str, Any]:

@@ -1,0 +1,339 @@
+"""Protection levels against the errors: Stanford counts, availability, continuity, and the epochs beyond.
+
+Counted twice. `vouched`: a level counts where the run vouched for it, that is where the status of the
+position is ok and the verdict on the level no alarm; a position that is ambiguous, off the map or failed a
+check has no bound, as if its level were infinite. `all`: every level as it stands, whatever the verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from railfix.evaluate.figures import ALL, KEYS
+from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.run_folder import floats
+from railfix.reasons import Status
+from railfix.stanford import Region, Stanford, stanford
+
+Floats = NDArray[np.float64]
+LevelsOf = Literal["vouched", "all"]
+
+#: Which levels count, see above.
+LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("vouched", "all")
+#: Parts of a level, and what a run says of it, by their names without "protection_".
+PARTS: Final = ("fault_free_m", "one_fault_m", "two_faults_m")
+TOLD: Final = ("cause", "status")
+_ALARM: Final = "alarm"
+_REGIONS: Final = {
+    Region.NOMINAL: "nominal",
+    Region.MISLEADING: "misleading",
+    Region.HAZARDOUS: "hazardously_misleading",
+    Region.UNAVAILABLE: "unavailable",
+    Region.UNAVAILABLE_MISLEADING: "unavailable_misleading",
+    Region.UNJUDGED: "unjudged",
+    Region.NO_POSITION: "no_position",
+}
+
+#: Columns of the table of counts beside its keys, with their meaning.
+STANFORD_COLUMNS: Final[dict[str, str]] = {
+    "grouping": "`all` or `environment`",
+    "group": "which of them",
+    "levels_of": "`vouched`: status ok and no alarm, the others as infinite; `all`: every level as it stands",
+    "alarm_limit_m": "AL: levels up to it are available",
+    "own_limit": "it is the alarm limit that the run had (of rows together: all their runs)",
+    "epochs": "of the run inside the reference, those put in where the log has a gap included",
+    "observed": "of them with observations",
+    "judged": "of them with an error",
+    "nominal": "error <= level <= AL",
+    "misleading": "level < error <= AL",
+    "hazardously_misleading": "level <= AL < error",
+    "unavailable": "AL < level, error <= level",
+    "unavailable_misleading": "AL < level < error",
+    "unjudged": "a position, but the reference is worse than its limit",
+    "no_position": "neither position nor level",
+    "available": "levels up to AL, judged or not",
+    "availability": "available / epochs",
+    "availability_of_observed": "available / observed",
+    "beyond": "errors over their level, at any AL the same",
+    "beyond_share": "beyond / judged",
+    "beyond_blocks": "stretches of time (60 s) with an error over its level, of each antenna",
+    "windows_15_s": "windows of 15 s that begin at an available epoch",
+    "kept_15_s": "of them those in which every epoch is available and none is missing",
+    "continuity_15_s": "kept / windows; not told by environment, whose stretches the line cuts",
+    "windows_60_s": "the same of 60 s",
+    "kept_60_s": "the same",
+    "continuity_60_s": "the same",
+}
+
+#: Columns of the list of epochs beyond, with their unit and meaning; KIND is that of the level.
+BEYOND_COLUMNS: Final[dict[str, str]] = {
+    "run": "name of the run",
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "chainage_m": "of the reference: where the antenna was",
+    "environment": "of the reference or the sections",
+    "error_m": "on the map, + toward the end of the line",
+    "KIND_level_m": "what the error is over",
+    "KIND_fault_free_m": "part of it",
+    "KIND_one_fault_m": "part of it",
+    "KIND_two_faults_m": "part of it",
+    "KIND_cause": "what set the level",
+    "KIND_status": "verdict on the level",
+    "status": "what became of the epoch",
+    "n_used": "satellites used",
+    "vouched": "status ok and no alarm: misleading information",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelledRun:
+    """A run with protection levels.
+
+    Attributes
+    ----------
+    name : str
+    kind : str
+        What the level rests on; prefix of its columns.
+    alarm_limit_m : float or None
+        That the run had.
+    """
+
+    name: str
+    kind: str
+    alarm_limit_m: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Integrity:
+    """Levels of one kind against the errors.
+
+    Attributes
+    ----------
+    stanford : polars.DataFrame
+        `railfix.evaluate.figures.KEYS`, then `STANFORD_COLUMNS`.
+    beyond : polars.DataFrame
+        `BEYOND_COLUMNS`, the largest excess first.
+    """
+
+    stanford: pl.DataFrame
+    beyond: pl.DataFrame
+
+
+def level_name(kind: str) -> str:
+    """Column of the levels of a kind in the table of epochs."""
+    return f"{kind}_protection_level_m"
+
+
+def counted_levels(
+    level_m: Floats,
+    has: NDArray[np.bool_],
+    status: NDArray[np.str_],
+    verdict: NDArray[np.str_],
+    *,
+    levels_of: LevelsOf,
+) -> Floats:
+    """Levels as they count: infinite where a position has no bound, NaN where there is no position.
+
+    Parameters
+    ----------
+    level_m : ndarray, shape (T,) [m]
+        NaN where the run gave none.
+    has : ndarray of bool, shape (T,)
+        Epochs with a position.
+    status, verdict : ndarray of str, shape (T,)
+        Of the position (`railfix.reasons.Status`), of the level (`railfix.protection.Status`); blank where
+        there is none.
+    levels_of : {"vouched", "all"}
+
+    Returns
+    -------
+    ndarray, shape (T,) [m]
+    """
+    bound = np.where(np.isnan(level_m), np.inf, level_m)
+    if levels_of == "vouched":
+        bound = np.where(_vouched(status, verdict), bound, np.inf)
+    return np.where(has, bound, np.nan)
+
+
+def _vouched(status: NDArray[np.str_], verdict: NDArray[np.str_]) -> NDArray[np.bool_]:
+    return np.asarray((status == Status.OK.text) & (verdict != _ALARM))
+
+
+def _words(table: pl.DataFrame, name: str) -> NDArray[np.str_]:
+    if name not in table.columns:
+        return np.full(len(table), "")
+    return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
+
+
+def epochs_diagram(
+    epochs: pl.DataFrame, kind: str, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
+) -> Stanford:
+    """Stanford diagram of the epochs of one antenna of one run that lie inside the reference.
+
+    Parameters
+    ----------
+    epochs : polars.DataFrame
+        `railfix.evaluate.EPOCH_COLUMNS` and the levels, in order of time.
+    kind : str
+        Whose levels.
+    alarm_limit_m : float [m]
+    levels_of : {"vouched", "all"}
+    options : EvaluationOptions
+    """
+    spanned = epochs.filter("in_reference")
+    has = spanned["positioned"].to_numpy()
+    error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
+    level = counted_levels(
+        floats(spanned, level_name(kind)),
+        has,
+        _words(spanned, "status"),
+        _words(spanned, f"{kind}_protection_status"),
+        levels_of=levels_of,
+    )
+    return _sorted(spanned, error, level, alarm_limit_m, options)
+
+
+def positions_diagram(
+    positions: pl.DataFrame, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
+) -> Stanford:
+    """The same of a run without a reference: nothing is judged, availability and continuity are told.
+
+    Parameters
+    ----------
+    positions : polars.DataFrame
+        Of one antenna, columns of `railfix.tables.POSITION_COLUMNS`, in order of time.
+    alarm_limit_m : float [m]
+    levels_of : {"vouched", "all"}
+    options : EvaluationOptions
+    """
+    level = counted_levels(
+        floats(positions, "protection_level_m"),
+        np.isfinite(floats(positions, "chainage_m")),
+        _words(positions, "status"),
+        _words(positions, "protection_status"),
+        levels_of=levels_of,
+    )
+    return _sorted(positions, np.full(len(positions), np.nan), level, alarm_limit_m, options)
+
+
+def _sorted(
+    table: pl.DataFrame, error_m: Floats, level_m: Floats, alarm_limit_m: float, options: EvaluationOptions
+) -> Stanford:
+    return stanford(
+        table["time_gpst"].to_numpy(),
+        error_m,
+        level_m,
+        alarm_limit_m=alarm_limit_m,
+        windows_s=options.windows_s,
+        block_s=options.block_s,
+    )
+
+
+def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: EvaluationOptions) -> dict[str, Integrity]:
+    """Levels against errors, by kind; empty where no run has any.
+
+    Every run is counted at the limits asked for, at its own, and at those of the others, so that rows
+    of several runs together hold them all.
+
+    Parameters
+    ----------
+    epochs : polars.DataFrame
+        `railfix.evaluate.EPOCH_COLUMNS` and the levels, of all runs.
+    runs : sequence of LevelledRun
+    options : EvaluationOptions
+    """
+    own = {run.alarm_limit_m for run in runs if run.alarm_limit_m is not None}
+    limits = sorted({*options.alarm_limits_m, *own})
+    found = {}
+    for kind in dict.fromkeys(run.kind for run in runs):
+        mine = [run for run in runs if run.kind == kind]
+        rows: list[dict[str, Any]] = []
+        for run in mine:
+            for part in epochs.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
+                rows += _counted(part, run, limits, options)
+        names = pl.col("run").is_in([run.name for run in mine])
+        found[kind] = Integrity(stanford=_pooled(rows, options), beyond=_beyond(epochs.filter(names), kind))
+    return found
+
+
+def _counted(
+    part: pl.DataFrame, run: LevelledRun, limits: Sequence[float], options: EvaluationOptions
+) -> Iterator[dict[str, Any]]:
+    """Counts of one antenna of a run: as a whole, then by environment."""
+    keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
+    groups = [(ALL, ALL, part)]
+    environments = part.filter("in_reference").partition_by("environment", maintain_order=True)
+    groups += [("environment", str(one["environment"][0]), one) for one in environments]
+    for grouping, group, mine in groups:
+        spanned = mine.filter("in_reference")
+        for levels_of in LEVELS_OF:
+            for limit in limits:
+                diagram = epochs_diagram(mine, run.kind, alarm_limit_m=limit, levels_of=levels_of, options=options)
+                regions = {name: diagram.counts[region] for region, name in _REGIONS.items()}
+                row = {
+                    **keys,
+                    "grouping": grouping,
+                    "group": group,
+                    "levels_of": levels_of,
+                    "alarm_limit_m": limit,
+                    "own_limit": limit == run.alarm_limit_m,
+                    "epochs": len(spanned),
+                    "observed": int(spanned["observed"].sum()),
+                    "judged": int(diagram.histogram.sum()),
+                    **regions,
+                    "available": round(diagram.available_rate * len(spanned)),
+                    "beyond": len(diagram.beyond),
+                    "beyond_blocks": int(np.count_nonzero(diagram.blocks.misleading)),
+                }
+                for one in diagram.continuity:
+                    row |= {f"windows_{one.window_s:g}_s": one.windows, f"kept_{one.window_s:g}_s": one.kept}
+                yield row
+
+
+def _pooled(rows: list[dict[str, Any]], options: EvaluationOptions) -> pl.DataFrame:
+    """The rows, those of both antennas together, those of all runs of a configuration together; with shares."""
+    parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
+    if parts[0]["antenna"].n_unique() > 1:
+        parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))
+    if parts[0]["run"].n_unique() > 1:
+        parts += [part.with_columns(run=pl.lit(ALL), line=pl.lit(ALL)) for part in parts]
+    named = [*KEYS, "grouping", "group", "levels_of", "alarm_limit_m"]
+    counts = [name for name in parts[0].columns if name not in named and name != "own_limit"]
+    whole = pl.concat(parts).group_by(named, maintain_order=True).agg(pl.col("own_limit").all(), pl.col(counts).sum())
+    windows = [f"{name}_{window:g}_s" for window in options.windows_s for name in ("windows", "kept")]
+    whole = whole.with_columns(pl.when(pl.col("grouping") == ALL).then(pl.col(name)).alias(name) for name in windows)
+    shares = {
+        "availability": ("available", "epochs"),
+        "availability_of_observed": ("available", "observed"),
+        "beyond_share": ("beyond", "judged"),
+        **{f"continuity_{window:g}_s": (f"kept_{window:g}_s", f"windows_{window:g}_s") for window in options.windows_s},
+    }
+    whole = whole.with_columns(
+        pl.when(pl.col(below) > 0).then(pl.col(above) / pl.col(below)).alias(name)
+        for name, (above, below) in shares.items()
+    )
+    return whole.select(*KEYS, *STANFORD_COLUMNS)
+
+
+def _beyond(epochs: pl.DataFrame, kind: str) -> pl.DataFrame:
+    """Epochs whose error is over a finite level, the largest excess first."""
+    level = pl.col(level_name(kind))
+    told = {name: f"{kind}_protection_{name}" for name in (*PARTS, *TOLD)}
+    absent = [name for name in told.values() if name not in epochs.columns]
+    blank = [pl.lit(None, pl.Float64 if name.endswith("_m") else pl.String).alias(name) for name in absent]
+    over = epochs.with_columns(blank).filter(
+        "in_reference", "reference_good", "positioned", level.is_finite() & (pl.col("error_m").abs() > level)
+    )
+    excess = pl.col("error_m").abs() - level
+    verdict = pl.Series("vouched", _vouched(_words(over, "status"), _words(over, told["status"])))
+    named = {f"{kind}_{name}": pl.col(column) for name, column in told.items()}
+    listed = over.with_columns(verdict, level.alias(f"{kind}_level_m"), **named)
+    return listed.sort(excess, descending=True, maintain_order=True).select(
+        name.replace("KIND", kind) for name in BEYOND_COLUMNS
+    )
