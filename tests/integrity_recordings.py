@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +21,7 @@ import recordings_score
 from conftest import ROOT
 from railfix.antenna import Trajectory
 from railfix.clock_elimination import ClockTies, Ranges, clock_groups
-from railfix.config import parse_config
+from railfix.config import Config, parse_config
 from railfix.epochs import Observations
 from railfix.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
 from railfix.evaluate import along_track_error, interpolate_reference
@@ -29,6 +29,8 @@ from railfix.geodesy import range_with_rotation
 from railfix.navigation import Navigation
 from railfix.pipeline import AntennaResult, EpochProcessor
 from railfix.preparation import SOMEWHERE_ABOVE_M
+from railfix.protecting import risk_of
+from railfix.protection import ProtectionLevel, along_track_level
 from railfix.raim import constrained_model
 from railfix.range_errors import ModelInputs, error_model_from_runs, range_errors
 from railfix.reasons import CHECK_FAILED, Reason, Status
@@ -42,10 +44,12 @@ MASK: Final = {"elevation": {"mask_deg": 15.0}}
 ALARM_LIMITS_M: Final = (10.0, 20.0, 40.0)
 #: Weights by their name: none (noise settings times the estimated scale), or the runs that an error model is made from.
 #: "base" is Japan with its reference station: what is local of a geodetic receiver under open sky. "half" is the
-#: recording's own first half; the second one is judged. "no C/N0" is of one bin: these logs do not have any.
+#: recording's own first half; the second one is judged. "no C/N0" is of one bin: these logs
+#: do not have any. "scale": as none, but the sigmas of the level are never scaled down.
 MODELS: Final = {
     "urbannav_f9p": {
         "none": (),
+        "none, scale at least 1": ("scale",),
         "other receiver, same car": ("urbannav_m8t",),
         "other cities": ("gsdc", "japan"),
         "all others": ("urbannav_m8t", "gsdc", "japan"),
@@ -54,6 +58,7 @@ MODELS: Final = {
     },
     "urbannav_m8t": {
         "none": (),
+        "none, scale at least 1": ("scale",),
         "other receiver, same car": ("urbannav_f9p",),
         "other cities": ("gsdc", "japan"),
         "all others": ("urbannav_f9p", "gsdc", "japan"),
@@ -62,18 +67,21 @@ MODELS: Final = {
     },
     "gsdc": {
         "none": (),
+        "none, scale at least 1": ("scale",),
         "all others": ("urbannav_f9p", "urbannav_m8t", "japan"),
         "own first half": ("half",),
         "open sky, base": ("base",),
     },
     "japan": {
         "none": (),
+        "none, scale at least 1": ("scale",),
         "all others": ("urbannav_f9p", "urbannav_m8t", "gsdc"),
         "own first half": ("half",),
         "own first half, base": ("half", "base"),
     },
     "geonet2005": {
         "none": (),
+        "none, scale at least 1": ("scale",),
         "open sky, base": ("base",),
         "same, no C/N0": ("base", "no C/N0"),
         "all others, no C/N0": ("urbannav_f9p", "urbannav_m8t", "gsdc", "japan", "no C/N0"),
@@ -238,11 +246,16 @@ def recordings_of(data: Path, folder: Path, name: str) -> list[Recording]:
 # ---- levels and what they have to bound ---------------------------------------------------------------------
 
 
-def judged(one: Recording, model: str, file: Path | None, *, since: np.datetime64 | None = None) -> Judged:
+def judged(
+    one: Recording, model: str, file: Path | None, *, since: np.datetime64 | None = None, least_scale: float = 0.0
+) -> Judged:
     """Positions weighted by a model, levels, errors of positions and of ranges; judged from an epoch on."""
     config = parse_config({**MASK, **({} if file is None else {"error_model": str(file)})})
     processor = EpochProcessor(config, one.navigation, {"front": one.trajectory})
     result = processor.process({"front": one.observations})[0].antennas["front"]
+    if least_scale > 0.0:
+        level = _with_scale(one, result, config, np.maximum(result.noise_scale, least_scale))
+        result = replace(result, protection=replace(result.protection, level=level))
     place = interpolate_reference(result.time, one.reference.time, one.reference.ecef_m)
     error = along_track_error(result.arc_m, place, one.trajectory)
     found = range_errors(result, one.trajectory, one.reference)
@@ -257,7 +270,7 @@ def judged(one: Recording, model: str, file: Path | None, *, since: np.datetime6
         which = channel[np.argmax(used[row[of]][:, channel], axis=1)]
         by_range[row[of], which] = found.samples.error_m[of]
     share, misfit = _moved(one, result, used, place)
-    scale = np.ones(len(result)) if file is not None else result.noise_scale
+    scale = np.ones(len(result)) if file is not None else np.maximum(result.noise_scale, least_scale)
     bias = np.zeros(used.shape) if file is None else _bias(file, result, one)
     sigma = scale[:, None] * result.sigma_m[:, result.columns]
     observed = np.isfinite(place[:, 0]) & np.any((result.reason & 1) == 0, axis=1)
@@ -287,6 +300,19 @@ def _bias(file: Path, result: AntennaResult, one: Recording) -> np.ndarray:
     turned = result.azimuth_deg[:, columns] - one.trajectory.body_azimuth_deg(arc)[:, None]
     _, bias = read_error_model(file).at(result.elevation_deg[:, columns], turned, result.cn0_dbhz[:, columns])
     return np.nan_to_num(bias)
+
+
+def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np.ndarray) -> ProtectionLevel:
+    """The levels of the run with another scale of the ranges' sigmas."""
+    has = np.isfinite(result.protection.level.level_m)
+    arc, section = np.where(has, result.constrained.arc_m, np.nan), np.maximum(result.constrained.section, 0)
+    return along_track_level(
+        constrained_model(ranges_of(result), one.trajectory, arc, section=section),
+        [name[0] for name in result.satellite[result.columns].tolist()],
+        risk=risk_of(config),
+        scale=scale,
+        n_excluded=result.raim.excluded.sum(axis=1),
+    )
 
 
 def ranges_of(result: AntennaResult) -> Ranges:
@@ -328,11 +354,11 @@ def _moved(one: Recording, result: AntennaResult, used: np.ndarray, place: np.nd
 # ---- epochs over their level --------------------------------------------------------------------------------
 
 
-def over_level(one: Judged) -> list[Over]:
-    """Every epoch with a consistent level that its error passes."""
-    level, result = one.level_m, one.result
+def over_level(one: Judged, level_m: np.ndarray | None = None) -> list[Over]:
+    """Every epoch with a consistent level that its error passes; or passes another bound than the level."""
+    level, result = one.level_m if level_m is None else level_m, one.result
     found = []
-    for t in np.flatnonzero(np.abs(one.error_m) > level):
+    for t in np.flatnonzero((np.abs(one.error_m) > level) & np.isfinite(one.level_m)):
         parts = result.protection.level
         found.append(
             Over(
@@ -398,46 +424,65 @@ Group = list[Judged]
 def table(groups: list[Group]) -> list[str]:
     """One row a recording and model: levels and errors of all positions, whatever their status."""
     rows = [
-        f"{'recording':14s} {'error model':25s} epochs levels alarms  level p50  p95 m  error p50  p95   max m  "
-        "largest error/level   over  blocks  over K sigma alone"
+        f"{'':40s} {'':21s} level [m]       error [m]           error/sigma  error/level     over       over K sigma",
+        f"{'recording':14s} {'error model':25s} epochs levels alarms    50 %   95 %   50 %  95 %   max       68 %"
+        "       largest   level  blocks   alone",
     ]
     for group in groups:
         level, error = _joined(group, "level_m"), np.abs(_joined(group, "error_m"))
-        alone = _joined(group, "fault_free_m")
+        alone, sigma = _joined(group, "fault_free_m"), _joined(group, "sigma_m")
         finite, both = np.isfinite(level), np.isfinite(level) & np.isfinite(error)
         blocks = [one.diagram(20.0, one.level_m).blocks for one in group]
         words = [
             f"{_name(group)} {len(level):6d} {finite.sum():6d} {sum(one.alarms.sum() for one in group):6d}",
-            f"{_percentile(level, 50):10.1f} {_percentile(level, 95):6.1f}",
-            f"{_percentile(error, 50):10.2f} {_percentile(error, 95):5.1f} {np.nanmax(error):6.1f}",
-            f"{(error[both] / level[both]).max():20.2f} {np.count_nonzero(error[both] > level[both]):6d}",
+            f"{_percentile(level, 50):7.1f} {_percentile(level, 95):6.1f}",
+            f"{_percentile(error, 50):6.2f} {_percentile(error, 95):5.1f} {np.nanmax(error):5.1f}",
+            f"{_percentile(error[both] / sigma[both], 68):10.2f} {(error[both] / level[both]).max():13.2f}",
+            f"{np.count_nonzero(error[both] > level[both]):7d}",
             f"{sum(np.count_nonzero(b.misleading) for b in blocks):3d}/{sum(len(b.start) for b in blocks):3d}",
-            f"{np.count_nonzero(error[both] > alone[both]):8d} ({_share(error[both] > alone[both]):.2f} %)",
+            f"{np.count_nonzero(error[both] > alone[both]):7d}",
         ]
         rows.append(" ".join(words))
     return rows
 
 
 def diagrams(groups: list[Group]) -> list[str]:
-    """Stanford's regions at every alarm limit: by levels alone, and by the pipeline's verdict."""
+    """Stanford's regions at every alarm limit, by levels alone."""
     rows = [
-        f"{'':46s}  levels alone{'':49s}     continuity %    verdict",
-        f"{'recording':14s} {'error model':25s} limit  nominal mislead hazard unavailable and mislead. neither  avail %"
-        "    15 s   60 s   avail %  mislead hazard",
+        f"{'':40s}" + "".join(f"  alarm limit {limit:.0f} m{'':15s}" for limit in ALARM_LIMITS_M),
+        f"{'recording':14s} {'error model':25s}" + "  nominal  mis haz unavail u+m  -" * len(ALARM_LIMITS_M),
     ]
     for group in groups:
+        words = [_name(group)]
         for limit in ALARM_LIMITS_M:
-            alone = [one.diagram(limit, one.level_m) for one in group]
-            verdict = [one.diagram(limit, one.verdict_m) for one in group]
-            c, v = (sum((Counter(d.counts) for d in diagrams), Counter()) for diagrams in (alone, verdict))
-            words = [
-                f"{_name(group)} {limit:5.0f} {c[Region.NOMINAL]:8d} {c[Region.MISLEADING]:7d}",
-                f"{c[Region.HAZARDOUS]:6d} {c[Region.UNAVAILABLE]:11d} {c[Region.UNAVAILABLE_MISLEADING]:12d}",
-                f"{c[Region.NO_POSITION] + c[Region.UNJUDGED]:8d} {_available(alone):9.1f}",
-                f"{_kept(alone, 0)} {_kept(alone, 1)} {_available(verdict):9.1f}",
-                f"{v[Region.MISLEADING]:8d} {v[Region.HAZARDOUS]:6d}",
-            ]
-            rows.append(" ".join(words))
+            c = sum((Counter(one.diagram(limit, one.level_m).counts) for one in group), Counter())
+            words.append(
+                f"  {c[Region.NOMINAL]:6d} {c[Region.MISLEADING]:4d} {c[Region.HAZARDOUS]:3d} "
+                f"{c[Region.UNAVAILABLE]:7d} {c[Region.UNAVAILABLE_MISLEADING]:3d} "
+                f"{c[Region.NO_POSITION] + c[Region.UNJUDGED]:2d}"
+            )
+        rows.append(" ".join(words))
+    return rows
+
+
+def availabilities(groups: list[Group]) -> list[str]:
+    """Availability and continuity by levels alone, and by the pipeline's verdict."""
+    rows = [
+        f"{'':40s}  levels alone, alarm limit [m]:{'':34s}verdict: over",
+        f"{'recording':14s} {'error model':25s}  available % 10    20    40  15 s % 20    40  60 s % 20    40"
+        "  available % 10    20    40  the level",
+    ]
+    for group in groups:
+        alone = [[one.diagram(limit, one.level_m) for one in group] for limit in ALARM_LIMITS_M]
+        verdict = [[one.diagram(limit, one.verdict_m) for one in group] for limit in ALARM_LIMITS_M]
+        over = sum(len(diagram.beyond) for diagram in verdict[0])
+        words = [
+            f"{_name(group)} {'':9s} {' '.join(f'{_available(found):5.1f}' for found in alone)}",
+            f"{'':6s} {' '.join(_kept(found, 0) for found in alone[1:])}",
+            f"{'':6s} {' '.join(_kept(found, 1) for found in alone[1:])}",
+            f"{'':10s} {' '.join(f'{_available(found):5.1f}' for found in verdict)} {over:10d}",
+        ]
+        rows.append(" ".join(words))
     return rows
 
 
@@ -471,11 +516,25 @@ def reasons(groups: list[Group]) -> list[str]:
     return rows or ["no error is over its level"]
 
 
+def held_by_hypotheses(groups: list[Group]) -> list[str]:
+    """Epochs that K sigma without fault hypotheses would not have bounded, by what was wrong."""
+    rows = [f"{'recording':14s} {'error model':25s} errors over K sigma without hypotheses, by what was wrong"]
+    for group in groups:
+        counts: Counter[str] = Counter()
+        for one in group:
+            found = over_level(one, one.result.protection.level.fault_free_m)
+            counts.update(over.why.replace(f" of {over.used}", "") for over in found)
+        if counts:
+            rows.append(f"{_name(group)} {'; '.join(f'{number} x {why}' for why, number in counts.most_common())}")
+    return rows
+
+
 def _joined(group: Group, name: str) -> np.ndarray:
     """One array of all epochs that are judged."""
     parts = []
     for one in group:
-        values = {"status": one.result.status, "fault_free_m": one.result.protection.level.fault_free_m}
+        level = one.result.protection.level
+        values = {"status": one.result.status, "fault_free_m": level.fault_free_m, "sigma_m": level.sigma_m}
         parts.append((values[name] if name in values else getattr(one, name))[one.observed])
     return np.concatenate(parts)
 
@@ -490,17 +549,13 @@ def _percentile(values: np.ndarray, which: float) -> float:
     return float(np.percentile(good, which)) if len(good) else np.nan
 
 
-def _share(mask: np.ndarray) -> float:
-    return 100.0 * float(np.mean(mask)) if len(mask) else np.nan
-
-
 def _available(found: list[Stanford]) -> float:
     return 100.0 * sum(d.available_rate * len(d.region) for d in found) / sum(len(d.region) for d in found)
 
 
 def _kept(found: list[Stanford], which: int) -> str:
     windows = sum(d.continuity[which].windows for d in found)
-    return f"{100.0 * sum(d.continuity[which].kept for d in found) / windows:6.1f}" if windows else "     -"
+    return f"{100.0 * sum(d.continuity[which].kept for d in found) / windows:5.1f}" if windows else "    -"
 
 
 def everything(data: Path, folder: Path, names: list[str]) -> list[Group]:
@@ -510,9 +565,10 @@ def everything(data: Path, folder: Path, names: list[str]) -> list[Group]:
     for name in names:
         recordings = recordings_of(data, folder, name)
         for model, sources in MODELS[name].items():
-            file = write_model(data, folder, name, sources) if sources else None
+            file = write_model(data, folder, name, sources) if sources and sources != ("scale",) else None
             since = middle_of(recordings[0].observations) if "half" in sources else None
-            found.append([judged(one, model, file, since=since) for one in recordings])
+            least = 1.0 if sources == ("scale",) else 0.0
+            found.append([judged(one, model, file, since=since, least_scale=least) for one in recordings])
     return found
 
 
@@ -527,7 +583,7 @@ def main() -> int:
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
     found = everything(data, options.folder, options.only)
-    for part in (table, diagrams, by_status, reasons):
+    for part in (table, availabilities, diagrams, by_status, held_by_hypotheses, reasons):
         print("\n".join(part(found)), end="\n\n")
     return 0
 

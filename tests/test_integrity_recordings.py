@@ -110,6 +110,18 @@ def test_levels_are_not_empty_of_meaning(groups):
 
 
 @pytest.mark.requirement("C3")
+def test_without_a_model_the_sigma_of_open_sky_is_too_small(groups):
+    """Residuals of six minutes do not show what moves a position by a metre all the time; the floor of 1 m would."""
+    found = {}
+    for model in ("none", "none, scale at least 1"):
+        (one,) = groups["japan", model]
+        has = np.isfinite(one.level_m) & np.isfinite(one.error_m)
+        found[model] = np.percentile(np.abs(one.error_m[has]) / one.result.protection.level.sigma_m[has], 68)
+    assert found["none"] > 1.8
+    assert found["none, scale at least 1"] < 1.0
+
+
+@pytest.mark.requirement("C3")
 @pytest.mark.parametrize("name", ["urbannav_f9p", "gsdc", "japan"])
 def test_errors_of_positions_are_what_the_errors_of_ranges_do(groups, name):
     """Gains of the model that the level rests on, times true errors of the ranges, against the reference."""
