@@ -424,9 +424,10 @@ Group = list[Judged]
 def table(groups: list[Group]) -> list[str]:
     """One row a recording and model: levels and errors of all positions, whatever their status."""
     rows = [
-        f"{'':40s} {'':21s} level [m]       error [m]           error/sigma  error/level     over       over K sigma",
-        f"{'recording':14s} {'error model':25s} epochs levels alarms    50 %   95 %   50 %  95 %   max       68 %"
-        "       largest   level  blocks   alone",
+        f"{'':40s} {'':21s} level [m]       K sigma  error [m]           "
+        "error/sigma  error/level     over       over K sigma",
+        f"{'recording':14s} {'error model':25s} epochs levels alarms    50 %   95 %    50 %   50 %  95 %   max       "
+        "68 %       largest   level  blocks   alone",
     ]
     for group in groups:
         level, error = _joined(group, "level_m"), np.abs(_joined(group, "error_m"))
@@ -435,7 +436,7 @@ def table(groups: list[Group]) -> list[str]:
         blocks = [one.diagram(20.0, one.level_m).blocks for one in group]
         words = [
             f"{_name(group)} {len(level):6d} {finite.sum():6d} {sum(one.alarms.sum() for one in group):6d}",
-            f"{_percentile(level, 50):7.1f} {_percentile(level, 95):6.1f}",
+            f"{_percentile(level, 50):7.1f} {_percentile(level, 95):6.1f} {_percentile(alone[finite], 50):7.1f}",
             f"{_percentile(error, 50):6.2f} {_percentile(error, 95):5.1f} {np.nanmax(error):5.1f}",
             f"{_percentile(error[both] / sigma[both], 68):10.2f} {(error[both] / level[both]).max():13.2f}",
             f"{np.count_nonzero(error[both] > level[both]):7d}",
