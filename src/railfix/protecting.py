@@ -101,10 +101,8 @@ def protect(
 
 
 def _level_scale(scale: Floats, config: Config) -> Floats | float:
-    """What the sigmas of the ranges are multiplied by: those of a model stand, those of SBAS never shrink."""
-    if config.error_model is not None:
-        return 1.0
-    return np.maximum(scale, 1.0) if config.sbas else scale
+    """What the sigmas of the ranges are multiplied by: those of a model stand; quiet residuals shrink none."""
+    return 1.0 if config.error_model is not None else np.maximum(scale, 1.0)
 
 
 def judged(protection: Protection, status: NDArray[np.int8], has: NDArray[np.bool_], config: Config) -> Protection:
