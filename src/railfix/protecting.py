@@ -95,9 +95,8 @@ def protect(
         bias_m=one.bias_m,
         n_excluded=raim.excluded.sum(axis=1),
     )
-    return Protection(
-        level=level, status=availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    )
+    status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    return Protection(level=level, status=status, kind=kind_of(config))
 
 
 def _level_scale(scale: Floats, config: Config) -> Floats | float:
@@ -129,4 +128,4 @@ def judged(protection: Protection, status: NDArray[np.int8], has: NDArray[np.boo
     verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
     doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP])
     verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
-    return Protection(level=level, status=verdict.astype(np.int8))
+    return Protection(level=level, status=verdict.astype(np.int8), kind=protection.kind)

@@ -63,10 +63,13 @@ class Protection:
         NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
     status : ndarray of int8, shape (T,)
         `protection.Status` against `Config.alarm_limit_m`.
+    kind : str
+        What the levels rest on: "sbas" or "separation" (`protecting.KINDS`).
     """
 
     level: ProtectionLevel
     status: NDArray[np.int8]
+    kind: str
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from railfix.pipeline import AntennaResult, Result
+from railfix.protecting import KINDS
 from railfix.protection import Cause
 from railfix.protection import Status as LevelStatus
 from railfix.raim import Outcome
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 STATUS_TYPE: Final = pl.Enum([s.text for s in Status])
 #: Words of the column ``raim_outcome``.
 OUTCOME_TYPE: Final = pl.Enum([o.name.lower() for o in Outcome])
+#: Words of the column ``protection_kind``.
+KIND_TYPE: Final = pl.Enum(KINDS)
 #: Words of the column ``protection_cause``, and of ``protection_status``.
 CAUSE_TYPE: Final = pl.Enum([c.name.lower() for c in Cause])
 LEVEL_STATUS_TYPE: Final = pl.Enum([s.name.lower() for s in LevelStatus])
@@ -68,6 +71,8 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "protection_k_one_fault": "sigmas that the second part stands for, beside its threshold",
     "protection_k_two_faults": "sigmas that the third part stands for, beside its threshold",
     "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
+    "protection_kind": "what it rests on: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
+    "hypotheses of satellites' own faults as well",
     "protection_cause": "what sets the level: "
     "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
     "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
@@ -207,6 +212,8 @@ def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
         name: _floats(np.full(epochs, np.nan) if found is None else getattr(found.level, field))
         for name, field in _OF_LEVEL.items()
     }
+    named = pl.Series(values=[None if found is None else found.kind], dtype=KIND_TYPE)
+    columns["protection_kind"] = named.new_from_index(0, epochs)
     for name, (kind, values) in words.items():
         if values is None:
             columns[name] = pl.Series(values=[None], dtype=kind).new_from_index(0, epochs)
