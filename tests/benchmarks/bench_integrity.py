@@ -1,9 +1,10 @@
 """What protection levels, an error model and SBAS add to an epoch of a batch, against what solving takes.
 
-Two logs of one antenna are simulated first: GPS, QZSS and Galileo of a made sky, and GPS of the navigation file
-recorded with the hour of MSAS messages of 2025, at that hour (with the recordings beside the checkout; its GPS time
-is 17:00 to 18:00 and the messages come first, so the log begins at 17:20). Each is then positioned by one choice of
-settings after the other, round by round, chunk by chunk as `railfix run` does, from observations in memory::
+Logs of one antenna are simulated first: GPS, QZSS and Galileo of a made sky; the same, and GPS alone, of the
+navigation file recorded with the hour of MSAS messages of 2025, at that hour (with the recordings beside the
+checkout; GPS time 17:00 to 18:00, and the messages come first, so the logs begin at 17:20). Each is then positioned by
+one choice of settings after the other, round by round, chunk by chunk as `railfix run` does, from observations in
+memory::
 
     python tests/benchmarks/bench_integrity.py [--seconds 1800] [--rounds 7] [--profile]
 
@@ -203,26 +204,21 @@ def main() -> int:
         if not MESSAGES.is_file():
             print(f"the real recordings are not at {RECORDINGS}: SBAS is not measured", file=sys.stderr)
             return 1
-        log = simulated(
-            scratch / "hour",
-            options.seconds,
-            "start=2025-02-15T17:20:00",
-            f"sky.nav={NAVIGATION}",
-            "sky.systems=G",
-            "sky.unhealthy=[]",
-            "sky.ionosphere_scale=0",
-        )
         sbas = {"sbas": [str(MESSAGES)]}
-        choices = [
-            Choice("solving", off, []),
-            Choice("with levels", {}, []),
-            Choice("with SBAS", off | sbas, []),
-            Choice("with SBAS and levels", sbas, []),
-            Choice("with SBAS, error model and levels", sbas | model, []),
-        ]
-        rounds_of(log, choices, options.rounds)
-        table("GPS of 2025-02-15, 17:20", log, choices)
-        parts_of_sbas(log, options.rounds)
+        for systems, title in (("GJE", "GPS, QZSS, Galileo"), ("G", "GPS")):
+            hour = ["start=2025-02-15T17:20:00", f"sky.nav={NAVIGATION}", f"sky.systems={systems}"]
+            hour += ["sky.unhealthy=[]", "sky.ionosphere_scale=0"]
+            log = simulated(scratch / f"hour{systems}", options.seconds, *hour)
+            choices = [
+                Choice("solving", off, []),
+                Choice("with levels", {}, []),
+                Choice("with SBAS", off | sbas, []),
+                Choice("with SBAS and levels", sbas, []),
+                Choice("with SBAS, error model and levels", sbas | model, []),
+            ]
+            rounds_of(log, choices, options.rounds)
+            table(f"{title} of 2025-02-15, 17:20", log, choices)
+            parts_of_sbas(log, options.rounds)
         if options.profile:
             profiled(log, sbas)
     print(f"load {os.getloadavg()[0]:.1f} at the end")
