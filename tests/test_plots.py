@@ -149,6 +149,40 @@ def test_stanford_counts_by_hand() -> None:
     assert layer(chart, Cells).x_edges[-1] == pytest.approx(40.0)
 
 
+@pytest.mark.requirement("C4")
+def test_stanford_regions_are_written_where_they_are() -> None:
+    """The words of each region stand inside it and tell its epochs; the limit may be anywhere."""
+    rng = np.random.default_rng(3)
+    error, level = rng.exponential(6.0, 500), rng.exponential(12.0, 500)
+    for limit, bin_m in ((10.0, None), (17.0, 0.5)):
+        diagram = sorted_epochs(times(np.arange(500)), error, level, alarm_limit_m=limit, bin_m=bin_m)
+        chart = plots.stanford(diagram)
+        marks = layer(chart, Marks)
+        assert marks.place == "on"
+        expected = {
+            "nominal": (error <= level) & (level <= limit),
+            "misleading": (level < error) & (error <= limit),
+            "hazardously misleading": (level <= limit) & (limit < error),
+            "unavailable": (limit < level) & (error <= level),
+            "unavailable, misleading": (limit < level) & (level < error),
+        }
+        told = {}
+        for x, y, words in zip(marks.x, marks.y, marks.words, strict=True):
+            *name, count = words.split("\n")
+            told[" ".join(name)] = int(count)
+            # error over x, level over y: the place itself is of that region
+            one = sorted_epochs(times(np.arange(1)), [x], [y], alarm_limit_m=limit)
+            region = next(r for r, n in one.counts.items() if n)
+            assert diagram.counts[region] == int(count)
+            assert x < chart.x_range[1]
+            assert y < chart.y_range[1]
+        assert told == {name: int(mask.sum()) for name, mask in expected.items()}
+        assert all(told.values())
+    # bins that end at the limit have no room for the regions beyond it
+    small = plots.stanford(sorted_epochs(times(np.arange(500)), error, level, alarm_limit_m=40.0, bin_m=0.4))
+    assert [words.split("\n")[0] for words in layer(small, Marks).words] == ["nominal", "misleading"]
+
+
 def test_levels_over_time(positions: pl.DataFrame) -> None:
     told = positions.with_columns(
         protection_level_m=pl.Series([5.0, np.inf, 7.0, None, 6.0]),
@@ -161,7 +195,14 @@ def test_levels_over_time(positions: pl.DataFrame) -> None:
     np.testing.assert_array_equal(layer(chart, Points, "level").x, [0.0, 2.0, 4.0])
     assert {one.label for one in chart.layers} == {"level", "fault-free part", "alarm limit 20 m"}
     assert "Epochs: available 3, unavailable 1, alarm 1." in chart.caption
+    assert "1 levels are infinite" in chart.caption
     assert plots.levels_over_time(positions, 20.0).empty
+    along = plots.levels_over_chainage(told.with_columns(chainage_m=pl.Series([10.0, 20.0, None, 40.0, 50.0])), 20.0)
+    np.testing.assert_array_equal(layer(along, Points, "level").y, [5.0, 6.0])
+    np.testing.assert_array_equal(layer(along, Points, "level").x, [10.0, 50.0])
+    np.testing.assert_array_equal(layer(along, Points, "level").epoch_s, [0.0, 4.0])
+    assert along.start is None
+    assert plots.levels_over_chainage(positions, 20.0).empty
 
 
 def test_plan_in_metres(positions: pl.DataFrame) -> None:
@@ -301,6 +342,7 @@ def test_every_picture_is_drawn(errors: pl.DataFrame, positions: pl.DataFrame, o
         plots.plot_error_ranges({"run": errors}),
         plots.plot_stanford(sorted_epochs(times([0.0, 1.0]), [1.0, 2.0], [3.0, 4.0], alarm_limit_m=20.0)),
         plots.plot_levels_over_time(positions.with_columns(protection_level_m=5.0), 20.0),
+        plots.plot_levels_over_chainage(positions.with_columns(protection_level_m=5.0), 20.0),
         plots.plot_interval_over_chainage(errors),
         plots.plot_interval_distribution(errors),
         plots.plot_satellites_over_time(positions),

@@ -21,6 +21,7 @@ from railfix.report import read_runs, report_page, write_report
 from railfix.report.encode import packed, script_json
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.html import number, share, table
+from railfix.report.protection import NO_LEVELS
 from railfix.run import RunOptions, RunSummary, run_files
 from report_page import Page, fetched
 
@@ -126,7 +127,8 @@ def test_the_head_tells_what_was_run(document: str, folder: Path) -> None:
         assert entry["sha256"] in document
     assert record["versions"]["numpy"] in document
     assert '<th scope="row">raim.false_alarm</th><td>0.01</td><td>0.01</td>' in document
-    assert document.count("<tr class=asked>") == 2
+    settings = document.split("<summary>Settings asked for and used")[1].split("</details>")[0]
+    assert settings.count("<tr class=asked>") == 2
     facts = record["antennas"]["front"]
     for reason, count in facts["observations_refused_by_first_reason"].items():
         assert f'<th scope="row">  {reason}</th><td class="n">{count:,}</td>' in document
@@ -154,6 +156,84 @@ def test_nothing_is_fetched_and_nothing_unescaped(document: str, page: Page) -> 
     assert STRANGE not in document
     assert "a&lt;b&gt;&amp;" in document
     assert "b" not in {tag for tag, _ in page.elements}
+
+
+@pytest.mark.requirement("C4")
+def test_the_protection_level_has_its_section(document: str, page: Page, folder: Path) -> None:
+    names = [figure["data-name"] for figure in page.figures]
+    assert names.count("stanford") == 4  # vouched for and all, of two antennas
+    assert names.count("levels") == names.count("levels-chainage") == 2
+    _, evaluation = read_runs([folder], [demo_truth()])
+    assert evaluation is not None
+    table = evaluation.integrity["separation"].stanford.filter(grouping="all", own_limit=True)
+    regions = ("nominal", "misleading", "hazardously_misleading", "unavailable", "unavailable_misleading")
+    order = [(antenna, levels_of) for antenna in ("front", "rear") for levels_of in ("vouched", "all")]
+    for at, (antenna, levels_of) in enumerate(order):
+        (row,) = table.filter(antenna=antenna, levels_of=levels_of).iter_rows(named=True)
+        values = chart(page, "stanford", at)
+        marks = next(layer for layer in values["layers"] if layer["kind"] == "marks")
+        counted = [int(words.split("\n")[-1].replace(",", "")) for words in marks["words"]]
+        assert counted == [row[name] for name in regions]
+        cells = next(layer for layer in values["layers"] if layer["kind"] == "cells")
+        assert unpacked(cells["n"]).sum() == row["judged"]
+        assert f'<td>{levels_of}</td><td class="n">20 (own)</td><td class="n">{row["epochs"]:,}</td>' in document
+    told = json.loads((folder / "run.json").read_text(encoding="utf-8"))["protection"]
+    assert f"<td>{told['risk_per_hour']:.4g}</td>" in document
+    assert f"<td>{told['k_of_whole_risk']:.4g} sigma, two-sided</td>" in document
+    assert told["sigmas"].split("'")[0] in document
+
+
+@pytest.mark.requirement("C4")
+def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "run"
+    shutil.copytree(folder, mine)
+    positions = pl.read_parquet(mine / "positions.parquet").with_columns(protection_level_m=pl.lit(0.3))
+    positions.write_parquet(mine / "positions.parquet")
+    (mine / "positions.csv").unlink()
+    runs, evaluation = read_runs([mine], [demo_truth()])
+    document = report_page(runs, evaluation)
+    truth = pl.read_csv(demo_truth(), schema_overrides={"time_gpst": pl.Datetime("ns")})
+    rows = positions.with_columns(pl.col("antenna").cast(pl.String)).join(
+        truth.select("time_gpst", "antenna", true_m="chainage_m"), on=["time_gpst", "antenna"]
+    )
+    over = rows.filter((pl.col("chainage_m") - pl.col("true_m")).abs() > 0.3)
+    vouched = over.filter(
+        pl.col("status").cast(pl.String) == "ok", pl.col("protection_status").cast(pl.String) != "alarm"
+    )
+    assert len(over) > 20
+    assert f"Errors over their level: {len(over):,}, of them {len(vouched):,} vouched for; the 20 furthest" in document
+    listed = document.split("Errors over their level")[1].split("</table>")[0]
+    assert listed.count("<tr>") == 1 + 20
+    worst = over.select(size=(pl.col("chainage_m") - pl.col("true_m")).abs()).max().item()
+    assert f"{worst:.2f}</td>" in listed.split("<tr>")[2]
+
+
+@pytest.mark.requirement("C4")
+def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_path: Path) -> None:
+    runs, _ = read_runs([folder])
+    document = report_page(runs, None)
+    names = [figure["data-name"] for figure in Page(document).figures]
+    assert names.count("levels") == names.count("levels-chainage") == 2
+    assert "stanford" not in names
+    positions = pl.read_parquet(folder / "positions.parquet").filter(pl.col("antenna").cast(pl.String) == "front")
+    within = positions.filter(
+        pl.col("status").cast(pl.String) == "ok",
+        pl.col("protection_status").cast(pl.String) != "alarm",
+        pl.col("protection_level_m") <= 20.0,
+    )
+    section = document.split("<h3>Protection level</h3>")[1].split("<h3>")[0]
+    row = next(line for line in section.split("<tr>") if "front" in line and "vouched" in line and ">20<" in line)
+    assert f"{100 * len(within) / len(positions):.2f} %" in row
+    shutil.copy(folder / "run.json", tmp_path)
+    record = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))
+    record["protection"] = {}
+    (tmp_path / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    columns = [name for name in positions.columns if name.startswith("protection_")]
+    positions.drop(columns, "raim_level_m").write_parquet(tmp_path / "positions.parquet")
+    runs, evaluation = read_runs([tmp_path], [demo_truth()])
+    bare = report_page(runs, evaluation)
+    assert NO_LEVELS in bare
+    assert not {"levels", "stanford"} & {figure["data-name"] for figure in Page(bare).figures}
 
 
 def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:
@@ -303,7 +383,10 @@ def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> Non
     assert result.exit_code == 0, result.output
     last = result.output.strip().splitlines()[-1]
     assert last.endswith("report.html")
-    assert "conventional" in result.output
+    assert result.output.count("conventional") >= 2
+    assert result.output.count("on the map, ok") == 2
+    assert result.output.count("protection level (separation), ") == 2
+    assert "within the alarm limit of 20 m at" in result.output
     written = sorted(path.name for path in (tmp_path / "demo").iterdir())
     assert written == ["observations.parquet", "positions.csv", "positions.parquet", "report.html", "run.json"]
     names = [figure["data-name"] for figure in Page((tmp_path / "demo" / "report.html").read_text()).figures]

@@ -13,7 +13,8 @@ import polars as pl
 import pytest
 
 from railfix.demonstration import demo_inputs, demo_truth
-from railfix.report import write_report
+from railfix.evaluate import EvaluationOptions, RunAndReference, evaluate_runs
+from railfix.report import read_runs, report_page, write_report
 from railfix.run import RunOptions, run_files
 from report_page import Page, browser, opened, run_browser, timing_ms
 
@@ -73,6 +74,21 @@ EXERCISE = """
 })();
 </script></body>"""
 
+#: Opens what is folded and says which tables are wider than the page.
+WIDE = """
+<script>
+(function () {
+  for (const folded of document.querySelectorAll("details")) folded.open = true;
+  const said = document.createElement("div"), boxes = [...document.querySelectorAll(".scroll")];
+  said.id = "wide";
+  said.dataset.tables = boxes.length;
+  said.dataset.window = window.innerWidth;
+  said.dataset.over = boxes.filter(box => box.scrollWidth > box.clientWidth)
+    .map(box => box.scrollWidth + " " + box.textContent.slice(0, 40)).join("; ");
+  document.body.append(said);
+})();
+</script></body>"""
+
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -119,6 +135,26 @@ def test_pictures_can_be_pointed_at_enlarged_and_clicked(page: Path, tmp_path: P
     assert int(said["data-zooms"]) == len(charts)
     # the first click on each antenna's sky leaves its first epoch, later ones may meet the one that is shown
     assert 2 <= int(said["data-skies"]) <= len(linked)
+
+
+@pytest.mark.slow
+def test_tables_fit_a_window_of_1300_pixels(tmp_path: Path) -> None:
+    """With limits of confidence, and the names of demo and antennas; nothing has to be scrolled sideways."""
+    out = tmp_path / "run"
+    run_files(demo_inputs(), out=out)
+    runs, _ = read_runs([out])
+    with_limits = EvaluationOptions(block_s=20.0)
+    evaluation = evaluate_runs([RunAndReference(run=out, reference=demo_truth())], options=with_limits)
+    document = report_page(runs, evaluation)
+    assert "95 % limits" in document
+    assert "% to 100.0 %]" in document
+    page = tmp_path / "wide.html"
+    page.write_text(document.replace("</body>", WIDE), encoding="utf-8")
+    read = Page(run_browser(page, "--window-size=1300,1000", "--dump-dom"))
+    said = read.by_id("wide")
+    assert int(said["data-tables"]) > 10
+    assert said["data-over"] == ""
+    assert said["data-window"] == "1300"
 
 
 def test_an_error_of_the_script_would_be_seen(page: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Final
 from railfix.plots.chart import Chart, SkyEpochs
 from railfix.plots.draw import draw_chart, draw_figure, draw_sky, drawn
 from railfix.plots.errors import error_over_chainage, error_over_time, error_ranges
-from railfix.plots.levels import levels_over_time, stanford
+from railfix.plots.levels import levels_over_chainage, levels_over_time, stanford
 from railfix.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
 from railfix.plots.run_screens import draw_run_screens, screens_of
 from railfix.plots.screens import draw_cn0_curve, draw_screen, screen_over_chainage, screen_over_time
@@ -25,6 +25,7 @@ plot_error_over_chainage: Final = drawn(error_over_chainage)
 plot_error_ranges: Final = drawn(error_ranges)
 plot_stanford: Final = drawn(stanford)
 plot_levels_over_time: Final = drawn(levels_over_time)
+plot_levels_over_chainage: Final = drawn(levels_over_chainage)
 plot_interval_over_chainage: Final = drawn(interval_over_chainage)
 plot_interval_distribution: Final = drawn(interval_distribution)
 plot_satellites_over_time: Final = drawn(satellites_over_time)
@@ -47,6 +48,7 @@ __all__ = [
     "error_ranges",
     "interval_distribution",
     "interval_over_chainage",
+    "levels_over_chainage",
     "levels_over_time",
     "plan",
     "plot_error_over_chainage",
@@ -54,6 +56,7 @@ __all__ = [
     "plot_error_ranges",
     "plot_interval_distribution",
     "plot_interval_over_chainage",
+    "plot_levels_over_chainage",
     "plot_levels_over_time",
     "plot_plan",
     "plot_processing_time",

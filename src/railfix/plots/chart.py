@@ -149,13 +149,26 @@ class Ranges:
 
 @dataclass(frozen=True, kw_only=True)
 class Marks:
-    """Words at places."""
+    """Words at places.
+
+    Attributes
+    ----------
+    label : str
+        Blank: not in the legend.
+    colour : str
+    x, y : ndarray, shape (P,)
+    words : tuple of str
+        Lines apart by line feeds.
+    place : {"beside", "on"}
+        Beside a cross at the place; or the middle of the words on it, without a cross.
+    """
 
     label: str
     colour: str
     x: Floats
     y: Floats
     words: tuple[str, ...]
+    place: Literal["beside", "on"] = "beside"
 
     def __post_init__(self) -> None:
         _same_length(self.label, self.x, self.y, np.array(self.words))

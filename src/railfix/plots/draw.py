@@ -219,6 +219,11 @@ def _ranges(layer: Ranges, axes: Axes) -> None:
 
 
 def _marks(layer: Marks, axes: Axes) -> None:
+    if layer.place == "on":
+        ground = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
+        for x, y, word in zip(layer.x, layer.y, layer.words, strict=True):
+            axes.text(x, y, word, ha="center", va="center", fontsize=8, color=layer.colour, bbox=ground)
+        return
     axes.plot(layer.x, layer.y, "+", color=layer.colour, ms=7)
     for x, y, word in zip(layer.x, layer.y, layer.words, strict=True):
         axes.annotate(word, (x, y), textcoords="offset points", xytext=(4, 4), fontsize=8, color=layer.colour)

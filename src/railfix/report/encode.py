@@ -109,6 +109,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
             values |= {name: packed(getattr(layer, name)) for name in ("low", "mid", "high")}
         case Marks():
             values |= {"kind": "marks", "x": packed(layer.x), "y": packed(layer.y), "words": list(layer.words)}
+            values["place"] = layer.place
     return values
 
 

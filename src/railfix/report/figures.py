@@ -10,17 +10,19 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from railfix.evaluate import EvaluationOptions
+from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram
 from railfix.plots.chart import Chart, SkyEpochs
 from railfix.plots.columns import floats, start_of
-from railfix.plots.errors import error_over_chainage, error_over_time, good_errors, level_columns
-from railfix.plots.levels import levels_over_time, stanford
+from railfix.plots.errors import error_over_chainage, error_over_time, good_errors
+from railfix.plots.levels import levels_over_chainage, levels_over_time, stanford
 from railfix.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
 from railfix.plots.run_screens import screens_of
 from railfix.plots.screens import screen_over_chainage, screen_over_time
 from railfix.plots.signals import SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.plots.timing import processing_time
+from railfix.report.protection import NO_LEVELS
 from railfix.report.runs import ReportedRun
-from railfix.stanford import stanford as sorted_epochs
 
 #: Largest errors whose epochs are surely among those of the sky.
 _WORST: Final = 200
@@ -74,13 +76,16 @@ def antenna_groups(run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS) -> 
     along = None if errors is None else _aligned(positions, errors)
     yield Group(title="The line", charts=_kept(plan(positions, error_m=along)), start=start)
     if errors is not None:
-        charts = (error_over_time(errors), error_over_chainage(errors), *_stanford(run, errors))
-        yield Group(title="Errors", charts=_kept(*charts), start=start_of(errors))
+        over = _kept(error_over_time(errors), error_over_chainage(errors))
+        yield Group(title="Errors", charts=over, start=start_of(errors))
     else:
         yield Group(title="Errors", charts=(), start=start, absent=(NO_REFERENCE,))
-    levels = _kept(levels_over_time(positions, run.config.alarm_limit_m))
-    absent = () if levels else ("The run worked out no protection levels, so there is no picture of them.",)
-    yield Group(title="Protection levels", charts=levels, start=start, absent=absent)
+    limit = run.folder.alarm_limit_m or run.config.alarm_limit_m
+    levels = _kept(levels_over_time(positions, limit), levels_over_chainage(positions, limit))
+    if levels and errors is not None:
+        levels = _kept(*_stanford(run, errors, limit)) + levels
+    absent = () if levels else (NO_LEVELS,)
+    yield Group(title="Protection level", charts=levels, start=start, absent=absent)
     table = positions if errors is None else errors
     charts = (interval_over_chainage(table), interval_distribution(table), satellites_over_time(positions))
     yield Group(title="Positioning interval and satellites", charts=_kept(*charts), start=start)
@@ -129,12 +134,14 @@ def _kept(*charts: Chart) -> tuple[Chart, ...]:
     return tuple(chart for chart in charts if not chart.empty)
 
 
-def _stanford(run: ReportedRun, errors: pl.DataFrame) -> Iterator[Chart]:
-    for column in level_columns(errors):
-        time = errors["time_gpst"].to_numpy()
-        error, level = good_errors(errors, "error_m"), floats(errors, column)
-        diagram = sorted_epochs(time, error, level, alarm_limit_m=run.config.alarm_limit_m)
-        yield stanford(diagram, title=f"Stanford diagram: {column.removesuffix('_m').replace('_', ' ')}")
+def _stanford(run: ReportedRun, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
+    """The diagram of the levels that the run vouched for, and of all."""
+    kind = run.folder.level_kind
+    if kind is None:
+        return
+    for levels_of, words in zip(LEVELS_OF, ("levels vouched for", "levels alone"), strict=True):
+        diagram = epochs_diagram(errors, kind, alarm_limit_m=limit_m, levels_of=levels_of, options=EvaluationOptions())
+        yield stanford(diagram, title=f"Stanford diagram, {words} ({kind})")
 
 
 def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> NDArray[np.float64]:

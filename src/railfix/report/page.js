@@ -397,6 +397,7 @@
       return n;
     },
     marks(pen, box, layer) {
+      if (layer.place === "on") return wordsOn(pen, box, layer);
       pen.strokeStyle = pen.fillStyle = layer.colour;
       pen.lineWidth = 1.5;
       pen.textAlign = "left";
@@ -416,6 +417,24 @@
       return layer.x.length;
     }
   };
+
+  function wordsOn(pen, box, layer) {
+    pen.textAlign = "center";
+    pen.textBaseline = "middle";
+    pen.lineJoin = "round";
+    pen.fillStyle = layer.colour;
+    pen.strokeStyle = "#ffffffd9";
+    pen.lineWidth = 4;
+    for (let i = 0; i < layer.x.length; i++) {
+      const lines = layer.words[i].split("\n"), x = box.px(layer.x[i]), y = box.py(layer.y[i]);
+      lines.forEach((line, k) => {
+        const down = y + 14 * (k - (lines.length - 1) / 2);
+        pen.strokeText(line, x, down);
+        pen.fillText(line, x, down);
+      });
+    }
+    return layer.x.length;
+  }
 
   // ---- tips, zoom, choice of an epoch
   Plot.prototype.near = function (x, y) {

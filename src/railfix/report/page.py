@@ -20,6 +20,7 @@ from railfix.report import tables
 from railfix.report.encode import chart_values, script_json, sky_values
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, run_group
 from railfix.report.html import absent, text
+from railfix.report.protection import protection
 from railfix.report.runs import ReportedRun, read_runs
 
 #: Epochs of the sky that every antenna has.
@@ -152,6 +153,7 @@ def _run(run: ReportedRun, evaluation: Evaluation | None, k: int, numbers: Itera
     parts += ["<h3>What became of epochs and pseudoranges</h3>", tables.budget(run)]
     if evaluation is not None:
         parts += ["<h3>Figures of merit</h3>", tables.merits(run, evaluation)]
+    parts += ["<h3>Protection level</h3>", protection(run, evaluation)]
     parts.append(_group(run_group(run), numbers, ""))
     for i, antenna in enumerate(run.folder.antennas):
         parts.append(f'<h2 id="run{k}-{i}">{text(run.name)}: {text(antenna)} antenna</h2>')

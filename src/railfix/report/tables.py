@@ -51,7 +51,7 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> str:
 
 
 def _figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
-    name = _name_in(evaluation, run)
+    name = name_in(evaluation, run)
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all",
         pl.col("epochs_of") == "own",
@@ -62,7 +62,8 @@ def _figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: s
     return rows.row(0, named=True) if len(rows) == 1 else {}
 
 
-def _name_in(evaluation: Evaluation, run: ReportedRun) -> str:
+def name_in(evaluation: Evaluation, run: ReportedRun) -> str:
+    """Name that the evaluation gave a run."""
     return next(r.name for r in evaluation.runs if r.path.resolve() == run.folder.path.resolve())
 
 
@@ -176,12 +177,12 @@ def budget(run: ReportedRun) -> str:
 
 
 def merits(run: ReportedRun, evaluation: Evaluation) -> str:
-    """Figures of merit, intervals and levels of one run, constrained beside conventional."""
-    name = _name_in(evaluation, run)
+    """Figures of merit and intervals of one run, constrained beside conventional."""
+    name = name_in(evaluation, run)
     figures = evaluation.figures.filter(pl.col("run") == name, pl.col("epochs_of") == "own")
     whole = figures.filter(pl.col("grouping") == "all")
     confidence = f"{100 * evaluation.options.confidence:g} %"
-    head = "antenna|position|errors|rate|mean|std|p50|p95|p99|largest|over 50 m|error / sigma, rms".split("|")
+    head = "antenna|position|errors|rate|mean|std|p50|p95|p99|largest|over 50 m|rms / sigma".split("|")
     parts = [
         table(
             head,
@@ -200,7 +201,6 @@ def merits(run: ReportedRun, evaluation: Evaluation) -> str:
             )
             parts.append(f"<details><summary>By {text(word)}</summary>{inside}</details>")
     parts.append(_intervals(evaluation, name))
-    parts.append(_levels(evaluation, name))
     return "\n".join(parts)
 
 
@@ -226,7 +226,7 @@ def _limits(low: float | None, high: float | None, *, per_cent: bool = False) ->
     if low is None or high is None:
         return ""
     ends = (share(low, 1), share(high, 1)) if per_cent else (number(low), number(high))
-    return f" [{ends[0]} to {ends[1]}]"
+    return f"\n[{ends[0]} to {ends[1]}]"
 
 
 def _intervals(evaluation: Evaluation, name: str) -> str:
@@ -250,7 +250,8 @@ def _intervals(evaluation: Evaluation, name: str) -> str:
     )
 
 
-def _levels(evaluation: Evaluation, name: str) -> str:
+def level_widths(evaluation: Evaluation, name: str) -> str:
+    """How wide the levels of a run are, and how many errors are larger."""
     if evaluation.levels is None:
         return ""
     rows = evaluation.levels.filter(pl.col("run") == name) if "run" in evaluation.levels.columns else evaluation.levels
