@@ -696,6 +696,14 @@ def test_levels_whose_kind_is_not_told(tmp_path: Path):
         found = evaluate_run(run, truth)
         assert list(found.integrity) == ["unknown"]
         assert any("does not tell what the protection levels rest on" in note for note in found.runs[0].notes)
+    positions = pl.read_parquet(run / "positions.parquet").with_columns(protection_kind=pl.lit("separation"))
+    positions.write_parquet(run / "positions.parquet")
+    (run / "run.json").write_text(json.dumps(record | {"protection": {}}))
+    assert list(evaluate_run(run, truth).integrity) == ["separation"]
+    (run / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputFileError, match="sbas and separation"):
+        evaluate_run(run, truth)
+    positions.drop("protection_kind").write_parquet(run / "positions.parquet")
     for wrong in (0.0, -1.0, "20", True):
         (run / "run.json").write_text(json.dumps(record | {"protection": {"kind": "sbas", "alarm_limit_m": wrong}}))
         with pytest.raises(InputFileError, match="alarm_limit_m"):

@@ -226,7 +226,7 @@ def _sorted(
     table: pl.DataFrame, error_m: Floats, level_m: Floats, alarm_limit_m: float, options: EvaluationOptions
 ) -> Stanford:
     return stanford(
-        table["time_gpst"].to_numpy(),
+        table["time_gpst"].to_numpy().astype("datetime64[ns]"),
         error_m,
         level_m,
         alarm_limit_m=alarm_limit_m,

@@ -82,7 +82,13 @@ class RunFolder:
 
     @property
     def level_kind(self) -> str | None:
-        """What the protection levels rest on in a word, `UNKNOWN_KIND` where the run does not tell; None without."""
+        """What the protection levels rest on in a word, `UNKNOWN_KIND` where the run does not tell; None without.
+
+        Raises
+        ------
+        InputFileError
+            Positions and record tell different kinds.
+        """
         level = "protection_level_m"
         if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
             return None if not self.protection else self._kind
@@ -90,8 +96,16 @@ class RunFolder:
 
     @property
     def _kind(self) -> str:
-        kind = self.protection.get("kind")
-        return str(kind) if kind in KINDS else UNKNOWN_KIND
+        told = {self.protection.get("kind")}
+        if "protection_kind" in self.positions.columns:
+            told |= set(self.positions["protection_kind"].cast(pl.String).unique())
+        known = [kind for kind in KINDS if kind in told]
+        if len(known) > 1:
+            raise InputFileError(
+                self.positions_path,
+                f"its protection_kind and that of run.json are both {' and '.join(known)}; expected one kind in a run",
+            )
+        return known[0] if known else UNKNOWN_KIND
 
     @property
     def alarm_limit_m(self) -> float | None:
