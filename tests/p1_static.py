@@ -23,13 +23,14 @@ from railfix.pipeline import EpochProcessor
 from railfix.reasons import Status
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
+from railfix.simulate.line_settings import Element, LineSettings
 from railfix.simulate.run import vehicle_toml
 from railfix.simulate.scenario import RunSettings, Station
 from railfix.simulate.scenario_file import load_recipe, whole_run_s
 from railfix.vehicle import antenna_trajectory, read_vehicle
 
 Floats = NDArray[np.float64]
-Place = Literal["houses", "open field"]
+Place = Literal["houses", "open field", "open field, a line without curves"]
 
 #: Starts of the standing experiments: the sky turns on between them.
 STARTS: Final = tuple(np.datetime64("2010-08-19T00:14:30", "ns") + np.timedelta64(4 * h, "h") for h in range(6))
@@ -83,6 +84,9 @@ def standing(start: np.datetime64, seed: int, place: Place, places: Sequence[flo
         stations=tuple(Station(at_m=float(m), dwell_s=STANDING_S) for m in places),
     )
     around = base.environment if place == "houses" else EnvironmentSettings()
+    if place == "open field, a line without curves":
+        straight = Element(kind="straight", length_m=756.0)
+        base = replace(base, line=LineSettings(kind="elements", elements=(straight,)))
     scenario = replace(base, start=start, seed=seed, rate_hz=1.0, run=run, sensors=None, environment=around)
     return replace(scenario, duration_s=whole_run_s(scenario))
 
@@ -184,6 +188,8 @@ def rows(name: str, found: Subsets) -> Iterator[str]:
     doubtful = (found.excess <= EXCESS) | (found.status != Status.OK)
     for number, word in [*enumerate(CLASSES), (-1, "everywhere")]:
         part = usable & (found.place == number if number >= 0 else True)
+        if not part.any():
+            continue
         wrong, rest = found.wrong[part], ~doubtful[part]
         size = np.abs(found.error_m[part])
         turn = np.median(found.turn_deg[part][wrong]) if wrong.any() else np.nan

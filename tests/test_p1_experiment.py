@@ -1,0 +1,139 @@
+"""P1's experiments on simulated lines print what docs/p1-results.md shows, and hold what it says."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import p1_experiment
+import p1_static
+from conftest import ROOT
+from p1_experiment import against_distance_run
+from p1_ride import Bench, Found, Passage, Way, intervals_m, ridden
+from p1_static import STARTS, Subsets, joined, subsets
+from railfix.reasons import Status
+from test_p4_experiment import assert_same
+
+DOCUMENT = ROOT / "docs" / "p1-results.md"
+
+
+def shown(part: str) -> list[str]:
+    """The block of the document under the command of a part."""
+    pattern = rf"^\$ python tests/p1_experiment\.py {part}\n(.*?)^```$"
+    (block,) = re.findall(pattern, DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    return block.rstrip().splitlines()
+
+
+def printed(part: str, folder: Path) -> list[str]:
+    return "\n".join(p1_experiment.report(part, folder)).rstrip().splitlines()
+
+
+@pytest.mark.requirement("D2")
+def test_the_first_minutes_are_as_the_document_shows(tmp_path: Path) -> None:
+    assert_same(printed("short", tmp_path), shown("short"))
+
+
+@pytest.mark.slow
+@pytest.mark.requirement("D2")
+@pytest.mark.requirement("D4")
+@pytest.mark.parametrize("part", ["commercial", "others", "test-line"])
+def test_a_whole_part_is_as_the_document_shows(part: str, tmp_path: Path) -> None:
+    assert_same(printed(part, tmp_path), shown(part))
+
+
+@pytest.mark.slow
+@pytest.mark.requirement("A3")
+def test_the_standing_experiments_are_as_the_document_shows(tmp_path: Path) -> None:
+    assert_same(printed("static", tmp_path), shown("static"))
+
+
+@pytest.mark.requirement("D2")
+def test_strict_is_what_the_preset_makes_of_it() -> None:
+    """The limit of the own sigma put upon the results of "default, drop" is the preset "strict"."""
+    scenario = p1_experiment.short_scenario()
+    ways = (p1_experiment.WAYS[5], Way("preset", {"preset": "strict"}))
+    campaign = ridden(Bench(scenario, "short", ways, ("GJ",), None))
+    for one, two in zip(campaign.found["GJ", "strict"], campaign.found["GJ", "preset"], strict=True):
+        assert np.isfinite(one.error_m).sum() > 500
+        np.testing.assert_array_equal(one.error_m, two.error_m)
+
+
+def straight_run(error_m: np.ndarray, speed_mps: np.ndarray) -> tuple[Passage, Found]:
+    """A train that runs an epoch a second, with positions of these errors."""
+    count = len(error_m)
+    passage = Passage(
+        run="",
+        antenna="front",
+        time=np.arange(count).astype("datetime64[ns]"),
+        chainage_m=1000.0 + np.cumsum(speed_mps),
+        speed_mps=speed_mps,
+        environment=np.full(count, "open"),
+        observed=np.ones(count, dtype=bool),
+        ecef_m=np.zeros((count, 3)),
+    )
+    found = Found(
+        error_m=error_m,
+        before_checks_m=error_m,
+        status=np.full(count, Status.OK, dtype=np.int8),
+        n_used=np.full(count, 5),
+        own_sigma_m=np.ones(count),
+        horizontal_m=np.abs(error_m),
+    )
+    return passage, found
+
+
+@pytest.mark.requirement("D2")
+def test_the_distance_run_finds_what_jumps_and_is_not_misled_by_standing() -> None:
+    speed = np.full(200, 2.0)
+    speed[120:160] = 0.0
+    error = np.zeros(200)
+    error[30] = 8.0  # before there is anything to compare with
+    error[100] = 8.0
+    error[120:160] = 6.0  # the whole stop, longer than one would wait
+    passage, found = straight_run(error, speed)
+    before = error.copy()
+    before[110] = 1.0
+    error[110] = np.nan
+    status = found.status.copy()
+    status[110] = Status.ANTENNAS_DISAGREE
+    found = replace(found, error_m=error, before_checks_m=before, status=status)
+    checked = against_distance_run(passage, found, back_m=3.0)
+    gone = np.flatnonzero(np.isnan(checked.error_m))
+    np.testing.assert_array_equal(gone, [100, *range(120, 160)])
+    assert checked.error_m[110] == 1.0
+    assert checked.error_m[30] == 8.0
+    assert np.isnan(against_distance_run(passage, found, back_m=0.0).error_m[110])
+
+
+@pytest.mark.requirement("D2")
+def test_intervals_are_the_way_between_positions() -> None:
+    error = np.array([0.1, np.nan, 0.2, 0.3, 0.3, np.nan, 0.1])
+    passage, found = straight_run(error, np.array([2.0, 2.0, 2.0, 2.0, 0.0, 2.0, 2.0]))
+    np.testing.assert_array_equal(intervals_m(passage, found, np.ones(7, dtype=bool)), [4.0, 2.0, 4.0])
+    inside = np.array([True, True, True, False, False, True, True])
+    np.testing.assert_array_equal(intervals_m(passage, found, inside), [4.0])
+
+
+@pytest.mark.requirement("A3")
+@pytest.mark.requirement("A4")
+def test_two_satellites_mistake_the_section_and_three_hardly_do() -> None:
+    """P1 3.2: with two satellites the search errs where the line turns; what noise explains is told."""
+    places = tuple(float(m) for m in range(96, 300, 24))
+
+    def found(size: int) -> Subsets:
+        return joined([subsets(start, 100 + k, size, "open field", places) for k, start in enumerate(STARTS[:2])])
+
+    two, three = found(2), found(3)
+    for one in (two, three):
+        usable = one.dilution <= p1_static.DILUTION
+        doubtful = one.excess <= p1_static.EXCESS
+        assert usable.sum() > 500
+        assert (doubtful | ~one.wrong)[usable].mean() > 0.999
+    curve = two.place == 3
+    assert two.wrong[curve & (two.dilution <= p1_static.DILUTION)].mean() > 0.01
+    assert np.median(two.turn_deg[two.wrong]) > 10.0
+    assert three.wrong.mean() < 0.2 * two.wrong.mean()
