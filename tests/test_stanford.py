@@ -129,3 +129,11 @@ def test_refusals():
         stanford(time, np.zeros(3), -np.ones(3), alarm_limit_m=20.0)
     with pytest.raises(ValueError, match="positive"):
         stanford(time, np.zeros(3), np.ones(3), alarm_limit_m=0.0)
+
+
+def test_the_unit_of_the_times_changes_nothing() -> None:
+    time = np.datetime64("2024-01-01T00:00:00") + np.arange(100) * np.timedelta64(1, "s")
+    fine = time.astype("datetime64[ns]")
+    one, other = (stanford(t, np.zeros(100), np.ones(100), alarm_limit_m=5.0) for t in (time, fine))
+    assert one.continuity == other.continuity
+    assert one.continuity[0].kept > 0

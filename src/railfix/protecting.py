@@ -35,7 +35,7 @@ def level_facts(config: Config) -> dict[str, Any]:
     if config.protection == "off":
         return {}
     risk = risk_of(config)
-    sigmas = "noise settings times the receiver's estimated scale: no promise about tails"
+    sigmas = "noise settings times the receiver's estimated scale, 1 at least: no promise about tails"
     return {
         "kind": kind_of(config),
         "sigmas": sigmas if config.error_model is None else str(config.error_model),

@@ -135,7 +135,7 @@ def stanford(
 
     Parameters
     ----------
-    time : ndarray of datetime64[ns], shape (T,)
+    time : ndarray of datetime64, shape (T,)
         Ascending; every epoch of the run, with a position or without.
     error_m : array_like, shape (T,) [m]
         Along the track, signed or not; NaN where there is no position or no reference.
@@ -161,6 +161,7 @@ def stanford(
     ValueError
         On arrays of different lengths, times that do not ascend, a negative level, limits that are not positive.
     """
+    time = time.astype("datetime64[ns]")
     error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
     if not len(time) == len(error) == len(level):
         raise ValueError(f"one time, error and level an epoch: got {len(time)}, {len(error)} and {len(level)}")
