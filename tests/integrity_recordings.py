@@ -20,12 +20,13 @@ import recordings_ablate
 import recordings_score
 from conftest import ROOT
 from railfix.antenna import Trajectory
-from railfix.clock_elimination import ClockTies, Ranges, clock_groups
+from railfix.clock_elimination import ClockTies, Ranges, clock_groups, fit
 from railfix.config import Config, parse_config
+from railfix.constrained import constrained_position
 from railfix.epochs import Observations
 from railfix.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
 from railfix.evaluate import along_track_error, interpolate_reference
-from railfix.geodesy import range_with_rotation
+from railfix.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.navigation import Navigation
 from railfix.pipeline import AntennaResult, EpochProcessor
 from railfix.preparation import SOMEWHERE_ABOVE_M
@@ -42,14 +43,15 @@ from railfix.stanford import Region, Stanford, stanford
 
 MASK: Final = {"elevation": {"mask_deg": 15.0}}
 ALARM_LIMITS_M: Final = (10.0, 20.0, 40.0)
-#: Weights by their name: none (noise settings times the estimated scale), or the runs that an error model is made from.
+#: Weights by their name: none (noise settings times the estimated scale, 1 at least in the level), or the runs that
+#: an error model is made from.
 #: "base" is Japan with its reference station: what is local of a geodetic receiver under open sky. "half" is the
 #: recording's own first half; the second one is judged. "no C/N0" is of one bin: these logs
-#: do not have any. "scale": as none, but the sigmas of the level are never scaled down.
+#: do not have any. "scale": as none, but the sigmas of the level scaled down as well.
 MODELS: Final = {
     "urbannav_f9p": {
         "none": (),
-        "none, scale at least 1": ("scale",),
+        "none, scale as estimated": ("scale",),
         "other receiver, same car": ("urbannav_m8t",),
         "other cities": ("gsdc", "japan"),
         "all others": ("urbannav_m8t", "gsdc", "japan"),
@@ -58,7 +60,7 @@ MODELS: Final = {
     },
     "urbannav_m8t": {
         "none": (),
-        "none, scale at least 1": ("scale",),
+        "none, scale as estimated": ("scale",),
         "other receiver, same car": ("urbannav_f9p",),
         "other cities": ("gsdc", "japan"),
         "all others": ("urbannav_f9p", "gsdc", "japan"),
@@ -67,21 +69,21 @@ MODELS: Final = {
     },
     "gsdc": {
         "none": (),
-        "none, scale at least 1": ("scale",),
+        "none, scale as estimated": ("scale",),
         "all others": ("urbannav_f9p", "urbannav_m8t", "japan"),
         "own first half": ("half",),
         "open sky, base": ("base",),
     },
     "japan": {
         "none": (),
-        "none, scale at least 1": ("scale",),
+        "none, scale as estimated": ("scale",),
         "all others": ("urbannav_f9p", "urbannav_m8t", "gsdc"),
         "own first half": ("half",),
         "own first half, base": ("half", "base"),
     },
     "geonet2005": {
         "none": (),
-        "none, scale at least 1": ("scale",),
+        "none, scale as estimated": ("scale",),
         "open sky, base": ("base",),
         "same, no C/N0": ("base", "no C/N0"),
         "all others, no C/N0": ("urbannav_f9p", "urbannav_m8t", "gsdc", "japan", "no C/N0"),
@@ -117,6 +119,7 @@ class Judged:
     trajectory: Trajectory
     reference: AntennaReference
     observed: np.ndarray  # epochs with observations inside the reference
+    place_ecef_m: np.ndarray  # (T, 3) of the reference
     error_m: np.ndarray
     range_error_m: np.ndarray  # (T, K) of `range_errors`
     from_ranges_m: np.ndarray  # along the line, by the errors of the ranges used
@@ -158,6 +161,7 @@ class Over:
     used: int
     explained_m: float
     why: str
+    where: str
     ranges: str = field(repr=False)
 
 
@@ -196,8 +200,8 @@ def write_model(data: Path, folder: Path, target: str, sources: tuple[str, ...])
         )
         for name in runs
     ]
-    fit = ErrorModelFit(bins=ErrorBins(cn0_dbhz=(0.0, 60.0))) if "no C/N0" in words else None
-    model, _ = error_model_from_runs(inputs, fit=fit)
+    of_bins = ErrorModelFit(bins=ErrorBins(cn0_dbhz=(0.0, 60.0))) if "no C/N0" in words else None
+    model, _ = error_model_from_runs(inputs, fit=of_bins)
     write_error_model(model, path)
     return path
 
@@ -247,13 +251,13 @@ def recordings_of(data: Path, folder: Path, name: str) -> list[Recording]:
 
 
 def judged(
-    one: Recording, model: str, file: Path | None, *, since: np.datetime64 | None = None, least_scale: float = 0.0
+    one: Recording, model: str, file: Path | None, *, since: np.datetime64 | None = None, least_scale: float = 1.0
 ) -> Judged:
     """Positions weighted by a model, levels, errors of positions and of ranges; judged from an epoch on."""
     config = parse_config({**MASK, **({} if file is None else {"error_model": str(file)})})
     processor = EpochProcessor(config, one.navigation, {"front": one.trajectory})
     result = processor.process({"front": one.observations})[0].antennas["front"]
-    if least_scale > 0.0:
+    if least_scale < 1.0:
         level = _with_scale(one, result, config, np.maximum(result.noise_scale, least_scale))
         result = replace(result, protection=replace(result.protection, level=level))
     place = interpolate_reference(result.time, one.reference.time, one.reference.ecef_m)
@@ -284,6 +288,7 @@ def judged(
         trajectory=one.trajectory,
         reference=one.reference,
         observed=observed,
+        place_ecef_m=place,
         error_m=error,
         range_error_m=by_range,
         from_ranges_m=np.where(used, share * misfit, 0.0).sum(axis=1),
@@ -315,11 +320,12 @@ def _with_scale(one: Recording, result: AntennaResult, config: Config, scale: np
     )
 
 
-def ranges_of(result: AntennaResult) -> Ranges:
-    """The ranges that the positions were solved with in the end, from what the result tells."""
+def ranges_of(result: AntennaResult, reasons: int = -1) -> Ranges:
+    """The ranges that the positions were solved with in the end, from what the result tells; or those besides that
+    have no other reason than the ones masked out."""
     columns = result.columns
     sigma, code = result.sigma_m[:, columns], result.corrected_code_m[:, columns]
-    used = (result.reason[:, columns] == 0) & np.isfinite(sigma) & np.isfinite(code)
+    used = ((result.reason[:, columns] & reasons) == 0) & np.isfinite(sigma) & np.isfinite(code)
     return Ranges(
         sat_ecef_m=np.where(used[..., None], result.satellites.position_ecef_m, SOMEWHERE_ABOVE_M),
         code_m=np.where(used, code, 0.0),
@@ -370,6 +376,7 @@ def over_level(one: Judged, level_m: np.ndarray | None = None) -> list[Over]:
                 used=int(result.n_used[t]),
                 explained_m=float(one.from_ranges_m[t]),
                 why=_why(one, int(t)),
+                where=_where(one, int(t)),
                 ranges=_ranges_text(one, int(t)),
             )
         )
@@ -385,6 +392,25 @@ def _why(one: Judged, t: int) -> str:
     if off.sum() > 2:
         return f"{what}, {off.sum()} of {one.result.n_used[t]} ranges off"
     return f"{what}, {'each range within its model' if not off.any() else 'one or two ranges off'}"
+
+
+def _where(one: Judged, t: int) -> str:
+    """How far the place found is from the true one, and what the ranges say without those that are off."""
+    result, line = one.result, one.trajectory
+    true_arc, _ = line.nearest(one.place_ecef_m[t : t + 1])
+    sections = [int(line.segment_at(arc)[0][0]) for arc in (result.arc_m[t : t + 1], true_arc)]
+    turned = float(line.tangent[sections[0]] @ line.tangent[sections[1]])
+    straight = float(np.linalg.norm(line.at_arc(result.arc_m[t : t + 1])[0] - one.place_ecef_m[t]))
+    ranges = ranges_of(result, ~int(Reason.FAULT_EXCLUDED)).take(np.array([t]))
+    ranges = replace(ranges, weight=np.where(one.outside[t] > OUTSIDE, 0.0, ranges.weight))
+    best = int(np.argmin(fit(ranges.take(np.zeros(len(line.ecef_m), dtype=np.intp)), line.ecef_m)))
+    other = constrained_position(ranges, line, np.array([best]))
+    again = float(np.linalg.norm(line.at_arc(other.arc_m)[0] - one.place_ecef_m[t]))
+    return (
+        f"found {straight:.0f} m away in a straight line, {abs(float(result.arc_m[t] - true_arc[0])):.0f} m along it, "
+        f"cosine of the directions {turned:+.2f}, own sigma {result.own_sigma_m[t]:.0f} m; "
+        f"best fit without those off: {again:.0f} m away"
+    )
 
 
 def _in_gap(known: np.ndarray, time: np.datetime64) -> bool:
@@ -513,6 +539,7 @@ def reasons(groups: list[Group]) -> list[str]:
                 f"(no fault {free:.1f}, one {first:.1f}, two {second:.1f}) {over.status}, {over.used} used, "
                 f"by the ranges {over.explained_m:+.1f}: {over.why}"
             )
+            rows.append(f"    {over.where}")
             rows += [f"    {words}" for words in over.ranges.split("; ")]
     return rows or ["no error is over its level"]
 
@@ -528,6 +555,34 @@ def held_by_hypotheses(groups: list[Group]) -> list[str]:
         if counts:
             rows.append(f"{_name(group)} {'; '.join(f'{number} x {why}' for why, number in counts.most_common())}")
     return rows
+
+
+def constant_parts(groups: list[Group]) -> list[str]:
+    """What one shift of all positions, the same the whole time, explains of the errors along the line."""
+    rows = [
+        f"{'recording':14s} {'error model':25s} shift east north [m]  rms of errors, left without it [m]  scale 50 %"
+    ]
+    for group in groups:
+        if len(group) > 1 or group[0].model != "none":
+            continue
+        (one,) = group
+        at = np.flatnonzero(np.isfinite(one.error_m) & (np.abs(one.error_m) < 50.0))
+        latitude, longitude, _ = geodetic_from_ecef(one.place_ecef_m[at[0]])
+        level = one.trajectory.tangent[one.result.constrained.section[at]] @ enu_axes(latitude, longitude)[:2].T
+        shift, *_ = np.linalg.lstsq(level, one.error_m[at], rcond=None)
+        left = one.error_m[at] - level @ shift
+        rows.append(
+            f"{_name(group)} {shift[0]:10.2f} {shift[1]:5.2f} {np.sqrt(np.mean(one.error_m[at] ** 2)):15.2f} "
+            f"{np.sqrt(np.mean(left**2)):10.2f} {np.median(one.result.noise_scale[at]):18.2f}"
+        )
+    return rows
+
+
+def total(groups: list[Group]) -> list[str]:
+    """All of them together."""
+    both = [np.isfinite(one.level_m) & np.isfinite(one.error_m) for group in groups for one in group]
+    over = sum(len(over_level(one)) for group in groups for one in group)
+    return [f"{sum(int(b.sum()) for b in both)} levels with an error, {over} of them passed by it"]
 
 
 def _joined(group: Group, name: str) -> np.ndarray:
@@ -568,7 +623,7 @@ def everything(data: Path, folder: Path, names: list[str]) -> list[Group]:
         for model, sources in MODELS[name].items():
             file = write_model(data, folder, name, sources) if sources and sources != ("scale",) else None
             since = middle_of(recordings[0].observations) if "half" in sources else None
-            least = 1.0 if sources == ("scale",) else 0.0
+            least = 0.0 if sources == ("scale",) else 1.0
             found.append([judged(one, model, file, since=since, least_scale=least) for one in recordings])
     return found
 
@@ -584,7 +639,7 @@ def main() -> int:
         print(f"the real recordings are not at {data}", file=sys.stderr)
         return 1
     found = everything(data, options.folder, options.only)
-    for part in (table, availabilities, diagrams, by_status, held_by_hypotheses, reasons):
+    for part in (table, total, constant_parts, availabilities, diagrams, by_status, held_by_hypotheses, reasons):
         print("\n".join(part(found)), end="\n\n")
     return 0
 

@@ -72,15 +72,15 @@ def test_the_verdict_never_lets_an_error_pass(groups):
     [
         ("urbannav_f9p", "none", 45.0, 40.0, 0.45),
         ("urbannav_f9p", "all others", 80.0, 40.0, 0.10),
-        ("urbannav_m8t", "none", 60.0, 40.0, 0.35),
+        ("urbannav_m8t", "none", 80.0, 40.0, 0.25),
         ("urbannav_m8t", "all others", 90.0, 40.0, 0.10),
         ("gsdc", "none", 95.0, 40.0, 0.08),
         ("gsdc", "all others", 120.0, 40.0, 0.07),
-        ("japan", "none", 4.0, 10.0, 0.98),
+        ("japan", "none", 10.0, 10.0, 0.98),
         ("japan", "all others", 80.0, 40.0, 0.05),
         ("japan", "own first half", 6.0, 10.0, 0.98),
         ("japan", "own first half, base", 13.0, 10.0, 0.80),
-        ("geonet2005", "none", 13.0, 20.0, 0.90),
+        ("geonet2005", "none", 20.0, 20.0, 0.50),
         ("geonet2005", "same, no C/N0", 65.0, 40.0, 0.15),
     ],
 )
@@ -103,22 +103,22 @@ def test_a_model_of_open_sky_is_found_out_in_a_city(groups):
 
 @pytest.mark.requirement("C3")
 def test_levels_are_not_empty_of_meaning(groups):
-    """Where they are sharpest, errors come to half of them: a tenth narrower and they would be passed."""
-    (one,) = groups["japan", "none"]
+    """On the phone an error comes to more than half of its level: half as wide and it would be passed."""
+    (one,) = groups["gsdc", "none"]
     ratio = np.abs(one.error_m) / one.level_m
-    assert 0.4 < np.nanmax(ratio[np.isfinite(one.level_m)]) < 1.0
+    assert 0.5 < np.nanmax(ratio[np.isfinite(one.level_m)]) < 1.0
 
 
 @pytest.mark.requirement("C3")
-def test_without_a_model_the_sigma_of_open_sky_is_too_small(groups):
-    """Residuals of six minutes do not show what moves a position by a metre all the time; the floor of 1 m would."""
+def test_a_scale_of_quiet_residuals_would_be_too_small_under_open_sky(groups):
+    """Residuals of six minutes do not show what moves a position by a metre all the time; the floor of 1 m does."""
     found = {}
-    for model in ("none", "none, scale at least 1"):
+    for model in ("none", "none, scale as estimated"):
         (one,) = groups["japan", model]
         has = np.isfinite(one.level_m) & np.isfinite(one.error_m)
         found[model] = np.percentile(np.abs(one.error_m[has]) / one.result.protection.level.sigma_m[has], 68)
-    assert found["none"] > 1.8
-    assert found["none, scale at least 1"] < 1.0
+    assert found["none, scale as estimated"] > 1.8
+    assert found["none"] < 1.0
 
 
 @pytest.mark.requirement("C3")
