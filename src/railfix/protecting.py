@@ -92,7 +92,7 @@ def protect(
         [name[0] for name in one.satellite.tolist()],
         risk=risk_of(config),
         scale=_level_scale(scale, config),
-        bias_m=one.bias_m,
+        bias_m=None if config.error_model is None else one.bias_m,
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)

@@ -56,7 +56,7 @@ class SbasDelays:
     Attributes
     ----------
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        On the channel's own carrier; NaN where unknown.
+        On the channel's own carrier; NaN where unknown, and where the satellite has no correction.
     sigma_m : ndarray, shape (T, K) [m]
         Root of ``sigma_flt^2 + sigma_UIRE^2 + sigma_tropo^2``; NaN where one of them is unknown.
     reason : ndarray of int64, shape (T, K)
@@ -97,6 +97,8 @@ def sbas_delays(
 ) -> SbasDelays:
     """Delays of the air by the grid and by DO-229D's troposphere, and the sigma of the corrected codes.
 
+    Worked out for the channels that have a correction at any of the epochs; the others are refused anyway.
+
     Parameters
     ----------
     sbas : SbasCorrections
@@ -111,19 +113,26 @@ def sbas_delays(
     -------
     SbasDelays
     """
-    latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
-    elevation, azimuth = elevation_azimuth(satellite_ecef_m, receiver_ecef_m)
-    grid = sbas.ionosphere(time, latitude, longitude, elevation, azimuth)
-    sight = satellite_ecef_m - receiver_ecef_m[:, None, :]
-    sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
-    flt = fixes.sigma_flt_m(sbas.delta_udre(time, fixes, sight, latitude, longitude))
-    scale = (FREQUENCY_L1 / frequency_hz) ** 2
-    known = (grid.state == IonosphereState.OK) & np.isfinite(grid.sigma_uire_m)
-    variance = flt**2 + (scale * grid.sigma_uire_m) ** 2 + sigma_tropo_m(elevation) ** 2
-    unknown = np.where(known, 0, int(Reason.SBAS_NO_IONOSPHERE))
-    return SbasDelays(
-        ionosphere_m=scale * np.where(known, grid.delay_m, np.nan),
-        troposphere_m=troposphere_m(time, latitude, height, elevation),
-        sigma_m=np.sqrt(variance),
-        reason=np.where(fixes.state == SatelliteState.OK, unknown, 0).astype(np.int64),
-    )
+    shape = fixes.state.shape
+    ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
+    reason = np.zeros(shape, dtype=np.int64)
+    some = np.flatnonzero((fixes.state == SatelliteState.OK).any(axis=0))
+    if len(some):
+        part = fixes.take_satellites(some)
+        latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
+        there = satellite_ecef_m[:, some]
+        elevation, azimuth = elevation_azimuth(there, receiver_ecef_m)
+        grid = sbas.ionosphere(time, latitude, longitude, elevation, azimuth)
+        sight = there - receiver_ecef_m[:, None, :]
+        sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
+        flt = part.sigma_flt_m(sbas.delta_udre(time, part, sight, latitude, longitude))
+        scale = (FREQUENCY_L1 / frequency_hz[some]) ** 2
+        known = (grid.state == IonosphereState.OK) & np.isfinite(grid.sigma_uire_m)
+        variance = flt**2 + (scale * grid.sigma_uire_m) ** 2 + sigma_tropo_m(elevation) ** 2
+        unknown = np.where(known, 0, int(Reason.SBAS_NO_IONOSPHERE))
+        corrected = part.state == SatelliteState.OK
+        ionosphere[:, some] = scale * np.where(known & corrected, grid.delay_m, np.nan)
+        troposphere[:, some] = np.where(corrected, troposphere_m(time, latitude, height, elevation), np.nan)
+        sigma[:, some] = np.where(corrected, np.sqrt(variance), np.nan)
+        reason[:, some] = np.where(corrected, unknown, 0)
+    return SbasDelays(ionosphere_m=ionosphere, troposphere_m=troposphere, sigma_m=sigma, reason=reason)

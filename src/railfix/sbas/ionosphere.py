@@ -106,9 +106,9 @@ def _choose(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floa
         u, v = (longitude[at] - w) / b, (latitude[at] - s) / h
         found = np.asarray(inside.all(axis=1))
         for missing in range(4):
-            rest = [corner for corner in range(4) if corner != missing]
-            three = inside[:, rest].all(axis=1) & ~inside[:, missing]
-            found |= three & (triangle_weights(u, v, missing) >= 0.0).all(axis=1)
+            three = np.flatnonzero((inside.sum(axis=1) == 3) & ~inside[:, missing])
+            if len(three):
+                found[three] |= (triangle_weights(u[three], v[three], missing) >= 0.0).all(axis=1)
         chosen = at[found]
         point[chosen] = np.where(inside, corners, _NO_POINT)[found]
         x[chosen], y[chosen] = u[found], v[found]
@@ -161,12 +161,13 @@ def ionosphere(
     t = np.repeat(np.arange(len(time)), shape[1])
     when, at_latitude, at_longitude = time[t], latitude.ravel(), longitude.ravel()
     point, x, y = _choose(grid, when, at_latitude, at_longitude)
-    polar = np.flatnonzero(np.isfinite(at_latitude) & (np.abs(at_latitude) >= _POLAR_DEG))
+    in_cap = np.isfinite(at_latitude) & (np.abs(at_latitude) >= _POLAR_DEG)
+    polar = np.flatnonzero(in_cap)
     polar_weights = np.full((len(when), 4), np.nan)
     if len(polar):
         point[polar], polar_weights[polar] = _choose_polar(grid, when[polar], at_latitude[polar], at_longitude[polar])
     row, state = _judge(grid, limits, tables, when, point)
-    weights, used = _weights(point, state, x, y, polar_weights, np.isin(np.arange(len(when)), polar))
+    weights, used = _weights(point, state, x, y, polar_weights, in_cap)
     delay, variance, known = _values(grid, limits, tables, when, row)
     total = np.where(used[:, None] & (weights > 0.0), weights * delay, 0.0).sum(axis=1)
     spread = np.where(used[:, None] & (weights > 0.0), weights * variance, 0.0).sum(axis=1)
@@ -243,11 +244,12 @@ def _weights(
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)
     for missing in range(4):
-        rest = [corner for corner in range(4) if corner != missing]
-        three = triangle_weights(x, y, missing)
-        fits = good[:, rest].all(axis=1) & ~good[:, missing] & ~polar & (three >= 0.0).all(axis=1)
-        weights = np.where(fits[:, None], three, weights)
-        used |= fits
+        at = np.flatnonzero((good.sum(axis=1) == 3) & ~good[:, missing] & ~polar)
+        if len(at):
+            three = triangle_weights(x[at], y[at], missing)
+            fits = (three >= 0.0).all(axis=1)
+            weights[at[fits]] = three[fits]
+            used[at[fits]] = True
     return weights, used & (point >= 0).any(axis=1)
 
 

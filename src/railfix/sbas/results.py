@@ -116,6 +116,10 @@ class SatelliteCorrections(_Frozen):
     rss: Masks
     covariance: Integers
 
+    def take_satellites(self, which: Integers) -> SatelliteCorrections:
+        """The corrections of some satellites, by index."""
+        return SatelliteCorrections(**{item.name: getattr(self, item.name)[:, which] for item in fields(self)})
+
     def sigma_flt_m(self, delta_udre: Floats | float = 1.0) -> Floats:
         """Standard deviation after fast and long-term correction, shape (T, K) [m] (DO-229D, A.4.5.1 and J.2.2).
 
