@@ -14,7 +14,7 @@ from railfix.constants import FREQUENCY_L1
 from railfix.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.protecting import risk_of
 from railfix.sbas import SatelliteState
-from railfix.sbas_use import sbas_delays
+from railfix.sbas_use import SeenFrom, sbas_delays
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -81,8 +81,18 @@ def test_k_sigma_is_the_textbooks(above: sbas_hour.Sky, line: Trajectory, found:
 def test_the_sigmas_are_those_that_positions_are_weighted_with(above: sbas_hour.Sky, line: Trajectory):
     place = np.broadcast_to(line.ecef_m[1], (len(above.time), 3))
     frequency = np.full(len(above.satellite), FREQUENCY_L1)
-    air = sbas_delays(above.engine, above.fixes, above.time, place, above.position_ecef_m, frequency)
     elevation, azimuth = elevation_azimuth(above.position_ecef_m, place)
+    latitude, longitude, height = geodetic_from_ecef(place)
+    seen = SeenFrom(
+        receiver_ecef_m=place,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        satellite_ecef_m=above.position_ecef_m,
+        elevation_deg=elevation,
+        azimuth_deg=azimuth,
+    )
+    air = sbas_delays(above.engine, above.fixes, above.time, seen, frequency)
     flt, uire, tropo = sbas_hour.sigmas_of_sbas(above, place, elevation, azimuth)
     both = above.good & (elevation > 5.0) & np.isfinite(uire)
     assert both.sum() > 300

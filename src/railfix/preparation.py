@@ -21,7 +21,7 @@ from railfix.navigation import Navigation
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import Reason
 from railfix.sbas import SbasCorrections
-from railfix.sbas_use import SBAS_SIGNAL, corrected_satellites, sbas_delays
+from railfix.sbas_use import SBAS_SIGNAL, SeenFrom, corrected_satellites, sbas_delays
 from railfix.screens import Screened
 from railfix.section import SearchIndex, search
 from railfix.spp import single_point
@@ -202,7 +202,16 @@ def prepare(
         troposphere = saastamoinen_delay_m(latitude, height, elevation)
     sbas_sigma = np.zeros(code.shape)
     if sbas is not None and fixes is not None:
-        air = sbas_delays(sbas, fixes, obs.time, anchor, states.position_ecef_m, channels.frequency_hz)
+        seen = SeenFrom(
+            receiver_ecef_m=anchor,
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
+            satellite_ecef_m=states.position_ecef_m,
+            elevation_deg=elevation,
+            azimuth_deg=azimuth,
+        )
+        air = sbas_delays(sbas, fixes, obs.time, seen, channels.frequency_hz)
         ionosphere, troposphere, sbas_sigma = air.ionosphere_m, air.troposphere_m, air.sigma_m
         reason |= np.where(reason & Reason.NOT_OBSERVED, 0, air.reason)
     clean = clean - ionosphere - troposphere

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.orbits import SatelliteStates
 from railfix.reasons import Reason
 from railfix.sbas import (
@@ -47,6 +46,28 @@ _REASON_OF: Final = {
 }
 #: Reason of each state of a satellite, by its number.
 REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenFrom:
+    """Where the satellites stand from a place that is good to some hundred metres: T epochs by K channels.
+
+    Attributes
+    ----------
+    receiver_ecef_m : ndarray, shape (T, 3) [m]
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+        The same.
+    satellite_ecef_m : ndarray, shape (T, K, 3) [m]
+    elevation_deg, azimuth_deg : ndarray, shape (T, K)
+    """
+
+    receiver_ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    satellite_ecef_m: Floats
+    elevation_deg: Floats
+    azimuth_deg: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +112,7 @@ def sbas_delays(
     sbas: SbasCorrections,
     fixes: SatelliteCorrections,
     time: NDArray[np.datetime64],
-    receiver_ecef_m: Floats,
-    satellite_ecef_m: Floats,
+    seen: SeenFrom,
     frequency_hz: Floats,
 ) -> SbasDelays:
     """Delays of the air by the grid and by DO-229D's troposphere, and the sigma of the corrected codes.
@@ -104,9 +124,7 @@ def sbas_delays(
     sbas : SbasCorrections
     fixes : SatelliteCorrections
     time : ndarray of datetime64[ns], shape (T,)
-    receiver_ecef_m : ndarray, shape (T, 3) [m]
-        Good to some hundred metres.
-    satellite_ecef_m : ndarray, shape (T, K, 3) [m]
+    seen : SeenFrom
     frequency_hz : ndarray, shape (K,) [Hz]
 
     Returns
@@ -119,11 +137,10 @@ def sbas_delays(
     some = np.flatnonzero((fixes.state == SatelliteState.OK).any(axis=0))
     if len(some):
         part = fixes.take_satellites(some)
-        latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
-        there = satellite_ecef_m[:, some]
-        elevation, azimuth = elevation_azimuth(there, receiver_ecef_m)
+        latitude, longitude, height = seen.latitude_deg, seen.longitude_deg, seen.height_m
+        elevation, azimuth = seen.elevation_deg[:, some], seen.azimuth_deg[:, some]
         grid = sbas.ionosphere(time, latitude, longitude, elevation, azimuth)
-        sight = there - receiver_ecef_m[:, None, :]
+        sight = seen.satellite_ecef_m[:, some] - seen.receiver_ecef_m[:, None, :]
         sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
         flt = part.sigma_flt_m(sbas.delta_udre(time, part, sight, latitude, longitude))
         scale = (FREQUENCY_L1 / frequency_hz[some]) ** 2

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.sbas.decode import grid_delays, grid_masks
-from railfix.sbas.limits import SbasLimits
+from railfix.sbas.limits import STOP_S, SbasLimits
 from railfix.sbas.log import SbasLog
+from railfix.sbas.spans import Spans
 from railfix.sbas.tables import LONG_AGO, Stops
 from railfix.sbas.timeline import Timeline, series_order
 from railfix.timescale import seconds
@@ -88,11 +89,15 @@ class GridTables:
     time : ndarray of datetime64[ns], shape (n,)
     newest : Timeline
         Of points.
+    spans : Spans
+        In which nothing about the grid changes.
     """
 
     def __init__(self, log: SbasLog, limits: SbasLimits, stops: Stops) -> None:
         self.unused: Counter[str] = Counter()
         self._stops = stops
+        timeouts = [limits.timeout_s(what) for what in ("grid_mask", "grid_delay", "degradation")]
+        self.spans = Spans(log.time, [*timeouts, STOP_S])
         self._mask_limit = limits.timeout_s("grid_mask")
         masks = grid_masks(log)
         known = np.flatnonzero(masks.band < BANDS)

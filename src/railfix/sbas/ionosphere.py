@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix.sbas.degrade import degradation_row
-from railfix.sbas.grid import GridTables, point_number
+from railfix.sbas.grid import COLUMNS, ROWS, GridTables, point_number
 from railfix.sbas.limits import GIVE_VARIANCE_M2, STOP_S, SbasLimits
 from railfix.sbas.results import IonosphereDelays, IonosphereState
+from railfix.sbas.spans import looked_up
 from railfix.sbas.tables import LONG_AGO, SatelliteTables
 from railfix.timescale import seconds
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Indices = NDArray[np.intp]
 Masks = NDArray[np.bool_]
 Datetimes = NDArray[np.datetime64]
 
@@ -75,34 +79,43 @@ def _square_weights(x: Floats, y: Floats) -> Floats:
     return np.stack([(1.0 - x) * (1.0 - y), (1.0 - x) * y, x * (1.0 - y), x * y], axis=-1)
 
 
-def _cells(latitude: Floats, longitude: Floats) -> list[tuple[Floats, Floats, Floats, Floats]]:
+def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], tuple[Floats, ...]]]:
     """South-west corners and sizes of the cells to try, in order (A.4.4.10.2): the small one, then 10 by 10."""
-    high = np.abs(latitude) >= 60.0
-    width = np.where(high, 10.0, 5.0)
-    small = (np.floor(latitude / 5.0) * 5.0, np.floor(longitude / width) * width, np.full(latitude.shape, 5.0), width)
-    ten = np.full(latitude.shape, 10.0)
-    large = [
-        (np.floor((latitude - a) / 10.0) * 10.0 + a, np.floor((longitude - b) / 10.0) * 10.0 + b, ten, ten)
-        for b in (0.0, 5.0)
-        for a in (0.0, 5.0)
-    ]
-    return [small, *large]
+
+    def small(at: Indices) -> tuple[Floats, ...]:
+        lat, lon = latitude[at], longitude[at]
+        width = np.where(np.abs(lat) >= 60.0, 10.0, 5.0)
+        return np.floor(lat / 5.0) * 5.0, np.floor(lon / width) * width, np.full(lat.shape, 5.0), width
+
+    def large(at: Indices, a: float, b: float) -> tuple[Floats, ...]:
+        ten = np.full(len(at), 10.0)
+        south, west = np.floor((latitude[at] - a) / 10.0) * 10.0 + a, np.floor((longitude[at] - b) / 10.0) * 10.0 + b
+        return south, west, ten, ten
+
+    yield small
+    for b in (0.0, 5.0):
+        for a in (0.0, 5.0):
+            yield partial(large, a=a, b=b)
 
 
-def _choose(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats, Floats]:
+def _choose(
+    grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
+) -> tuple[Integers, Floats, Floats]:
     """Corner points (M, 4), -1 where not used, and the place in the cell (M,), (M,) below 75 degrees."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
-    for south, west, height, width in _cells(latitude, longitude):
+    for cell in _cells(latitude, longitude):
         at = np.flatnonzero(open_)
         if not len(at):
             break
-        s, w, h, b = south[at], west[at], height[at], width[at]
+        s, w, h, b = cell(at)
         corners = np.stack(
             [point_number(s, w), point_number(s + h, w), point_number(s, w + b), point_number(s + h, w + b)], axis=1
         )
-        inside = grid.in_mask(corners, time[at][:, None])
+        inside = looked_up(
+            lambda points, when: grid.in_mask(points, when[:, None]), span[at], corners, time[at], ROWS * COLUMNS
+        )
         u, v = (longitude[at] - w) / b, (latitude[at] - s) / h
         found = np.asarray(inside.all(axis=1))
         for missing in range(4):
@@ -160,20 +173,25 @@ def ionosphere(
     shape = latitude.shape
     t = np.repeat(np.arange(len(time)), shape[1])
     when, at_latitude, at_longitude = time[t], latitude.ravel(), longitude.ravel()
-    point, x, y = _choose(grid, when, at_latitude, at_longitude)
+    span = grid.spans.number(time)[t]
+    point, x, y = _choose(grid, when, span, at_latitude, at_longitude)
     in_cap = np.isfinite(at_latitude) & (np.abs(at_latitude) >= _POLAR_DEG)
     polar = np.flatnonzero(in_cap)
     polar_weights = np.full((len(when), 4), np.nan)
     if len(polar):
         point[polar], polar_weights[polar] = _choose_polar(grid, when[polar], at_latitude[polar], at_longitude[polar])
-    row, state = _judge(grid, limits, tables, when, point)
+    judged = looked_up(
+        lambda points, then: np.stack(_judge(grid, limits, tables, then, points), axis=-1),
+        span, point, when, ROWS * COLUMNS,
+    )  # fmt: skip
+    row, state = judged[..., 0], judged[..., 1]
     weights, used = _weights(point, state, x, y, polar_weights, in_cap)
-    delay, variance, known = _values(grid, limits, tables, when, row)
+    delay, variance, known = _values(grid, limits, tables, time, t, row)
     total = np.where(used[:, None] & (weights > 0.0), weights * delay, 0.0).sum(axis=1)
     spread = np.where(used[:, None] & (weights > 0.0), weights * variance, 0.0).sum(axis=1)
     worst = np.select(
         [
-            seconds(when - tables.stops.last(when)) < STOP_S,
+            (seconds(time - tables.stops.last(time)) < STOP_S)[t],
             ~(point >= 0).any(axis=1),
             (state == IonosphereState.DO_NOT_USE).any(axis=1),
             used & ~known,
@@ -254,18 +272,19 @@ def _weights(
 
 
 def _values(
-    grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, row: Integers
+    grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
-    """Vertical delay and variance of corners (M, 4), and where type 10 is in force (M,)."""
+    """Vertical delay and variance of corners (M, 4), and where type 10 is in force (M,); t is the epoch of each."""
     if not len(grid.time):
         nothing = np.full(row.shape, np.nan)
         return nothing, nothing, np.zeros(len(row), dtype=bool)
-    of_ten, active = degradation_row(tables, limits, time, tables.stops.last(time))
+    newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
+    of_ten, active = newest[t], in_force[t]
     variance = _GIVE_VARIANCE[grid.givei[row]]
     if not len(tables.degradation.time):
         return grid.delay_m[row], variance, active
     values = tables.degradation.values
-    age = seconds(time[:, None] - grid.time[row]) + limits.message_s
+    age = seconds(time[t][:, None] - grid.time[row]) + limits.message_s
     interval = np.maximum(values.iono_interval_s[of_ten], 1.0)[:, None]
     grown = values.iono_step_m[of_ten][:, None] * np.floor(age / interval) + values.iono_rate_mps[of_ten][:, None] * age
     squares = (values.rss_iono[of_ten] == 1)[:, None]
