@@ -17,6 +17,7 @@ import polars as pl
 
 import recordings_score
 import recordings_truth
+from pipeline_cases import clean_files
 from railfix.antenna import Trajectory
 from railfix.atmosphere import saastamoinen_delay_m
 from railfix.carrier import (
@@ -44,7 +45,6 @@ from railfix.geodesy import geodetic_from_ecef
 from railfix.navigation import Navigation
 from railfix.pipeline import AntennaResult, EpochProcessor
 from railfix.rinex import read_navigation, read_observations
-from railfix.simulate.demo_data import demo_files
 from railfix.track_map import read_track
 from railfix.vehicle import antenna_trajectory, read_vehicle
 
@@ -195,8 +195,8 @@ def in_runs(
     return replace(pieces[-1], **joined)
 
 
-def demo() -> list[Case]:
-    files = demo_files()
+def clean() -> list[Case]:
+    files = clean_files()
     track, vehicle = read_track(files["track"]), read_vehicle(files["vehicle"])
     truth = pl.read_csv(files["truth"], schema_overrides={"time_gpst": pl.Datetime("ns")})
     cases = []
@@ -204,7 +204,7 @@ def demo() -> list[Case]:
         rows = truth.filter(pl.col("antenna") == name)
         cases.append(
             Case(
-                f"demo {name}",
+                f"clean run {name}",
                 read_observations(files[name]),
                 read_navigation(files["nav"]),
                 antenna_trajectory(track, vehicle, name),
@@ -333,9 +333,9 @@ def slip_table(cases: list[Case]) -> None:
 
 def main(only: Callable[[str], bool] = lambda _: True) -> int:
     data = Path(__file__).resolve().parents[2] / "shared" / "data"
-    cases = demo() + (recordings(data) if data.is_dir() else [])
+    cases = clean() + (recordings(data) if data.is_dir() else [])
     if sys.argv[1:2] == ["slips"]:
-        slip_table([c for c in cases if c.name.startswith(("demo front", "japan", "urban", "gsdc"))])
+        slip_table([c for c in cases if c.name.startswith(("clean run front", "japan", "urban", "gsdc"))])
         return 0
     names = ("n", "mean m", "std m", "p50 m", "p95 m", "max m")
     print(f"{'log':18s} {'form':6s} {names[0]:>5s} " + " ".join(f"{n:>7s}" for n in names[1:]) + "  error/sigma")

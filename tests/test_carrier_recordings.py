@@ -1,4 +1,4 @@
-"""What carrier phase buys on the shipped demonstration run and on the recordings."""
+"""What carrier phase buys on a made run with noise alone and on the recordings."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from railfix.evaluate import Score, score
 
 
 @cache
-def demo() -> carrier_score.Carried:
-    return carrier_score.carried(carrier_score.demo()[0])
+def clean() -> carrier_score.Carried:
+    return carrier_score.carried(carrier_score.clean()[0])
 
 
 @cache
@@ -33,7 +33,7 @@ def scores(found: carrier_score.Carried) -> dict[str, Score]:
 @pytest.mark.requirement("A5")
 def test_noise_of_the_simulated_run_falls():
     """Codes 0.43 m; smoothed below a fifth, with float ambiguities below a tenth of that."""
-    got = scores(demo())
+    got = scores(clean())
     assert got["code"].std_m > 0.35
     assert got["hatch"].std_m < 0.2 * got["code"].std_m
     assert got["live"].std_m < 0.1 * got["code"].std_m
@@ -42,7 +42,7 @@ def test_noise_of_the_simulated_run_falls():
 
 @pytest.mark.requirement("A5")
 def test_slips_put_into_the_simulated_run_are_all_found():
-    found = demo()
+    found = clean()
     assert not (found.slips.slip[1:] & np.isfinite(found.slips.phase_m[:-1])).any()
     assert not found.jumps.jump.any()
     for one in carrier_score.detections(found, count=60):

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from conftest import ROOT
+from pipeline_cases import clean_files, clean_observations
 from railfix.constants import SPEED_OF_LIGHT
 from railfix.epochs import Observations
 from railfix.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
@@ -340,22 +340,23 @@ def test_steps_on_one_of_two_real_receivers_are_found(recordings: Path) -> None:
 
 @b3
 @b5
-def test_the_demonstration_s_antennas() -> None:
+def test_two_antennas_of_a_clean_run() -> None:
     """18.2 m apart on a line with a curve, moving, no multipath: what is left is noise, from the zenith down."""
-    folder = ROOT / "data" / "demo"
-    front, rear = (read_observations(folder / f"{name}.crx.gz") for name in ("front", "rear"))
-    truth = pl.read_csv(folder / "truth.csv.gz")
+    front, rear = (clean_observations()[name] for name in ("front", "rear"))
+    truth = pl.read_csv(clean_files()["truth"])
     places = [truth.filter(pl.col("antenna") == name) for name in ("front", "rear")]
     ecef = [place.select("x_m", "y_m", "z_m").to_numpy() for place in places]
     assert places[0]["time_gpst"].to_list()[-1] == str(front.time[-1])
     direction = spacing_direction(*ecef)
-    result = _two_logs(front, rear, folder / "nav.rnx.gz", direction)
-    turned = _two_logs(front, rear, folder / "nav.rnx.gz", ((direction[0] + 180) % 360, -direction[1], direction[2]))
+    result = _two_logs(front, rear, clean_files()["nav"], direction)
+    turned = _two_logs(front, rear, clean_files()["nav"], ((direction[0] + 180) % 360, -direction[1], direction[2]))
     strong = np.nanmedian(front.cn0_dbhz, axis=0)[np.isfinite(result.expected_m).any(axis=0)] > 47.0
     rms, other = (float(np.sqrt(np.nanmean(r.metric[:, strong] ** 2))) for r in (result, turned))
     share = float(result.reject.sum() / np.isfinite(result.metric).sum())
     high = float(result.reject[:, strong].sum() / np.isfinite(result.metric[:, strong]).sum())
-    print(f"demo: rms of strong satellites {rms:.2f} m, turned {other:.2f}; refused {share:.4f}, strong {high:.5f}")
+    print(
+        f"clean run: rms of strong satellites {rms:.2f} m, turned {other:.2f}; refused {share:.4f}, strong {high:.5f}"
+    )
     assert rms < 1.0 < 4.0 * rms < other
     assert high < 1e-3
     chainage = [place["chainage_m"].to_numpy() for place in places]

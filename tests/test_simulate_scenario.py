@@ -91,7 +91,6 @@ def test_a_scenario_is_the_same_after_its_file(tmp_path: Path, scenario: Scenari
 
 def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
     assert load_scenario(write_text(tmp_path, "")) == Scenario()
-    assert load_scenario("demo") == Scenario()
 
 
 @pytest.mark.parametrize(
