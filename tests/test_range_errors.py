@@ -16,12 +16,14 @@ from railfix.cli import app
 from railfix.config import Config, parse_config
 from railfix.demonstration import demo_inputs
 from railfix.epochs import Observations
-from railfix.error_model import ErrorModelFit, read_error_model
+from railfix.error_model import ErrorModelFit, read_error_model, write_error_model
 from railfix.errors import InputFileError, MismatchError
-from railfix.pipeline import EpochProcessor
+from railfix.navigation import Navigation
+from railfix.pipeline import EpochProcessor, conditions_of
 from railfix.range_errors import (
     BaseStation,
     ModelInputs,
+    base_station,
     base_station_from_files,
     error_model_from_runs,
     range_errors,
@@ -33,6 +35,7 @@ from railfix.run import RunOptions, past_run, run_files
 from railfix.run.driver import open_inputs
 from railfix.simulate import Scenario, Simulation, demo_files
 from railfix.track_map import from_positions
+from recordings_score import straight_line
 
 pytestmark = pytest.mark.requirement("C3")
 EPOCH = np.datetime64("2024-03-05T00:00:00", "ns")
@@ -158,7 +161,8 @@ def test_a_station_takes_the_common_errors_away(recordings: Path) -> None:
     reference = AntennaReference(
         time=time, ecef_m=ecef, chainage_m=blank, speed_mps=blank, sigma_m=blank, source=words, environment=words
     )
-    station = base_station_from_files([folder / "3034265G.21O"], navigation, config)
+    processor = EpochProcessor(config, navigation, {"front": path})
+    station = base_station_from_files([folder / "3034265G.21O"], processor)
     assert station.smoothed
     antenna = result.antennas["front"]
     alone = range_errors(antenna, path, reference)
@@ -243,3 +247,75 @@ def test_what_cannot_be_is_said_before_the_work(
     done = CliRunner().invoke(app, ["error-model", str(done_run), "--reference", "a", *arguments])
     assert done.exit_code == code
     assert said in done.output
+
+
+def test_a_reference_that_is_nowhere_good_enough_is_refused() -> None:
+    processor, obs, reference = _demo(parse_config({"screens": ["elevation"]}), slice(0, 20))
+    result, _ = processor.process({"front": obs})
+    wide = replace(reference, sigma_m=np.full(len(reference.time), 0.6))
+    with pytest.raises(MismatchError, match=r"fewer than two have a sigma of 0\.5 m or less"):
+        range_errors(result.antennas["front"], processor.trajectories["front"], wide)
+
+
+def test_a_run_of_another_version_is_refused(done_run: Path, tmp_path: Path) -> None:
+    record = json.loads((done_run / "run.json").read_text())
+    record["options"]["novelty"] = 1
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    with pytest.raises(InputFileError, match="other options than this version writes"):
+        past_run(tmp_path)
+
+
+def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
+    """A station that plays the train, on an SBAS run: nothing is left but what each has of its own."""
+    folder = recordings / "sbas" / "msas_20080526_crescent"
+    navigation = read_navigation([folder / "cres_20080526.bin.nav"])
+    config = parse_config(
+        {"sbas": [str(folder / "cres_20080526.bin.sbs")], "sbas_prn": 137, "elevation": {"mask_deg": 10.0}}
+    )
+    plain = parse_config({"elevation": {"mask_deg": 10.0}})
+    log = read_observations(folder / "cres_20080526.bin.obs")[:200]
+    line = straight_line(log.header.approximate_ecef_m, 45.0)
+    found, _ = EpochProcessor(plain, navigation, {"front": line}).process({"front": log})
+    place = np.nanmedian(found.antennas["front"].conventional_ecef_m, axis=0)
+    line = straight_line(place, 45.0)
+    processor = EpochProcessor(config, navigation, {"front": line})
+    result, _ = processor.process({"front": log})
+    blank, words = np.full(len(log), np.nan), np.full(len(log), "")
+    reference = AntennaReference(
+        time=log.time,
+        ecef_m=np.tile(place, (len(log), 1)),
+        chainage_m=blank,
+        speed_mps=blank,
+        sigma_m=blank,
+        source=words,
+        environment=words,
+    )
+    errors = []
+    for one in (processor, EpochProcessor(plain, navigation, {"front": line})):
+        station = base_station([log], one, place, name="itself")
+        found_errors = range_errors(result.antennas["front"], line, reference, station)
+        errors.append(
+            max(
+                abs(float(found_errors.samples.error_m[found_errors.satellite == name].mean()))
+                for name in np.unique(found_errors.satellite)
+            )
+        )
+    same, other = errors
+    print(f"largest mean error of a satellite: {same:.2f} m with the station corrected alike, {other:.2f} m if not")
+    assert same < 1.2
+    assert other > 2.0 * same
+
+
+def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: Path) -> None:
+    model, _ = error_model_from_runs([ModelInputs(run=done_run, reference=demo_files()["truth"])])
+    assert model.source.conditions == conditions_of(past_run(done_run).config)
+    write_error_model(model, tmp_path / "m.toml")
+    same = EpochProcessor(parse_config({"error_model": str(tmp_path / "m.toml")}), *_nothing())
+    assert not any("other conditions" in note for note in same.notes)
+    other = EpochProcessor(parse_config({"error_model": str(tmp_path / "m.toml"), "screens": []}), *_nothing())
+    assert any("made under other conditions" in note for note in other.notes)
+
+
+def _nothing() -> tuple[Navigation, dict[str, Trajectory]]:
+    navigation, line, _ = open_inputs(demo_inputs(), RunOptions())
+    return navigation, line.trajectories

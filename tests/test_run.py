@@ -329,3 +329,14 @@ def test_positions_that_failed_a_check_do_not_count_when_they_are_dropped(tmp_pa
     dropped = [rows.filter(pl.col("status").cast(pl.String) == s.text).height for s in CHECK_FAILED]
     without = sum(dropped) + sum(front.status[s] for s in ("no_observation", "too_few_satellites", "unobservable"))
     assert front.positioned == rows["chainage_m"].count() == 2000 - without
+
+
+@pytest.mark.requirement("C2")
+def test_a_run_says_what_speaks_against_its_levels(whole: RunSummary, tmp_path: Path) -> None:
+    """Faults that RAIM excludes are likelier than the level takes them to be; and a budget too small gives none."""
+    assert any("RAIM has excluded" in note and "see risk.local_prior" in note for note in whole.notes)
+    small = Config.model_validate({"risk": {"local_prior": 0.02}, "protection": "on"})
+    summary = run_files(demo_inputs(), small, out=tmp_path / "out")
+    assert summary.levels["front"].without_budget > 1000
+    assert any("epochs without a protection level" in note for note in summary.notes)
+    assert not any("RAIM has excluded" in note for note in summary.notes)

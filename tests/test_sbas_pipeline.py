@@ -234,3 +234,31 @@ def test_other_signals_than_l1_ca_are_not_corrected(recording: Recording) -> Non
     observed = ((found.reason & Reason.NOT_OBSERVED) == 0) & np.char.startswith(found.satellite, "G")
     assert observed.any()
     assert (found.reason[observed] & Reason.SBAS_NOT_COVERED).all()
+
+
+def test_a_newer_record_that_calls_a_satellite_unhealthy_wins_over_the_issue_of_its_correction(
+    recording: Recording, corrected: AntennaResult
+) -> None:
+    used = (corrected.reason == 0).sum(axis=0)
+    one = str(corrected.satellite[int(np.argmax(used))])
+    kepler = recording.navigation.kepler
+    row = int(np.flatnonzero(kepler.satellite == one)[0])
+    names = list(kepler.__dataclass_fields__)
+    extra = {name: np.append(getattr(kepler, name), getattr(kepler, name)[row]) for name in names}
+    extra["health"][-1], extra["iode"][-1] = 63, (int(kepler.iode[row]) + 7) % 256
+    extra["transmitted"][-1] = recording.observations.time[0]
+    extra["toe"][-1] = extra["toe"][-1] + np.timedelta64(16, "s")
+    navigation = replace(recording.navigation, kepler=replace(kepler, **extra))
+    processor = EpochProcessor(recording.config(), navigation, {"front": recording.line})
+    found = processor.process({"front": recording.observations})[0].antennas["front"]
+    column = int(np.flatnonzero(found.satellite == one)[0])
+    observed = (found.reason[:, column] & Reason.NOT_OBSERVED) == 0
+    assert (found.reason[observed, column] & Reason.UNHEALTHY).all()
+
+
+@pytest.mark.requirement("C2")
+def test_positions_from_code_and_phase_have_no_level(recording: Recording) -> None:
+    config = recording.config(carrier="float")
+    processor = EpochProcessor(config, recording.navigation, {"front": recording.line})
+    assert processor.process({"front": recording.observations[150:170]})[0].antennas["front"].protection is None
+    assert any("there is none for positions from code and phase together" in note for note in processor.notes)

@@ -78,7 +78,7 @@ class EpochProcessor:
             raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
         self.sbas = None if not config.sbas else _opened_sbas(config)
         self._cn0_curve = None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve)
-        self._klobuchar, notes = self._ionosphere()
+        self.klobuchar, notes = self._ionosphere()
         said = () if self.sbas is None else self.sbas.notes
         self.notes = (*notes, *said, *self._what_screens_lack())
         dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
@@ -113,6 +113,13 @@ class EpochProcessor:
                 lacking.append(
                     f"screen {name}: asked for, but without a vehicle file the spacing is unknown; not judged"
                 )
+        made = "" if self._error_model is None else self._error_model.source.conditions
+        if made and made != conditions_of(config := self.config):
+            lacking.append(
+                f"error model: made under other conditions ({made}) than this run's ({conditions_of(config)})"
+            )
+        if self.config.protection == "on" and self.config.carrier == "float":
+            lacking.append("protection level: asked for, but there is none for positions from code and phase together")
         return tuple(lacking)
 
     def process(self, observations: Mapping[str, Observations], state: State | None = None) -> tuple[Result, State]:
@@ -163,7 +170,7 @@ class EpochProcessor:
             self.config,
             self.navigation,
             self._index[name],
-            self._klobuchar,
+            self.klobuchar,
             error_model=self._error_model,
             sbas=self.sbas,
         )
@@ -256,7 +263,7 @@ class EpochProcessor:
         one.refuse(raim.excluded, Reason.FAULT_EXCLUDED)
         one_map = place.constrained
         level = None
-        if self.config.protection == "on":
+        if self.config.protection == "on" and self.config.carrier != "float":
             level = protect(one, ranges, index.trajectory, one_map, raim, scale, self.config)
         own_sigma = own_sigma_m(redundancy_of(ranges), one_map.wsse, one_map.exact_map_sigma_m, scale)
         status = self._status(one.code_m, ranges, index.trajectory, place, raim, own_sigma)
@@ -370,6 +377,14 @@ class EpochProcessor:
             clock_offset_m=found.ties.offset_m,
             clock_offset_sigma_m=found.ties.sigma_m,
         )
+
+
+def conditions_of(config: Config) -> str:
+    """Screens and corrections that the errors of the ranges depend on, in words: what an error model holds for."""
+    screens = ", ".join(config.screens) or "none"
+    corrections = "sbas" if config.sbas else f"ionosphere {config.ionosphere}, troposphere {config.troposphere}"
+    carrier = "codes smoothed" if config.carrier == "smoothed" else "codes as they are"
+    return f"screens {screens}; mask {config.elevation.mask_deg:g} deg; {corrections}; {carrier}"
 
 
 def _opened_sbas(config: Config) -> SbasCorrections:

@@ -38,7 +38,7 @@ from railfix.errors import InputFileError, OutputError
 FORMAT: Final = "railfix error model 1"
 _COLUMNS: Final = tuple(item.name for item in fields(BinStatistics))
 _WHOLE: Final = ("count", "blocks", "pooled")
-_TEXTS: Final = ("base", "start", "end", "railfix_version")
+_TEXTS: Final = ("base", "conditions", "start", "end", "railfix_version")
 
 
 def write_error_model(model: ErrorModel, path: str | PathLike[str]) -> None:

@@ -107,10 +107,24 @@ class BinStatistics:
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorModelSource:
-    """What a model was made from, for its file."""
+    """What a model was made from, for its file.
+
+    Attributes
+    ----------
+    runs : tuple of str
+    base : str
+        Marker of the reference station.
+    conditions : str
+        Screens and corrections under which it holds (`pipeline.conditions_of`).
+    epochs : int
+    start, end, railfix_version : str
+    files : tuple of (str, str)
+        Names and SHA-256.
+    """
 
     runs: tuple[str, ...] = ()
     base: str = ""
+    conditions: str = ""
     epochs: int = 0
     start: str = ""
     end: str = ""

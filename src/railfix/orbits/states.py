@@ -114,7 +114,8 @@ def satellite_states(
         Tighter limit on the distance from toe than the records' own validity [s].
     record : ndarray of int, shape (T, M), optional
         Rows of `navigation.kepler` to take instead of choosing, -1 to choose as ever: corrections
-        hold for one issue of data (`issues.issue_records`). GLONASS is not concerned.
+        hold for one issue of data (`issues.issue_records`). A satellite that the record chosen as ever
+        calls unhealthy is unhealthy all the same. GLONASS is not concerned.
 
     Returns
     -------
@@ -193,7 +194,7 @@ def _fill_kepler(
         # What was on the air goes before what is right after the fact.
         better = other_valid & (~valid | (future & ~other_future))
         rows, future, valid = np.where(better, others, rows), np.where(better, other_future, future), valid | better
-    channels = plan.kepler
+    channels, newest = plan.kepler, rows
     if record is not None:
         asked = record[:, channels].T
         given = asked >= 0
@@ -209,6 +210,10 @@ def _fill_kepler(
     found.future_record[:, channels] = (usable & future).T
     for k, t, row in _groups(rows, usable):
         _kepler_group(table, plan, k, t, row, time, code_m, found)
+    if record is not None:
+        # An older record that calls the satellite healthy does not win, whatever a correction is made for.
+        sick = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
+        found.unhealthy[:, channels] |= sick.T
 
 
 def _groups(rows: Indices, usable: Masks) -> Iterator[tuple[Any, Any, Indices]]:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from railfix.antenna import Trajectory
 from railfix.carrying import CarrierState, slips_of, smoothed
 from railfix.channels import ChannelBook
-from railfix.config import Config
 from railfix.epochs import Observations
 from railfix.errors import InputFileError
 from railfix.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
-from railfix.navigation import Navigation
+from railfix.pipeline import EpochProcessor
 from railfix.preparation import prepare
 from railfix.range_errors.robust_clock import robust_clock
 from railfix.reasons import Reason
@@ -75,7 +74,7 @@ class BaseStation:
 
 
 def base_station(
-    parts: Iterable[Observations], navigation: Navigation, config: Config, position_ecef_m: Floats, *, name: str
+    parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> BaseStation:
     """Errors of a station that stands at a known place.
 
@@ -86,8 +85,8 @@ def base_station(
     ----------
     parts : iterable of Observations
         Pieces of its log, in order of time.
-    navigation : Navigation
-    config : Config
+    processor : EpochProcessor
+        Of the train: its settings, records, ionosphere and SBAS correct the station's codes, too.
     position_ecef_m : ndarray, shape (3,) [m]
     name : str
 
@@ -98,14 +97,13 @@ def base_station(
     latitude, longitude, height = (float(x) for x in geodetic_from_ecef(position_ecef_m))
     ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
     index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
-    book, klobuchar = ChannelBook(config, navigation), navigation.klobuchar.get("G")
+    config, navigation = processor.config, processor.navigation
+    book = ChannelBook(config, navigation)
     state, phases = CarrierState(), False
     times: list[Times] = []
     errors: list[dict[str, Floats]] = []
     for obs in parts:
-        one = prepare(
-            obs, book.of(obs), config, navigation, index, klobuchar if config.ionosphere == "klobuchar" else None
-        )
+        one = prepare(obs, book.of(obs), config, navigation, index, processor.klobuchar, sbas=processor.sbas)
         slips, state = slips_of(one, navigation, config, state)
         one, state = smoothed(one, slips, config, state)
         phases |= bool(np.isfinite(obs.phase_cycles).any())
@@ -139,7 +137,7 @@ def base_station(
 
 
 def base_station_from_files(
-    paths: Sequence[Path], navigation: Navigation, config: Config, *, position_ecef_m: Floats | None = None
+    paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
 ) -> BaseStation:
     """The same from RINEX files; the place is that of the header where none is given.
 
@@ -152,7 +150,7 @@ def base_station_from_files(
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
     if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:
         raise InputFileError(paths[0], "its header has no position; give that of the station (--base-position)")
-    station = base_station(parts, navigation, config, np.asarray(place), name=parts[0].header.marker or paths[0].name)
+    station = base_station(parts, processor, np.asarray(place), name=parts[0].header.marker or paths[0].name)
     if not np.isfinite(station.error_m).any():
         raise InputFileError(
             paths[0], "of no satellite the station's error can be told; is the navigation file of the same day?"

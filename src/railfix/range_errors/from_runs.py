@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from railfix import __version__
 from railfix.error_model import ErrorModel, ErrorModelFit, ErrorModelSource, ErrorSamples, fit_bins
 from railfix.errors import MismatchError
-from railfix.pipeline import EpochProcessor, State
+from railfix.pipeline import EpochProcessor, State, conditions_of
 from railfix.range_errors.base_station import BaseStation, base_station_from_files
 from railfix.range_errors.gather import GatherLimits, joined, range_errors
 from railfix.reference_log import read_reference
@@ -55,6 +55,7 @@ class _Gathered:
     epochs: int = 0
     files: dict[str, str] = field(default_factory=dict)
     bases: list[str] = field(default_factory=list)
+    conditions: list[str] = field(default_factory=list)
 
 
 def error_model_from_runs(
@@ -86,7 +87,8 @@ def error_model_from_runs(
     Raises
     ------
     MismatchError
-        Some runs have a reference station and others none; or no range has an error that can be told.
+        Some runs have a reference station and others none, their screens differ, or no range has an error that
+        can be told.
     RailfixError
         A file is not what it should be, or has changed since the run.
     """
@@ -102,6 +104,9 @@ def error_model_from_runs(
         raise MismatchError(
             "no pseudorange has an error that can be told; do run, reference and station belong together?"
         )
+    if len(set(gathered.conditions)) > 1:
+        told = " and ".join(sorted(set(gathered.conditions)))
+        raise MismatchError(f"the runs were done under different conditions: {told}; make a model for each")
     model = ErrorModel(
         bins=fit.bins,
         before=fit_bins(samples, np.ones(len(samples.error_m), dtype=np.bool_), fit),
@@ -110,6 +115,7 @@ def error_model_from_runs(
         source=ErrorModelSource(
             runs=tuple(str(one.run) for one in inputs),
             base=", ".join(dict.fromkeys(gathered.bases)),
+            conditions=gathered.conditions[0],
             epochs=gathered.epochs,
             start=str(min(gathered.times)),
             end=str(max(gathered.times)),
@@ -128,11 +134,12 @@ def _gather(
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options)
     references = read_reference(one.reference, tuple(past.inputs.logs))
+    processor, state, done = EpochProcessor(past.config, navigation, line.trajectories), State(), 0
     base: BaseStation | None = None
     if one.base:
-        base = base_station_from_files(one.base, navigation, past.config, position_ecef_m=one.base_position_ecef_m)
+        base = base_station_from_files(one.base, processor, position_ecef_m=one.base_position_ecef_m)
         into.bases.append(base.name)
-    processor, state, done = EpochProcessor(past.config, navigation, line.trajectories), State(), 0
+    into.conditions.append(conditions_of(past.config))
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
         for antenna, (name, found) in enumerate(result.antennas.items()):

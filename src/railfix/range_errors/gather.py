@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from railfix.antenna import Trajectory
 from railfix.clock_elimination import clock_groups
 from railfix.error_model import ErrorSamples
+from railfix.errors import MismatchError
 from railfix.evaluate import interpolate_reference
 from railfix.geodesy import range_with_rotation
 from railfix.range_errors.base_station import BaseStation
@@ -32,6 +33,11 @@ NO_RANGE: Final = (
     | Reason.EPHEMERIS_TOO_OLD
     | Reason.UNHEALTHY
     | Reason.NO_CORRECTION
+    | Reason.SBAS_NOT_COVERED
+    | Reason.SBAS_NO_CORRECTION
+    | Reason.SBAS_TIMED_OUT
+    | Reason.SBAS_DO_NOT_USE
+    | Reason.SBAS_NO_IONOSPHERE
 )
 
 
@@ -105,10 +111,20 @@ def range_errors(
     Returns
     -------
     RangeErrors
+
+    Raises
+    ------
+    MismatchError
+        The reference is nowhere good enough.
     """
     limits = limits or GatherLimits()
     columns = result.columns
     good = ~(reference.sigma_m > limits.largest_reference_sigma_m)
+    if np.count_nonzero(good) < 2:
+        raise MismatchError(
+            f"of {len(good)} positions of the reference fewer than two have a sigma of "
+            f"{limits.largest_reference_sigma_m:g} m or less; a better reference is needed"
+        )
     place = interpolate_reference(
         result.time, reference.time[good], reference.ecef_m[good], largest_gap_s=limits.largest_reference_gap_s
     )

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
+from railfix.antenna import TRACK_AS_PATH, Trajectory
 from railfix.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.errors import MismatchError, NoPositionError
 from railfix.position_log import PositionLog
@@ -222,7 +222,12 @@ class _Builder:
         good = fixes.good
         if len(good) < 2:
             told = ", ".join(f"{count} {what}" for what, count in fixes.counts().items() if count)
-            raise NoPositionError(f"{self.name}: fewer than two good fixes ({told}); no reference can be made")
+            lacks = (
+                "; without a vehicle file the track itself is taken as the antenna's path"
+                if TRACK_AS_PATH in self.trajectory.notes
+                else ""
+            )
+            raise NoPositionError(f"{self.name}: fewer than two good fixes ({told}); no reference can be made{lacks}")
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:

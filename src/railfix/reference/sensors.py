@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from railfix.errors import InputFileError
@@ -15,6 +17,8 @@ from railfix.named_columns import NamedColumns, parse_named_columns
 from railfix.position_log import positions_times
 from railfix.timescale import seconds
 
+#: How times are written.
+_ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"
 Floats = NDArray[np.float64]
 Datetimes = NDArray[np.datetime64]
 
@@ -88,7 +92,7 @@ class Acceleration:
 
 
 def read_pulses(path: str | PathLike[str]) -> Pulses:
-    """Read a tachometer's table: CSV with ``time_gpst`` and what was counted.
+    """Read a tachometer's table: CSV (or the same as .parquet) with ``time_gpst`` and what was counted.
 
     ``count`` is a counter's reading (falling when it runs backward, never wrapping), ``distance_m`` metres run;
     with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives pulses their sign.
@@ -117,7 +121,7 @@ def read_pulses(path: str | PathLike[str]) -> Pulses:
 
 
 def read_acceleration(path: str | PathLike[str]) -> Acceleration:
-    """Read a table of accelerations: CSV with ``time_gpst`` and one other column, toward the vehicle's front.
+    """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
 
     ``specific_force_mps2`` is what an accelerometer measures (gravity on gradients is taken off by the map), and
     so is ``force_forward_mps2`` of the simulator; ``acceleration_mps2`` is that of the motion alone.
@@ -149,6 +153,11 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
 
 
 def _table(path: str | PathLike[str]) -> NamedColumns:
+    if Path(path).suffix == ".parquet":
+        try:
+            return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO), path)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise InputFileError(path, f"cannot be read as a Parquet table ({error})") from None
     try:
         text = read_bytes(Path(path)).decode("utf-8-sig")
     except UnicodeDecodeError:

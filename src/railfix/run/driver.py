@@ -15,7 +15,7 @@ from railfix.config import Config
 from railfix.errors import SettingsError
 from railfix.navigation import Navigation
 from railfix.pipeline import EpochProcessor, State
-from railfix.protecting import level_facts
+from railfix.protecting import level_facts, risk_of
 from railfix.rinex import read_navigation
 from railfix.run.checks import (
     RECORD_REACH,
@@ -150,7 +150,7 @@ def run_files(
         check_sbas_time(processor.sbas, tally)
         check_positions(tally)
         sigma, found_levels = along_sigma(folder), levels(folder)
-        notes = notes_of(line, navigation, tally, logs)
+        notes = (*notes_of(line, navigation, tally, logs), *_notes_of_levels(config, tally, found_levels))
         wall = clock.perf_counter() - began
         record = run_record(
             files=collected(fingerprints),
@@ -253,6 +253,27 @@ def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
         if log.passed_over:
             told = ", ".join(f"{count} {what}" for what, count in sorted(log.passed_over.items()))
             yield f"{name}: read over: {told}"
+
+
+def _notes_of_levels(config: Config, tally: Tally, found: Mapping[str, Levels]) -> Iterator[str]:
+    """Where a run speaks against what its protection levels stand on."""
+    if not found:
+        return
+    for name, of_antenna in found.items():
+        if of_antenna.without_budget:
+            yield (
+                f"{name}: {of_antenna.without_budget} epochs without a protection level, where more than two faults at "
+                "a time, or more satellites excluded, are likelier than the risk allows (settings risk)"
+            )
+    used = sum(antenna.used for antenna in tally.antennas.values())
+    excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
+    risk = risk_of(config)
+    prior = risk.local_prior + max(risk.satellite_prior.values())
+    if excluded > prior * (used + excluded):
+        yield (
+            f"protection level: it stands for faults with a probability of {prior:g} a range at most, and RAIM has "
+            f"excluded {excluded} of {used + excluded} ({excluded / (used + excluded):.2g}); see risk.local_prior"
+        )
 
 
 def _footer(record: Mapping[str, Any]) -> dict[str, str]:

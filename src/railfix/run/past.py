@@ -84,15 +84,21 @@ def past_run(folder: Path) -> PastRun:
     if not isinstance(record, dict) or needed - set(record):
         missing = ", ".join(sorted(needed - set(record))) if isinstance(record, dict) else "everything"
         raise InputFileError(path, f"lacks {missing}; it was not written by this version, repeat the run")
-    options = dict(record["options"])
-    when = {name: None if options[name] is None else datetime.fromisoformat(options[name]) for name in ("start", "end")}
     return PastRun(
         folder=folder,
         record=record,
         inputs=_inputs(record),
         config=parse_config(dict(record["settings_used"]), source=str(path)),
-        options=RunOptions(**(options | when | {"track": TrackReading(**options["track"])})),
+        options=_options(path, record["options"]),
     )
+
+
+def _options(path: Path, table: Mapping[str, Any]) -> RunOptions:
+    known, of_track = {item.name for item in fields(RunOptions)}, {item.name for item in fields(TrackReading)}
+    if set(table) != known or set(table["track"]) != of_track:
+        raise InputFileError(path, "has other options than this version writes; repeat the run")
+    when = {name: None if table[name] is None else datetime.fromisoformat(table[name]) for name in ("start", "end")}
+    return RunOptions(**(dict(table) | when | {"track": TrackReading(**table["track"])}))
 
 
 def _inputs(record: Mapping[str, Any]) -> RunInputs:

@@ -31,13 +31,17 @@ class AlongSigma:
 
 @dataclass(frozen=True, kw_only=True)
 class Levels:
-    """Protection levels of an antenna: median and 95th percentile of the finite ones [m], and epochs by status."""
+    """Protection levels of an antenna: median and 95th percentile of the finite ones [m], and epochs by status.
+
+    `without_budget`: epochs without a level because more faults are likelier than the risk allows.
+    """
 
     p50_m: float | None
     p95_m: float | None
     available: int
     unavailable: int
     alarm: int
+    without_budget: int
 
 
 def levels(folder: OutputFolder) -> dict[str, Levels]:
@@ -52,6 +56,7 @@ def levels(folder: OutputFolder) -> dict[str, Levels]:
             p50_m=finite.quantile(0.5),
             p95_m=finite.quantile(0.95),
             **{word: (status == word).sum() for word in ("available", "unavailable", "alarm")},
+            without_budget=(pl.col("protection_cause").cast(pl.String) == "budget").sum(),
         )
         .sort("antenna")
         .collect()
