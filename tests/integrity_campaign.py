@@ -1,7 +1,7 @@
 """Protection levels on simulated commercial lines: is any epoch misled, and how often is the level of use?
 
 ``python tests/integrity_campaign.py FOLDER [--runs 48] [--jobs 2]`` simulates runs over lines, places and skies
-that all differ (the shipped scenario ``commercial-run`` under other seeds), half of which make an error model
+that all differ (the shipped scenario ``p1-commercial`` under other seeds), half of which make an error model
 that the other half is judged by, and the other way round. Each run is kept in FOLDER, so that a broken
 campaign goes on where it was. ``--summary`` prints the tables of what is there.
 """
@@ -22,7 +22,15 @@ import numpy as np
 
 from railfix.antenna import Trajectory
 from railfix.config import parse_config
-from railfix.error_model import ErrorModel, ErrorModelFit, ErrorSamples, fit_bins, read_error_model, write_error_model
+from railfix.error_model import (
+    ErrorBins,
+    ErrorModel,
+    ErrorModelFit,
+    ErrorSamples,
+    fit_bins,
+    read_error_model,
+    write_error_model,
+)
 from railfix.pipeline import EpochProcessor
 from railfix.protection import Cause
 from railfix.protection import Status as LevelStatus
@@ -39,6 +47,8 @@ from railfix.vehicle import antenna_trajectory, read_vehicle
 
 ANTENNAS = ("front", "rear")
 ALARM_LIMITS_M = (10.0, 20.0, 40.0)
+#: Bins of the models: finer in C/N0 than by default, there are millions of samples.
+BINS = ErrorBins(cn0_dbhz=(0.0, 30.0, 35.0, 37.5, 40.0, 42.5, 45.0, 47.5, 50.0, 60.0))
 #: Settings of both halves.
 SETTINGS: dict[str, Any] = {"elevation": {"mask_deg": 15.0}}
 
@@ -130,7 +140,7 @@ def model_of(runs: list[int], folder: Path, name: str) -> Path:
         for run in runs:
             with np.load(folder / f"samples-{run:03d}.npz") as file:
                 parts.append(ErrorSamples(**{key: file[key] for key in file.files}))
-        samples, fit = joined(parts), ErrorModelFit()
+        samples, fit = joined(parts), ErrorModelFit(bins=BINS)
         everything = np.ones(len(samples.error_m), dtype=bool)
         model = ErrorModel(
             bins=fit.bins,
