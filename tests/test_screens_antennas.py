@@ -36,14 +36,11 @@ from railfix.timescale import timedelta
 START = np.datetime64("2021-01-01T00:00:00", "ns")
 NAN = np.nan
 
-b3 = pytest.mark.requirement("B3")
-b5 = pytest.mark.requirement("B5")
-
 
 # -- the ambiguity zone -------------------------------------------------------------------------------------
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_the_paper_s_ambiguity_zone() -> None:
     """P1 2.3(3): about 1.1 m at 18.2 m spacing from 3 deg of elevation and 3.5 deg of azimuth."""
     elevation, azimuth = np.meshgrid(np.linspace(0, 90, 181), np.linspace(0, 360, 721))
@@ -55,7 +52,7 @@ def test_the_paper_s_ambiguity_zone() -> None:
     assert ambiguity_m(0.0, 0.0, 18.2) == pytest.approx(18.2 * (1 - np.cos(np.radians(3)) * np.cos(np.radians(3.5))))
 
 
-@b3
+@pytest.mark.requirement("B3")
 @settings(max_examples=50)
 @given(
     elevation=st.floats(0, 87), azimuth=st.floats(0, 360), by_elevation=st.floats(0, 10), by_azimuth=st.floats(0, 10)
@@ -74,7 +71,7 @@ def test_the_zone_is_the_largest_change_within_the_errors(
 # -- the expected difference --------------------------------------------------------------------------------
 
 
-@b3
+@pytest.mark.requirement("B3")
 @settings(max_examples=40)
 @given(heading=st.floats(0, 360), gradient=st.floats(-80, 80), spacing=st.floats(0.5, 40), seed=st.integers(0, 1000))
 def test_expected_difference_is_that_of_two_ranges(heading: float, gradient: float, spacing: float, seed: int) -> None:
@@ -100,7 +97,7 @@ def test_expected_difference_is_that_of_two_ranges(heading: float, gradient: flo
 # -- pairs --------------------------------------------------------------------------------------------------
 
 
-@b3
+@pytest.mark.requirement("B3")
 @pytest.mark.parametrize(
     ("front", "rear", "pairs"),
     [
@@ -122,7 +119,7 @@ def test_pairs_of_epochs(front: list[float], rear: list[float], pairs: list[tupl
     assert list(zip(a.tolist(), b.tolist(), strict=True)) == pairs
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_pairs_of_channels_and_verdicts_on_both_antennas() -> None:
     front, rear = ["G01 1C", "G01 5Q", "E05 1C", "C20 2I"], ["C20 2I", "G01 1C", "J02 1C"]
     split = [np.array([name.split() for name in names]).T for names in (front, rear)]
@@ -177,7 +174,7 @@ TRUTH_TABLE = [
 ]
 
 
-@b3
+@pytest.mark.requirement("B3")
 @pytest.mark.parametrize(("front_m", "rear_m", "refused"), TRUTH_TABLE)
 @pytest.mark.parametrize("clocks", ["common", "median"])
 def test_truth_table(front_m: float, rear_m: float, refused: bool, clocks: str) -> None:
@@ -201,7 +198,7 @@ def test_truth_table(front_m: float, rear_m: float, refused: bool, clocks: str) 
         assert "common" in result.clocks
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_exactly_at_the_limit_is_used() -> None:
     front = np.full((1, 5), 2.0**24)
     rear = front + np.array([5.0, 5.0 + 2.0**-20, -5.0, 0.0, 0.0])
@@ -213,7 +210,7 @@ def test_exactly_at_the_limit_is_used() -> None:
     assert result.reject.tolist() == [[False, True, False, False, False]]
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_a_limit_below_the_zone_is_the_zone() -> None:
     front, rear, told = two_antennas()
     rear += 0.7
@@ -223,7 +220,7 @@ def test_a_limit_below_the_zone_is_the_zone() -> None:
     assert 0 < result.reject.sum() < result.reject.size
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_instants_of_separate_clocks() -> None:
     """Tags alike, clocks 0.5 ms apart: the satellites moved meanwhile, by up to 0.4 m."""
     rate = np.broadcast_to([-790.0, 610.0, -300.0, 250.0, 5.0], (6, 5)).copy()
@@ -237,7 +234,7 @@ def test_instants_of_separate_clocks() -> None:
         np.testing.assert_allclose(result.clock_m[:, 0], SPEED_OF_LIGHT * clock_s, atol=2e-3)
 
 
-@b3
+@pytest.mark.requirement("B3")
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000))
 def test_order_and_cutting_do_not_matter(seed: int) -> None:
@@ -257,7 +254,7 @@ def test_order_and_cutting_do_not_matter(seed: int) -> None:
     np.testing.assert_array_equal(whole.metric[:, order], other.metric)
 
 
-@b3
+@pytest.mark.requirement("B3")
 @pytest.mark.parametrize(
     "wrong", [{"limit_m": 0.0}, {"clocks": "rubidium"}, {"least_satellites": 2}, {"azimuth_error_deg": -1.0}]
 )
@@ -295,7 +292,7 @@ def _two_logs(
     )  # fmt: skip
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_two_receivers_on_one_roof(recordings: Path) -> None:
     folder = recordings / "dual" / "mosaic_x2_99cm"
     front, rear = (read_observations(folder / name) for name in ("rover.obs", "base.obs"))
@@ -315,7 +312,7 @@ def test_two_receivers_on_one_roof(recordings: Path) -> None:
     assert share < 0.01
 
 
-@b3
+@pytest.mark.requirement("B3")
 def test_steps_on_one_of_two_real_receivers_are_found(recordings: Path) -> None:
     folder = recordings / "dual" / "mosaic_x2_99cm"
     front, rear = (read_observations(folder / name) for name in ("rover.obs", "base.obs"))
@@ -338,8 +335,8 @@ def test_steps_on_one_of_two_real_receivers_are_found(recordings: Path) -> None:
     assert wrong == 0
 
 
-@b3
-@b5
+@pytest.mark.requirement("B3")
+@pytest.mark.requirement("B5")
 def test_two_antennas_of_a_clean_run() -> None:
     """18.2 m apart on a line with a curve, moving, no multipath: what is left is noise, from the zenith down."""
     front, rear = (clean_observations()[name] for name in ("front", "rear"))
@@ -388,7 +385,7 @@ POSITIONS = [
 ]
 
 
-@b5
+@pytest.mark.requirement("B5")
 def test_positions_truth_table() -> None:
     front, rear, spacing, facing, metric, refused = (np.array(column) for column in zip(*POSITIONS, strict=True))
     for array in (front, rear, spacing):
@@ -402,7 +399,7 @@ def test_positions_truth_table() -> None:
         assert single.reject.tolist() == [refused[i]]
 
 
-@b5
+@pytest.mark.requirement("B5")
 @given(
     front=st.floats(-1e5, 1e5), rear=st.floats(-1e5, 1e5), spacing=st.floats(0, 200), facing=st.sampled_from([-1, 0, 1])
 )
@@ -416,7 +413,7 @@ def test_turning_the_line_round_changes_nothing(front: float, rear: float, spaci
     assert not (wide.reject & ~one.reject).any()
 
 
-@b5
+@pytest.mark.requirement("B5")
 def test_positions_are_checked() -> None:
     with pytest.raises(ValueError, match="limit_m"):
         AntennaSpacingLimits(limit_m=-1.0)
