@@ -117,8 +117,8 @@ def in_pieces(
     }, state
 
 
-#: What belongs to the channels of a log, not to its epochs.
-NO_EPOCHS = {"satellite", "signal", "columns", "clocks"}
+#: What belongs to the channels of a log or to the settings, not to its epochs.
+NO_EPOCHS = {"satellite", "signal", "columns", "clocks", "kind"}
 
 
 def flat(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
