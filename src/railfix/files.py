@@ -31,7 +31,7 @@ from typing import IO, Final, cast
 
 import ncompress
 
-from railfix.errors import InputFileError
+from railfix.errors import InputFileError, OutputError
 
 FilePath = str | PathLike[str]
 
@@ -175,6 +175,32 @@ def read_bytes(path: FilePath) -> bytes:
     """
     with open_stream(path) as stream:
         return stream.read()
+
+
+def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
+    """Write a text file under a temporary name, then rename it: it appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    text : str
+    what : str
+        What it is, for the message.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(target)
+    except OSError as error:
+        if temporary.parent.is_dir():
+            temporary.unlink(missing_ok=True)
+        raise OutputError(f"{target}: the {what} cannot be written ({error.strerror or error})") from None
 
 
 def read_text_lines(path: FilePath) -> list[str]:

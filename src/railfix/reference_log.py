@@ -19,7 +19,6 @@ such a file without a source, and so are logs of positions (RTKLIB, CSV, NMEA).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
@@ -30,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railfix.epochs import frozen
-from railfix.errors import InputFileError, OutputError
-from railfix.files import read_bytes
+from railfix.errors import InputFileError
+from railfix.files import read_bytes, write_whole
 from railfix.named_columns import NamedColumns, parse_named_columns, read_named_columns
 from railfix.nmea import read_any_positions
 from railfix.position_log import PositionLog, positions_of_table
@@ -197,14 +196,7 @@ def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaR
     OutputError
         The file cannot be written.
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text("\n".join(reference_lines(references)) + "\n", encoding="utf-8")
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{target}: the file cannot be written ({error.strerror or error})") from error
+    write_whole(path, "\n".join(reference_lines(references)) + "\n")
 
 
 def reference_lines(references: Mapping[str, AntennaReference]) -> list[str]:

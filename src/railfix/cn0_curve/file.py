@@ -21,7 +21,6 @@
 from __future__ import annotations
 
 import json
-import os
 import tomllib
 from collections.abc import Iterable
 from dataclasses import fields
@@ -32,7 +31,8 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.cn0_curve.curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean
-from railfix.errors import InputFileError, OutputError
+from railfix.errors import InputFileError
+from railfix.files import write_whole
 
 FORMAT: Final = "railfix C/N0 curve 1"
 _COLUMNS: Final = ("elevation_deg", "mean_dbhz", "spread_db", "count")
@@ -54,14 +54,7 @@ def write_cn0_curve(curve: Cn0Curve, path: str | PathLike[str]) -> None:
     OutputError
         The file cannot be written.
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text("\n".join(_lines(curve)) + "\n", encoding="utf-8")
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: the curve cannot be written ({error.strerror})") from None
+    write_whole(path, "\n".join(_lines(curve)) + "\n", what="curve")
 
 
 def _text(value: str) -> str:

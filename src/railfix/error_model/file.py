@@ -22,7 +22,6 @@ The rows stand in order of elevation, then sector, then C/N0. `pooled` counts in
 from __future__ import annotations
 
 import json
-import os
 import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
@@ -33,7 +32,8 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.error_model.model import COVERS, POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource
-from railfix.errors import InputFileError, OutputError
+from railfix.errors import InputFileError
+from railfix.files import write_whole
 
 FORMAT: Final = "railfix error model 1"
 _COLUMNS: Final = tuple(item.name for item in fields(BinStatistics))
@@ -49,14 +49,7 @@ def write_error_model(model: ErrorModel, path: str | PathLike[str]) -> None:
     OutputError
         The file cannot be written.
     """
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text("\n".join(_lines(model)) + "\n", encoding="utf-8")
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: the error model cannot be written ({error.strerror})") from None
+    write_whole(path, "\n".join(_lines(model)) + "\n", what="error model")
 
 
 def _text(value: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -11,8 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from railfix import __version__
-from railfix.errors import OutputError
 from railfix.evaluate import Evaluation
+from railfix.files import write_whole
 from railfix.plots.chart import Chart, Points, SkyEpochs
 from railfix.plots.errors import error_ranges
 from railfix.plots.signals import SKY_EPOCHS
@@ -60,14 +59,7 @@ def write_report(runs: Sequence[Path], out: Path, *, references: Sequence[Path] 
 
 def write_page(runs: Sequence[ReportedRun], evaluation: Evaluation | None, out: Path, *, title: str = "") -> Path:
     """Write the report on runs that are read already; see `write_report`."""
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
-    page = report_page(runs, evaluation, title=title)
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        temporary.replace(out)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{out}: the report cannot be written ({error.strerror or error})") from None
+    write_whole(out, report_page(runs, evaluation, title=title), what="report")
     return out
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from os import PathLike
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -12,7 +10,8 @@ from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from railfix.errors import InputFileError, OutputError, SettingsError
+from railfix.errors import InputFileError, SettingsError
+from railfix.files import write_whole
 from railfix.named_columns import NamedColumns, misspelt, read_named_columns
 from railfix.track_map.heights import check_height_datum, ellipsoidal_heights
 from railfix.track_map.segment import Segment
@@ -212,15 +211,3 @@ def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
         *(",".join(row) for row in zip(*columns.values(), strict=True)),
     ]
     write_whole(path, "\n".join(lines) + "\n")
-
-
-def write_whole(path: str | PathLike[str], text: str) -> None:
-    """Write a text file under a temporary name, then rename it."""
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True) if temporary.parent.is_dir() else None
-        raise OutputError(f"{path}: the file cannot be written ({error.strerror})") from None
