@@ -45,6 +45,7 @@ FLOORS: Final[dict[int, tuple[str, ...]]] = {
         "fault_free",
         "protecting",
         "sbas_use",
+        "delays",
         "pipeline",
     ),
     6: (

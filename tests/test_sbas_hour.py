@@ -11,10 +11,11 @@ import sbas_hour
 from railfix.antenna import Trajectory
 from railfix.config import parse_config
 from railfix.constants import FREQUENCY_L1
+from railfix.delays import SeenFrom
 from railfix.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.protecting import risk_of
 from railfix.sbas import SatelliteState
-from railfix.sbas_use import SeenFrom, sbas_delays
+from railfix.sbas_use import sbas_delays
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -82,16 +83,7 @@ def test_the_sigmas_are_those_that_positions_are_weighted_with(above: sbas_hour.
     place = np.broadcast_to(line.ecef_m[1], (len(above.time), 3))
     frequency = np.full(len(above.satellite), FREQUENCY_L1)
     elevation, azimuth = elevation_azimuth(above.position_ecef_m, place)
-    latitude, longitude, height = geodetic_from_ecef(place)
-    seen = SeenFrom(
-        receiver_ecef_m=place,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        height_m=height,
-        satellite_ecef_m=above.position_ecef_m,
-        elevation_deg=elevation,
-        azimuth_deg=azimuth,
-    )
+    seen = SeenFrom.of(place, above.position_ecef_m)
     air = sbas_delays(above.engine, above.fixes, above.time, seen, frequency)
     flt, uire, tropo = sbas_hour.sigmas_of_sbas(above, place, elevation, azimuth)
     both = above.good & (elevation > 5.0) & np.isfinite(uire)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import gzip
 import importlib.resources
 import io
+import json
 import os
 import re
 import shutil
@@ -175,6 +176,11 @@ def read_bytes(path: FilePath) -> bytes:
     """
     with open_stream(path) as stream:
         return stream.read()
+
+
+def toml_string(text: str) -> str:
+    """A text as TOML writes it: a JSON string, but for the control character that only TOML escapes."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:

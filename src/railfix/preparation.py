@@ -8,20 +8,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.carrier import Slips
 from railfix.channels import Channels
 from railfix.clock_elimination import Ranges
 from railfix.config import Config
+from railfix.delays import SeenFrom, modelled_delays
 from railfix.epochs import Observations
 from railfix.error_model import ErrorModel
-from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.measurement import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.navigation import Navigation
 from railfix.orbits import SatelliteStates, satellite_states
 from railfix.reasons import Reason
 from railfix.sbas import SbasCorrections
-from railfix.sbas_use import SBAS_SIGNAL, SeenFrom, corrected_satellites, sbas_delays
+from railfix.sbas_use import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.screens import Screened
 from railfix.section import SearchIndex, search
 from railfix.spp import single_point
@@ -54,7 +53,7 @@ class Prepared:
         Where the satellites are seen from.
     elevation_deg, azimuth_deg : ndarray, shape (T, K)
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        Delays taken off the codes; 0 where the model is off.
+        Delays taken off the codes; 0 where the model is off, NaN where SBAS has none.
     corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
     bias_m : ndarray, shape (T, K) [m]
         Largest nominal bias of each range by the error model; 0 without one.
@@ -191,37 +190,17 @@ def prepare(
     if fixes is not None:
         clean = clean + np.nan_to_num(fixes.fast_m)
     anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
-    elevation, azimuth = elevation_azimuth(states.position_ecef_m, anchor)
-    latitude, longitude, height = geodetic_from_ecef(anchor)
-    ionosphere, troposphere = np.zeros((2, *code.shape))
-    if klobuchar is not None:
-        ionosphere = klobuchar_delay_m(
-            obs.time, latitude, longitude, elevation, azimuth, klobuchar, channels.frequency_hz
-        )
-    if config.troposphere == "saastamoinen":
-        troposphere = saastamoinen_delay_m(latitude, height, elevation)
-    sbas_sigma = np.zeros(code.shape)
-    if sbas is not None and fixes is not None:
-        seen = SeenFrom(
-            receiver_ecef_m=anchor,
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            height_m=height,
-            satellite_ecef_m=states.position_ecef_m,
-            elevation_deg=elevation,
-            azimuth_deg=azimuth,
-        )
-        air = sbas_delays(sbas, fixes, obs.time, seen, channels.frequency_hz)
-        ionosphere, troposphere, sbas_sigma = air.ionosphere_m, air.troposphere_m, air.sigma_m
-        reason |= np.where(reason & Reason.NOT_OBSERVED, 0, air.reason)
-    clean = clean - ionosphere - troposphere
-    if error_model is None:
-        sigma, bias = code_sigma_m(cn0, elevation, noise=config.noise), np.zeros(code.shape)
+    seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
+    if sbas is None or fixes is None:
+        air = modelled_delays(obs.time, seen, frequency, klobuchar=klobuchar, troposphere=config.troposphere)
     else:
-        sigma, bias = _modelled(error_model, index, anchor, elevation, azimuth, cn0)
-        if error_model.covers == "local" and sbas is None:
-            sigma = np.hypot(sigma, config.nominal.sigma_m(elevation))
-    sigma = np.hypot(sigma, sbas_sigma)
+        air = sbas_delays(sbas, fixes, obs.time, seen, frequency)
+        reason |= np.where(reason & Reason.NOT_OBSERVED, 0, air.reason)
+    clean = clean - air.ionosphere_m - air.troposphere_m
+    local, bias = _local_errors(seen, cn0, index, config, error_model)
+    if error_model is not None and error_model.covers == "local" and sbas is None:
+        local = np.hypot(local, config.nominal.sigma_m(seen.elevation_deg))
+    sigma = np.hypot(local, air.sigma_m)
     reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
     return Prepared(
         observations=obs,
@@ -231,10 +210,10 @@ def prepare(
         cn0_dbhz=cn0,
         satellites=states,
         anchor_ecef_m=anchor,
-        elevation_deg=elevation,
-        azimuth_deg=azimuth,
-        ionosphere_m=ionosphere,
-        troposphere_m=troposphere,
+        elevation_deg=seen.elevation_deg,
+        azimuth_deg=seen.azimuth_deg,
+        ionosphere_m=air.ionosphere_m,
+        troposphere_m=air.troposphere_m,
         corrected_code_m=clean,
         sigma_m=sigma,
         bias_m=bias,
@@ -242,17 +221,15 @@ def prepare(
     )
 
 
-def _modelled(
-    model: ErrorModel,
-    index: SearchIndex,
-    anchor: Floats,
-    elevation: Floats,
-    azimuth: Floats,
-    cn0: Floats,
+def _local_errors(
+    seen: SeenFrom, cn0: Floats, index: SearchIndex, config: Config, model: ErrorModel | None
 ) -> tuple[Floats, Floats]:
-    """Sigma and bias of the ranges by an error model, shapes (T, K)."""
-    arc, _ = index.trajectory.nearest(anchor)
-    sigma, bias = model.at(elevation, azimuth - index.trajectory.body_azimuth_deg(arc)[:, None], cn0)
+    """Sigma and bias of the ranges by the error model, or by the noise settings: shapes (T, K)."""
+    if model is None:
+        return code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), np.zeros(cn0.shape)
+    arc, _ = index.trajectory.nearest(seen.receiver_ecef_m)
+    turned = seen.azimuth_deg - index.trajectory.body_azimuth_deg(arc)[:, None]
+    sigma, bias = model.at(seen.elevation_deg, turned, cn0)
     return sigma, np.nan_to_num(bias)
 
 

@@ -6,13 +6,14 @@ sigma_UIRE^2 + sigma_tropo^2``. What multipath and receiver add on a railway com
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.delays import Delays, SeenFrom
 from railfix.orbits import SatelliteStates
 from railfix.reasons import Reason
 from railfix.sbas import (
@@ -48,47 +49,6 @@ _REASON_OF: Final = {
 REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteState)], dtype=np.int64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeenFrom:
-    """Where the satellites stand from a place that is good to some hundred metres: T epochs by K channels.
-
-    Attributes
-    ----------
-    receiver_ecef_m : ndarray, shape (T, 3) [m]
-    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-        The same.
-    satellite_ecef_m : ndarray, shape (T, K, 3) [m]
-    elevation_deg, azimuth_deg : ndarray, shape (T, K)
-    """
-
-    receiver_ecef_m: Floats
-    latitude_deg: Floats
-    longitude_deg: Floats
-    height_m: Floats
-    satellite_ecef_m: Floats
-    elevation_deg: Floats
-    azimuth_deg: Floats
-
-
-@dataclass(frozen=True, kw_only=True)
-class SbasDelays:
-    """Delays and uncertainty of T epochs by K channels.
-
-    Attributes
-    ----------
-    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        On the channel's own carrier; NaN where unknown, and where the satellite has no correction.
-    sigma_m : ndarray, shape (T, K) [m]
-        Root of ``sigma_flt^2 + sigma_UIRE^2 + sigma_tropo^2``; NaN where one of them is unknown.
-    reason : ndarray of int64, shape (T, K)
-    """
-
-    ionosphere_m: Floats
-    troposphere_m: Floats
-    sigma_m: Floats
-    reason: Bits
-
-
 def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
     """Satellites moved and their clocks set by long-term corrections, and the reasons of those without.
 
@@ -114,7 +74,7 @@ def sbas_delays(
     time: NDArray[np.datetime64],
     seen: SeenFrom,
     frequency_hz: Floats,
-) -> SbasDelays:
+) -> Delays:
     """Delays of the air by the grid and by DO-229D's troposphere, and the sigma of the corrected codes.
 
     Worked out for the channels that have a correction at any of the epochs; the others are refused anyway.
@@ -129,7 +89,7 @@ def sbas_delays(
 
     Returns
     -------
-    SbasDelays
+    Delays
     """
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
@@ -152,4 +112,4 @@ def sbas_delays(
         troposphere[:, some] = np.where(corrected, troposphere_m(time, latitude, height, elevation), np.nan)
         sigma[:, some] = np.where(corrected, np.sqrt(variance), np.nan)
         reason[:, some] = np.where(corrected, unknown, 0)
-    return SbasDelays(ionosphere_m=ionosphere, troposphere_m=troposphere, sigma_m=sigma, reason=reason)
+    return Delays(ionosphere_m=ionosphere, troposphere_m=troposphere, sigma_m=sigma, reason=reason)

@@ -1,4 +1,4 @@
-"""The command line: ``railfix run``, ``railfix demo``, ``railfix map``.
+"""The command line: the program ``railfix`` and its commands.
 
 The commands import what they need when they run, so that ``railfix --help`` answers at once.
 """

@@ -20,7 +20,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Iterable
 from dataclasses import fields
@@ -32,7 +31,7 @@ import numpy as np
 
 from railfix.cn0_curve.curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean
 from railfix.errors import InputFileError
-from railfix.files import write_whole
+from railfix.files import toml_string, write_whole
 
 FORMAT: Final = "railfix C/N0 curve 1"
 _COLUMNS: Final = ("elevation_deg", "mean_dbhz", "spread_db", "count")
@@ -57,11 +56,6 @@ def write_cn0_curve(curve: Cn0Curve, path: str | PathLike[str]) -> None:
     write_whole(path, "\n".join(_lines(curve)) + "\n", what="curve")
 
 
-def _text(value: str) -> str:
-    # a JSON string is a TOML basic string
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def _numbers(values: Iterable[float], digits: int) -> str:
     return "[" + ", ".join(f"{value:.{digits}f}" for value in values) + "]"
 
@@ -69,23 +63,23 @@ def _numbers(values: Iterable[float], digits: int) -> str:
 def _lines(curve: Cn0Curve) -> Iterable[str]:
     source = curve.source
     yield "# Mean C/N0 over elevation, measured under open sky; belongs to this antenna and receiver only."
-    yield f"format = {_text(FORMAT)}"
+    yield f"format = {toml_string(FORMAT)}"
     yield ""
     yield "[source]"
     for name in _TEXTS:
-        yield f"{name} = {_text(getattr(source, name))}"
+        yield f"{name} = {toml_string(getattr(source, name))}"
     yield f"epochs = {source.epochs}"
     yield f"position_ecef_m = {_numbers(source.position_ecef_m, 3)}"
     for name, digest in source.files:
         yield ""
         yield "[[source.file]]"
-        yield f"name = {_text(name)}"
-        yield f"sha256 = {_text(digest)}"
+        yield f"name = {toml_string(name)}"
+        yield f"sha256 = {toml_string(digest)}"
     for mean in curve.means:
         yield ""
         yield f"[[curve]]  # {KINDS.get(mean.kind, mean.kind)}"
-        yield f"kind = {_text(mean.kind)}"
-        yield f"signal = {_text(mean.signal)}"
+        yield f"kind = {toml_string(mean.kind)}"
+        yield f"signal = {toml_string(mean.signal)}"
         for name, digits in zip(_COLUMNS, (3, 2, 2, 0), strict=True):
             yield f"{name} = {_numbers(getattr(mean, name), digits)}"
 

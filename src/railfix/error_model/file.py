@@ -33,7 +33,7 @@ import numpy as np
 
 from railfix.error_model.model import COVERS, POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource
 from railfix.errors import InputFileError
-from railfix.files import write_whole
+from railfix.files import toml_string, write_whole
 
 FORMAT: Final = "railfix error model 1"
 _COLUMNS: Final = tuple(item.name for item in fields(BinStatistics))
@@ -52,16 +52,11 @@ def write_error_model(model: ErrorModel, path: str | PathLike[str]) -> None:
     write_whole(path, "\n".join(_lines(model)) + "\n", what="error model")
 
 
-def _text(value: str) -> str:
-    # a JSON string is a TOML basic string
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def _lines(model: ErrorModel) -> Iterator[str]:
     source, bins = model.source, model.bins
     yield "# Errors of corrected pseudoranges by elevation, azimuth from the car's front, and C/N0."
-    yield f"format = {_text(FORMAT)}"
-    yield f"covers = {_text(model.covers)}"
+    yield f"format = {toml_string(FORMAT)}"
+    yield f"covers = {toml_string(model.covers)}"
     yield ""
     yield "[bins]"
     yield f"elevation_deg = {list(bins.elevation_deg)}"
@@ -69,15 +64,15 @@ def _lines(model: ErrorModel) -> Iterator[str]:
     yield f"cn0_dbhz = {list(bins.cn0_dbhz)}"
     yield ""
     yield "[source]"
-    yield f"runs = [{', '.join(_text(run) for run in source.runs)}]"
+    yield f"runs = [{', '.join(toml_string(run) for run in source.runs)}]"
     for name in _TEXTS:
-        yield f"{name} = {_text(getattr(source, name))}"
+        yield f"{name} = {toml_string(getattr(source, name))}"
     yield f"epochs = {source.epochs}"
     for name, digest in source.files:
         yield ""
         yield "[[source.file]]"
-        yield f"name = {_text(name)}"
-        yield f"sha256 = {_text(digest)}"
+        yield f"name = {toml_string(name)}"
+        yield f"sha256 = {toml_string(digest)}"
     for name in ("before", "after"):
         statistics: BinStatistics = getattr(model, name)
         yield ""

@@ -11,7 +11,7 @@ From the model of `railfix.raim`, once for noise alone and once with fault hypot
 
 from railfix.protection.level import Cause, ProtectionLevel, along_track_level
 from railfix.protection.risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
-from railfix.protection.sbas import LevelsInSpace, levels_in_space, range_variance_m2, sbas_level
+from railfix.protection.sbas import LevelsInSpace, levels_in_space, sbas_level
 from railfix.protection.status import Status, availability
 
 __all__ = [
@@ -29,6 +29,5 @@ __all__ = [
     "availability",
     "k_factor",
     "levels_in_space",
-    "range_variance_m2",
     "sbas_level",
 ]

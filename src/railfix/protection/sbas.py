@@ -1,7 +1,7 @@
 """Levels without a fault: along the track, and in space after RTCA DO-229D appendix J.
 
 Both take the variances of the ranges from their weights, ``1/weight = sigma_flt^2 + sigma_UIRE^2 +
-sigma_tropo^2 + sigma_rail^2`` (`range_variance_m2`): the railway model of multipath and receiver noise
+sigma_tropo^2 + sigma_rail^2``: the railway model of multipath and receiver noise
 stands where appendix J has the airborne one (P1 2.4).
 """
 
@@ -19,31 +19,13 @@ from railfix.raim import LinearModel, point_model
 Floats = NDArray[np.float64]
 
 
-def range_variance_m2(
-    flt_sigma_m: ArrayLike, uire_sigma_m: ArrayLike, tropo_sigma_m: ArrayLike, rail_sigma_m: ArrayLike
-) -> Floats:
-    """Variance of a corrected range, any shape [m^2] (DO-229D J.1, the last term the railway's; P1 2.4).
-
-    Parameters
-    ----------
-    flt_sigma_m, uire_sigma_m, tropo_sigma_m, rail_sigma_m : array_like [m]
-        Fast and long-term corrections with their degradation, ionosphere, troposphere, multipath left after
-        the screens with receiver noise. NaN in any gives NaN.
-    """
-    parts = (flt_sigma_m, uire_sigma_m, tropo_sigma_m, rail_sigma_m)
-    total = np.zeros(())
-    for part in parts:
-        total = total + np.asarray(part, dtype=np.float64) ** 2
-    return np.asarray(total)
-
-
 def sbas_level(model: LinearModel, *, k: float, scale: ArrayLike = 1.0) -> Floats:
     """Fault-free level along the track, ``K sigma_s``, shape (T,) [m]; NaN where there is no position.
 
     Parameters
     ----------
     model : LinearModel
-        On the line; weights from `range_variance_m2`.
+        On the line; weights from the variances of the corrected ranges.
     k : float
         `RiskBudget.sample_k`, or one of DO-229's.
     scale : array_like, shape (T,) or ()
@@ -90,7 +72,7 @@ def levels_in_space(
     Parameters
     ----------
     ranges : Ranges
-        T epochs; weights from `range_variance_m2`.
+        T epochs; weights from the variances of the corrected ranges.
     ecef_m : ndarray, shape (T, 3) [m]
         Positions; NaN where there is none.
     k_horizontal, k_vertical : float

@@ -16,6 +16,7 @@ from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.navigation import Navigation
 from railfix.simulate.alignment import Alignment, made_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
+from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ, CN0_SECOND_DB
 from railfix.simulate.constellation import made_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
 from railfix.simulate.disturbance import Disturbances, Geometry
@@ -31,10 +32,6 @@ from railfix.timescale import seconds
 Floats = NDArray[np.float64]
 Times = NDArray[np.datetime64]
 
-#: C/N0 at elevation el [dB-Hz]: a + b sin(el); the second signal is weaker.
-CN0_HORIZON_DBHZ: Final = 34.0
-CN0_RISE_DBHZ: Final = 16.0
-CN0_SECOND_DB: Final = -3.0
 #: Receivers report C/N0 in steps [dB-Hz].
 CN0_STEP_DBHZ: Final = 0.25
 #: Epochs that are simulated at once.

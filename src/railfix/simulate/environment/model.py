@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railfix.constants import SPEED_OF_LIGHT
 from railfix.signals import carrier_frequency_hz
+from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ
 from railfix.simulate.disturbance import Disturbance, Geometry
 from railfix.simulate.environment.bars import Electrification
 from railfix.simulate.environment.correlator import Tracked, tracked
@@ -105,7 +106,7 @@ class Environment:
             e, c = epoch[first : first + _BLOCK], channel[first : first + _BLOCK]
             rays = _rays(geometry, e, c, wavelength, self.settings.antenna_height_m)
             got = self._tracked(rays, platform[e], geometry.speed_mps[e], chip[c])
-            clear = receiver.cn0_horizon_dbhz + receiver.cn0_rise_dbhz * rays.z
+            clear = CN0_HORIZON_DBHZ + CN0_RISE_DBHZ * rays.z
             lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
             code[e, c] = np.where(lost, np.nan, got.code_m)
             phase[e, c] = got.phase_m

@@ -232,8 +232,6 @@ class CorrelatorSettings:
         Early to late.
     tracking_cn0_dbhz : float
         Weaker signals are lost.
-    cn0_horizon_dbhz, cn0_rise_dbhz : float
-        C/N0 of a clear signal, horizon + rise sin(elevation): against these the loss is judged.
     code_loop_hz, carrier_loop_hz : float
         Bandwidths of the loops: multipath that turns faster is averaged.
     backward_db : float
@@ -243,8 +241,6 @@ class CorrelatorSettings:
     chip_m: float = 293.05
     spacing_chips: float = 0.1
     tracking_cn0_dbhz: float = 20.0
-    cn0_horizon_dbhz: float = 34.0
-    cn0_rise_dbhz: float = 16.0
     code_loop_hz: float = 1.0
     carrier_loop_hz: float = 10.0
     backward_db: float = 15.0
