@@ -120,7 +120,7 @@ def epoch_starts(text: str) -> list[int]:
 
 def bench_in(folder: Path) -> Bench:
     """The shipped run, cut short and unpacked."""
-    from railfix.files import read_bytes
+    from railfix.core.files import read_bytes
     from railfix.simulate.demo_data import demo_files
 
     demo = demo_files()

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 import synthetic
-from railfix.antenna import Trajectory
-from railfix.carrier import Phases
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.epochs import Observations
-from railfix.geodesy import range_with_rotation
-from railfix.track_map import Track
+from railfix.core.geodesy import range_with_rotation
+from railfix.gnss.observations import Observations
+from railfix.positioning.carrier import Phases
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 START = np.datetime64("2024-03-05T03:10:03", "ns")
 WAVELENGTH_M = 299_792_458.0 / 1_575.42e6

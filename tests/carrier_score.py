@@ -18,9 +18,14 @@ import polars as pl
 import recordings_score
 import recordings_truth
 from pipeline_cases import clean_files
-from railfix.antenna import Trajectory
-from railfix.atmosphere import saastamoinen_delay_m
-from railfix.carrier import (
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.evaluate import along_track_error, interpolate_reference, score
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.positioning.carrier import (
     PhaseLimits,
     PhasePositions,
     Phases,
@@ -36,17 +41,12 @@ from railfix.carrier import (
     smooth_codes,
     track_jumps,
 )
-from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges, clock_groups
-from railfix.config import Config, parse_config
-from railfix.constrained import constrained_position
-from railfix.epochs import Observations
-from railfix.evaluate import along_track_error, interpolate_reference, score
-from railfix.geodesy import geodetic_from_ecef
-from railfix.navigation import Navigation
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.rinex import read_navigation, read_observations
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.positioning.constrained import constrained_position
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups
+from railfix.ranges.atmosphere import saastamoinen_delay_m
+from railfix.track import read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 SETTINGS = parse_config({"elevation": {"mask_deg": 15.0}})
 #: Phase noise at the zenith [m]: tracking, multipath, delays that the models miss.

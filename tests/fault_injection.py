@@ -14,19 +14,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import ncx2
 
 import recordings_truth
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import ClockTies, Ranges, clock_groups
-from railfix.config import Config, parse_config
-from railfix.constrained import constrained_position
-from railfix.epochs import Observations
-from railfix.geodesy import ecef_from_geodetic
-from railfix.navigation import Navigation
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.raim import (
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.integrity.raim import (
     LinearModel,
     RaimLimits,
     constrained_model,
@@ -36,13 +31,14 @@ from railfix.raim import (
     reliability,
     threshold,
 )
-from railfix.raim.model import compact
-from railfix.rinex import read_navigation, read_observations
+from railfix.integrity.raim.model import compact
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.positioning.constrained import constrained_position
+from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups
+from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
-
-Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 #: Sizes of the faults [m].
 SIZES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)

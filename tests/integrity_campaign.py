@@ -20,9 +20,17 @@ from typing import Any
 
 import numpy as np
 
-from railfix.antenna import Trajectory
-from railfix.config import parse_config
-from railfix.error_model import (
+from railfix.core.reasons import Status
+from railfix.evaluate.range_errors import range_errors
+from railfix.evaluate.range_errors.gather import joined
+from railfix.integrity.protection import Cause
+from railfix.integrity.protection import Status as LevelStatus
+from railfix.integrity.stanford import Region, stanford
+from railfix.io.reference_log import AntennaReference
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult, State
+from railfix.ranges.error_model import (
     ErrorBins,
     ErrorModel,
     ErrorModelFit,
@@ -31,19 +39,11 @@ from railfix.error_model import (
     read_error_model,
     write_error_model,
 )
-from railfix.pipeline import EpochProcessor
-from railfix.protection import Cause
-from railfix.protection import Status as LevelStatus
-from railfix.range_errors import range_errors
-from railfix.range_errors.gather import joined
-from railfix.reasons import Status
-from railfix.reference_log import AntennaReference
-from railfix.results import AntennaResult, State
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_toml
 from railfix.simulate.scenario_file import load_recipe
-from railfix.stanford import Region, stanford
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 ANTENNAS = ("front", "rear")
 ALARM_LIMITS_M = (10.0, 20.0, 40.0)

@@ -19,27 +19,27 @@ import numpy as np
 import recordings_ablate
 import recordings_score
 from conftest import ROOT
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import ClockTies, Ranges, clock_groups, fit
-from railfix.config import Config, parse_config
-from railfix.constrained import constrained_position
-from railfix.epochs import Observations
-from railfix.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.core.reasons import CHECK_FAILED, Reason, Status
 from railfix.evaluate import along_track_error, interpolate_reference
-from railfix.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.navigation import Navigation
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.preparation import SOMEWHERE_ABOVE_M
-from railfix.protecting import risk_of
-from railfix.protection import ProtectionLevel, along_track_level
-from railfix.raim import constrained_model
-from railfix.range_errors import ModelInputs, error_model_from_runs, range_errors
-from railfix.reasons import CHECK_FAILED, Reason, Status
-from railfix.reference_log import AntennaReference, read_reference
-from railfix.rinex import read_navigation, read_observations
+from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs, range_errors
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.integrity.protection import ProtectionLevel, along_track_level
+from railfix.integrity.raim import constrained_model
+from railfix.integrity.stanford import Region, Stanford, stanford
+from railfix.io.reference_log import AntennaReference, read_reference
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.protection_levels import risk_of
+from railfix.positioning.constrained import constrained_position
+from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, fit
+from railfix.ranges.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
 from railfix.run.driver import open_inputs
 from railfix.run.past import past_run
-from railfix.stanford import Region, Stanford, stanford
+from railfix.track.trajectory import Trajectory
 
 MASK: Final = {"elevation": {"mask_deg": 15.0}}
 ALARM_LIMITS_M: Final = (10.0, 20.0, 40.0)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-#: A sound Keplerian record (GPS-like orbit), by the names of `railfix.navigation.KeplerRecords` where it has them.
+#: A sound Keplerian record (GPS-like orbit), by the names of `railfix.gnss.navigation.KeplerRecords` where it has them.
 KEPLER: dict[str, float] = {
     "af0_s": -1.234567890123e-04, "af1": 3.4e-12, "af2": 0.0,
     "iode": 45.0, "crs": -57.25, "delta_n": 4.6e-09, "m0": 1.2345,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 
 TOE = np.datetime64("2024-03-13T08:00:00", "ns")
 HOUR = np.timedelta64(3600, "s")

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from p1_ride import (
     LARGE_M,
@@ -43,12 +42,10 @@ from p1_ride import (
 )
 from p1_static import static_report
 from p1_test_line import line_report
-from railfix.reasons import CHECK_FAILED, Status
+from railfix.core.arrays import Masks
+from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.simulate import Scenario
 from railfix.simulate.scenario_file import load_recipe
-
-Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
 
 #: P1, chapter 5: largest error and positioning rate, conventional and by P1's method.
 P1_LARGEST_M: Final = (65.8, 10.2)

@@ -10,21 +10,18 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
-from railfix.config import parse_config
-from railfix.pipeline import AntennaResult, EpochProcessor, State
-from railfix.reasons import CHECK_FAILED, Status
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.reasons import CHECK_FAILED, Status
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
+from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_toml
 from railfix.simulate.scenario import ANTENNAS, RunSettings
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.signals import Piece
-from railfix.vehicle import antenna_trajectory, read_vehicle
-
-Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 #: Errors along the line from here on are kept with the signals that made them.
 LARGE_M: Final = 10.0
@@ -83,10 +80,10 @@ class Passage:
 
     run: str
     antenna: str
-    time: NDArray[np.datetime64]
+    time: Datetimes
     chainage_m: Floats
     speed_mps: Floats
-    environment: NDArray[np.str_]
+    environment: Strings
     observed: Masks
     ecef_m: Floats
 
@@ -97,8 +94,8 @@ class Found:
 
     error_m: Floats
     before_checks_m: Floats
-    status: NDArray[np.int8]
-    n_used: NDArray[np.int64]
+    status: Codes
+    n_used: Integers
     own_sigma_m: Floats
     horizontal_m: Floats
 

@@ -14,22 +14,21 @@ from tempfile import TemporaryDirectory
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
-from railfix.config import parse_config
-from railfix.epochs import Observations
-from railfix.pipeline import EpochProcessor
-from railfix.reasons import Status
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
+from railfix.core.reasons import Status
+from railfix.gnss.observations import Observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.line_settings import Element, LineSettings
 from railfix.simulate.run import vehicle_toml
 from railfix.simulate.scenario import RunSettings, Station
 from railfix.simulate.scenario_file import load_recipe, whole_run_s
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-Floats = NDArray[np.float64]
 Place = Literal["houses", "open field", "open field, a line without curves"]
 
 #: Starts of the standing experiments: the sky turns on between them.
@@ -57,20 +56,20 @@ class Subsets:
     `turn_deg` is how far the line turns between the true place and the position.
     """
 
-    place: NDArray[np.int64]
+    place: Integers
     error_m: Floats
     turn_deg: Floats
     sigma_m: Floats
     dilution: Floats
-    status: NDArray[np.int8]
+    status: Codes
     excess: Floats
 
     @property
-    def over(self) -> NDArray[np.bool_]:
+    def over(self) -> Masks:
         return np.abs(self.error_m) > WRONG_M
 
     @property
-    def wrong(self) -> NDArray[np.bool_]:
+    def wrong(self) -> Masks:
         return self.over & (np.abs(self.error_m) > WRONG_SIGMAS * self.sigma_m)
 
 
@@ -99,13 +98,13 @@ def trajectory_of(simulation: Simulation) -> Trajectory:
         return antenna_trajectory(simulation.line.track(), read_vehicle(path), "front")
 
 
-def classes_of(simulation: Simulation, chainage_m: Floats) -> NDArray[np.int64]:
+def classes_of(simulation: Simulation, chainage_m: Floats) -> Integers:
     """Index into `CLASSES` of places."""
     radius = 1.0 / np.maximum(np.abs(simulation.line.curvature_at(chainage_m)), 1e-9)
     return np.select([radius > 3000.0, radius > 305.0, radius > 295.0, radius < 165.0], [0, 1, 2, 3], 1)
 
 
-def only(observations: Observations, channels: Sequence[int], epochs: NDArray[np.intp]) -> Observations:
+def only(observations: Observations, channels: Sequence[int], epochs: Indices) -> Observations:
     """Some channels and epochs of a log."""
     index = list(channels)
     return Observations(

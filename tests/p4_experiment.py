@@ -13,19 +13,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
-from railfix.config import parse_config
-from railfix.epochs import Observations
+from railfix.core.arrays import Floats, Masks
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.evaluate import along_track_error
-from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.raim import Outcome, RaimLimits
-from railfix.rinex import read_navigation, read_observations
-from railfix.track_map import Track
-
-Floats = NDArray[np.float64]
+from railfix.gnss.observations import Observations
+from railfix.integrity.raim import Outcome, RaimLimits
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 #: P4: the station is 1433 m along the line from the first point, 2.7 m beside it.
 ALONG_M: Final = 1433.0
@@ -95,11 +93,11 @@ class Day:
     east_north_m: Floats
 
     @property
-    def tested(self) -> NDArray[np.bool_]:
+    def tested(self) -> Masks:
         return self.result.raim.outcome != Outcome.UNTESTABLE
 
     @property
-    def located(self) -> NDArray[np.bool_]:
+    def located(self) -> Masks:
         return np.isfinite(self.along_m)
 
 

@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from railfix.antenna import Trajectory
-from railfix.config import Config, parse_config
-from railfix.epochs import Observations
-from railfix.navigation import Navigation
-from railfix.pipeline import AntennaResult, EpochProcessor, State
-from railfix.rinex import read_navigation, read_observations
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.simulate import Scenario, write_run
 from railfix.simulate.demo_data import demo_files
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track import read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 ANTENNAS = ("front", "rear")
 

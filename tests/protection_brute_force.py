@@ -20,12 +20,12 @@ from scipy.stats import poisson
 
 import raim_oracle
 import synthetic
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.geodesy import range_with_rotation
-from railfix.protection import ProtectionLevel, RiskBudget, along_track_level
-from railfix.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude
-from railfix.raim.model import compact
+from railfix.core.geodesy import range_with_rotation
+from railfix.integrity.protection import ProtectionLevel, RiskBudget, along_track_level
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude
+from railfix.integrity.raim.model import compact
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.track.trajectory import Trajectory
 
 #: Ten of each of three clocks to choose from.
 SYSTEMS: Final = "G" * 10 + "E" * 10 + "C" * 10

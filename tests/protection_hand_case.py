@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from scipy.stats import norm
 
-from railfix.protection import RiskBudget, along_track_level
-from railfix.protection.risk import more_than_two
-from railfix.raim import LinearModel
+from railfix.integrity.protection import RiskBudget, along_track_level
+from railfix.integrity.protection.risk import more_than_two
+from railfix.integrity.raim import LinearModel
 
 #: A risk whose parts are all asked for, and leave figures that can be followed.
 HAND: Final = RiskBudget(

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pyrtklib5 as rtk
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.navigation import GlonassRecords, KeplerRecords
-from railfix.timescale import to_week
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import to_week
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
 _SYSTEMS = {"G": rtk.SYS_GPS, "J": rtk.SYS_QZS, "E": rtk.SYS_GAL, "C": rtk.SYS_CMP, "R": rtk.SYS_GLO}
 

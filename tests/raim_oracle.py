@@ -10,13 +10,13 @@ import numpy as np
 from scipy.stats import chi2
 
 import synthetic
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import UNTIED_M, ClockTies, Ranges, clock_groups
-from railfix.constrained import Constrained, constrained_position
-from railfix.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.raim import LinearModel, Outcome, RaimLimits, constrained_model, point_model
-from railfix.spp import single_point
-from railfix.track_map import Track
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model, point_model
+from railfix.positioning.constrained import Constrained, constrained_position
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups
+from railfix.positioning.single_point import single_point
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 #: Offsets of the clocks that made cases have [m].
 CLOCK_OFFSET_M = (0.0, 12.0, -30.0, 5.0)

@@ -17,7 +17,7 @@ import multipath_run
 import recordings_truth
 from conftest import ROOT
 from railfix.cli import app
-from railfix.files import read_bytes
+from railfix.core.files import read_bytes
 
 DOCUMENT: Final = ROOT / "docs" / "screens.md"
 BLOCK: Final = re.compile(r"(<!-- tables -->\n).*?(<!-- end of tables -->\n)", re.DOTALL)

@@ -13,25 +13,25 @@ from pathlib import Path
 import numpy as np
 
 import recordings_truth
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.clock_offsets import OffsetState, tie_clocks
-from railfix.config import Config, parse_config
-from railfix.constants import CLOCK_GROUP
-from railfix.constrained import Constrained, constrained_position
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.timescale import timedelta
 from railfix.evaluate import Score, along_track_error, interpolate_reference, score
-from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
-from railfix.measurement import code_sigma_m
-from railfix.noise_scale import noise_scale, own_sigma_m
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.preparation import without
-from railfix.raim import Outcome as RaimOutcome
-from railfix.raim import constrained_model, exclude
-from railfix.rinex import read_navigation, read_observations
-from railfix.section import SearchIndex, search
-from railfix.spp import single_point
-from railfix.timescale import timedelta
-from railfix.track_map import Track, from_positions
+from railfix.integrity.raim import Outcome as RaimOutcome
+from railfix.integrity.raim import constrained_model, exclude
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.corrected_ranges import without
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.positioning.constrained import Constrained, constrained_position
+from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
+from railfix.positioning.noise_scale import noise_scale, own_sigma_m
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.section_search import SearchIndex, search
+from railfix.positioning.single_point import single_point
+from railfix.ranges.weights import code_sigma_m
+from railfix.track import Track, from_positions
+from railfix.track.trajectory import Trajectory
 
 #: Settings of the tables: the elevation mask of 15 deg is common to all.
 TABLES = {

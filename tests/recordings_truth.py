@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.position_log import read_positions, write_positions_csv
-from railfix.timescale import from_week, timedelta, utc_to_gpst
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.core.timescale import from_week, timedelta, utc_to_gpst
+from railfix.io.position_log import read_positions, write_positions_csv
 
-Floats = NDArray[np.float64]
-Datetimes = NDArray[np.datetime64]
 Truth = tuple[Datetimes, Floats]
 
 #: Antenna from the reference unit: right, forward, up [m]. extrinsic.yaml gives the antenna from the IMU

@@ -10,41 +10,42 @@ import sys
 from pathlib import Path
 from typing import Any, Final
 
-from railfix import errors, reasons
-from railfix.config import Config
-from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.core import errors, reasons
+from railfix.pipeline.config import Config
+from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
 
 DOCUMENT: Final = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
 
 #: Modules whose public names are listed, in reading order.
 MODULES: Final = (
-    "railfix.rinex",
-    "railfix.track_map",
-    "railfix.antenna",
-    "railfix.vehicle",
-    "railfix.config",
-    "railfix.pipeline",
-    "railfix.results",
+    "railfix.io.rinex",
+    "railfix.track",
+    "railfix.track.trajectory",
+    "railfix.track.vehicle",
+    "railfix.pipeline.config",
+    "railfix.pipeline.processor",
+    "railfix.pipeline.results",
     "railfix.screens",
-    "railfix.raim",
-    "railfix.protection",
-    "railfix.stanford",
-    "railfix.error_model",
-    "railfix.range_errors",
-    "railfix.sbas",
-    "railfix.cn0_curve",
-    "railfix.tables",
+    "railfix.integrity.raim",
+    "railfix.integrity.protection",
+    "railfix.integrity.stanford",
+    "railfix.ranges.error_model",
+    "railfix.evaluate.range_errors",
+    "railfix.ranges.sbas",
+    "railfix.ranges.cn0_curve",
+    "railfix.pipeline.tables",
     "railfix.run",
-    "railfix.reference_log",
+    "railfix.io.reference_log",
     "railfix.reference",
-    "railfix.doppler_speed",
+    "railfix.positioning.doppler_speed",
     "railfix.evaluate",
-    "railfix.plots",
+    "railfix.evaluate.ablation",
+    "railfix.report.plots",
     "railfix.report",
     "railfix.simulate",
-    "railfix.reasons",
-    "railfix.timescale",
-    "railfix.geodesy",
+    "railfix.core.reasons",
+    "railfix.core.timescale",
+    "railfix.core.geodesy",
 )
 
 

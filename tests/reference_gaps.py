@@ -15,21 +15,19 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 import recordings_truth
-from railfix.antenna import Trajectory
-from railfix.config import DEFAULT_SIGNALS
-from railfix.doppler_speed import Dopplers, doppler_speed, dopplers_of_log
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.timescale import seconds, timedelta
 from railfix.evaluate import along_track_error, interpolate_reference
-from railfix.position_log import PositionLog
+from railfix.io.position_log import PositionLog
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import DEFAULT_SIGNALS
+from railfix.positioning.doppler_speed import Dopplers, doppler_speed, dopplers_of_log
 from railfix.reference import Pulses, ReferenceData, ReferenceSettings, build_references
 from railfix.reference.matching import match
-from railfix.rinex import read_navigation, read_observations
-from railfix.timescale import seconds, timedelta
+from railfix.track.trajectory import Trajectory
 from recordings_score import trajectory_of
-
-Floats = NDArray[np.float64]
 
 LENGTHS_S: Final = (5, 10, 20, 30, 60)
 PHASES: Final = 4
@@ -42,17 +40,17 @@ class Recording:
     """Fixes once a second, the map, and what bridges."""
 
     name: str
-    truth: tuple[NDArray[np.datetime64], Floats]
+    truth: tuple[Datetimes, Floats]
     log: PositionLog
     trajectory: Trajectory
     dopplers: Dopplers | None = None
     pulses: Pulses | None = None
 
-    def true(self, time: NDArray[np.datetime64]) -> Floats:
+    def true(self, time: Datetimes) -> Floats:
         """Places at instants."""
         return interpolate_reference(time, *self.truth)
 
-    def data(self, keep: NDArray[np.bool_], bridge: str) -> ReferenceData:
+    def data(self, keep: Masks, bridge: str) -> ReferenceData:
         """The recording with some of its fixes."""
         log = replace(
             self.log,
@@ -84,7 +82,7 @@ class Errors:
         return float(np.sqrt(np.mean((self.error_m / self.sigma_m) ** 2)))
 
 
-def _log(time: NDArray[np.datetime64], ecef: Floats, first: np.datetime64, last: np.datetime64) -> PositionLog:
+def _log(time: Datetimes, ecef: Floats, first: np.datetime64, last: np.datetime64) -> PositionLog:
     """One position a second between two instants."""
     span = (time >= first) & (time <= last)
     time, ecef = time[span], ecef[span]
@@ -177,7 +175,7 @@ def bridged(recording: Recording, length_s: float, bridge: str, settings: Refere
     return Errors(error, sigma, given / asked if asked else 1.0)
 
 
-def _interpolated(recording: Recording, keep: NDArray[np.bool_]) -> Floats:
+def _interpolated(recording: Recording, keep: Masks) -> Floats:
     """The yardstick: an even run between the places of the fixes on the map."""
     built = build_references(recording.data(keep, "nothing"), SETTINGS)["front"]
     good = built.fixes.good

@@ -18,9 +18,9 @@ from statistics import median
 
 import polars as pl
 
-from railfix.demonstration import demo_inputs, demo_truth
 from railfix.report import write_report
 from railfix.run import RunOptions, run_files
+from railfix.simulate.demonstration import demo_inputs, demo_truth
 from report_page import browser, opened, timing_ms
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from railfix.geodesy import ecef_from_geodetic, elevation_azimuth
-from railfix.orbits.states import satellite_states
-from railfix.rinex.navigation import read_navigation
-from railfix.sbas import IonosphereState, SatelliteState, SbasCorrections, SbasLimits, decode, read_sbas
+from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth
+from railfix.gnss.orbits.states import satellite_states
+from railfix.io.rinex.navigation import read_navigation
+from railfix.ranges.sbas import IonosphereState, SatelliteState, SbasCorrections, SbasLimits, decode, read_sbas
 
 GPS = np.array([f"G{i:02d}" for i in range(1, 33)])
 PLACES = {"Tokyo": (35.68, 139.77), "Sapporo": (43.06, 141.35), "Fukuoka": (33.59, 130.40), "Naha": (26.21, 127.68)}

@@ -19,19 +19,17 @@ from typing import Final
 import numpy as np
 
 from conftest import ROOT
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.config import parse_config
-from railfix.error_model import ErrorModel, read_error_model
-from railfix.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
-from railfix.measurement import CodeNoise, code_sigma_m
-from railfix.orbits import satellite_states
-from railfix.preparation import SOMEWHERE_ABOVE_M
-from railfix.protecting import risk_of
-from railfix.protection import along_track_level, sbas_level
-from railfix.raim import constrained_model
-from railfix.rinex import read_navigation
-from railfix.sbas import (
+from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
+from railfix.gnss.orbits import satellite_states
+from railfix.integrity.protection import along_track_level, sbas_level
+from railfix.integrity.raim import constrained_model
+from railfix.io.rinex import read_navigation
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
+from railfix.pipeline.protection_levels import risk_of
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.ranges.error_model import ErrorModel, read_error_model
+from railfix.ranges.sbas import (
     IonosphereState,
     SatelliteCorrections,
     SatelliteState,
@@ -39,8 +37,10 @@ from railfix.sbas import (
     read_sbas,
     sigma_tropo_m,
 )
-from railfix.sbas_use import corrected_satellites
-from railfix.track_map import Track
+from railfix.ranges.sbas_delays import corrected_satellites
+from railfix.ranges.weights import CodeNoise, code_sigma_m
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 #: Latitude, longitude [deg] of the ends.
 LINES: Final = {

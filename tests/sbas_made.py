@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from railfix.sbas import SbasLog
-from railfix.sbas.parity import PREAMBLES, with_parity
+from railfix.ranges.sbas import SbasLog
+from railfix.ranges.sbas.parity import PREAMBLES, with_parity
 
 START = np.datetime64("2025-02-15T12:00:00", "ns")
 

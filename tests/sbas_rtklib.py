@@ -8,8 +8,8 @@ import numpy as np
 import pyrtklib5 as rtk
 
 from pyrtklib_orbits import instant, satellite_number
-from railfix.sbas import SbasLog
-from railfix.timescale import to_week
+from railfix.core.timescale import to_week
+from railfix.ranges.sbas import SbasLog
 
 
 class RtklibSbas:

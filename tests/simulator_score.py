@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.constants import SPEED_OF_LIGHT
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.simulate import LineSettings, Scenario, SensorSettings, Simulation, SkySettings, sensor_tables, write_run
 from railfix.simulate.errors import (
     ClockWalkSettings,

@@ -1,8 +1,8 @@
 """Write the outputs of every command to a folder, and compare two such folders value by value.
 
 A refactoring changes no number: run ``python tests/snapshot.py write FOLDER`` before it and after it, then
-``python tests/snapshot.py compare BEFORE AFTER``. Numbers, statuses and reasons are compared exactly; run times, versions and
-paths are not. With the recordings beside the checkout they are part of the snapshot.
+``python tests/snapshot.py compare BEFORE AFTER``. Numbers, statuses and reasons are compared exactly; run times,
+versions and paths are not. With the recordings beside the checkout they are part of the snapshot.
 """
 
 from __future__ import annotations
@@ -49,7 +49,20 @@ TRUTH_OF: Final = {"f9p": "urbannav", "m8t": "urbannav", "gsdc": "gsdc", "japan"
 #: Where the receiver of the SBAS log stood: latitude, longitude [deg], height [m].
 PARKED_DEG: Final = (35.8729254, 138.3898229, 1004.46)
 #: Keys of JSON files that two runs of the same code do not share.
-VOLATILE: Final = {"version", "versions", "railfix", "seconds", "command", "created", "started", "finished", "sha256", "wall_s", "positioning_s", "bytes"}
+VOLATILE: Final = {
+    "version",
+    "versions",
+    "railfix",
+    "seconds",
+    "command",
+    "created",
+    "started",
+    "finished",
+    "sha256",
+    "wall_s",
+    "positioning_s",
+    "bytes",
+}
 
 
 def railfix(*arguments: object) -> None:

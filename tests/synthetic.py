@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.track_map import Track
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 ORIGIN = (35.0, 135.7, 60.0)
 

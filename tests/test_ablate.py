@@ -15,15 +15,15 @@ from typer.testing import CliRunner
 
 import recordings_ablate
 from railfix.cli import app
-from railfix.config import parse_config
-from railfix.demonstration import demo_inputs
-from railfix.epochs import Observations
-from railfix.errors import InputFileError
-from railfix.reference_log import read_reference
-from railfix.rinex import scan_observations
+from railfix.core.errors import InputFileError
+from railfix.evaluate.ablation import Ablation, ablate_files, choices
+from railfix.gnss.observations import Observations
+from railfix.io.reference_log import read_reference
+from railfix.io.rinex import scan_observations
+from railfix.pipeline.config import parse_config
 from railfix.run import RunInputs, run_files
 from railfix.run import sources as run_sources
-from railfix.run.ablation import Ablation, ablate_files, choices
+from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = [pytest.mark.requirement("B7"), pytest.mark.requirement("D2")]
 

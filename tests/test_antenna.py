@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from railfix.antenna import TRACK_AS_PATH, Trajectory
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.polyline import project_on_segments
-from railfix.track_map import Track
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.track import Track
+from railfix.track.polyline import project_on_segments
+from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 ORIGIN = (35.0, 139.0, 50.0)
 

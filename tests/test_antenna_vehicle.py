@@ -10,19 +10,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from railfix.antenna import Trajectory
-from railfix.errors import InputFileError, MismatchError, RailfixError, SettingsError
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.track_map import Provenance, Track
-from railfix.track_map.from_positions import ANTENNA_PATH
-from railfix.vehicle import PATH_TOLERANCE_M, AntennaOffset, Vehicle, antenna_trajectory, body_pose, read_vehicle
-
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, MismatchError, RailfixError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.track import Provenance, Track
+from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import PATH_TOLERANCE_M, AntennaOffset, Vehicle, antenna_trajectory, body_pose, read_vehicle
 
 ORIGIN = (34.7, 135.5, 80.0)
 OFFSET = AntennaOffset(along_m=9.1, across_m=0.35, up_m=4.1)

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orbits_made import TOE
-from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
-from railfix.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.epochs import frozen
+from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.gnss.observations import frozen
+from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 
 REFERENCES = json.loads((Path(__file__).parent / "references" / "orbits.json").read_text())
 COEFFICIENTS = np.array(REFERENCES["klobuchar"])

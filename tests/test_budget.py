@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 from broken_bench import Bench, bench_in
 from railfix.cli import app
-from railfix.config import parse_config
-from railfix.demonstration import demo_inputs
-from railfix.pipeline import AntennaResult
-from railfix.reasons import Reason, Status
+from railfix.core.reasons import Reason, Status
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import AntennaResult
 from railfix.run import RunSummary, run_files
 from railfix.run.tally import AntennaTally
+from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("B7")
 

@@ -7,8 +7,8 @@ import pytest
 
 import carrier_made
 import synthetic
-from railfix.carrier import ContinuityLimits, ContinuityState, track_jumps
-from railfix.carrier.continuity import TrackJumps
+from railfix.positioning.carrier import ContinuityLimits, ContinuityState, track_jumps
+from railfix.positioning.carrier.continuity import TrackJumps
 
 LINE = synthetic.line()
 EPOCHS, SYSTEMS = 40, "GGGGJEEE"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import carrier_made
-from railfix.carrier import SlipLimits, SlipReason, find_slips, number_arcs
-from railfix.carrier.arcs import NO_ARC, channel_of
-from railfix.epochs import Observations
+from railfix.gnss.observations import Observations
+from railfix.positioning.carrier import SlipLimits, SlipReason, find_slips, number_arcs
+from railfix.positioning.carrier.arcs import NO_ARC, channel_of
 
 MILLISECOND_M = 299_792.458
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import carrier_made
-from railfix.carrier import Smoothed, SmoothingLimits, SmoothingState, find_slips, smooth_codes
-from railfix.carrier.recursion import linear_recursion
-from railfix.epochs import Observations
+from railfix.gnss.observations import Observations
+from railfix.positioning.carrier import Smoothed, SmoothingLimits, SmoothingState, find_slips, smooth_codes
+from railfix.positioning.carrier.recursion import linear_recursion
 
 
 def smoothed(obs: Observations, slip: np.ndarray | None = None, **limits: object) -> Smoothed:

@@ -8,13 +8,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.config import parse_config
 from railfix.evaluate import along_track_error
-from railfix.pipeline import EpochProcessor
-from railfix.rinex import read_navigation, read_observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
 from railfix.simulate import demo_files
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track import read_track
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 EPOCHS = 150
 

@@ -12,8 +12,9 @@ import pytest
 from typer.testing import CliRunner
 
 from conftest import ROOT
-from railfix import __version__, errors
+from railfix import __version__
 from railfix.cli import app
+from railfix.core import errors
 
 RUNNER = CliRunner(env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"})
 COMMANDS = [

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from railfix.cli import Commands
 from railfix.cli.map import map_app
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.track_map import Track, read_track, write_track_csv
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.track import Track, read_track, write_track_csv
 
 runner = CliRunner()
 app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
@@ -129,5 +129,5 @@ def test_help_reads_like_a_manual() -> None:
 def test_the_commands_do_not_load_matplotlib() -> None:
     import subprocess
 
-    code = "import sys, railfix.cli.map, railfix.track_map, railfix.vehicle; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, railfix.cli.map, railfix.track, railfix.track.vehicle; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

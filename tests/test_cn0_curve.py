@@ -16,7 +16,10 @@ from typer.testing import CliRunner
 from conftest import ROOT
 from railfix.cli import Commands
 from railfix.cli.cn0_curve import cn0_curve as command
-from railfix.cn0_curve import (
+from railfix.core.errors import InputFileError, MismatchError, OutputError, SettingsError
+from railfix.gnss.observations import ObservationHeader
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.ranges.cn0_curve import (
     KINDS,
     Cn0Curve,
     Cn0CurveSource,
@@ -30,10 +33,7 @@ from railfix.cn0_curve import (
     satellite_kind,
     write_cn0_curve,
 )
-from railfix.epochs import ObservationHeader
-from railfix.errors import InputFileError, MismatchError, OutputError, SettingsError
-from railfix.plots.screens import ScreenPicture, draw_cn0_curve, draw_screen
-from railfix.rinex import read_navigation, read_observations
+from railfix.report.plots.screens import ScreenPicture, draw_cn0_curve, draw_screen
 from railfix.screens import cn0_screen
 
 pytestmark = pytest.mark.requirement("B1")

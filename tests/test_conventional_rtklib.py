@@ -24,18 +24,18 @@ import numpy as np
 import pytest
 
 import recordings_truth
-from railfix.antenna import Trajectory
-from railfix.atmosphere import klobuchar_delay_m
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.config import parse_config
-from railfix.epochs import Observations
-from railfix.geodesy import enu_axes, geodetic_from_ecef
-from railfix.navigation import Navigation
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.position_log import read_positions
-from railfix.rinex import read_navigation, read_observations
-from railfix.signals import carrier_frequency_hz
-from railfix.spp import single_point
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.io.position_log import read_positions
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.single_point import single_point
+from railfix.ranges.atmosphere import klobuchar_delay_m
+from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
 pytestmark = [

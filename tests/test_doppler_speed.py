@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 
 import reference_gaps
-from railfix.config import DEFAULT_SIGNALS
-from railfix.doppler_speed import (
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import concatenate
+from railfix.pipeline.config import DEFAULT_SIGNALS
+from railfix.positioning.doppler_speed import (
     Dopplers,
     DopplerSpeed,
     DopplerSpeedLimits,
     doppler_speed,
     dopplers_of_log,
 )
-from railfix.epochs import concatenate
 from railfix.simulate.scenario import ReceiverSettings, RunSettings, Scenario
 from railfix.simulate.signals import Simulation
-from railfix.timescale import seconds
 
 pytestmark = pytest.mark.requirement("D1")
 

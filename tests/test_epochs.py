@@ -7,9 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from railfix import errors
-from railfix.epochs import MAX_PROBLEMS, ObservationHeader, Observations, capped_problems, concatenate, frozen
-from railfix.reasons import POSITIONED, Reason, Status, first_reason, reason_text, reason_texts
+from railfix.core import errors
+from railfix.core.reasons import POSITIONED, Reason, Status, first_reason, reason_text, reason_texts
+from railfix.gnss.observations import (
+    MAX_PROBLEMS,
+    ObservationHeader,
+    Observations,
+    capped_problems,
+    concatenate,
+    frozen,
+)
 
 START = np.datetime64("2024-03-13T08:00:00", "ns")
 

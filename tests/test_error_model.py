@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from railfix.error_model import (
+from railfix.core.errors import InputFileError
+from railfix.ranges.error_model import (
     POOLED,
     BinStatistics,
     ErrorBins,
@@ -22,7 +23,6 @@ from railfix.error_model import (
     read_error_model,
     write_error_model,
 )
-from railfix.errors import InputFileError
 
 pytestmark = pytest.mark.requirement("C3")
 

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
 import synthetic
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges, clock_groups, fit, inverse_3x3, normal_equations
-from railfix.constrained import constrained_position
-from railfix.geodesy import range_with_rotation
-from railfix.section import SearchIndex, SectionLimits, exhaustive_search, search
-from railfix.spp import single_point
-from railfix.track_map import Track
+from railfix.core.geodesy import range_with_rotation
+from railfix.positioning.constrained import constrained_position
+from railfix.positioning.normal_equations import Ranges, clock_groups, fit, inverse_3x3, normal_equations
+from railfix.positioning.section_search import SearchIndex, SectionLimits, exhaustive_search, search
+from railfix.positioning.single_point import single_point
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 LINE = synthetic.line()
 MIDDLE = LINE.ecef_m.mean(axis=0)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import synthetic
-from railfix.antenna import Trajectory
+from railfix.core.timescale import timedelta
 from railfix.evaluate import along_track_error, interpolate_reference, score
-from railfix.timescale import timedelta
-from railfix.track_map import Track
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 START = np.datetime64("2024-03-05T01:00:00", "ns")
 STRAIGHT = Trajectory.from_track(

@@ -14,10 +14,9 @@ from typer.testing import CliRunner
 
 import synthetic
 from conftest import ROOT
-from railfix.antenna import Trajectory
 from railfix.cli import app
-from railfix.demonstration import demo_inputs
-from railfix.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.timescale import timedelta
 from railfix.evaluate import (
     BEYOND_COLUMNS,
     EPOCH_COLUMNS,
@@ -34,10 +33,11 @@ from railfix.evaluate import (
 from railfix.evaluate.blocks import block_limits
 from railfix.evaluate.epochs import travelled, with_missing
 from railfix.evaluate.sections import read_sections
-from railfix.reference_log import AntennaReference, write_reference
+from railfix.io.reference_log import AntennaReference, write_reference
 from railfix.run import run_files
-from railfix.timescale import timedelta
-from railfix.track_map import Track, read_track, write_track_csv
+from railfix.simulate.demonstration import demo_inputs
+from railfix.track import Track, read_track, write_track_csv
+from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("D2")
 

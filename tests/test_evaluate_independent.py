@@ -12,10 +12,10 @@ import polars as pl
 import pytest
 
 import independent_evaluation
-from railfix.demonstration import demo_inputs
 from railfix.evaluate import Evaluation, EvaluationOptions, evaluate_run
 from railfix.run import run_files
 from railfix.simulate import demo_files
+from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("D2")
 

@@ -10,7 +10,7 @@ import recordings_score
 import recordings_truth
 from railfix.evaluate import evaluate_run
 from railfix.run import RunInputs, run_files
-from railfix.track_map import from_positions, write_track_csv
+from railfix.track import from_positions, write_track_csv
 
 pytestmark = pytest.mark.requirement("D2")
 

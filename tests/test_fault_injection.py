@@ -28,14 +28,14 @@ from fault_injection import (
     steps,
     two_by_two,
 )
-from railfix.config import parse_config
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import Observations
-from railfix.pipeline import EpochProcessor
-from railfix.raim import detect
-from railfix.rinex import read_navigation, read_observations
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations
+from railfix.integrity.raim import detect
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
 from railfix.screens import DopplerLimits
-from railfix.timescale import seconds
 from recordings_score import straight_line, trajectory_of
 
 pytestmark = pytest.mark.requirement("B4")

@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
-from railfix.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.epochs import frozen
-from railfix.geodesy import (
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.geodesy import (
     ecef_from_geodetic,
     elevation_azimuth,
     enu_axes,
     geodetic_from_ecef,
     range_with_rotation,
 )
+from railfix.gnss.observations import frozen
 
 A, F = 6_378_137.0, 1 / 298.257_223_563
 latitudes, longitudes = st.floats(-90.0, 90.0), st.floats(-180.0, 180.0)

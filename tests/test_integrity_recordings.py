@@ -13,9 +13,9 @@ import pytest
 
 import integrity_recordings
 from integrity_recordings import ALARM_LIMITS_M, Group
-from railfix.raim import constrained_model
-from railfix.reasons import Status
-from railfix.stanford import Region
+from railfix.core.reasons import Status
+from railfix.integrity.raim import constrained_model
+from railfix.integrity.stanford import Region
 
 pytestmark = [pytest.mark.requirement("C2"), pytest.mark.slow]
 

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from navigation_text import header, label, record, record_2, write
-from railfix.errors import InputFileError
-from railfix.navigation import Navigation
-from railfix.rinex import read_navigation
+from railfix.core.errors import InputFileError
+from railfix.gnss.navigation import Navigation
+from railfix.io.rinex import read_navigation
 
 pytestmark = pytest.mark.requirement("A7")
 

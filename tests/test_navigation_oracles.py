@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.rinex import read_navigation
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.io.rinex import read_navigation
 
 pytestmark = pytest.mark.requirement("A7")
 

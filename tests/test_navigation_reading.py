@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from navigation_text import KEPLER, header, label, record, record_2, write
-from railfix.navigation import Navigation, glonass_channels
-from railfix.rinex import read_navigation
-from railfix.signals import carrier_frequency_hz
+from railfix.gnss.navigation import Navigation, glonass_channels
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.io.rinex import read_navigation
 
 pytestmark = pytest.mark.requirement("A7")
 

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 
 import orbits_made
 from orbits_made import HOUR, KINDS, TOE, glonass, kepler, navigation
-from railfix.constants import (
+from railfix.core.constants import (
     EARTH_ROTATION_RATE,
     EARTH_ROTATION_RATE_BEIDOU,
     EARTH_ROTATION_RATE_GLONASS,
@@ -27,10 +27,10 @@ from railfix.constants import (
     PZ90_SEMI_MAJOR_AXIS,
     SPEED_OF_LIGHT,
 )
-from railfix.epochs import frozen
-from railfix.navigation import KeplerRecords, Navigation
-from railfix.orbits import SatelliteStates, satellite_states
-from railfix.orbits.kepler import Orbits, eccentric_anomaly, kepler_state
+from railfix.gnss.navigation import KeplerRecords, Navigation
+from railfix.gnss.observations import frozen
+from railfix.gnss.orbits import SatelliteStates, satellite_states
+from railfix.gnss.orbits.kepler import Orbits, eccentric_anomaly, kepler_state
 
 REFERENCES = json.loads((Path(__file__).parent / "references" / "orbits.json").read_text())
 CODE = 23_456_789.012

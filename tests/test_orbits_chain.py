@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.orbits import satellite_states
-from railfix.rinex import read_navigation, read_observations
-from railfix.rinex.write_navigation import write_navigation
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.orbits import satellite_states
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.io.rinex.write_navigation import write_navigation
 
 #: Log, navigation file, signals of one channel a satellite.
 LOGS = {

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from orbits_made import one_record
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.navigation import Navigation
-from railfix.orbits import satellite_states
-from railfix.orbits.kepler import Orbits, kepler_state
-from railfix.orbits.selection import validity_s
-from railfix.rinex import read_navigation
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.orbits import satellite_states
+from railfix.gnss.orbits.kepler import Orbits, kepler_state
+from railfix.gnss.orbits.selection import validity_s
+from railfix.io.rinex import read_navigation
 
 FILES = (
     "dual/mosaic_x2_99cm/base.nav",

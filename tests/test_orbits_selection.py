@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orbits_made import HOUR, TOE, kepler, navigation
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.navigation import Navigation
-from railfix.orbits import SatelliteStates, satellite_states
-from railfix.orbits.selection import make_lookup
-from railfix.orbits.signal_health import group_delay_s, unhealthy
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.orbits import SatelliteStates, satellite_states
+from railfix.gnss.orbits.selection import make_lookup
+from railfix.gnss.orbits.signal_health import group_delay_s, unhealthy
 
 CODE = 23_000_000.0
 NAT = np.datetime64("NaT", "ns")

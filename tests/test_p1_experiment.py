@@ -15,7 +15,7 @@ from conftest import ROOT
 from p1_experiment import against_distance_run
 from p1_ride import Bench, Found, Passage, Way, intervals_m, ridden
 from p1_static import STARTS, Subsets, joined, subsets
-from railfix.reasons import Status
+from railfix.core.reasons import Status
 from test_p4_experiment import assert_same
 
 DOCUMENT = ROOT / "docs" / "p1-results.md"

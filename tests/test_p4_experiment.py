@@ -11,7 +11,7 @@ import pytest
 import fault_injection
 import p4_experiment
 from conftest import ROOT
-from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 
 pytestmark = pytest.mark.requirement("B6")
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")

@@ -28,12 +28,12 @@ from pipeline_cases import (
     true_chainage,
     with_code,
 )
-from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.epochs import Observations
-from railfix.pipeline import EpochProcessor
-from railfix.reasons import POSITIONED, Reason, Status
-from railfix.rinex import read_navigation, read_observations
-from railfix.timescale import timedelta
+from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.reasons import POSITIONED, Reason, Status
+from railfix.core.timescale import timedelta
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.processor import EpochProcessor
 
 #: Epochs a chunk, and epochs of the log.
 CHUNKS = {1: 120, 7: 350, 1000: 2000}

@@ -19,13 +19,13 @@ from pipeline_cases import (
     processor,
     with_code,
 )
-from railfix.antenna import Trajectory
-from railfix.epochs import Observations
-from railfix.navigation import Navigation
-from railfix.pipeline import AntennaResult
-from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status
+from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.pipeline.processor import AntennaResult
 from railfix.screens.cn0 import Cn0Limits
-from railfix.track_map import Track
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("B7")
 

@@ -11,11 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.config import parse_config
-from railfix.demonstration import demo_inputs
-from railfix.plots import run_screens
-from railfix.plots.screens import ScreenPicture
+from railfix.pipeline.config import parse_config
+from railfix.report.plots import run_screens
+from railfix.report.plots.screens import ScreenPicture
 from railfix.run import RunOptions, RunSummary, run_files
+from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("B7")
 

@@ -11,14 +11,14 @@ import polars as pl
 import pytest
 from matplotlib.figure import Figure
 
-from railfix import plots
-from railfix.geodesy import ecef_from_geodetic
-from railfix.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, Ranges, SkyEpochs
-from railfix.plots.columns import nice_step
-from railfix.plots.thinning import extremes, one_a_cell, spread
-from railfix.reasons import Reason
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.reasons import Reason
+from railfix.integrity.stanford import stanford as sorted_epochs
+from railfix.report import plots
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, Ranges, SkyEpochs
+from railfix.report.plots.columns import nice_step
+from railfix.report.plots.thinning import extremes, one_a_cell, spread
 from railfix.screens import Cn0Limits
-from railfix.stanford import stanford as sorted_epochs
 
 pytestmark = pytest.mark.requirement("D3")
 

@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
-from railfix.errors import InputFileError, RailfixError, SettingsError
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.position_log import read_positions
-from railfix.track_map import ThinningLimits, from_position_log, from_positions, read_track, thin
-from railfix.track_map.from_positions import ANTENNA_PATH
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.errors import InputFileError, RailfixError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.io.position_log import read_positions
+from railfix.track import ThinningLimits, from_position_log, from_positions, read_track, thin
+from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.trajectory import Trajectory
 from recordings_truth import TRUTHS, write_truth_csv
-
-Floats = NDArray[np.float64]
 
 START = np.datetime64("2021-09-22T06:30:00", "ns")
 EXPECTED = ecef_from_geodetic([35.34205801, 35.342057994], [139.521986546, -139.521986524], [47.5764, -47.5750])
@@ -187,7 +185,7 @@ def test_solutions_written_by_rtklib_itself(tmp_path: Path, recordings: Path) ->
 ORIGIN = (35.0, 139.0, 50.0)
 
 
-def run_of(speed: Floats, sigma: float, seed: int = 0, drift: float = 0.0) -> tuple[NDArray[np.datetime64], Floats]:
+def run_of(speed: Floats, sigma: float, seed: int = 0, drift: float = 0.0) -> tuple[Datetimes, Floats]:
     """A run to the north at 10 Hz with white noise, and drift to the east."""
     random = np.random.default_rng(seed)
     t = 0.1 * np.arange(len(speed))
@@ -310,7 +308,7 @@ def test_rtk_log_of_the_recordings_is_thinned_by_quality(recordings: Path) -> No
 
 
 def test_notes_survive_the_file(tmp_path: Path) -> None:
-    from railfix.track_map import write_track_csv
+    from railfix.track import write_track_csv
 
     time, ecef = run_of(np.full(100, 10.0), 0.0)
     write_track_csv(from_positions(time, ecef), tmp_path / "map.csv")

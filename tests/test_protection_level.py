@@ -13,9 +13,17 @@ from scipy.stats import norm
 import protection_oracle
 import raim_oracle as oracle
 from protection_hand_case import HAND, hand_model
-from railfix.clock_elimination import UNTIED_M
-from railfix.protection import Cause, ProtectionLevel, RiskBudget, Status, along_track_level, availability, sbas_level
-from railfix.raim import constrained_model, point_model
+from railfix.integrity.protection import (
+    Cause,
+    ProtectionLevel,
+    RiskBudget,
+    Status,
+    along_track_level,
+    availability,
+    sbas_level,
+)
+from railfix.integrity.raim import constrained_model, point_model
+from railfix.positioning.normal_equations import UNTIED_M
 
 pytestmark = pytest.mark.requirement("C2")
 

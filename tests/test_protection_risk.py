@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from railfix.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
-from railfix.protection.risk import more_than_two, pair_sum
+from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
+from railfix.integrity.protection.risk import more_than_two, pair_sum
 
 pytestmark = pytest.mark.requirement("C2")
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import protection_oracle
 import raim_oracle as oracle
-from railfix.clock_elimination import UNTIED_M
-from railfix.protection import RiskBudget, along_track_level
-from railfix.protection.separation import Separations, whole, without_constellation, without_one, without_two
-from railfix.raim import constrained_model
+from railfix.integrity.protection import RiskBudget, along_track_level
+from railfix.integrity.protection.separation import Separations, whole, without_constellation, without_one, without_two
+from railfix.integrity.raim import constrained_model
+from railfix.positioning.normal_equations import UNTIED_M
 
 pytestmark = pytest.mark.requirement("C2")
 

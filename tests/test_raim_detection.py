@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom, chi2
 
 import raim_oracle as oracle
-from railfix.raim import RaimLimits, detect, threshold
+from railfix.integrity.raim import RaimLimits, detect, threshold
 
 pytestmark = pytest.mark.requirement("B6")
 

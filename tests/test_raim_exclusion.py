@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 import raim_oracle as oracle
 import synthetic
-from railfix.clock_elimination import UNTIED_M, Ranges
-from railfix.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude, reliability
+from railfix.integrity.raim import LinearModel, Outcome, RaimLimits, constrained_model, exclude, reliability
+from railfix.positioning.normal_equations import UNTIED_M, Ranges
 
 pytestmark = pytest.mark.requirement("B4")
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 import raim_oracle as oracle
 import synthetic
-from railfix.clock_elimination import UNTIED_M, ClockTies
-from railfix.constrained import constrained_position
-from railfix.raim import constrained_model, point_model
-from railfix.raim.model import compact
-from railfix.spp import single_point
+from railfix.integrity.raim import constrained_model, point_model
+from railfix.integrity.raim.model import compact
+from railfix.positioning.constrained import constrained_position
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies
+from railfix.positioning.single_point import single_point
 
 pytestmark = pytest.mark.requirement("B6")
 

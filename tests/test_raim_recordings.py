@@ -9,12 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges, clock_groups
-from railfix.constrained import Constrained, constrained_position
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.evaluate import along_track_error
-from railfix.geodesy import enu_axes, geodetic_from_ecef
-from railfix.raim import (
+from railfix.integrity.raim import (
     LinearModel,
     Outcome,
     RaimLimits,
@@ -25,8 +22,11 @@ from railfix.raim import (
     point_model,
     reliability,
 )
-from railfix.raim.model import compact
-from railfix.rinex import read_observations
+from railfix.integrity.raim.model import compact
+from railfix.io.rinex import read_observations
+from railfix.positioning.constrained import Constrained, constrained_position
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.track.trajectory import Trajectory
 from recordings_score import geonet
 
 pytestmark = pytest.mark.requirement("B6")

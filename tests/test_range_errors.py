@@ -11,16 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 import recordings_truth
-from railfix.antenna import Trajectory
 from railfix.cli import app
-from railfix.config import Config, parse_config
-from railfix.demonstration import demo_inputs
-from railfix.epochs import Observations
-from railfix.error_model import ErrorModelFit, read_error_model, write_error_model
-from railfix.errors import InputFileError, MismatchError
-from railfix.navigation import Navigation
-from railfix.pipeline import EpochProcessor, conditions_of
-from railfix.range_errors import (
+from railfix.core.errors import InputFileError, MismatchError
+from railfix.evaluate.range_errors import (
     BaseStation,
     ModelInputs,
     base_station,
@@ -29,12 +22,19 @@ from railfix.range_errors import (
     range_errors,
     robust_clock,
 )
-from railfix.reference_log import AntennaReference, read_reference
-from railfix.rinex import read_navigation, read_observations
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.reference_log import AntennaReference, read_reference
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.processor import EpochProcessor, conditions_of
+from railfix.ranges.error_model import ErrorModelFit, read_error_model, write_error_model
 from railfix.run import RunOptions, past_run, run_files
 from railfix.run.driver import open_inputs
 from railfix.simulate import Scenario, Simulation, demo_files
-from railfix.track_map import from_positions
+from railfix.simulate.demonstration import demo_inputs
+from railfix.track import from_positions
+from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line
 
 pytestmark = pytest.mark.requirement("C3")

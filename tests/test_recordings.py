@@ -15,8 +15,8 @@ import pytest
 
 import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
-from railfix.position_log import read_positions
-from railfix.rinex import read_observations
+from railfix.io.position_log import read_positions
+from railfix.io.rinex import read_observations
 
 
 def hold(found: Score, *, rate: float, p50_m: float, p95_m: float, wrong_place: float) -> None:

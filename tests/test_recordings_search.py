@@ -17,11 +17,12 @@ from scipy.optimize import least_squares
 import recordings_score
 import synthetic
 from pipeline_cases import demo_observations, processor
-from railfix import constrained, placing, preparation, section
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import UNTIED_M, Ranges
-from railfix.constrained import Constrained
-from railfix.section import SearchIndex, Section, exhaustive_search
+from railfix.pipeline import corrected_ranges, solve
+from railfix.positioning import constrained, section_search
+from railfix.positioning.constrained import Constrained
+from railfix.positioning.normal_equations import UNTIED_M, Ranges
+from railfix.positioning.section_search import SearchIndex, Section, exhaustive_search
+from railfix.track.trajectory import Trajectory
 
 #: Points times channels looked at together, to keep the exhaustive search in memory.
 BLOCK = 64
@@ -40,7 +41,7 @@ def calls(monkeypatch) -> Calls:
     found = Calls()
 
     def search(ranges: Ranges, index: SearchIndex, *args, **kwargs) -> Section:
-        result = section.search(ranges, index, *args, **kwargs)
+        result = section_search.search(ranges, index, *args, **kwargs)
         found.searches.append((ranges, index.trajectory, result))
         return result
 
@@ -49,9 +50,9 @@ def calls(monkeypatch) -> Calls:
         found.positions.append((ranges, trajectory, result))
         return result
 
-    for module in (placing, preparation, recordings_score):
+    for module in (solve, corrected_ranges, recordings_score):
         monkeypatch.setattr(module, "search", search)
-    for module in (placing, recordings_score):
+    for module in (solve, recordings_score):
         monkeypatch.setattr(module, "constrained_position", position)
     return found
 

@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
-from railfix.config import DEFAULT_SIGNALS
-from railfix.doppler_speed import Dopplers, dopplers_of_log
-from railfix.epochs import concatenate
-from railfix.errors import MismatchError, NoPositionError, SettingsError
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.position_log import PositionLog
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.errors import MismatchError, NoPositionError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.core.timescale import seconds, timedelta
+from railfix.gnss.observations import concatenate
+from railfix.io.position_log import PositionLog
+from railfix.pipeline.config import DEFAULT_SIGNALS
+from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
 from railfix.reference import (
     Acceleration,
     Built,
@@ -28,13 +28,11 @@ from railfix.simulate import AntennaTruth, antenna_truth
 from railfix.simulate.motion import Motion, shuttle
 from railfix.simulate.scenario import LineSettings, ReceiverSettings, RunSettings, Scenario
 from railfix.simulate.signals import Simulation
-from railfix.timescale import seconds, timedelta
-from railfix.track_map import Track
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("D1")
 
-Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
 
 START = np.datetime64("2024-03-05T03:00:00", "ns")
 ORIGIN = (35.0, 139.0, 50.0)
@@ -53,7 +51,7 @@ class Run:
     """A made run on a trajectory, one instant a row."""
 
     trajectory: Trajectory
-    time: NDArray[np.datetime64]
+    time: Datetimes
     arc_m: Floats
     speed_mps: Floats
     motion: Motion

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.reference.chain import Chain
+from railfix.motion.chain import Chain
 
 pytestmark = pytest.mark.requirement("D1")
 

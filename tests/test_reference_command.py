@@ -14,12 +14,12 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.errors import InputFileError
+from railfix.core.errors import InputFileError
+from railfix.core.timescale import seconds
+from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.reference import read_acceleration, read_pulses
-from railfix.reference_log import AntennaReference, read_reference
 from railfix.simulate import Scenario, write_run
 from railfix.simulate.sensors.settings import InertialSettings, SensorSettings, TachometerSettings
-from railfix.timescale import seconds
 
 pytestmark = pytest.mark.requirement("D1")
 

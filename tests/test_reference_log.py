@@ -9,9 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.demonstration import demo_inputs
-from railfix.errors import InputFileError, OutputError
-from railfix.reference_log import AntennaReference, read_reference, write_reference
+from railfix.core.errors import InputFileError, OutputError
+from railfix.io.reference_log import AntennaReference, read_reference, write_reference
+from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("D1")
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from railfix.errors import InputFileError
-from railfix.geodesy import ecef_from_geodetic
-from railfix.nmea import read_any_positions, read_nmea
-from railfix.position_log import read_positions
+from railfix.core.errors import InputFileError
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.io.nmea import read_any_positions, read_nmea
+from railfix.io.position_log import read_positions
 
 pytestmark = pytest.mark.requirement("D1")
 

@@ -15,14 +15,14 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.config import parse_config
-from railfix.demonstration import demo_inputs, demo_truth
+from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
 from railfix.report.encode import packed, script_json
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
 from railfix.report.html import number, share, table
 from railfix.report.protection import NO_LEVELS
 from railfix.run import RunOptions, RunSummary, run_files
+from railfix.simulate.demonstration import demo_inputs, demo_truth
 from report_page import Page, fetched
 
 pytestmark = pytest.mark.requirement("D3")

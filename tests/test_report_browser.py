@@ -12,10 +12,10 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from railfix.demonstration import demo_inputs, demo_truth
 from railfix.evaluate import EvaluationOptions, RunAndReference, evaluate_runs
 from railfix.report import read_runs, report_page, write_report
 from railfix.run import RunOptions, run_files
+from railfix.simulate.demonstration import demo_inputs, demo_truth
 from report_page import Page, browser, opened, run_browser, timing_ms
 
 pytestmark = [

@@ -14,10 +14,10 @@ from hatanaka import rnx2crx
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from railfix import files
-from railfix.epochs import Observations, concatenate
-from railfix.errors import InputFileError
-from railfix.rinex import observations_blocks, observations_fields, read_observations, scan_observations
+from railfix.core import files
+from railfix.core.errors import InputFileError
+from railfix.gnss.observations import Observations, concatenate
+from railfix.io.rinex import observations_blocks, observations_fields, read_observations, scan_observations
 from rinex_observations_text import epoch_2, epoch_3, event_2, field, header_2, header_3, record, text_of, write
 
 pytestmark = pytest.mark.requirement("A7")

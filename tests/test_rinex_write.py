@@ -14,12 +14,12 @@ from hatanaka import crx2rnx
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from railfix.epochs import ObservationHeader, Observations, concatenate
-from railfix.errors import OutputError
-from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.rinex import read_navigation, read_observations
-from railfix.rinex.packing import packing_of
-from railfix.rinex.write import _fixed_3, write_navigation, write_observations
+from railfix.core.errors import OutputError
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.observations import ObservationHeader, Observations, concatenate
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.io.rinex.packing import packing_of
+from railfix.io.rinex.write import _fixed_3, write_navigation, write_observations
 from railfix.simulate import Scenario, SkySettings, made_navigation
 
 START = np.datetime64("2024-03-05T23:59:58.5", "ns")

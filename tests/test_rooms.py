@@ -1,4 +1,4 @@
-"""The flow of the package is one-way: a room imports only from its own floor or floors below, without cycles."""
+"""The flow of the package is one-way: a room imports only from the floors below it."""
 
 from __future__ import annotations
 
@@ -10,58 +10,23 @@ from conftest import ROOT
 
 SOURCE: Final = ROOT / "src" / "railfix"
 
-#: The rooms (a module or a folder of the package), floor by floor. docs/concepts.md draws the same.
-FLOORS: Final[dict[int, tuple[str, ...]]] = {
-    0: ("constants", "errors", "timescale", "geodesy", "polyline", "signals"),
-    1: ("epochs", "navigation", "reasons", "named_columns"),
-    2: ("files", "rinex", "sp3", "position_log", "nmea", "reference_log", "orbits", "atmosphere"),
-    3: ("track_map", "antenna", "vehicle", "sbas"),
-    4: (
-        "clock_elimination",
-        "clock_offsets",
-        "noise_scale",
-        "measurement",
-        "section",
-        "constrained",
-        "spp",
-        "screens",
-        "raim",
-        "protection",
-        "stanford",
-        "carrier",
-        "cn0_curve",
-        "doppler_speed",
-        "error_model",
-    ),
-    5: (
-        "config",
-        "results",
-        "channels",
-        "preparation",
-        "refusals",
-        "pairing",
-        "carrying",
-        "placing",
-        "fault_free",
-        "protecting",
-        "sbas_use",
-        "delays",
-        "pipeline",
-    ),
-    6: (
-        "range_errors",
-        "simulate",
-        "evaluate",
-        "tables",
-        "reference",
-        "plots",
-        "report",
-        "run",
-        "demonstration",
-        "cli",
-    ),
-}
-FLOOR_OF: Final = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
+#: The rooms (the packages below `railfix`), floor by floor. docs/concepts.md draws the same.
+FLOORS: Final[tuple[tuple[str, ...], ...]] = (
+    ("core",),
+    ("gnss",),
+    ("io",),
+    ("track",),
+    ("ranges",),
+    ("positioning", "motion"),
+    ("screens", "integrity"),
+    ("pipeline",),
+    ("run",),
+    ("simulate", "reference"),
+    ("evaluate",),
+    ("report",),
+    ("cli",),
+)
+FLOOR_OF: Final = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 
 
 def _room(path: Path) -> str:

@@ -14,17 +14,23 @@ import pytest
 from polars.testing import assert_frame_equal
 
 from broken_bench import EPOCHS, Bench, bench_in
-from railfix.config import Config
-from railfix.demonstration import demo_inputs, demo_truth
-from railfix.errors import MismatchError, NoPositionError
+from railfix.core.errors import MismatchError, NoPositionError
+from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reason_text
 from railfix.evaluate import evaluate_run
-from railfix.pipeline import EpochProcessor, Result
-from railfix.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reason_text
-from railfix.rinex import read_navigation, read_observations, scan_observations
+from railfix.io.rinex import read_navigation, read_observations, scan_observations
+from railfix.pipeline.config import Config
+from railfix.pipeline.processor import EpochProcessor, Result
+from railfix.pipeline.tables import (
+    OBSERVATION_COLUMNS,
+    POSITION_COLUMNS,
+    observations_table,
+    positions_table,
+    to_xarray,
+)
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
-from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table, to_xarray
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.simulate.demonstration import demo_inputs, demo_truth
+from railfix.track import read_track
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from railfix.epochs import Observations
-from railfix.errors import OutputError
+from railfix.core.errors import OutputError
+from railfix.gnss.observations import Observations
 from railfix.run.chunks import aligned
 from railfix.run.output import OutputFolder
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import sbas_made as made
-from railfix.rinex.navigation import read_navigation
-from railfix.sbas import SatelliteState, SbasCorrections, SbasLimits, read_sbas
-from railfix.sbas.limits import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S
+from railfix.io.rinex.navigation import read_navigation
+from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, read_sbas
+from railfix.ranges.sbas.limits import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S
 
 pytestmark = pytest.mark.requirement("C1")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sbas_made as made
-from railfix.sbas import SbasLog, decode, decode_service, read_sbas
+from railfix.ranges.sbas import SbasLog, decode, decode_service, read_sbas
 
 pytestmark = pytest.mark.requirement("C1")
 

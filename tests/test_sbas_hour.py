@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import sbas_hour
-from railfix.antenna import Trajectory
-from railfix.config import parse_config
-from railfix.constants import FREQUENCY_L1
-from railfix.delays import SeenFrom
-from railfix.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
-from railfix.protecting import risk_of
-from railfix.sbas import SatelliteState
-from railfix.sbas_use import sbas_delays
+from railfix.core.constants import FREQUENCY_L1
+from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.protection_levels import risk_of
+from railfix.ranges.atmospheric_delays import SeenFrom
+from railfix.ranges.sbas import SatelliteState
+from railfix.ranges.sbas_delays import sbas_delays
+from railfix.track.trajectory import Trajectory
 
 pytestmark = pytest.mark.requirement("C2")
 

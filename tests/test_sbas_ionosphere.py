@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 import sbas_made as made
-from railfix.sbas import IonosphereDelays, IonosphereState, SbasCorrections, SbasLimits, sigma_tropo_m, troposphere_m
-from railfix.sbas.grid import BANDS, CELLS_OF_POINT, POINT_OF_BIT, point_number
-from railfix.sbas.ionosphere import EARTH_RADIUS_KM, LAYER_HEIGHT_KM, pierce_point
+from railfix.ranges.sbas import (
+    IonosphereDelays,
+    IonosphereState,
+    SbasCorrections,
+    SbasLimits,
+    sigma_tropo_m,
+    troposphere_m,
+)
+from railfix.ranges.sbas.grid import BANDS, CELLS_OF_POINT, POINT_OF_BIT, point_number
+from railfix.ranges.sbas.ionosphere import EARTH_RADIUS_KM, LAYER_HEIGHT_KM, pierce_point
 
 pytestmark = pytest.mark.requirement("C1")
 

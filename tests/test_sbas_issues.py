@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import orbits_made as made
-from railfix.orbits.issues import issue_records
-from railfix.orbits.states import satellite_states
+from railfix.gnss.orbits.issues import issue_records
+from railfix.gnss.orbits.states import satellite_states
 
 pytestmark = pytest.mark.requirement("C1")
 

@@ -10,28 +10,28 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from railfix.antenna import Trajectory
-from railfix.atmosphere import saastamoinen_delay_m
 from railfix.cli import app
-from railfix.config import Config, parse_config
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import Observations
-from railfix.errors import SettingsError
-from railfix.fault_free import fault_free
-from railfix.geodesy import geodetic_from_ecef
-from railfix.navigation import Navigation
-from railfix.orbits import satellite_states
-from railfix.pipeline import AntennaResult, EpochProcessor
-from railfix.placing import place_on_line
-from railfix.protecting import level_facts, protect
-from railfix.reasons import Reason, Status
-from railfix.results import AntennaState, State
-from railfix.rinex import read_navigation, read_observations
-from railfix.sbas import SatelliteState, SbasCorrections, read_sbas
-from railfix.sbas_use import REASONS
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.reasons import Reason, Status
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.gnss.orbits import satellite_states
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.fault_exclusion import fault_free
+from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.protection_levels import level_facts, protect
+from railfix.pipeline.results import AntennaState, State
+from railfix.pipeline.solve import place_on_line
+from railfix.positioning.single_point import single_point
+from railfix.ranges.atmosphere import saastamoinen_delay_m
+from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
+from railfix.ranges.sbas_delays import REASONS
 from railfix.simulate import demo_files
-from railfix.spp import single_point
-from railfix.track_map import Track, write_track_csv
+from railfix.track import Track, write_track_csv
+from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line
 
 pytestmark = pytest.mark.requirement("C1")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import sbas_made as made
-from railfix.errors import InputFileError
-from railfix.sbas import SbasLog, read_sbas
-from railfix.sbas.names import DECODED, system_name, type_name
-from railfix.sbas.parity import carried_parity, message_parity
-from railfix.timescale import from_week, to_week
+from railfix.core.errors import InputFileError
+from railfix.core.timescale import from_week, to_week
+from railfix.ranges.sbas import SbasLog, read_sbas
+from railfix.ranges.sbas.names import DECODED, system_name, type_name
+from railfix.ranges.sbas.parity import carried_parity, message_parity
 
 pytestmark = pytest.mark.requirement("C1")
 

@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
-from railfix.orbits.states import satellite_states
-from railfix.rinex.navigation import read_navigation
-from railfix.rinex.observations import read_observations
-from railfix.sbas import (
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
+from railfix.core.timescale import from_week
+from railfix.gnss.orbits.states import satellite_states
+from railfix.io.rinex.navigation import read_navigation
+from railfix.io.rinex.observations import read_observations
+from railfix.ranges.sbas import (
     IonosphereState,
     SatelliteState,
     SbasCorrections,
@@ -25,7 +26,6 @@ from railfix.sbas import (
     read_sbas,
     troposphere_m,
 )
-from railfix.timescale import from_week
 
 GPS = np.array([f"G{i:02d}" for i in range(1, 33)])
 #: What RTKLIB does: corrections as sent, at the second of their tag, whatever their degradation data and UDREI.

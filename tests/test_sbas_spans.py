@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.sbas.spans import Spans, looked_up, once_each
+from railfix.ranges.sbas.spans import Spans, looked_up, once_each
 
 pytestmark = pytest.mark.requirement("C1")
 START = np.datetime64("2025-02-15T12:00:00", "ns")

@@ -8,15 +8,15 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.cn0_curve import read_cn0_curve
-from railfix.config import parse_config
-from railfix.demonstration import demo_inputs
-from railfix.pipeline import EpochProcessor, Result
-from railfix.raim import Outcome, threshold
-from railfix.reasons import CHECK_FAILED, Status
-from railfix.rinex import read_navigation, read_observations
+from railfix.core.reasons import CHECK_FAILED, Status
+from railfix.integrity.raim import Outcome, threshold
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor, Result
+from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table
+from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.sources import TrackReading, open_line
-from railfix.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table
+from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = [pytest.mark.requirement("B7"), pytest.mark.requirement("B6")]
 

@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from pipeline_cases import clean_files, clean_observations
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import Observations
-from railfix.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
-from railfix.orbits import satellite_states
-from railfix.rinex import read_navigation, read_observations
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
+from railfix.core.timescale import timedelta
+from railfix.gnss.observations import Observations
+from railfix.gnss.orbits import satellite_states
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.io.rinex import read_navigation, read_observations
 from railfix.screens import (
     AntennaPairLimits,
     AntennaPairScreened,
@@ -30,8 +32,6 @@ from railfix.screens import (
     pair_epochs,
     spacing_direction,
 )
-from railfix.signals import carrier_frequency_hz
-from railfix.timescale import timedelta
 
 START = np.datetime64("2021-01-01T00:00:00", "ns")
 NAN = np.nan

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from railfix.cn0_curve import Cn0Curve, Cn0Mean
-from railfix.rinex import read_observations
+from railfix.io.rinex import read_observations
+from railfix.ranges.cn0_curve import Cn0Curve, Cn0Mean
 from railfix.screens import Cn0Limits, cn0_screen
 
 pytestmark = pytest.mark.requirement("B1")

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import ROOT
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import Observations
-from railfix.rinex import read_observations
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import timedelta
+from railfix.gnss.observations import Observations
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.io.rinex import read_observations
 from railfix.screens import DopplerLimits, DopplerScreened, DopplerState, doppler_limit_m, doppler_screen
-from railfix.signals import carrier_frequency_hz
-from railfix.timescale import timedelta
 
 pytestmark = pytest.mark.requirement("B2")
 

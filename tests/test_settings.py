@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from broken_bench import Bench, bench_in
 from railfix.cli import app
 from railfix.cli.settings import Choices, settings_of
-from railfix.config import PRESETS, SCREENS, Config, load_config, parse_config
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
+from railfix.pipeline.config import PRESETS, SCREENS, Config, load_config, parse_config
 
 pytestmark = pytest.mark.requirement("B7")
 

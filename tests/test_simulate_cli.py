@@ -11,9 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.rinex import read_observations
+from railfix.io.rinex import read_observations
 from railfix.simulate import demo_files, load_scenario, shipped_scenarios
-from railfix.track_map import read_track
+from railfix.track import read_track
 
 pytestmark = pytest.mark.requirement("D4")
 

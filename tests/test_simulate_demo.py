@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from conftest import ROOT
 from railfix.cli import app
-from railfix.errors import InputFileError
-from railfix.rinex import read_navigation, read_observations
+from railfix.core.errors import InputFileError
+from railfix.io.rinex import read_navigation, read_observations
 from railfix.simulate import DEMO_FILES, Scenario, demo_data, demo_files, demo_folder, write_run
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track import read_track
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 pytestmark = pytest.mark.requirement("D4")
 

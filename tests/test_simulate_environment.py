@@ -12,9 +12,9 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from scipy.signal import max_len_seq
 
-from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.errors import SettingsError
-from railfix.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
+from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
 from railfix.simulate import Disturbance, Geometry, Scenario, Simulation
 from railfix.simulate.environment import (
     CorrelatorSettings,

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import concatenate
-from railfix.errors import SettingsError
-from railfix.geodesy import geodetic_from_ecef
-from railfix.signals import carrier_frequency_hz
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.gnss.observations import concatenate
+from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate import (
     Disturbance,
     Geometry,

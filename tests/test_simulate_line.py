@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from railfix.errors import InputFileError, SettingsError
-from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.simulate import (
     Element,
     GeneratedLine,
@@ -29,8 +29,8 @@ from railfix.simulate import (
 )
 from railfix.simulate.motion import Sway
 from railfix.simulate.run import vehicle_toml
-from railfix.track_map import read_track, write_track_csv
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track import read_track, write_track_csv
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 pytestmark = pytest.mark.requirement("D4")
 
@@ -306,7 +306,7 @@ def test_a_track_file_that_jitters_or_lacks_points_is_refused(tmp_path: Path) ->
 
 def read_track_with_jitter(folder: Path, lat: np.ndarray, lon: np.ndarray, height: np.ndarray) -> Path:
     """The map with every second point 0.5 m to the north."""
-    from railfix.track_map import Track
+    from railfix.track import Track
 
     moved = lat + np.where(np.arange(len(lat)) % 2 == 0, 0.5 / 111_000.0, 0.0)
     write_track_csv(Track.from_geodetic(moved, lon, height), folder / "rough.csv")

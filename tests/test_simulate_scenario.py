@@ -15,9 +15,9 @@ import polars as pl
 import pytest
 
 from conftest import ROOT
-from railfix.epochs import concatenate
-from railfix.errors import InputFileError, MismatchError, SettingsError
-from railfix.rinex import read_navigation, write
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.gnss.observations import concatenate
+from railfix.io.rinex import read_navigation, write
 from railfix.simulate import (
     Element,
     GeneratedLine,

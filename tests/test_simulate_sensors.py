@@ -12,8 +12,8 @@ from pydantic import TypeAdapter
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from railfix.errors import SettingsError
-from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.errors import SettingsError
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import RunSettings, Scenario, Simulation
 from railfix.simulate.sensors import (
     DrawnSlips,

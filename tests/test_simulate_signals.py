@@ -10,13 +10,13 @@ import numpy as np
 import polars as pl
 import pytest
 
-from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import Observations, concatenate
-from railfix.errors import SettingsError
-from railfix.geodesy import geodetic_from_ecef
-from railfix.orbits import satellite_states
-from railfix.signals import carrier_frequency_hz
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import SettingsError
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.orbits import satellite_states
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 from railfix.simulate import (
     Disturbance,
     Geometry,

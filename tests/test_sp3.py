@@ -15,12 +15,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from orbits_made import TOE, kepler, navigation
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.errors import InputFileError
-from railfix.navigation import PreciseEphemeris
-from railfix.orbits import satellite_states
-from railfix.orbits.kepler import Orbits, kepler_state
-from railfix.sp3 import read_sp3
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.errors import InputFileError
+from railfix.gnss.navigation import PreciseEphemeris
+from railfix.gnss.orbits import satellite_states
+from railfix.gnss.orbits.kepler import Orbits, kepler_state
+from railfix.io.sp3 import read_sp3
 
 START = TOE - np.timedelta64(2, "h")
 SATELLITES = ("E14", "G05", "J02")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.stanford import Region, stanford
+from railfix.integrity.stanford import Region, stanford
 
 pytestmark = pytest.mark.requirement("C4")
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from railfix import timescale
+from railfix.core import timescale
 
 WEEK = timescale.SECONDS_PER_WEEK
 NAT = np.datetime64("NaT", "ns")

@@ -8,14 +8,11 @@ from pathlib import Path
 import japan_geoid
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pyproj import Transformer
 
-from railfix.errors import InputFileError, OutputError, RailfixError, SettingsError
-from railfix.geodesy import ecef_from_geodetic
-from railfix.track_map import Track, interpolate_kilometrage, read_track, write_track_csv
-
-Floats = NDArray[np.float64]
+from railfix.core.errors import InputFileError, OutputError, RailfixError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.track import Track, interpolate_kilometrage, read_track, write_track_csv
 
 HEADER = "latitude_deg,longitude_deg,height_m,cant_mm,radius_m,gradient_permille,kilometrage_m"
 ROWS = [

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from railfix.geodesy import ecef_from_geodetic, enu_axes
-from railfix.track_map import Finding, MapLimits, Track, check_track
-
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.track import Finding, MapLimits, Track, check_track
 
 ORIGIN = (35.0, 139.0, 50.0)
 

@@ -15,21 +15,19 @@ from time import process_time
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 import recordings_score
 import recordings_truth
-from railfix.constants import CLOCK_GROUP
+from railfix.core.arrays import Floats, Masks, Strings
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.geodesy import range_with_rotation
+from railfix.core.reasons import Reason
 from railfix.evaluate import interpolate_reference
-from railfix.geodesy import range_with_rotation
-from railfix.measurement import CodeNoise, code_sigma_m
-from railfix.pipeline import AntennaResult
-from railfix.reasons import Reason
+from railfix.pipeline.processor import AntennaResult
+from railfix.ranges.weights import CodeNoise, code_sigma_m
 from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings, write_run
 from railfix.simulate.environment import ElectrificationSettings, Environment, EnvironmentSettings, SectionSettings
 from railfix.simulate.environment.settings import Kind
-
-Floats = NDArray[np.float64]
 
 #: Constellations that both sides have.
 SYSTEMS: Final = "GJEC"
@@ -55,11 +53,11 @@ class Sample:
     """Codes less true range, and what goes with them, shapes (T, K); NaN where not tracked."""
 
     name: str
-    satellite: NDArray[np.str_]
+    satellite: Strings
     residual_m: Floats
     elevation_deg: Floats
     cn0_dbhz: Floats
-    in_view: NDArray[np.bool_] | None = None
+    in_view: Masks | None = None
 
     def errors_m(self) -> Floats:
         """Residuals less one clock an epoch and one offset a constellation, shape (T, K).

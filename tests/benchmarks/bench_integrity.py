@@ -29,24 +29,24 @@ from typing import Any
 
 import numpy as np
 
-from railfix.antenna import Trajectory
-from railfix.config import parse_config
-from railfix.epochs import Observations
-from railfix.error_model import (
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.ranges.error_model import (
     ErrorModel,
     ErrorModelFit,
     ErrorSamples,
     fit_bins,
     write_error_model,
 )
-from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.navigation import Navigation
-from railfix.pipeline import EpochProcessor
-from railfix.rinex import read_navigation, read_observations
+from railfix.ranges.sbas import SbasCorrections, read_sbas, sigma_tropo_m, troposphere_m
 from railfix.run.driver import RunOptions
-from railfix.sbas import SbasCorrections, read_sbas, sigma_tropo_m, troposphere_m
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track import read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "sbas" / "msas_20250215"
 MESSAGES, NAVIGATION = RECORDINGS / "046r_sbas_prn137.txt", RECORDINGS / "046r_rnx.nav"

@@ -18,13 +18,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.config import Config
-from railfix.epochs import Observations
-from railfix.pipeline import EpochProcessor
-from railfix.rinex import read_navigation, read_observations
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config
+from railfix.pipeline.processor import EpochProcessor
 from railfix.simulate.demo_data import demo_files
-from railfix.track_map import read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
+from railfix.track import read_track
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 #: Epochs before the clock starts: caches fill, offsets between clocks become known.
 WARM_UP = 50

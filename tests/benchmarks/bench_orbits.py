@@ -19,9 +19,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from orbits_made import TOE, navigation
-from railfix.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
-from railfix.navigation import Navigation, PreciseEphemeris
-from railfix.orbits import satellite_states
+from railfix.gnss.navigation import Navigation, PreciseEphemeris
+from railfix.gnss.orbits import satellite_states
+from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 
 EPOCHS = 36_000
 GEC = [f"G{n:02d}" for n in range(1, 9)] + [f"E{n:02d}" for n in range(1, 7)] + ["C03", "C20", "C21", "C22"]

@@ -101,7 +101,7 @@ def seconds(action: Callable[[], object], rounds: int) -> float:
 
 def read_with_railfix(path: Path) -> int:
     """Epochs read."""
-    from railfix.rinex import read_observations
+    from railfix.io.rinex import read_observations
 
     return len(read_observations(path))
 
@@ -135,7 +135,7 @@ def peak_memory_mb(path: Path) -> float:
     """Peak memory of a process that scans a log in pieces [MB]."""
     program = (
         "import resource, sys\n"
-        "from railfix.rinex import scan_observations\n"
+        "from railfix.io.rinex import scan_observations\n"
         "total = sum(len(piece) for piece in scan_observations(sys.argv[1], epochs=600))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
     )

@@ -21,10 +21,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import synthetic
-from railfix.antenna import Trajectory
-from railfix.clock_elimination import Ranges
-from railfix.section import SearchIndex, search
-from railfix.spp import SinglePoint, single_point
+from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.section_search import SearchIndex, search
+from railfix.positioning.single_point import SinglePoint, single_point
+from railfix.track.trajectory import Trajectory
 
 LENGTHS_M = (1_000.0, 200_000.0)
 #: Wanted with a 3-D position.

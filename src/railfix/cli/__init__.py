@@ -22,7 +22,7 @@ from railfix.cli.reference import reference as reference_command
 from railfix.cli.report import report as report_command
 from railfix.cli.run import run as run_command
 from railfix.cli.simulate import simulate as simulate_command
-from railfix.errors import RailfixError
+from railfix.core.errors import RailfixError
 
 
 class Commands(TyperGroup):

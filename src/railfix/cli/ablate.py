@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from railfix.evaluate import Score
-    from railfix.run.ablation import Ablation, Effect
+    from railfix.evaluate.ablation import Ablation, Effect
 
 #: Columns of text that the table needs.
 _WIDTH = 110
@@ -98,7 +98,8 @@ def ablate(
     written; 1 a defect of railfix.
     """
     from railfix.cli.console import progress_bar
-    from railfix.run import RunInputs, RunOptions, TrackReading, ablate_files
+    from railfix.evaluate.ablation import ablate_files
+    from railfix.run import RunInputs, RunOptions, TrackReading
 
     chosen = Choices(
         config=config,

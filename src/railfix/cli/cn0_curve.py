@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from railfix.errors import OutputError, SettingsError
+from railfix.core.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from railfix.cn0_curve import Cn0Curve
+    from railfix.core.arrays import Floats
+    from railfix.ranges.cn0_curve import Cn0Curve
 
 
 def cn0_curve(
@@ -53,7 +51,7 @@ def cn0_curve(
 
     Exit codes as `railfix --help` says; 5 where the position or the navigation files do not fit the log.
     """
-    from railfix.cn0_curve import CurveFit, cn0_curve_from_log, write_cn0_curve
+    from railfix.ranges.cn0_curve import CurveFit, cn0_curve_from_log, write_cn0_curve
 
     try:
         fit = CurveFit(bin_deg=bin_deg)
@@ -67,7 +65,7 @@ def cn0_curve(
         observations, nav, position_ecef_m=place, fit=fit, on_error="lenient" if lenient else "strict"
     )
     if plot is not None:
-        from railfix.plots.screens import draw_cn0_curve
+        from railfix.report.plots.screens import draw_cn0_curve
 
         draw_cn0_curve(plot, made.curve, made.samples)
     write_cn0_curve(made.curve, out)
@@ -77,9 +75,9 @@ def cn0_curve(
             typer.echo(f"wrote {path}")
 
 
-def place_of(text: str, option: str) -> NDArray[np.float64]:
+def place_of(text: str, option: str) -> Floats:
     """A place given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
-    from railfix.geodesy import ecef_from_geodetic
+    from railfix.core.geodesy import ecef_from_geodetic
 
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
@@ -94,7 +92,7 @@ def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from railfix.cn0_curve import KINDS
+    from railfix.ranges.cn0_curve import KINDS
 
     console, source = Console(highlight=False), curve.source
     console.print(

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from railfix.reasons import Status
+from railfix.core.reasons import Status
 
 if TYPE_CHECKING:
     from railfix.run import RunSummary

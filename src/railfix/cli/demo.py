@@ -37,9 +37,9 @@ def demo(
     Exit codes: 0 done; 8 DIR cannot be written; 1 a defect of railfix.
     """
     from railfix.cli.console import progress_bar, show_summary
-    from railfix.demonstration import demo_inputs, demo_truth
     from railfix.report import read_runs, write_page
     from railfix.run import RunOptions, run_files
+    from railfix.simulate.demonstration import demo_inputs, demo_truth
 
     inputs = demo_inputs()
     with progress_bar() as progress:

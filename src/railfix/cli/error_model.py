@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from railfix.errors import OutputError, SettingsError
+from railfix.core.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
-    from railfix.error_model import ErrorModel
+    from railfix.ranges.error_model import ErrorModel
 
 
 def error_model(
@@ -65,8 +65,8 @@ def error_model(
     import numpy as np
 
     from railfix.cli.cn0_curve import place_of
-    from railfix.error_model import ErrorBins, ErrorModelFit, write_error_model
-    from railfix.range_errors import ModelInputs, error_model_from_runs
+    from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
+    from railfix.ranges.error_model import ErrorBins, ErrorModelFit, write_error_model
 
     if len(reference) != len(runs):
         raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")
@@ -96,7 +96,7 @@ def _print_model(model: ErrorModel, samples: int) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from railfix.error_model import summary
+    from railfix.ranges.error_model import summary
 
     console = Console(highlight=False)
     base = model.source.base or "none: errors of satellites and atmosphere are in the model"

@@ -150,7 +150,7 @@ def evaluate(
 
 def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> list[RunAndReference]:
     """Each run with its reference and label."""
-    from railfix.errors import SettingsError
+    from railfix.core.errors import SettingsError
     from railfix.evaluate import RunAndReference
 
     references: list[str] = reference * len(runs) if reference == ["auto"] else reference
@@ -166,7 +166,7 @@ def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> 
 
 def _numbers(option: str, text: str) -> tuple[float, ...]:
     """Numbers between commas."""
-    from railfix.errors import SettingsError
+    from railfix.core.errors import SettingsError
 
     try:
         return tuple(float(part) for part in text.split(","))

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from railfix.errors import MapQualityError, OutputError, SettingsError
+from railfix.core.errors import MapQualityError, OutputError, SettingsError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from railfix.track_map import Thinned, Track, TrackQuality
+    from railfix.track import Thinned, Track, TrackQuality
 
 map_app = typer.Typer(
     name="map",
@@ -73,7 +73,7 @@ def check(
     3 a file is not a track map; 4 an option is wrong; 8 the picture cannot be written; 1 a defect of
     railfix.
     """
-    from railfix.track_map import MapLimits, check_track, read_track
+    from railfix.track import MapLimits, check_track, read_track
 
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
@@ -83,7 +83,7 @@ def check(
     quality = check_track(track, limits=MapLimits(mid_chord_m=mid_chord))
     picture = None
     if out is not None:
-        from railfix.plots.track import plot_track_quality
+        from railfix.report.plots.track import plot_track_quality
 
         picture = _folder(out) / "map_check.png"
         plot_track_quality(quality, picture)
@@ -136,8 +136,8 @@ def from_positions_command(
     Exit codes: 0 done; 2 the command line was misused; 3 the file is no log of positions, or its
     positions make no line; 4 an option is wrong; 8 the map cannot be written; 1 a defect of railfix.
     """
-    from railfix.position_log import read_positions
-    from railfix.track_map import from_position_log, write_track_csv
+    from railfix.io.position_log import read_positions
+    from railfix.track import from_position_log, write_track_csv
 
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")

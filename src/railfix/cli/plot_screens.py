@@ -26,7 +26,7 @@ def plot_screens(
     Exit codes: 0 done; 2 the command line was misused; 3 DIR is not that of a run with observations;
     8 the pictures cannot be written; 1 a defect of railfix.
     """
-    from railfix.plots.run_screens import draw_run_screens
+    from railfix.report.plots.run_screens import draw_run_screens
 
     drawn = draw_run_screens(run, out)
     for path in drawn:

@@ -128,7 +128,7 @@ def reference(
     """
     import numpy as np
 
-    from railfix.errors import SettingsError
+    from railfix.core.errors import SettingsError
     from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettings, reference_files
     from railfix.run import TrackReading
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 
 if TYPE_CHECKING:
-    from railfix.config import Config
+    from railfix.pipeline.config import Config
 
 _PANEL = "Choices"
 
@@ -128,7 +128,7 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
     """
     import tomllib
 
-    from railfix.config import load_config, parse_config
+    from railfix.pipeline.config import load_config, parse_config
 
     values: dict[str, Any] = {}
     source = "command line"
@@ -155,7 +155,7 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
 
 
 def _preset(name: str) -> str:
-    from railfix.config import PRESETS
+    from railfix.pipeline.config import PRESETS
 
     if name not in PRESETS:
         raise SettingsError(f"--preset {name}: unknown preset; known are {', '.join(PRESETS)}")
@@ -164,7 +164,7 @@ def _preset(name: str) -> str:
 
 def _screens(option: str, text: str) -> list[str]:
     """Names of screens, with commas between them."""
-    from railfix.config import SCREENS
+    from railfix.pipeline.config import SCREENS
 
     names = [name.strip() for name in text.split(",")]
     for name in names:

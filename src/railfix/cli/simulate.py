@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from railfix.errors import OutputError, SettingsError
+from railfix.core.errors import OutputError, SettingsError
 
 if TYPE_CHECKING:
     from railfix.simulate.scenario import Scenario

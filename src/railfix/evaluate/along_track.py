@@ -9,18 +9,16 @@ from __future__ import annotations
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from railfix.antenna import Trajectory
+from railfix.core.arrays import Datetimes, Floats
 from railfix.evaluate.bracket import LARGEST_GAP_S, bracket
-
-Floats = NDArray[np.float64]
+from railfix.track.trajectory import Trajectory
 
 
 def interpolate_reference(
-    time: NDArray[np.datetime64],
-    reference_time: NDArray[np.datetime64],
+    time: Datetimes,
+    reference_time: Datetimes,
     reference_ecef_m: Floats,
     *,
     largest_gap_s: float = LARGEST_GAP_S,

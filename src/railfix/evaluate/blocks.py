@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from railfix.core.arrays import Floats, Integers, Masks
 
 #: With fewer blocks than this no limits are told.
 FEWEST_BLOCKS: Final = 5
@@ -40,8 +38,8 @@ class Limits:
 
 def block_limits(
     error_m: Floats,
-    observed: NDArray[np.bool_],
-    positioned: NDArray[np.bool_],
+    observed: Masks,
+    positioned: Masks,
     block: Integers,
     *,
     replicates: int,

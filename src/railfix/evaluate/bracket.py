@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.timescale import seconds
 
 #: Longest step of a reference that is bridged [s].
 LARGEST_GAP_S = 2.5
@@ -33,7 +30,7 @@ class Bracket:
     left: Indices
     right: Indices
     share: Floats
-    inside: NDArray[np.bool_]
+    inside: Masks
 
     def of(self, values: Floats) -> Floats:
         """Values of the reference, shape (R,) or (R, n), at the times, linearly; NaN where not inside."""
@@ -48,9 +45,7 @@ class Bracket:
         return np.where(self.share <= 0.5, self.left, self.right)
 
 
-def bracket(
-    time: NDArray[np.datetime64], reference_time: NDArray[np.datetime64], *, largest_gap_s: float = LARGEST_GAP_S
-) -> Bracket:
+def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
     """Where each time lies in a reference.
 
     Parameters

@@ -7,21 +7,18 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from railfix.errors import MismatchError
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.errors import MismatchError
+from railfix.core.reasons import Status
+from railfix.core.timescale import seconds
 from railfix.evaluate.bracket import bracket
 from railfix.evaluate.integrity import PARTS, TOLD
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import Answers, Errors, TrackFiles, errors_of
 from railfix.evaluate.run_folder import RunFolder, floats
 from railfix.evaluate.sections import Sections
-from railfix.reasons import Status
-from railfix.reference_log import AntennaReference
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Datetimes = NDArray[np.datetime64]
+from railfix.io.reference_log import AntennaReference
 
 #: Status of an epoch that the log does not have though the epochs around it are there.
 NOT_LOGGED: Final = "not_logged"
@@ -97,7 +94,7 @@ def protection_columns(table: pl.DataFrame) -> list[str]:
     return levels + [name for name in table.columns if name.endswith(tuple(told))]
 
 
-def with_missing(time: Datetimes) -> tuple[Datetimes, NDArray[np.bool_], float]:
+def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
     """Epochs with those put in that a log skips.
 
     Parameters
@@ -130,7 +127,7 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, NDArray[np.bool_], float]:
 
 
 def travelled(
-    time: Datetimes, step_m: Floats, known: NDArray[np.bool_], speed_mps: Floats, *, options: EvaluationOptions
+    time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
     """Distance run since the first epoch whose place is known.
 
@@ -165,7 +162,7 @@ def travelled(
     return np.asarray(np.interp(clock, clock[at], total, left=np.nan, right=np.nan), dtype=np.float64)
 
 
-def since_last(values: Floats, has: NDArray[np.bool_]) -> Floats:
+def since_last(values: Floats, has: Masks) -> Floats:
     """Growth of a rising quantity since the row before that `has`, at those rows, shape (T,); NaN elsewhere."""
     grown = np.full(len(values), np.nan)
     at = np.flatnonzero(has & np.isfinite(values))
@@ -265,19 +262,19 @@ def antenna_epochs(
     )
 
 
-def _texts(table: pl.DataFrame, name: str, rows: NDArray[np.intp]) -> pl.Series:
+def _texts(table: pl.DataFrame, name: str, rows: Indices) -> pl.Series:
     """A column of words, null where the log has no epoch."""
     told = table[name].cast(pl.String)
     return pl.concat([told, pl.Series([None], dtype=pl.String)])[rows]
 
 
-def _steps(values: Floats, known: NDArray[np.bool_]) -> Floats:
+def _steps(values: Floats, known: Masks) -> Floats:
     """Size of the steps between known places: differences of chainage, or straight distances."""
     step = np.diff(values[known], axis=0)
     return np.abs(step) if step.ndim == 1 else np.asarray(np.linalg.norm(step, axis=1))
 
 
-def _own_speed(time: Datetimes, step_m: Floats, known: NDArray[np.bool_]) -> Floats:
+def _own_speed(time: Datetimes, step_m: Floats, known: Masks) -> Floats:
     """Speed over the steps before and after each known place, shape (T,) [m/s]; NaN elsewhere."""
     speed = np.full(len(time), np.nan)
     at = np.flatnonzero(known)
@@ -289,7 +286,7 @@ def _own_speed(time: Datetimes, step_m: Floats, known: NDArray[np.bool_]) -> Flo
     return speed
 
 
-def _environment(told: NDArray[np.str_], sections: Sections | None, chainage_m: Floats) -> NDArray[np.str_]:
+def _environment(told: Strings, sections: Sections | None, chainage_m: Floats) -> Strings:
     """What the reference tells, else what the sections tell."""
     words = told if sections is None else np.where(told == "", sections.at(chainage_m), told)
     return np.where(words == "", UNKNOWN, words)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import polars as pl
 
-from railfix.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, protection_columns
 from railfix.evaluate.figures import ALL, KEYS, WORDS, classed, figures_by
 from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
@@ -20,7 +20,7 @@ from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import TrackFiles
 from railfix.evaluate.run_folder import UNKNOWN_KIND, RunFolder, fingerprint, read_run
 from railfix.evaluate.sections import read_sections
-from railfix.reference_log import AntennaReference, read_reference
+from railfix.io.reference_log import AntennaReference, read_reference
 
 #: Names of a reference that is looked for beside the log of a run.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")

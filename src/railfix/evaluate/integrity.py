@@ -13,15 +13,14 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Floats, Masks, Strings
+from railfix.core.reasons import Status
 from railfix.evaluate.figures import ALL, KEYS
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.run_folder import floats
-from railfix.reasons import Status
-from railfix.stanford import Region, Stanford, stanford
+from railfix.integrity.stanford import Region, Stanford, stanford
 
-Floats = NDArray[np.float64]
 LevelsOf = Literal["vouched", "all"]
 
 #: Which levels count, see above.
@@ -132,9 +131,9 @@ def level_name(kind: str) -> str:
 
 def counted_levels(
     level_m: Floats,
-    has: NDArray[np.bool_],
-    status: NDArray[np.str_],
-    verdict: NDArray[np.str_],
+    has: Masks,
+    status: Strings,
+    verdict: Strings,
     *,
     levels_of: LevelsOf,
 ) -> Floats:
@@ -147,8 +146,8 @@ def counted_levels(
     has : ndarray of bool, shape (T,)
         Epochs with a position.
     status, verdict : ndarray of str, shape (T,)
-        Of the position (`railfix.reasons.Status`), of the level (`railfix.protection.Status`); blank where
-        there is none.
+        Of the position (`railfix.core.reasons.Status`), of the level (`railfix.integrity.protection.Status`);
+        blank where there is none.
     levels_of : {"vouched", "all"}
 
     Returns
@@ -161,11 +160,11 @@ def counted_levels(
     return np.where(has, bound, np.nan)
 
 
-def _vouched(status: NDArray[np.str_], verdict: NDArray[np.str_]) -> NDArray[np.bool_]:
+def _vouched(status: Strings, verdict: Strings) -> Masks:
     return np.asarray((status == Status.OK.text) & (verdict != _ALARM))
 
 
-def _words(table: pl.DataFrame, name: str) -> NDArray[np.str_]:
+def _words(table: pl.DataFrame, name: str) -> Strings:
     if name not in table.columns:
         return np.full(len(table), "")
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
@@ -207,7 +206,7 @@ def positions_diagram(
     Parameters
     ----------
     positions : polars.DataFrame
-        Of one antenna, columns of `railfix.tables.POSITION_COLUMNS`, in order of time.
+        Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`, in order of time.
     alarm_limit_m : float [m]
     levels_of : {"vouched", "all"}
     options : EvaluationOptions

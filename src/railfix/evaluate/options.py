@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 from railfix.evaluate.bracket import LARGEST_GAP_S
 
 Method = Literal["chainage", "trajectory"]

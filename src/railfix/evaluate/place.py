@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
-from railfix.errors import InputFileError, MismatchError, RailfixError
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, MismatchError, RailfixError
 from railfix.evaluate.along_track import along_track_error
 from railfix.evaluate.options import Method
 from railfix.evaluate.run_folder import RunFolder
-from railfix.track_map import Track, read_track
-from railfix.vehicle import antenna_trajectory, read_vehicle
-
-Floats = NDArray[np.float64]
+from railfix.track import Track, read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 #: Chainages of the reference and of the run that differ from their places by more than this, at the median, are
 #: not of one map [m].
@@ -41,7 +39,7 @@ class TrackFiles:
         Empty: those of the run.
     vehicle : Path or None
     crs, height_datum, geoid : str or None
-        See `railfix.track_map.read_track`.
+        See `railfix.track.read_track`.
     """
 
     track: tuple[Path, ...] = ()

@@ -13,8 +13,8 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
-from railfix.errors import InputFileError
-from railfix.protecting import KINDS
+from railfix.core.errors import InputFileError
+from railfix.pipeline.protection_levels import KINDS
 
 #: Columns of the positions without which there is nothing to evaluate.
 NEEDED: Final = (
@@ -37,7 +37,7 @@ class RunFolder:
     positions_path : Path
         ``positions.parquet``, or ``positions.csv`` where that is absent.
     positions : polars.DataFrame
-        One row an epoch and antenna, see `railfix.tables.POSITION_COLUMNS`.
+        One row an epoch and antenna, see `railfix.pipeline.tables.POSITION_COLUMNS`.
     record : mapping
         ``run.json``.
     """

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats, Masks
 
 #: Distance on the map from which on an answer is in the wrong place [m].
 WRONG_PLACE_M = 50.0
@@ -44,7 +43,7 @@ class Score:
     wrong_place: float
 
 
-def score(error_m: Floats, observed: NDArray[np.bool_]) -> Score:
+def score(error_m: Floats, observed: Masks) -> Score:
     """Figures of merit from signed errors.
 
     Parameters

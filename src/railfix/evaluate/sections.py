@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.errors import InputFileError
-from railfix.named_columns import read_named_columns
-
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats, Strings
+from railfix.core.errors import InputFileError
+from railfix.io.named_columns import read_named_columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +29,7 @@ class Sections:
     to_m: Floats
     environment: tuple[str, ...]
 
-    def at(self, chainage_m: Floats) -> NDArray[np.str_]:
+    def at(self, chainage_m: Floats) -> Strings:
         """Environment at chainages, shape (T,); blank outside every section and for NaN."""
         words = np.array([*self.environment, ""])
         index = np.searchsorted(self.from_m, chainage_m, side="right") - 1

@@ -3,12 +3,12 @@
 `build_references` works on arrays, `reference_files` on files.
 """
 
+from railfix.io.sensor_log import Acceleration, Pulses, read_acceleration, read_pulses
 from railfix.reference.assemble import Built, Gap
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.driver import ReferenceSummary, reference_files
 from railfix.reference.fixes import Fixes, Refusal
 from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
-from railfix.reference.sensors import Acceleration, Pulses, read_acceleration, read_pulses
 from railfix.reference.settings import ReferenceSettings
 
 __all__ = [

@@ -6,17 +6,14 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.timescale import seconds
+from railfix.io.reference_log import AntennaReference
 from railfix.reference.fixes import Fixes
 from railfix.reference.settings import ReferenceSettings
 from railfix.reference.smoother import Evidence, Smoothed
-from railfix.reference_log import AntennaReference
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from railfix.track.trajectory import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +146,7 @@ def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return found
 
 
-def _near(known_s: Floats, at_s: Floats) -> NDArray[np.bool_]:
+def _near(known_s: Floats, at_s: Floats) -> Masks:
     """Whether one of the known instants, rising, is within `_NEAR_S` of each."""
     if not len(known_s):
         return np.zeros(len(at_s), dtype=np.bool_)

@@ -14,15 +14,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.antenna import TRACK_AS_PATH, Trajectory
-from railfix.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
-from railfix.errors import MismatchError, NoPositionError
-from railfix.position_log import PositionLog
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.errors import MismatchError, NoPositionError
+from railfix.core.timescale import seconds
+from railfix.io.position_log import PositionLog
+from railfix.io.sensor_log import Acceleration, Pulses
+from railfix.motion.wheel import Wheel, wheel_of
+from railfix.positioning.doppler_speed import Dopplers, DopplerSpeed, doppler_speed
 from railfix.reference.assemble import Built, assembled
 from railfix.reference.fixes import Fixes, judge_alone, judge_pair, judge_place, judge_travel
-from railfix.reference.sensors import Acceleration, Pulses
 from railfix.reference.settings import ReferenceSettings
 from railfix.reference.smoother import (
     WINDOWS,
@@ -35,12 +36,7 @@ from railfix.reference.smoother import (
     smooth,
 )
 from railfix.reference.ways import LONGEST_STEP_S, Speeds, fused, instants, nearest
-from railfix.reference.wheel import Wheel, wheel_of
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Datetimes = NDArray[np.datetime64]
+from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 #: Standard gravity [m/s2].
 GRAVITY_MPS2: Final = 9.80665

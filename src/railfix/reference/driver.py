@@ -13,20 +13,20 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from railfix import __version__
-from railfix.config import DEFAULT_SIGNALS
-from railfix.doppler_speed import Dopplers, dopplers_of_log
-from railfix.epochs import concatenate
-from railfix.errors import InputFileError
-from railfix.navigation import Navigation
-from railfix.nmea import read_any_positions
-from railfix.position_log import PositionLog
+from railfix.core.errors import InputFileError
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import concatenate
+from railfix.io.nmea import read_any_positions
+from railfix.io.position_log import PositionLog
+from railfix.io.rinex import read_navigation
+from railfix.io.sensor_log import read_acceleration, read_pulses
+from railfix.pipeline.config import DEFAULT_SIGNALS
+from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
 from railfix.reference.assemble import Built
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
 from railfix.reference.record import antenna_record, fixes_table, reference_table
-from railfix.reference.sensors import read_acceleration, read_pulses
 from railfix.reference.settings import ReferenceSettings
-from railfix.rinex import read_navigation
 from railfix.run.inputs import Antenna
 from railfix.run.output import OutputFolder
 from railfix.run.sources import Line, Log, open_line
@@ -67,7 +67,7 @@ def reference_files(
     """Make the reference of a run and write it.
 
     ================== ======================================================================
-    reference.csv      `railfix.reference_log`, one row an instant and antenna
+    reference.csv      `railfix.io.reference_log`, one row an instant and antenna
     fixes.csv          every row of the logs of positions, with what was refused and why
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
@@ -89,7 +89,7 @@ def reference_files(
     Raises
     ------
     RailfixError
-        See `railfix.errors`; nothing is left in `out` then.
+        See `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
     settings, options = settings or ReferenceSettings(), options or ReferenceOptions()

@@ -8,19 +8,14 @@ from enum import IntFlag
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.antenna import Trajectory
-from railfix.geodesy import enu_axes, geodetic_from_ecef
-from railfix.position_log import PositionLog
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.timescale import seconds
+from railfix.io.position_log import PositionLog
 from railfix.reference.matching import Matched, match
 from railfix.reference.settings import ReferenceSettings
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Bits = NDArray[np.int64]
-Datetimes = NDArray[np.datetime64]
-Indices = NDArray[np.intp]
+from railfix.track.trajectory import Trajectory
 
 #: Positions of two antennas that are tagged no further apart belong to one instant [ns].
 SAME_INSTANT_NS: Final = 5_000_000
@@ -78,7 +73,7 @@ class Fixes:
 
     time: Datetimes
     ecef_m: Floats
-    quality: NDArray[np.int64]
+    quality: Integers
     ratio: Floats
     sigma_enu_m: Floats
     refusal: Bits
@@ -141,7 +136,7 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
     )
 
 
-def _refuse(refusal: Bits, mask: NDArray[np.bool_], reason: Refusal) -> None:
+def _refuse(refusal: Bits, mask: Masks, reason: Refusal) -> None:
     """Give a reason to rows that have none yet."""
     refusal[mask & (refusal == 0)] |= reason
 
@@ -241,7 +236,7 @@ def judge_travel(
     way, variance = travelled(fixes.time[rows])
     offset = fixes.arc_m[rows] - way
 
-    def agrees(i: Indices, j: Indices) -> NDArray[np.bool_]:
+    def agrees(i: Indices, j: Indices) -> Masks:
         spread = np.abs(variance[j] - variance[i]) + fixes.sigma_m[rows[i]] ** 2 + fixes.sigma_m[rows[j]] ** 2
         limit = settings.travel_m + settings.travel_share * np.abs(way[j] - way[i]) + _TRAVEL_SIGMAS * np.sqrt(spread)
         # Where nothing measured the way nothing is refused.
@@ -255,9 +250,7 @@ def judge_travel(
     return replace(fixes, refusal=refusal, travel_m=travel)
 
 
-def _best_chain(
-    agrees: Callable[[Indices, Indices], NDArray[np.bool_]], time_s: Floats, hold_s: float
-) -> NDArray[np.bool_]:
+def _best_chain(agrees: Callable[[Indices, Indices], Masks], time_s: Floats, hold_s: float) -> Masks:
     """Which fixes are in the chain of runs of most seconds, less `hold_s` for each joint that does not agree."""
     count = len(time_s)
     worth = np.minimum(np.diff(time_s, append=time_s[-1] + np.median(np.diff(time_s))), 1.0)

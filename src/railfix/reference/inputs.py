@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from railfix.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.run.inputs import Antenna
 from railfix.run.sources import TrackReading
 

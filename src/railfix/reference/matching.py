@@ -6,15 +6,11 @@ from dataclasses import dataclass
 from itertools import chain, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from railfix.antenna import Trajectory
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Masks = NDArray[np.bool_]
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.timescale import seconds
+from railfix.track.trajectory import Trajectory
 
 #: A pass out of reach costs this much more than any other choice [m].
 _OUT_OF_REACH_M = 1e6
@@ -54,7 +50,7 @@ class _Passes:
 
 
 def match(
-    time: NDArray[np.datetime64],
+    time: Datetimes,
     ecef_m: Floats,
     trajectory: Trajectory,
     *,

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from railfix.antenna import Trajectory
+from railfix.io.reference_log import COLUMNS, AntennaReference
 from railfix.reference.assemble import Built
 from railfix.reference.fixes import Refusal
-from railfix.reference_log import COLUMNS, AntennaReference
+from railfix.track.trajectory import Trajectory
 
 
 def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:

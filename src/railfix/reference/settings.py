@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
-from railfix.doppler_speed import DopplerSpeedLimits
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
+from railfix.positioning.doppler_speed import DopplerSpeedLimits
 
 
 @dataclass(frozen=True, kw_only=True)

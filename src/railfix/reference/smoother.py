@@ -14,14 +14,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.reference.chain import Chain
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.timescale import seconds
+from railfix.motion.chain import Chain
 from railfix.reference.settings import ReferenceSettings
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 #: Standard deviations of what nothing is known of: speed [m/s], difference of the wheel's distance [m].
 _ANY_SPEED_MPS: Final = 100.0
@@ -56,7 +53,7 @@ class Evidence:
         Mean of each step along rising chainage, without gravity.
     """
 
-    time: NDArray[np.datetime64]
+    time: Datetimes
     fix_m: Floats
     fix_sigma_m: Floats
     doppler_mps: Floats
@@ -295,7 +292,7 @@ class Closings:
 
 
 def closings(
-    time: NDArray[np.datetime64],
+    time: Datetimes,
     way_m: Floats,
     variance_m2: Floats,
     fix_m: Floats,

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.timescale import seconds, timedelta
-
-Floats = NDArray[np.float64]
-Datetimes = NDArray[np.datetime64]
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.timescale import seconds, timedelta
 
 #: Tags that differ by no more belong to one instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
@@ -55,7 +52,7 @@ def fused(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
         return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
 
 
-def nearest(time: Datetimes, wanted: Datetimes) -> NDArray[np.intp]:
+def nearest(time: Datetimes, wanted: Datetimes) -> Indices:
     """Row of `time` at each wanted instant within `SAME_INSTANT_NS`; -1 where there is none."""
     if not len(time):
         return np.full(len(wanted), -1, dtype=np.intp)

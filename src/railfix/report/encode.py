@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
-from railfix.timescale import seconds
+from railfix.core.timescale import seconds
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Of whole numbers packed in 16 bits: unknown.

@@ -8,19 +8,19 @@ from typing import Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Datetimes, Floats
 from railfix.evaluate import EvaluationOptions
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram
-from railfix.plots.chart import Chart, SkyEpochs
-from railfix.plots.columns import floats, start_of
-from railfix.plots.errors import error_over_chainage, error_over_time, good_errors
-from railfix.plots.levels import levels_over_chainage, levels_over_time, stanford
-from railfix.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
-from railfix.plots.run_screens import screens_of
-from railfix.plots.screens import screen_over_chainage, screen_over_time
-from railfix.plots.signals import SKY_EPOCHS, cn0_over_elevation, sky_epochs
-from railfix.plots.timing import processing_time
+from railfix.report.plots.chart import Chart, SkyEpochs
+from railfix.report.plots.columns import floats, start_of
+from railfix.report.plots.errors import error_over_chainage, error_over_time, good_errors
+from railfix.report.plots.levels import levels_over_chainage, levels_over_time, stanford
+from railfix.report.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
+from railfix.report.plots.run_screens import screens_of
+from railfix.report.plots.screens import screen_over_chainage, screen_over_time
+from railfix.report.plots.signals import SKY_EPOCHS, cn0_over_elevation, sky_epochs
+from railfix.report.plots.timing import processing_time
 from railfix.report.protection import NO_LEVELS
 from railfix.report.runs import ReportedRun
 
@@ -144,14 +144,14 @@ def _stanford(run: ReportedRun, errors: pl.DataFrame, limit_m: float) -> Iterato
         yield stanford(diagram, title=f"Stanford diagram, {words} ({kind})")
 
 
-def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> NDArray[np.float64]:
+def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
     """Errors row by row of the positions."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")
 
 
-def _worst(errors: pl.DataFrame | None) -> NDArray[np.datetime64] | None:
+def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
     """Epochs of the largest errors, on the map and conventional."""
     if errors is None:
         return None

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Final
 
 from railfix import __version__
+from railfix.core.files import write_whole
 from railfix.evaluate import Evaluation
-from railfix.files import write_whole
-from railfix.plots.chart import Chart, Points, SkyEpochs
-from railfix.plots.errors import error_ranges
-from railfix.plots.signals import SKY_EPOCHS
 from railfix.report import tables
 from railfix.report.encode import chart_values, script_json, sky_values
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, run_group
 from railfix.report.html import absent, text
+from railfix.report.plots.chart import Chart, Points, SkyEpochs
+from railfix.report.plots.errors import error_ranges
+from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.protection import protection
 from railfix.report.runs import ReportedRun, read_runs
 
@@ -38,7 +38,7 @@ def write_report(runs: Sequence[Path], out: Path, *, references: Sequence[Path] 
     out : Path
         The page; it appears whole or not at all, in place of an earlier one.
     references : sequence of Path
-        None, one for all runs, or one for each (`railfix.reference_log.read_reference`).
+        None, one for all runs, or one for each (`railfix.io.reference_log.read_reference`).
     title : str
 
     Returns

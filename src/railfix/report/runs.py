@@ -10,11 +10,11 @@ from typing import Any
 import polars as pl
 from polars.exceptions import PolarsError
 
-from railfix.cn0_curve import Cn0Curve, read_cn0_curve
-from railfix.config import Config, parse_config
-from railfix.errors import InputFileError, RailfixError, SettingsError
+from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.evaluate import Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.run_folder import RunFolder, read_run
+from railfix.pipeline.config import Config, parse_config
+from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
 
 
 @dataclass(frozen=True, kw_only=True)

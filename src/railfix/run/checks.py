@@ -6,10 +6,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from railfix.errors import MismatchError, NoPositionError
-from railfix.navigation import Navigation
+from railfix.core.errors import MismatchError, NoPositionError
+from railfix.gnss.navigation import Navigation
+from railfix.ranges.sbas import SbasCorrections
 from railfix.run.tally import AntennaTally, Tally
-from railfix.sbas import SbasCorrections
 
 #: A conventional position further from the trajectory than this belongs to another place [m].
 ANOTHER_PLACE_M: Final = 100_000.0

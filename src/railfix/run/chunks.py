@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.epochs import Observations, concatenate
+from railfix.gnss.observations import Observations, concatenate
 
 #: Tags of two receivers that differ by no more than this belong to one instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000

@@ -11,12 +11,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from railfix.config import Config
-from railfix.errors import SettingsError
-from railfix.navigation import Navigation
-from railfix.pipeline import EpochProcessor, State
-from railfix.protecting import level_facts, risk_of
-from railfix.rinex import read_navigation
+from railfix.core.errors import SettingsError
+from railfix.gnss.navigation import Navigation
+from railfix.io.rinex import read_navigation
+from railfix.io.sp3 import read_sp3
+from railfix.pipeline.config import Config
+from railfix.pipeline.processor import EpochProcessor, State
+from railfix.pipeline.protection_levels import level_facts, risk_of
+from railfix.pipeline.tables import observations_table, positions_table, rounded
 from railfix.run.checks import (
     RECORD_REACH,
     check_positions,
@@ -31,8 +33,6 @@ from railfix.run.output import OutputFolder
 from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
 from railfix.run.sources import Line, Log, TrackReading, open_line
 from railfix.run.tally import Tally
-from railfix.sp3 import read_sp3
-from railfix.tables import observations_table, positions_table, rounded
 
 
 class Progress(Protocol):
@@ -133,7 +133,7 @@ def run_files(
     Raises
     ------
     RailfixError
-        See `railfix.errors`; nothing is left in `out` then.
+        See `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()

@@ -9,8 +9,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from railfix.config import Config
-from railfix.errors import InputFileError
+from railfix.core.errors import InputFileError
+from railfix.pipeline.config import Config
 
 Antenna = Literal["front", "rear"]
 

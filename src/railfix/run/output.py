@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Self
 
-from railfix.errors import OutputError
+from railfix.core.errors import OutputError
 
 if TYPE_CHECKING:
     import polars as pl

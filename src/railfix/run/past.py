@@ -9,8 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from railfix.config import Config, parse_config
-from railfix.errors import InputFileError, MismatchError
+from railfix.core.errors import InputFileError, MismatchError
+from railfix.pipeline.config import Config, parse_config
 from railfix.run.driver import RunOptions
 from railfix.run.inputs import RunInputs, file_sha256
 from railfix.run.sources import TrackReading

@@ -11,8 +11,8 @@ from typing import Any, Final
 import polars as pl
 
 from railfix import __version__
-from railfix.navigation import Navigation
-from railfix.reasons import Status
+from railfix.core.reasons import Status
+from railfix.gnss.navigation import Navigation
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
 

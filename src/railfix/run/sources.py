@@ -11,13 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from railfix.antenna import Trajectory
-from railfix.epochs import Observations
-from railfix.errors import SettingsError
-from railfix.rinex import scan_observations
+from railfix.core.errors import SettingsError
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import scan_observations
 from railfix.run.inputs import Antenna
-from railfix.track_map import Track, read_track
-from railfix.vehicle import Reference, Vehicle, antenna_trajectory, read_vehicle
+from railfix.track import Track, read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import Reference, Vehicle, antenna_trajectory, read_vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,9 +27,9 @@ class TrackReading:
     Attributes
     ----------
     crs, height_datum, geoid : str or None
-        Where the track's own file does not say; see `railfix.track_map.read_track`.
+        Where the track's own file does not say; see `railfix.track.read_track`.
     reference : str
-        The point of the vehicle whose chainage is given; see `railfix.vehicle.antenna_trajectory`.
+        The point of the vehicle whose chainage is given; see `railfix.track.vehicle.antenna_trajectory`.
     """
 
     crs: str | None = None
@@ -141,7 +141,7 @@ class Log:
         Raises
         ------
         InputFileError, MismatchError
-            See `railfix.rinex.scan_observations`.
+            See `railfix.io.rinex.scan_observations`.
         """
         pieces = scan_observations(
             self.paths,

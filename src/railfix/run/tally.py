@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.pipeline import AntennaResult, Result
-from railfix.reasons import Reason, Status, first_reason
+from railfix.core.arrays import Masks
+from railfix.core.reasons import Reason, Status, first_reason
+from railfix.pipeline.processor import AntennaResult, Result
 
 _NOT_A_REFUSAL = Reason.NOT_OBSERVED
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
@@ -117,7 +117,7 @@ class AntennaTally:
         # The signals that nobody looked at could not have stood in.
         looked_at = (reason & Reason.OTHER_SIGNAL_TAKEN) == 0
 
-        def enough(without: int) -> NDArray[np.bool_]:
+        def enough(without: int) -> Masks:
             left = (looked_at & ((reason & without) == 0)).astype(np.int64) @ member > 0
             return np.asarray(np.count_nonzero(left, axis=1) >= self.min_satellites)
 

@@ -21,17 +21,14 @@ from itertools import product
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.timescale import seconds
 from railfix.screens.medians import clock_columns, enough_satellites, row_median
 from railfix.screens.result import Screened
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
-Masks = NDArray[np.bool_]
 
 #: What each way to treat the clocks is called in the output.
 CLOCKS: Final = {
@@ -128,7 +125,7 @@ def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: flo
     return index, to_rear[index]
 
 
-def _nearest(values: NDArray[np.int64], among: NDArray[np.int64]) -> Indices:
+def _nearest(values: Integers, among: Integers) -> Indices:
     """Index of the nearest of rising numbers, the earlier of two equally near."""
     after = np.clip(np.searchsorted(among, values), 1, max(len(among) - 1, 1))
     before = after - 1
@@ -137,10 +134,10 @@ def _nearest(values: NDArray[np.int64], among: NDArray[np.int64]) -> Indices:
 
 
 def pair_channels(
-    satellite_front: NDArray[np.str_],
-    signal_front: NDArray[np.str_],
-    satellite_rear: NDArray[np.str_],
-    signal_rear: NDArray[np.str_],
+    satellite_front: Strings,
+    signal_front: Strings,
+    satellite_rear: Strings,
+    signal_rear: Strings,
 ) -> tuple[Indices, Indices]:
     """Channels of the same satellite and signal at both receivers, in the order of the front one's."""
     rear = {key: m for m, key in enumerate(zip(satellite_rear.tolist(), signal_rear.tolist(), strict=True))}
@@ -251,7 +248,7 @@ def antenna_pair_screen(
     elevation_deg: ArrayLike,
     azimuth_deg: ArrayLike,
     *,
-    satellite: NDArray[np.str_],
+    satellite: Strings,
     heading_deg: ArrayLike,
     gradient_permille: ArrayLike,
     spacing_m: ArrayLike,
@@ -313,7 +310,7 @@ def antenna_pair_screen(
     )
 
 
-def _clock_difference(raw: Floats, rate: Floats, satellite: NDArray[np.str_], *, least: int) -> Floats:
+def _clock_difference(raw: Floats, rate: Floats, satellite: Strings, *, least: int) -> Floats:
     """Median of each constellation, shape (P, C) [m]; the instants that it moves are allowed for."""
     clock = np.full(raw.shape, np.nan)
     for columns in clock_columns(satellite):

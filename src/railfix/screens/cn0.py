@@ -2,7 +2,7 @@
 
 Reflected, bent and shaded signals are weak. A limit that is the same for all elevations either lets
 bad signals of high satellites pass or loses good ones of low satellites, so P1 measures the mean over
-elevation for the antenna and receiver on a day of open sky (`railfix.cn0_curve`), and refuses what
+elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and refuses what
 lies 10 dB-Hz below it; and, for all satellites alike, what lies below 30 dB-Hz (table 6).
 """
 
@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from railfix.cn0_curve import Cn0Curve
+from railfix.core.arrays import Strings
+from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.screens.result import Screened
-
-Floats = NDArray[np.float64]
 
 #: What `Cn0Screened.judged_by` says of a channel.
 BY_BOTH, BY_CURVE, BY_FLOOR, BY_NOTHING = "curve and floor", "curve", "floor", "nothing"
@@ -67,7 +66,7 @@ class Cn0Screened:
 
     floor: Screened
     curve: Screened
-    judged_by: NDArray[np.str_]
+    judged_by: Strings
 
     @property
     def note(self) -> str:
@@ -85,8 +84,8 @@ def cn0_screen(
     cn0_dbhz: ArrayLike,
     elevation_deg: ArrayLike,
     *,
-    satellite: NDArray[np.str_],
-    signal: NDArray[np.str_],
+    satellite: Strings,
+    signal: Strings,
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
 ) -> Cn0Screened:

@@ -17,18 +17,15 @@ from dataclasses import dataclass, field, fields
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.epochs import frozen
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import frozen
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
 from railfix.screens.medians import clock_columns, enough_satellites, row_median
 from railfix.screens.result import Screened
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
-Datetimes = NDArray[np.datetime64]
 
 _NS: Final = 1e9
 
@@ -50,7 +47,7 @@ class DopplerScreened(Screened):
     level_m: Floats
 
 
-def _none(kind: str) -> NDArray[np.str_]:
+def _none(kind: str) -> Strings:
     return np.empty(0, dtype=kind)
 
 
@@ -75,8 +72,8 @@ class DopplerState:
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    satellite: NDArray[np.str_] = field(default_factory=lambda: _none("<U3"))
-    signal: NDArray[np.str_] = field(default_factory=lambda: _none("<U2"))
+    satellite: Strings = field(default_factory=lambda: _none("<U3"))
+    signal: Strings = field(default_factory=lambda: _none("<U2"))
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
     code_sigma_m: Floats = field(default_factory=lambda: np.empty(0))
@@ -97,8 +94,8 @@ def doppler_screen(
     code_m: ArrayLike,
     doppler_hz: ArrayLike,
     *,
-    satellite: NDArray[np.str_],
-    signal: NDArray[np.str_],
+    satellite: Strings,
+    signal: Strings,
     frequency_hz: ArrayLike,
     break_before: ArrayLike | None = None,
     code_sigma_m: ArrayLike | None = None,
@@ -181,7 +178,7 @@ def doppler_screen(
     return DopplerScreened(metric=metric, reject=reject, limit_m=limit, level_m=level), after
 
 
-def _aligned(state: DopplerState, satellite: NDArray[np.str_], signal: NDArray[np.str_]) -> DopplerState:
+def _aligned(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
     """The state on the channels of this chunk; channels that left have no observation in it anyway."""
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
     found = np.array([row.get(key, -1) for key in zip(satellite.tolist(), signal.tolist(), strict=True)], dtype=int)
@@ -214,7 +211,7 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
     return np.where(possible, interval, np.nan)
 
 
-def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: NDArray[np.str_], *, least: int) -> Floats:
+def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
     """Change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
     metric = np.full(change.shape, np.nan)
     for columns in clock_columns(satellite):

@@ -33,11 +33,10 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from railfix.core.arrays import Floats
 from railfix.screens.medians import row_median
-
-Floats = NDArray[np.float64]
 
 #: Median of the absolute value of a unit normal variable.
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7

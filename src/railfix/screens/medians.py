@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.constants import CLOCK_GROUP
-
-Floats = NDArray[np.float64]
-Masks = NDArray[np.bool_]
+from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.core.constants import CLOCK_GROUP
 
 
 def row_median(values: Floats) -> Floats:
@@ -22,13 +19,13 @@ def row_median(values: Floats) -> Floats:
     return np.asarray(np.where(count > 0, (low + high) / 2.0, np.nan))
 
 
-def clock_columns(satellite: NDArray[np.str_]) -> list[NDArray[np.intp]]:
+def clock_columns(satellite: Strings) -> list[Indices]:
     """Columns of the channels of each receiver clock (`constants.CLOCK_GROUP`)."""
     clock = np.array([CLOCK_GROUP[name[0]] for name in satellite.tolist()], dtype="<U1")
     return [np.flatnonzero(clock == letter) for letter in np.unique(clock)]
 
 
-def enough_satellites(finite: Masks, satellite: NDArray[np.str_], least: int) -> Masks:
+def enough_satellites(finite: Masks, satellite: Strings, least: int) -> Masks:
     """Whether each row has at least `least` satellites with a finite channel, shape (T, 1)."""
     names, which = np.unique(satellite, return_inverse=True)
     seen = finite.astype(np.int64) @ (which[:, None] == np.arange(len(names))).astype(np.int64) > 0

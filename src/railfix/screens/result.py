@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
+from railfix.core.arrays import Floats, Masks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,5 +19,5 @@ class Screened:
         True = rejected. Where the metric is NaN the screen does not reject.
     """
 
-    metric: NDArray[np.float64]
-    reject: NDArray[np.bool_]
+    metric: Floats
+    reject: Masks

@@ -14,18 +14,17 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
-from railfix.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.arrays import Floats
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.simulate.line_elements import Knots, generated_knots, knots_of_elements
 from railfix.simulate.line_file import FileLine, line_of_file
 from railfix.simulate.line_settings import PATTERN_LENGTH_M, LineSettings
 from railfix.simulate.waves import Waves
-from railfix.track_map import Track, interpolate_kilometrage
-from railfix.track_map.track import frozen
-
-Floats = NDArray[np.float64]
+from railfix.track import Track, interpolate_kilometrage
+from railfix.track.track import frozen
 
 _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563

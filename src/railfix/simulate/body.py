@@ -1,6 +1,6 @@
 """Where the antennas truly are: a rigid body with both bogie centres on the continuous line.
 
-Computed apart from `railfix.vehicle`, which works on the polyline of the map: here by Newton's method
+Computed apart from `railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method
 on the curve and by rotation about the body's axis (Rodrigues).
 """
 
@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.arrays import Floats
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.alignment import Alignment
 from railfix.simulate.scenario import VehicleSettings
-
-Floats = NDArray[np.float64]
 
 #: Contact points of the wheels lie further apart than the gauge [m].
 _RAIL_HEAD_M = 0.070

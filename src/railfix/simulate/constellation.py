@@ -12,16 +12,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.constants import BDT_MINUS_GPST_S
-from railfix.navigation import KeplerRecords, Navigation
+from railfix.core.constants import BDT_MINUS_GPST_S
+from railfix.core.timescale import gpst_minus_utc, to_week
+from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.simulate.satellites import EARTH, FRAME_ROTATION
 from railfix.simulate.scenario import Scenario
 from railfix.simulate.sky_file import no_glonass, sky_of_file
-from railfix.timescale import gpst_minus_utc, to_week
-
-Floats = NDArray[np.float64]
 
 #: Klobuchar coefficients of GPS, alpha then beta (invented, of ordinary size); they serve all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
@@ -48,7 +45,7 @@ class _Orbit:
 
 
 def made_navigation(scenario: Scenario) -> Navigation:
-    """Broadcast records for the whole of a run, as `railfix.rinex.write.write_navigation` writes them.
+    """Broadcast records for the whole of a run, as `railfix.io.rinex.write.write_navigation` writes them.
 
     All values are already rounded to the digits of the file, so that the file and the arrays are the
     same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.sky_file`).

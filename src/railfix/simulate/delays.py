@@ -1,4 +1,4 @@
-"""Delays of the atmosphere, computed apart from `railfix.atmosphere` by the same models.
+"""Delays of the atmosphere, computed apart from `railfix.ranges.atmosphere` by the same models.
 
 Klobuchar (IS-GPS-200, 20.3.3.5.2.5) and Saastamoinen with the standard atmosphere and 70 % relative
 humidity: what a receiver corrects is what the simulation put in, unless a scale says otherwise.
@@ -9,11 +9,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats
+from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 
 _HUMIDITY: Final = 0.7
 

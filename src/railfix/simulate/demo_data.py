@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from railfix.errors import InputFileError
+from railfix.core.errors import InputFileError
 
 #: Files of the demonstration run by what they are, as `railfix.simulate.write_run` names them.
 DEMO_FILES: Final = {

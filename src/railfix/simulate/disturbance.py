@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Datetimes, Floats, Strings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +29,9 @@ class Geometry:
     """
 
     antenna: str
-    time: NDArray[np.datetime64]
-    satellite: NDArray[np.str_]
-    signal: NDArray[np.str_]
+    time: Datetimes
+    satellite: Strings
+    signal: Strings
     chainage_m: Floats
     speed_mps: Floats
     antenna_ecef_m: Floats

@@ -8,12 +8,10 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.errors import SettingsError
+from railfix.core.arrays import Floats
+from railfix.core.errors import SettingsError
 from railfix.simulate.line_settings import Element, GeneratedLine, Gradient, LineSettings, Terrain
-
-Floats = NDArray[np.float64]
 
 _GRAVITY: Final = 9.806_65
 #: Distance between the wheels' contact points of the generated lines [m], for the equilibrium cant.

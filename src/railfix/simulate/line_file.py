@@ -13,16 +13,14 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from railfix.errors import InputFileError
-from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.arrays import Floats, Masks
+from railfix.core.errors import InputFileError
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.line_elements import Knots
 from railfix.simulate.line_settings import LineFile
-from railfix.track_map import Track, read_track
-
-Floats = NDArray[np.float64]
+from railfix.track import Track, read_track
 
 #: Spacing of the points by which the spline is turned into one of arc length [m].
 _STEP_M: Final = 0.5
@@ -95,7 +93,7 @@ def line_of_file(settings: LineFile) -> FileLine:
     )
 
 
-def _part(track: Track, used: NDArray[np.bool_]) -> Track:
+def _part(track: Track, used: Masks) -> Track:
     """Some of the points of a track."""
     if used.all():
         return track

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Final, Literal
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 from railfix.simulate.setting_checks import require_not_negative, require_one_of, require_positive
 
 #: Length of the pattern of P1's test line [m], and of a generated line, where none is given.
@@ -153,7 +153,7 @@ class LineFile:
     Attributes
     ----------
     path : str
-        As `railfix.track_map.read_track` reads it; in a scenario file relative to that file.
+        As `railfix.track.read_track` reads it; in a scenario file relative to that file.
     from_m, to_m : float
         Part of the file's chainage that is used.
     crs, height_datum, geoid : str

@@ -11,13 +11,12 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from railfix.core.arrays import Floats
 from railfix.simulate.alignment import Alignment
 from railfix.simulate.scenario import RunSettings, Scenario, Station
 from railfix.simulate.waves import Waves
-
-Floats = NDArray[np.float64]
 
 #: Spacing of the places at which a run curve looks at the limits [m].
 _STEP_M: Final = 2.0

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from railfix.core.arrays import Bytes, Floats, Masks
 from railfix.simulate.setting_checks import (
     require_not_negative,
     require_one_of,
     require_positive,
     require_share,
 )
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +134,9 @@ class Tracked:
         Bit 0 at the first epoch after a loss.
     """
 
-    lost: NDArray[np.bool_]
+    lost: Masks
     slip_cycles: Floats | float
-    loss_of_lock: NDArray[np.uint8]
+    loss_of_lock: Bytes
 
 
 class Tracking:
@@ -163,12 +162,12 @@ class Tracking:
         self._present = np.zeros(channels, dtype=np.bool_)
         self._losses = np.zeros(channels, dtype=np.uint64)
 
-    def too_weak(self, cn0_dbhz: Floats) -> NDArray[np.bool_]:
+    def too_weak(self, cn0_dbhz: Floats) -> Masks:
         """Signals below the threshold."""
         threshold = self._settings.threshold_dbhz
         return np.zeros(cn0_dbhz.shape, dtype=np.bool_) if threshold is None else np.asarray(cn0_dbhz < threshold)
 
-    def follow(self, bad: NDArray[np.bool_]) -> Tracked:
+    def follow(self, bad: Masks) -> Tracked:
         """What becomes of signals that cannot be tracked where `bad`, shape (T, M), the epochs that follow."""
         epoch = np.arange(1, len(bad) + 1, dtype=np.int64)[:, None]
         last_bad = np.maximum.accumulate(np.where(bad, epoch, -self._since), axis=0)

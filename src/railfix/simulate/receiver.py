@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.navigation import KeplerRecords
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.errors.settings import InterSystemSettings
 from railfix.simulate.noise import CarriedNoise, Tracking
 from railfix.simulate.satellites import newest_record
@@ -17,8 +17,6 @@ from railfix.simulate.scenario import ANTENNAS
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.datetime64]
 
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
@@ -66,7 +64,7 @@ class Receiver:
         return self._rng.standard_normal((epochs, len(self.names), 4))
 
 
-def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Times) -> Floats:
+def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Datetimes) -> Floats:
     """What a signal's code is late by against the broadcast clock, shape (T,) [s].
 
     GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2). Galileo I/NAV: BGD E5b/E1

@@ -14,16 +14,16 @@ from typing import Final, Literal
 import numpy as np
 import polars as pl
 
-from railfix.epochs import Observations
-from railfix.errors import OutputError
-from railfix.rinex.write import write_navigation, write_observations
+from railfix.core.errors import OutputError
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations
+from railfix.io.rinex.write import write_navigation, write_observations
 from railfix.simulate.run_readme import run_readme
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
 from railfix.simulate.sensors.tables import sensor_tables
 from railfix.simulate.settings_tables import to_toml
 from railfix.simulate.signals import Simulation
-from railfix.timescale import seconds
-from railfix.track_map import write_track_csv
+from railfix.track import write_track_csv
 
 #: Decimals of metres, metres a second and metres a second squared in the truth.
 TRUTH_DECIMALS: Final = 4
@@ -204,7 +204,7 @@ def _in_place(path: Path, out: Path) -> Path:
 
 
 def vehicle_toml(vehicle: VehicleSettings) -> str:
-    """The vehicle as `railfix.vehicle.read_vehicle` reads it."""
+    """The vehicle as `railfix.track.vehicle.read_vehicle` reads it."""
     lines = [
         f'name = "{vehicle.name}"',
         f"bogie_distance_m = {vehicle.bogie_distance_m}",

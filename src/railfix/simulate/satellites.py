@@ -1,4 +1,4 @@
-"""Positions and clocks of Keplerian records, computed apart from `railfix.orbits`.
+"""Positions and clocks of Keplerian records, computed apart from `railfix.gnss.orbits`.
 
 The user algorithm of IS-GPS-200 (table 20-IV), Galileo OS SIS ICD (5.1.1) and BDS-SIS-ICD-B1I
 (5.2.4.12), written anew for the simulation, so that an error in either shows. `links` works it out at
@@ -12,15 +12,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.navigation import KeplerRecords
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.datetime64]
-Rows = NDArray[np.intp]
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.gnss.navigation import KeplerRecords
 
 _PARAMETERS: Final = (
     "af0_s", "af1", "af2", "sqrt_a", "eccentricity", "m0", "delta_n", "omega0", "i0", "omega", "omega_dot", "i_dot",
@@ -64,7 +60,9 @@ class Links:
     clock_s: Floats
 
 
-def record_state(records: KeplerRecords, row: Rows, since_toe_s: Floats, since_toc_s: Floats) -> tuple[Floats, Floats]:
+def record_state(
+    records: KeplerRecords, row: Indices, since_toe_s: Floats, since_toc_s: Floats
+) -> tuple[Floats, Floats]:
     """Position in the Earth-fixed frame of the instant, shape (T, 3) [m], and clock, shape (T,) [s].
 
     Parameters
@@ -109,14 +107,14 @@ def _from_geo_frame(place: Floats, angle: Floats) -> Floats:
     return np.stack([cos * place[:, 0] + sin * y, cos * y - sin * place[:, 0], z], axis=-1)
 
 
-def newest_record(records: KeplerRecords, satellite: str, time: Times) -> Rows:
+def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
     """Row of the satellite's newest record transmitted by each time (its first where there is none)."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])
 
 
-def links(records: KeplerRecords, satellite: str, tag: Times, late_s: Floats, receiver_ecef_m: Floats) -> Links:
+def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
     """Signals of a satellite that arrive at a receiver.
 
     The equation of the transmit time is solved by iteration: the flight lasts as long as the distance
@@ -199,7 +197,7 @@ class SatelliteTable:
         # Power k of each piece, shape (_NODES, pieces, S, 4).
         self._powers = np.einsum("kn,pnsc->kpsc", to_powers, values)
 
-    def links(self, tag: Times, late_s: Floats, receiver_ecef_m: Floats) -> Links:
+    def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
         """Signals of all satellites that arrive at a receiver, as `links`.
 
         Parameters

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 from railfix.simulate.disturbance import Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.errors.settings import ErrorSettings

@@ -48,7 +48,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from railfix.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.simulate.alignment import made_alignment
 from railfix.simulate.motion import made_motion
 from railfix.simulate.scenario import Scenario

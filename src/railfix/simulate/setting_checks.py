@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 
 
 def _values(table: Any, name: str) -> tuple[float, ...]:

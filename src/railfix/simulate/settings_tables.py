@@ -17,7 +17,7 @@ from typing import Any, Final, get_args, get_origin, get_type_hints
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 
 #: Fields that come from Python only.
 _NOT_IN_FILES: Final = ("multipath",)

@@ -8,12 +8,13 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.epochs import ObservationHeader, Observations
-from railfix.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.navigation import Navigation
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.core.timescale import seconds
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, made_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ, CN0_SECOND_DB
@@ -27,10 +28,6 @@ from railfix.simulate.motion import Motion, Sway, made_motion
 from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
 from railfix.simulate.satellites import SatelliteTable, links
 from railfix.simulate.scenario import ANTENNAS, Scenario
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
-Times = NDArray[np.datetime64]
 
 #: Receivers report C/N0 in steps [dB-Hz].
 CN0_STEP_DBHZ: Final = 0.25
@@ -107,7 +104,7 @@ class Simulation:
         self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
         self.navigation: Navigation = made_navigation(scenario)
 
-    def time(self, first: int = 0, last: int | None = None) -> Times:
+    def time(self, first: int = 0, last: int | None = None) -> Datetimes:
         """Time tags of epochs `first` to before `last`, GPS time."""
         last = self.scenario.epochs if last is None else last
         return np.asarray(self.scenario.start + np.arange(first, last) * self.scenario.interval)
@@ -265,7 +262,7 @@ class _Instant:
     ionosphere_error_m: Floats
 
 
-def _instant(simulation: Simulation, time: Times, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
+def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
     """Signals of `Simulation.satellites` that arrive at the antenna `late_s` before the tags."""
     scale, navigation = simulation.scenario.sky, simulation.navigation
     found = simulation.satellite_table.links(time, late_s, antenna_ecef_m)
@@ -303,7 +300,7 @@ def _instant(simulation: Simulation, time: Times, late_s: Floats, antenna_ecef_m
     )
 
 
-def _geometry(simulation: Simulation, antenna: str, time: Times) -> tuple[Geometry, _Instant, Floats, Floats]:
+def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[Geometry, _Instant, Floats, Floats]:
     """Geometry by satellite, the instant of the epochs, and the rates of path and ionosphere [m/s].
 
     Rates are differences over a hundredth of a second of the true motion; the clock's steps are left out.
@@ -332,7 +329,7 @@ def _geometry(simulation: Simulation, antenna: str, time: Times) -> tuple[Geomet
     return geometry, now, path_rate, (after.ionosphere_m - before.ionosphere_m) / (2.0 * _RATE_S)
 
 
-def _piece(simulation: Simulation, receiver: Receiver, time: Times) -> Piece:
+def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece:
     """The next epochs of a receiver."""
     scenario, settings = simulation.scenario, simulation.scenario.receiver
     by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, receiver.antenna, time)
@@ -398,7 +395,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Times) -> Piece:
     )
 
 
-def _tracked(elevation_deg: Floats, scenario: Scenario) -> NDArray[np.bool_]:
+def _tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:
     """Satellites that a receiver tracks, shape (T, S)."""
     tracked = elevation_deg >= scenario.sky.cutoff_deg
     most = scenario.sky.satellites_at_most

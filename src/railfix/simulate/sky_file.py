@@ -11,18 +11,16 @@ from dataclasses import fields, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.errors import MismatchError
-from railfix.navigation import GlonassRecords, KeplerRecords, Navigation
-from railfix.rinex import read_navigation
+from railfix.core.arrays import Indices, Masks
+from railfix.core.errors import MismatchError
+from railfix.core.timescale import gpst_minus_utc
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.io.rinex import read_navigation
 from railfix.simulate.scenario import Scenario
-from railfix.timescale import gpst_minus_utc
-
-Rows = NDArray[np.intp]
 
 #: Farthest from its reference time that a record serves [s]: half of GPS' and QZSS' least fit interval, Galileo's
-#: and BeiDou's as `railfix.orbits`.
+#: and BeiDou's as `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
 #: A record whose transmission time is not known or not believed was sent so long before its reference time [s].
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
@@ -80,7 +78,7 @@ def no_glonass() -> GlonassRecords:
     )  # fmt: skip
 
 
-def _rows(records: KeplerRecords, rows: NDArray[np.intp] | NDArray[np.bool_]) -> KeplerRecords:
+def _rows(records: KeplerRecords, rows: Indices | Masks) -> KeplerRecords:
     return replace(records, **{item.name: getattr(records, item.name)[rows] for item in fields(records)})
 
 
@@ -101,8 +99,8 @@ def _believed(records: KeplerRecords, systems: str) -> KeplerRecords:
     return replace(records, transmitted=np.where(told, records.transmitted, records.toe - before))
 
 
-def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Rows:
-    """Rows of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
+def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:
+    """Indices of a satellite in force from `first` to `last`, by transmission; none where a moment is not served."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
     # Of records sent at one time the one for later.

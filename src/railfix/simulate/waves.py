@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats
 
 #: Cosines of one function.
 _WAVES: Final = 64

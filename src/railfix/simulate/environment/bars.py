@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Complexes, Floats
 from railfix.simulate.environment.faces import Rays
 from railfix.simulate.environment.settings import ElectrificationSettings
 from railfix.simulate.environment.waves import edge_amplitude, per_metre, strip_field
-
-Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 #: Bars are left out where less of them than this counts.
 _LEAST_WEIGHT: Final = 0.005

@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Complexes, Floats, Indices
+
 Singles = NDArray[np.float32]
-Complexes = NDArray[np.complex128]
 
 #: Repetitions: with an error of few hundredths of a chip three settle it, a wide spacing wants more.
 _ROUNDS_NARROW: Final = 3
@@ -46,7 +46,7 @@ class Tracked:
     phase_m: Floats
     rate_mps: Floats
     gain_db: Floats
-    main: NDArray[np.intp]
+    main: Indices
 
 
 def tracked(

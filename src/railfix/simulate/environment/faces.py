@@ -10,13 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Floats, Indices
 from railfix.simulate.environment.place import Strips
 from railfix.simulate.environment.waves import edge_amplitude, per_metre, roughness_loss
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 #: Fresnel parameter where nothing is in the way.
 FREE_V: Final = -99.0
@@ -45,7 +42,7 @@ class Rays:
     z: Floats
     wavelength_m: Floats
 
-    def take(self, rows: NDArray[np.intp]) -> Rays:
+    def take(self, rows: Indices) -> Rays:
         """Some of them."""
         return Rays(
             chainage_m=self.chainage_m[rows],

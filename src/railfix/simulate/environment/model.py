@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from railfix.constants import SPEED_OF_LIGHT
-from railfix.signals import carrier_frequency_hz
+from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ
 from railfix.simulate.disturbance import Disturbance, Geometry
 from railfix.simulate.environment.bars import Electrification
@@ -19,9 +20,6 @@ from railfix.simulate.environment.kinds import drawn_sections
 from railfix.simulate.environment.place import built
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.environment.waves import edge_amplitude, roughness_loss
-
-Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
 
 #: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
@@ -82,7 +80,7 @@ class Environment:
         self.place = built(self.sections, line_length_m, seed)
         self._bars = None if settings.electrification is None else Electrification(settings.electrification)
 
-    def label_at(self, chainage_m: ArrayLike) -> NDArray[np.str_]:
+    def label_at(self, chainage_m: ArrayLike) -> Strings:
         """Kind of section at chainages; "open" outside all sections."""
         return self.place.kind_at(np.asarray(chainage_m, dtype=np.float64))
 
@@ -114,7 +112,7 @@ class Environment:
             cn0[e, c] = got.gain_db
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
-    def _tracked(self, rays: Rays, platform: NDArray[np.bool_], speed_mps: Floats, chip_m: Floats) -> Tracked:
+    def _tracked(self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats) -> Tracked:
         receiver, paths = self.settings.receiver, self._paths(rays, platform)
         return tracked(
             paths.field,
@@ -127,7 +125,7 @@ class Environment:
             carrier_loop_hz=receiver.carrier_loop_hz,
         )
 
-    def _paths(self, rays: Rays, platform: NDArray[np.bool_]) -> Paths:
+    def _paths(self, rays: Rays, platform: Masks) -> Paths:
         """Direct path, ground, what bars throw, and one reflection a row of faces."""
         field, delay = self._direct(rays)
         nothing = np.zeros(len(rays.x))
@@ -197,9 +195,7 @@ class Environment:
         return -amplitude, image.extra_m, image.rate
 
 
-def _rays(
-    geometry: Geometry, epoch: NDArray[np.intp], channel: NDArray[np.intp], wavelength_m: Floats, height_m: float
-) -> Rays:
+def _rays(geometry: Geometry, epoch: Indices, channel: Indices, wavelength_m: Floats, height_m: float) -> Rays:
     elevation = np.radians(geometry.elevation_deg[epoch, channel])
     relative = np.radians(geometry.azimuth_deg[epoch, channel] - geometry.heading_deg[epoch])
     level = np.cos(elevation)

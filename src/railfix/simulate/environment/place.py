@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Floats, Indices, Strings
 from railfix.simulate.environment.kinds import ROOFS, ROWS, TUNNEL_CROWN
 from railfix.simulate.environment.settings import Between, RoofSettings, RowSettings, SectionSettings
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 #: The first and the last section go on so far beyond the line [m].
 BEYOND_M: Final = 500.0
@@ -69,9 +66,9 @@ class Place:
     faces: tuple[Strips, ...]
     roofs: tuple[Strips, ...]
     borders_m: Floats
-    kinds: NDArray[np.str_]
+    kinds: Strings
 
-    def kind_at(self, chainage_m: Floats) -> NDArray[np.str_]:
+    def kind_at(self, chainage_m: Floats) -> Strings:
         """Kind of section at chainages."""
         return self.kinds[np.searchsorted(self.borders_m, chainage_m, side="right")]
 

@@ -36,7 +36,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, ClassVar, Final, Literal, get_args
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 
 Kind = Literal["open", "suburban", "urban", "canyon", "cutting", "mountain", "station", "tunnel"]
 Sides = Literal["left", "right", "both"]

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fresnel
 
-Floats = NDArray[np.float64]
-Complexes = NDArray[np.complex128]
+from railfix.core.arrays import Complexes, Floats
 
 #: Below this the loss of an edge is 0 by the formula of ITU-R P.526-15, 4.1.
 CLEAR_V: Final = -0.78

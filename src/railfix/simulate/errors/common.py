@@ -11,16 +11,14 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from railfix.navigation import KeplerRecords
+from railfix.core.arrays import Floats
+from railfix.core.timescale import seconds
+from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.errors.processes import GaussMarkov, satellite_key
 from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings
 from railfix.simulate.satellites import FRAME_ROTATION, newest_record, record_state
-from railfix.timescale import seconds
-
-Floats = NDArray[np.float64]
 
 #: Radius of the Earth and height of the layer that the residual ionosphere lies in [km] (DO-229D, A.4.4.10).
 _EARTH_KM: Final = 6378.1363

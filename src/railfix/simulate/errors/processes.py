@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-Floats = NDArray[np.float64]
+from railfix.core.arrays import Floats, Indices
 
 #: Nodes in one correlation time.
 _NODES_A_TIME: Final = 32
@@ -44,7 +43,7 @@ class Interpolated:
         self._spacing_s = spacing_s
         self._before = nodes_before(spacing_s)
 
-    def _place(self, time_s: Floats) -> tuple[NDArray[np.intp], Floats]:
+    def _place(self, time_s: Floats) -> tuple[Indices, Floats]:
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 from railfix.simulate.noise import NoiseSettings, TrackingSettings
 from railfix.simulate.setting_checks import (
     require_finite,

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from railfix.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.arrays import Floats
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.errors.processes import GaussMarkov
 from railfix.simulate.satellites import FRAME_ROTATION
 from railfix.simulate.sensors.settings import InertialSettings
@@ -22,7 +22,6 @@ from railfix.simulate.sensors.settings import InertialSettings
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
-Floats = NDArray[np.float64]
 
 #: Longest half interval of the differences in time [s].
 _HALF_S: Final = 0.02

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Floats
 from railfix.simulate.errors.processes import GaussMarkov
 from railfix.simulate.sensors.settings import RadarSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
-Floats = NDArray[np.float64]
 
 #: Streams of random numbers: noise, sway, dropouts.
 _NOISE, _SWAY, _DROPOUTS = 26, 27, 28

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from railfix.errors import SettingsError
+from railfix.core.errors import SettingsError
 from railfix.simulate.setting_checks import (
     require_finite,
     require_interval,

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
+from railfix.core.arrays import Floats
 from railfix.simulate.sensors.settings import DrawnSlips, SlipInterval, TachometerSettings
 
 if TYPE_CHECKING:
     from railfix.simulate.motion import Motion
     from railfix.simulate.signals import Simulation
 
-Floats = NDArray[np.float64]
 
 #: Spacing of the instants between which the wheel is taken to accelerate evenly [s].
 _STEP_S: Final = 0.01

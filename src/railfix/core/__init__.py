@@ -1,0 +1,1 @@
+"""Foundations: constants, errors, time scales, geodesy, reasons, array types, files."""

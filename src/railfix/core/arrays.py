@@ -1,0 +1,27 @@
+"""Types of the arrays that functions take and return, by what their elements are."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Real numbers in the unit that the name of the array ends with; NaN where absent.
+Floats = NDArray[np.float64]
+#: Complex numbers.
+Complexes = NDArray[np.complex128]
+#: Counts and identifiers.
+Integers = NDArray[np.int64]
+#: Positions in another array.
+Indices = NDArray[np.intp]
+#: Members of an `IntEnum`, for example `railfix.core.reasons.Status`.
+Codes = NDArray[np.int8]
+#: Members of an `IntFlag`, for example `railfix.core.reasons.Reason`.
+Bits = NDArray[np.int64]
+#: Conditions; True in a reject mask means rejected.
+Masks = NDArray[np.bool_]
+#: Instants, GPS time; NaT where absent.
+Datetimes = NDArray[np.datetime64]
+#: Raw bytes of a file.
+Bytes = NDArray[np.uint8]
+#: Names, for example of satellites.
+Strings = NDArray[np.str_]

@@ -1,0 +1,289 @@
+"""Files as they come from receivers and archives: plain, gzip, compress (.Z), Hatanaka inside any.
+
+What a file is, is told by its first bytes and never by its name. Memory stays bounded whatever
+the size of the file:
+
+=============== ==================================================================================
+plain, gzip     streamed block by block
+compress (.Z)   unpacked to a temporary file by `ncompress` (compiled), then streamed
+Hatanaka (CRX)  piped through the compiled ``crx2rnx`` of the `hatanaka` package, which decodes
+                in a process of its own while its output is read; only a packed CRX file (.gz, .Z)
+                needs the disk, for a temporary file of the unpacked CRX
+=============== ==================================================================================
+"""
+
+from __future__ import annotations
+
+import gzip
+import importlib.resources
+import io
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import zlib
+from contextlib import ExitStack, closing
+from os import PathLike
+from pathlib import Path
+from typing import IO, Final, cast
+
+import ncompress
+
+from railfix.core.errors import InputFileError, OutputError
+
+FilePath = str | PathLike[str]
+
+_GZIP: Final = b"\x1f\x8b"
+_COMPRESS: Final = b"\x1f\x9d"
+#: First bytes of archives that are not read, and what to call them.
+_ARCHIVES: Final = {
+    b"PK\x03\x04": "a zip archive",
+    b"BZh": "a bzip2 archive",
+    b"\xfd7zXZ": "an xz archive",
+    b"7z\xbc\xaf": "a 7-zip archive",
+    b"(\xb5/\xfd": "a zstd archive",
+}
+_HEAD_BYTES: Final = 4096
+_COPY_BYTES: Final = 1 << 20
+
+
+class ByteStream(io.BufferedIOBase):
+    """Decompressed bytes of one file, to be read once, front to back.
+
+    A context manager. `read` raises `InputFileError` where the compressed data end early or are
+    damaged.
+
+    Attributes
+    ----------
+    path : str
+        The file as it was named.
+    """
+
+    def __init__(self, path: FilePath, source: IO[bytes], held: ExitStack, *, disk: IO[bytes] | None = None) -> None:
+        self.path = str(path)
+        self._source = source
+        self._held = held
+        self._disk = source if disk is None else disk
+
+    @property
+    def share(self) -> float:
+        """Part of the bytes on disk that has been read, 0 to 1."""
+        number = self._disk.fileno()
+        return os.lseek(number, 0, os.SEEK_CUR) / max(os.fstat(number).st_size, 1)
+
+    def readable(self) -> bool:
+        """Always true."""
+        return True
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Up to `size` bytes, all when negative or None; ``b""`` at the end."""
+        try:
+            return self._source.read(-1 if size is None else size)
+        except EOFError as error:
+            raise InputFileError(self.path, "the gzip data end early; copy or download it again") from error
+        except (zlib.error, gzip.BadGzipFile) as error:
+            raise InputFileError(self.path, f"the gzip data are damaged ({error}); download it again") from error
+        except OSError as error:
+            raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
+
+    def close(self) -> None:
+        """Close the file, end the decoder, remove temporary files."""
+        if not self.closed:
+            self._held.close()
+        super().close()
+
+
+class _HatanakaStream(ByteStream):
+    """Output of the Hatanaka decoder; its verdict is read where its output ends."""
+
+    def __init__(
+        self, path: FilePath, process: subprocess.Popen[bytes], log: IO[bytes], held: ExitStack, *, disk: IO[bytes]
+    ) -> None:
+        super().__init__(path, cast("IO[bytes]", process.stdout), held, disk=disk)
+        self._process = process
+        self._log = log
+        self._done = False
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        block = super().read(size)
+        at_end = size is None or size < 0 or (not block and size > 0)
+        if at_end and not self._done:
+            self._done = True
+            if self._process.wait() != 0:
+                raise InputFileError(self.path, self._complaint())
+        return block
+
+    def _complaint(self) -> str:
+        self._log.seek(0)
+        text = self._log.read().decode("ascii", "replace")
+        what = re.search(r"(?:ERROR|WARNING)[^:]*:?\s*([^\n]+)", text)
+        where = re.search(r"line\s*:?\s*(\d+)", text)
+        reason = what.group(1).strip().rstrip(".") if what else "the decoder crx2rnx gives no reason"
+        place = f" at line {where.group(1)} of the compressed text" if where else ""
+        return f"the Hatanaka (CRX) data are cut short or damaged{place}: {reason}; download it again"
+
+
+def open_stream(path: FilePath) -> ByteStream:
+    """Open a file as a stream of its decompressed bytes.
+
+    Parameters
+    ----------
+    path : path-like
+        Plain text, gzip, compress (.Z), or Hatanaka-compressed RINEX plain or in one of these.
+
+    Returns
+    -------
+    ByteStream
+        A context manager with `read(size)`. Line ends are as in the file (CR LF stays).
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, a directory, unreadable, empty, binary, an archive of another kind;
+        while reading: the compressed data end early or are damaged.
+    """
+    held = ExitStack()
+    with held:
+        source = held.enter_context(closing(_open_plain(path)))
+        head = source.read(_HEAD_BYTES)
+        source.seek(0)
+        _refuse_archive(path, head)
+        if head.startswith(_GZIP):
+            source = held.enter_context(closing(cast("IO[bytes]", gzip.GzipFile(fileobj=source, mode="rb"))))
+            with ByteStream(path, source, ExitStack()) as unpacked:
+                head = unpacked.read(_HEAD_BYTES)
+            source.seek(0)
+        elif head.startswith(_COMPRESS):
+            source = _unpack_compress(path, source, held)
+            head = source.read(_HEAD_BYTES)
+            source.seek(0)
+        _refuse_content(path, head)
+        if b"COMPACT RINEX" in head[:80]:
+            return _decode_hatanaka(path, source, held)
+        return ByteStream(path, source, held.pop_all())
+
+
+def read_bytes(path: FilePath) -> bytes:
+    """The whole decompressed content of a file; for small files (navigation, SP3).
+
+    Raises
+    ------
+    InputFileError
+        As `open_stream`.
+    """
+    with open_stream(path) as stream:
+        return stream.read()
+
+
+def toml_string(text: str) -> str:
+    """A text as TOML writes it: a JSON string, but for the control character that only TOML escapes."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
+    """Write a text file under a temporary name, then rename it: it appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    text : str
+    what : str
+        What it is, for the message.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(target)
+    except OSError as error:
+        if temporary.parent.is_dir():
+            temporary.unlink(missing_ok=True)
+        raise OutputError(f"{target}: the {what} cannot be written ({error.strerror or error})") from None
+
+
+def read_text_lines(path: FilePath) -> list[str]:
+    """The whole decompressed content of a small file as lines without their ends (LF or CR LF).
+
+    Bytes outside ASCII (names in comments) are read as Latin-1, so that columns stay columns.
+
+    Raises
+    ------
+    InputFileError
+        As `open_stream`.
+    """
+    lines = [line.removesuffix("\r") for line in read_bytes(path).decode("latin-1").split("\n")]
+    return lines if lines[-1] else lines[:-1]
+
+
+def _open_plain(path: FilePath) -> IO[bytes]:
+    file = Path(path)
+    if file.is_dir():
+        raise InputFileError(path, "is a directory; name the file inside it")
+    try:
+        if file.exists() and not file.is_file():
+            raise InputFileError(path, "is not a regular file; write its content to a file first")
+        return file.open("rb")
+    except FileNotFoundError as error:
+        raise InputFileError(path, "there is no such file; check the name") from error
+    except OSError as error:
+        raise InputFileError(path, f"cannot be opened ({error.strerror or error})") from error
+
+
+def _refuse_archive(path: FilePath, head: bytes) -> None:
+    for magic, name in _ARCHIVES.items():
+        if head.startswith(magic):
+            raise InputFileError(path, f"is {name}; unpack it first (.gz and .Z are read as they are)")
+
+
+def _refuse_content(path: FilePath, head: bytes) -> None:
+    if not head.strip():
+        raise InputFileError(path, "is empty")
+    if b"\0" in head:
+        raise InputFileError(path, "is binary, a text file (RINEX, SP3) was expected; convert a receiver's log first")
+
+
+def _temporary(held: ExitStack) -> IO[bytes]:
+    return held.enter_context(cast("IO[bytes]", tempfile.TemporaryFile(prefix="railfix-")))
+
+
+def _unpack_compress(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[bytes]:
+    unpacked = _temporary(held)
+    try:
+        ncompress.decompress(source, unpacked)
+    except ValueError as error:
+        raise InputFileError(path, f"the compress (.Z) data are damaged ({error}); download it again") from error
+    unpacked.seek(0)
+    return unpacked
+
+
+def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
+    """Start the decoder on an open source; the caller's `held` is taken over."""
+    if isinstance(source, gzip.GzipFile):
+        spool = _temporary(held)
+        with ByteStream(path, source, ExitStack()) as unpacked:
+            shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
+        spool.flush()
+        source = spool
+    source.seek(0)
+    log = _temporary(held)
+    name = "crx2rnx.exe" if sys.platform == "win32" else "crx2rnx"
+    program = held.enter_context(importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / name))
+    process = subprocess.Popen([str(program), "-"], stdin=source, stdout=subprocess.PIPE, stderr=log)
+    held.callback(_end, process)
+    return _HatanakaStream(path, process, log, held.pop_all(), disk=source)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    if process.stdout is not None:
+        process.stdout.close()
+    if process.poll() is None:
+        process.terminate()
+    process.wait()

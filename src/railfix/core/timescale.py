@@ -1,0 +1,131 @@
+"""Time as ``datetime64[ns]`` in GPS time, and the conversions to and from it.
+
+GPS time is the only time scale inside the package. Differences are taken on the integers before
+they become floats, so that a nanosecond survives anywhere in the range of the type.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.constants import BDT_MINUS_GPST_S
+
+#: Origin of GPS time (IS-GPS-200, 3.3.4).
+GPS_EPOCH: Final = np.datetime64("1980-01-06T00:00:00", "ns")
+#: Origin of BeiDou time, written in BDT (BDS-SIS-ICD-B1I 3.0, 3.3).
+BDT_EPOCH: Final = np.datetime64("2006-01-01T00:00:00", "ns")
+#: Origin of Galileo system time, written in GST = GPST (Galileo OS SIS ICD 5.1.2).
+GST_EPOCH: Final = np.datetime64("1999-08-22T00:00:00", "ns")
+
+SECONDS_PER_WEEK: Final = 604_800
+SECONDS_PER_DAY: Final = 86_400
+_NS: Final = 1_000_000_000
+
+#: UTC instants from which GPST - UTC takes a new value [s] (IERS Bulletin C).
+_LEAP_UTC: Final = np.array(
+    [
+        "1980-01-06", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01",
+        "1990-01-01", "1991-01-01", "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01",
+        "1997-07-01", "1999-01-01", "2006-01-01", "2009-01-01", "2012-07-01", "2015-07-01",
+        "2017-01-01",
+    ],
+    dtype="datetime64[ns]",
+)  # fmt: skip
+
+
+def seconds(delta: ArrayLike) -> Floats:
+    """Time differences as seconds.
+
+    Parameters
+    ----------
+    delta : array_like of timedelta64, any shape
+        Differences; NaT allowed.
+
+    Returns
+    -------
+    ndarray of float64, same shape [s]
+        NaN where `delta` is NaT.
+    """
+    ns = np.asarray(delta, dtype="timedelta64[ns]")
+    whole = ns.astype(np.int64)
+    result = (whole // _NS).astype(np.float64) + (whole % _NS) / _NS
+    return np.where(np.isnat(ns), np.nan, result)
+
+
+def timedelta(seconds_s: ArrayLike) -> NDArray[np.timedelta64]:
+    """Seconds as ``timedelta64[ns]``, rounded to the nanosecond; NaN becomes NaT."""
+    value = np.asarray(seconds_s, dtype=np.float64)
+    finite = np.isfinite(value)
+    filled = np.where(finite, value, 0.0)
+    whole = np.floor(filled)
+    ns = whole.astype(np.int64) * _NS + np.rint((filled - whole) * _NS).astype(np.int64)
+    result = ns.astype("timedelta64[ns]")
+    return np.where(finite, result, np.timedelta64("NaT", "ns"))
+
+
+def from_week(week: ArrayLike, seconds_of_week: ArrayLike) -> Datetimes:
+    """GPS week and seconds of week as GPS time.
+
+    Parameters
+    ----------
+    week : array_like of int
+        Full GPS week (no roll-over).
+    seconds_of_week : array_like of float [s]
+
+    Returns
+    -------
+    ndarray of datetime64[ns]
+    """
+    weeks = np.asarray(week, dtype=np.int64) * SECONDS_PER_WEEK
+    result = GPS_EPOCH + weeks.astype("timedelta64[s]") + timedelta(seconds_of_week)
+    return np.asarray(result, dtype="datetime64[ns]")
+
+
+def to_week(time: ArrayLike) -> tuple[Integers, Floats]:
+    """GPS time as full week number and seconds of week [s]."""
+    ns = (np.asarray(time, dtype="datetime64[ns]") - GPS_EPOCH).astype(np.int64)
+    week = ns // (SECONDS_PER_WEEK * _NS)
+    rest = ns - week * (SECONDS_PER_WEEK * _NS)
+    return week, (rest // _NS).astype(np.float64) + (rest % _NS) / _NS
+
+
+def bdt_to_gpst(time: ArrayLike) -> Datetimes:
+    """BeiDou time as GPS time: GPST = BDT + 14 s."""
+    shift = timedelta(-BDT_MINUS_GPST_S)
+    return np.asarray(np.asarray(time, dtype="datetime64[ns]") + shift, dtype="datetime64[ns]")
+
+
+def gpst_minus_utc(utc: ArrayLike) -> Integers:
+    """Leap seconds GPST - UTC [s] in force at UTC instants."""
+    at = np.asarray(utc, dtype="datetime64[ns]")
+    return np.asarray(np.searchsorted(_LEAP_UTC, at, side="right") - 1, dtype=np.int64)
+
+
+def utc_to_gpst(utc: ArrayLike) -> Datetimes:
+    """UTC as GPS time, by the table of leap seconds."""
+    at = np.asarray(utc, dtype="datetime64[ns]")
+    leap = gpst_minus_utc(at).astype("timedelta64[s]")
+    return np.asarray(at + leap, dtype="datetime64[ns]")
+
+
+def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
+    """GPS time with the given seconds of week that lies nearest to another time.
+
+    Parameters
+    ----------
+    seconds_of_week : array_like of float [s]
+    near : array_like of datetime64[ns]
+        A time known to within half a week (for example the clock time of the same record).
+
+    Returns
+    -------
+    ndarray of datetime64[ns]
+        Never further than half a week from `near`, whatever week a file claims.
+    """
+    week, sow = to_week(near)
+    shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)
+    return from_week(week + shift.astype(np.int64), seconds_of_week)

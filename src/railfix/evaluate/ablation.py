@@ -1,0 +1,286 @@
+"""What each screen buys and costs: one reading of the logs, every choice of screens side by side."""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import MismatchError
+from railfix.core.reasons import Status
+from railfix.evaluate.along_track import along_track_error, interpolate_reference
+from railfix.evaluate.scores import Score, score
+from railfix.io.reference_log import AntennaReference, read_reference
+from railfix.pipeline.config import Config
+from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
+from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
+from railfix.run.chunks import aligned
+from railfix.run.driver import Progress, RunOptions, notes_of, open_inputs
+from railfix.run.inputs import RunInputs, collected
+from railfix.run.output import OutputFolder
+from railfix.run.record import run_record
+from railfix.run.tally import Tally
+from railfix.track.trajectory import Trajectory
+
+#: Screens that compare two antennas.
+_OF_TWO: Final = ("antenna_pair", "antenna_spacing")
+#: Names of the choices with all screens and with none.
+ALL, NONE = "all", "none"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """What one choice of screens came to on one antenna.
+
+    Attributes
+    ----------
+    choice : str
+        "all", "none", "only raim", "without raim".
+    screens : tuple of str
+    antenna : str
+    epochs : int
+        Epochs with observations; with a truth, those of them inside its time.
+    rate, ok_rate : float
+        Share of the epochs with coordinates, and of those of status ok.
+    n_used : float
+        Satellites used, mean over the epochs.
+    sigma_p50_m : float [m]
+        Median of the standard deviation along the line, of the epochs with coordinates.
+    coordinates, ok, conventional : Score or None
+        Against the truth: epochs with coordinates, of status ok, and the conventional position from the
+        same ranges. None without a truth.
+    """
+
+    choice: str
+    screens: tuple[str, ...]
+    antenna: str
+    epochs: int
+    rate: float
+    ok_rate: float
+    n_used: float
+    sigma_p50_m: float
+    coordinates: Score | None = None
+    ok: Score | None = None
+    conventional: Score | None = None
+
+    def as_row(self) -> dict[str, Any]:
+        """Plain values for one row of a table, NaN as None."""
+        row: dict[str, Any] = {name: getattr(self, name) for name in _OF_EFFECT}
+        row["screens"] = " ".join(self.screens)
+        for name in ("coordinates", "ok", "conventional"):
+            figures: Score | None = getattr(self, name)
+            for figure in _OF_SCORE:
+                row[f"{name}_{figure}"] = None if figures is None else getattr(figures, figure)
+        return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in row.items()}
+
+
+_OF_EFFECT: Final = ("choice", "screens", "antenna", "epochs", "rate", "ok_rate", "n_used", "sigma_p50_m")
+_OF_SCORE: Final = ("positions", "mean_m", "std_m", "p50_m", "p95_m", "max_m", "wrong_place")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablation:
+    """Effects of all choices.
+
+    Attributes
+    ----------
+    effects : tuple of Effect
+        By antenna, then by choice.
+    notes : tuple of str
+    files : mapping of str to Path
+    wall_s : float
+    """
+
+    effects: tuple[Effect, ...]
+    notes: tuple[str, ...]
+    files: Mapping[str, Path]
+    wall_s: float
+
+
+def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """All screens, none, each alone, all but each, by name; of two choices that are the same, the first."""
+    named = {ALL: tuple(screens), NONE: ()}
+    named |= {f"only {name}": (name,) for name in screens}
+    named |= {f"without {name}": tuple(other for other in screens if other != name) for name in screens}
+    found: dict[str, tuple[str, ...]] = {}
+    for name, chosen in named.items():
+        if chosen not in found.values():
+            found[name] = chosen
+    return found
+
+
+def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Screens that are on and can judge in this run, and one sentence on each that cannot."""
+    notes = []
+    spaced = len(trajectories) > 1 and all(t.body_chainage_m is not None for t in trajectories.values())
+    for name in config.screens:
+        if name in _OF_TWO and not spaced:
+            notes.append(f"screen {name}: left out, it needs two antennas and a vehicle file")
+        if name == "cn0" and config.cn0_curve is None and config.cn0.floor_dbhz is None:
+            notes.append("screen cn0: left out, it needs a curve over elevation (cn0_curve) or a floor")
+    left_out = {note.split(":")[0].removeprefix("screen ") for note in notes}
+    return tuple(name for name in config.screens if name not in left_out), tuple(notes)
+
+
+def ablate_files(
+    inputs: RunInputs,
+    config: Config | None = None,
+    *,
+    out: Path,
+    options: RunOptions | None = None,
+    asked: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Ablation:
+    """Position the logs with every choice of screens, and write what each comes to.
+
+    The logs are read once; each chunk goes through all choices. ``ablation.csv`` has a row a choice
+    and antenna, ``ablation.json`` also what `run_files` writes to ``run.json``.
+
+    Parameters
+    ----------
+    inputs : RunInputs
+        Its `truth`, where given, adds errors along the line.
+    config : Config, optional
+        Its screens are the ones that are switched.
+    out : Path
+    options : RunOptions, optional
+    asked : mapping, optional
+    progress : Progress, optional
+
+    Raises
+    ------
+    RailfixError
+        See `railfix.core.errors`; nothing is left in `out` then.
+    """
+    began = clock.perf_counter()
+    config, options = config or Config(), options or RunOptions()
+    inputs = inputs.with_settings(config)
+    inputs.check()
+    with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
+        fingerprints = inputs.fingerprints(pool)
+        truth = None if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs))
+        navigation, line, logs = open_inputs(inputs, options)
+        screens, left_out = judging_screens(config, line.trajectories)
+        processors = {
+            name: EpochProcessor(
+                # Nobody asks for a protection level here.
+                config.model_copy(update={"screens": chosen, "protection": "off"}),
+                navigation,
+                line.trajectories,
+            )
+            for name, chosen in choices(screens).items()
+        }
+        states = dict.fromkeys(processors, State())
+        tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
+        kept = _Kept(truth=truth, trajectories=line.trajectories)
+        for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+            for name, processor in processors.items():
+                result, states[name] = processor.process(chunk, states[name])
+                tallies[name].add(result)
+                for antenna, found in result.antennas.items():
+                    kept.add(name, antenna, found)
+            check_same_day(navigation, tallies[NONE])
+            check_same_place(tallies[NONE], antennas="all")
+            if progress is not None:
+                progress(epochs=tallies[NONE].epochs, fraction=min(log.share for log in logs.values()))
+        check_same_time(tallies[NONE])
+        check_same_day(navigation, tallies[NONE], reach=RECORD_REACH)
+        check_same_place(tallies[NONE])
+        check_positions(tallies[NONE])
+        effects = tuple(
+            kept.effect(name, processor.config.screens, antenna)
+            for antenna in inputs.logs
+            for name, processor in processors.items()
+        )
+        notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs))
+        wall = clock.perf_counter() - began
+        record = run_record(
+            files=collected(fingerprints),
+            command=sys.argv,
+            asked=asked or {},
+            used=config.model_copy(update={"screens": screens}).as_dict(),
+            options=options.as_dict(),
+            line=line.facts,
+            navigation=navigation,
+            tally=tallies[ALL],
+            sigma={},
+            protection={},
+            found_levels={},
+            notes=notes,
+            wall_s=wall,
+        )
+        rows = [effect.as_row() for effect in effects]
+        folder.append_csv("ablation.csv", pl.DataFrame(rows, infer_schema_length=None))
+        folder.write_json("ablation.json", record | {"choices": rows})
+        files = folder.commit({})
+    return Ablation(effects=effects, notes=notes, files=files, wall_s=wall)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Kept:
+    """What is kept of each epoch, by choice and antenna, chunk by chunk."""
+
+    truth: Mapping[str, AntennaReference] | None
+    trajectories: Mapping[str, Trajectory]
+    parts: dict[tuple[str, str], list[dict[str, Floats]]] = field(default_factory=dict)
+
+    def add(self, choice: str, antenna: str, result: AntennaResult) -> None:
+        """One chunk of one choice and antenna."""
+        if not len(result):
+            return
+        part = {
+            "counts": (result.status != Status.NO_OBSERVATION).astype(np.float64),
+            "has": np.isfinite(result.arc_m).astype(np.float64),
+            "ok": (result.status == Status.OK).astype(np.float64),
+            "n_used": result.n_used.astype(np.float64),
+            "sigma_m": result.along_sigma_m,
+        }
+        if self.truth is not None:
+            truth, path = self.truth[antenna], self.trajectories[antenna]
+            reference = interpolate_reference(result.time, truth.time, truth.ecef_m)
+            part["counts"] *= np.isfinite(reference[:, 0])
+            part["error_m"] = along_track_error(result.arc_m, reference, path)
+            part["conventional_m"] = along_track_error(result.conventional_arc_m, reference, path)
+        self.parts.setdefault((choice, antenna), []).append(part)
+
+    def effect(self, choice: str, screens: tuple[str, ...], antenna: str) -> Effect:
+        """All chunks of one choice and antenna together.
+
+        Raises
+        ------
+        MismatchError
+            The truth and the log have no time in common.
+        """
+        parts = self.parts.get((choice, antenna), [])
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        counts = whole["counts"] > 0
+        if not counts.any():
+            raise MismatchError(f"the truth and the {antenna} log have no time in common; give that of the same run")
+        has, ok = counts & (whole["has"] > 0), counts & (whole["ok"] > 0)
+        figures: dict[str, Score] = {}
+        if self.truth is not None:
+            error = whole["error_m"]
+            figures = {
+                "coordinates": score(error, counts),
+                "ok": score(np.where(ok, error, np.nan), counts),
+                "conventional": score(whole["conventional_m"], counts),
+            }
+        return Effect(
+            choice=choice,
+            screens=screens,
+            antenna=antenna,
+            epochs=int(counts.sum()),
+            rate=float(has.sum() / counts.sum()),
+            ok_rate=float(ok.sum() / counts.sum()),
+            n_used=float(whole["n_used"][counts].mean()),
+            sigma_p50_m=float(np.median(whole["sigma_m"][has])) if has.any() else float("nan"),
+            **figures,
+        )

@@ -1,0 +1,155 @@
+"""What a nearby reference station says of each satellite: errors that both receivers have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.errors import InputFileError
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
+from railfix.core.reasons import Reason
+from railfix.core.timescale import seconds
+from railfix.evaluate.range_errors.robust_clock import robust_clock
+from railfix.gnss.observations import Observations
+from railfix.io.rinex import scan_observations
+from railfix.pipeline.carrier_phase import CarrierState, slips_of, smoothed
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.corrected_ranges import prepare
+from railfix.pipeline.processor import EpochProcessor
+from railfix.positioning.section_search import SearchIndex
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
+
+#: Half the length of the north-south line through the station that its codes are prepared on [deg]: about 50 m.
+_HALF_LINE_DEG = 0.0005
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseStation:
+    """Common errors by satellite, B epochs of the station by S satellites.
+
+    Attributes
+    ----------
+    name : str
+    time : ndarray of datetime64[ns], shape (B,)
+    satellite : ndarray of str, shape (S,)
+    error_m : ndarray, shape (B, S) [m]
+        Corrected code less range and clock; NaN where not observed.
+    smoothed : bool
+        Whether the codes were smoothed by their phases.
+    """
+
+    name: str
+    time: Datetimes
+    satellite: Strings
+    error_m: Floats
+    smoothed: bool
+
+    def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
+        """Errors at other times, linearly between the station's epochs, shape (T, K) [m].
+
+        NaN for satellites that the station does not see, outside its log and in gaps.
+        """
+        column = {name: i for i, name in enumerate(self.satellite.tolist())}
+        result = np.full((len(time), len(satellite)), np.nan)
+        if len(self.time) < 2:
+            return result
+        base, wanted = seconds(self.time - self.time[0]), seconds(time - self.time[0])
+        after = np.clip(np.searchsorted(base, wanted, side="right"), 1, len(base) - 1)
+        step = base[after] - base[after - 1]
+        part = (wanted - base[after - 1]) / step
+        inside = (part >= 0.0) & (part <= 1.0) & (step <= largest_gap_s)
+        for k, name in enumerate(satellite.tolist()):
+            if name in column:
+                series = self.error_m[:, column[name]]
+                result[:, k] = np.where(inside, (1.0 - part) * series[after - 1] + part * series[after], np.nan)
+        return result
+
+
+def base_station(
+    parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
+) -> BaseStation:
+    """Errors of a station that stands at a known place.
+
+    Its codes are corrected as the train's are, with the same settings; where it has carrier phases they
+    smooth its codes, so that little of its own noise goes into the result. Its own multipath stays in.
+
+    Parameters
+    ----------
+    parts : iterable of Observations
+        Pieces of its log, in order of time.
+    processor : EpochProcessor
+        Of the train: its settings, records, ionosphere and SBAS correct the station's codes, too.
+    position_ecef_m : ndarray, shape (3,) [m]
+    name : str
+
+    Returns
+    -------
+    BaseStation
+    """
+    latitude, longitude, height = (float(x) for x in geodetic_from_ecef(position_ecef_m))
+    ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
+    index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
+    config, navigation = processor.config, processor.navigation
+    book = ChannelBook(config, navigation)
+    state, phases = CarrierState(), False
+    times: list[Datetimes] = []
+    errors: list[dict[str, Floats]] = []
+    for obs in parts:
+        one = prepare(obs, book.of(obs), config, navigation, index, processor.klobuchar, sbas=processor.sbas)
+        slips, state = slips_of(one, navigation, config, state)
+        one, state = smoothed(one, slips, config, state)
+        phases |= bool(np.isfinite(obs.phase_cycles).any())
+        distance, _ = range_with_rotation(one.satellites.position_ecef_m, position_ecef_m)
+        residual = np.where(one.reason == Reason.USED, one.corrected_code_m - distance, np.nan)
+        clock = robust_clock(residual, one.sigma_m, one.groups).clock_m
+        owner = np.zeros(residual.shape[1], dtype=np.intp)
+        for g, group in enumerate(one.groups):
+            owner[group] = g
+        error = residual - clock[:, owner]
+        of_satellite: dict[str, Floats] = {}
+        for k, satellite in enumerate(one.satellite.tolist()):
+            before = of_satellite.get(satellite)
+            of_satellite[satellite] = error[:, k] if before is None else np.where(np.isnan(before), error[:, k], before)
+        times.append(obs.time)
+        errors.append(of_satellite)
+    names = sorted({satellite for part in errors for satellite in part})
+    blank = [np.full(len(time), np.nan) for time in times]
+    table = [
+        np.stack([part.get(satellite, empty) for satellite in names], axis=1)
+        for part, empty in zip(errors, blank, strict=True)
+        if names
+    ]
+    return BaseStation(
+        name=name,
+        time=np.concatenate(times) if times else np.empty(0, dtype="datetime64[ns]"),
+        satellite=np.array(names, dtype=np.str_),
+        error_m=np.concatenate(table) if table else np.empty((0, 0)),
+        smoothed=phases,
+    )
+
+
+def base_station_from_files(
+    paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
+) -> BaseStation:
+    """The same from RINEX files; the place is that of the header where none is given.
+
+    Raises
+    ------
+    InputFileError
+        No place is known, or no satellite's error can be told.
+    """
+    parts = list(scan_observations(paths, epochs=20_000))
+    place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
+    if place is None or not np.isfinite(place).all() or np.linalg.norm(place) < 1e6:
+        raise InputFileError(paths[0], "its header has no position; give that of the station (--base-position)")
+    station = base_station(parts, processor, np.asarray(place), name=parts[0].header.marker or paths[0].name)
+    if not np.isfinite(station.error_m).any():
+        raise InputFileError(
+            paths[0], "of no satellite the station's error can be told; is the navigation file of the same day?"
+        )
+    return station

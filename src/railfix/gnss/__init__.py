@@ -1,0 +1,1 @@
+"""Observations, navigation records, signals and satellite orbits."""

@@ -1,0 +1,220 @@
+"""Broadcast and precise ephemerides as frozen arrays: what the orbit stage reads.
+
+One row of a record table is one navigation message of one satellite. All times are GPS time.
+Units are those of the interface documents (SI, radians). Absent is NaN (NaT for times).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Strings
+from railfix.gnss.observations import frozen
+
+
+def _freeze(table: Any, length: int) -> None:
+    for item in fields(table):
+        value = getattr(table, item.name)
+        if isinstance(value, np.ndarray):
+            if len(value) != length:
+                raise ValueError(f"{item.name} has {len(value)} records, satellite has {length}")
+            object.__setattr__(table, item.name, frozen(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeplerRecords:
+    """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows.
+
+    Attributes
+    ----------
+    satellite : ndarray of str, shape (n,)
+    message : ndarray of str, shape (n,)
+        "LNAV" (GPS, QZSS), "INAV", "FNAV" (Galileo), "D1", "D2" (BeiDou; D2 is sent by GEO satellites).
+    toc, toe : ndarray of datetime64[ns], shape (n,)
+        Clock and ephemeris reference times, GPS time. The week is resolved from toc.
+    transmitted : ndarray of datetime64[ns], shape (n,)
+        Transmission time of the message; NaT when the file does not say (or says the 0.9999e9 of RINEX).
+    af0_s, af1, af2 : ndarray, shape (n,)
+        Clock polynomial [s, s/s, s/s^2].
+    sqrt_a, eccentricity, m0, delta_n, omega0, i0, omega, omega_dot, i_dot : ndarray, shape (n,)
+        [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s].
+    cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
+        Harmonic corrections [rad, rad, m, m, rad, rad].
+    toe_sow_s : ndarray, shape (n,) [s]
+        Toe as seconds of the constellation's own week (BDT for BeiDou): enters the node's longitude.
+    health : ndarray of int, shape (n,)
+        As broadcast: GPS/QZSS 6-bit SV health, Galileo 9-bit word, BeiDou SatH1.
+    accuracy_m : ndarray, shape (n,) [m]
+        URA or SISA as written.
+    iode, iodc : ndarray of int, shape (n,)
+        Issue of data (IODnav of Galileo in both; AODE and AODC of BeiDou).
+    data_source : ndarray of int, shape (n,)
+        Galileo data-source bits; 0 elsewhere.
+    group_delay_1_s, group_delay_2_s : ndarray, shape (n,) [s]
+        GPS/QZSS TGD and NaN; Galileo BGD E5a/E1 and BGD E5b/E1; BeiDou TGD1 and TGD2.
+    fit_interval_h : ndarray, shape (n,) [h]
+        GPS/QZSS fit interval in hours (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4); NaN elsewhere.
+    """
+
+    satellite: Strings
+    message: Strings
+    toc: Datetimes
+    toe: Datetimes
+    transmitted: Datetimes
+    af0_s: Floats
+    af1: Floats
+    af2: Floats
+    sqrt_a: Floats
+    eccentricity: Floats
+    m0: Floats
+    delta_n: Floats
+    omega0: Floats
+    i0: Floats
+    omega: Floats
+    omega_dot: Floats
+    i_dot: Floats
+    cuc: Floats
+    cus: Floats
+    crc: Floats
+    crs: Floats
+    cic: Floats
+    cis: Floats
+    toe_sow_s: Floats
+    health: Integers
+    accuracy_m: Floats
+    iode: Integers
+    iodc: Integers
+    data_source: Integers
+    group_delay_1_s: Floats
+    group_delay_2_s: Floats
+    fit_interval_h: Floats
+
+    def __post_init__(self) -> None:
+        _freeze(self, len(self.satellite))
+
+    def __len__(self) -> int:
+        return len(self.satellite)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GlonassRecords:
+    """State-vector records of GLONASS, n rows.
+
+    Attributes
+    ----------
+    satellite : ndarray of str, shape (n,)
+    toe : ndarray of datetime64[ns], shape (n,)
+        Reference time, UTC of the message turned into GPS time.
+    transmitted : ndarray of datetime64[ns], shape (n,)
+        Message frame time, GPS time; NaT when absent.
+    clock_bias_s : ndarray, shape (n,) [s]
+        -tau_n, the correction to be added (as RINEX writes it).
+    relative_frequency : ndarray, shape (n,)
+        +gamma_n.
+    position_ecef_m, velocity_ecef_mps, acceleration_ecef_mps2 : ndarray, shape (n, 3)
+        PZ-90, metres (RINEX writes kilometres); the acceleration is the luni-solar part.
+    health : ndarray of int, shape (n,)
+        0 is healthy.
+    frequency_channel : ndarray of int, shape (n,)
+    age_days : ndarray, shape (n,)
+    """
+
+    satellite: Strings
+    toe: Datetimes
+    transmitted: Datetimes
+    clock_bias_s: Floats
+    relative_frequency: Floats
+    position_ecef_m: Floats
+    velocity_ecef_mps: Floats
+    acceleration_ecef_mps2: Floats
+    health: Integers
+    frequency_channel: Integers
+    age_days: Floats
+
+    def __post_init__(self) -> None:
+        _freeze(self, len(self.satellite))
+
+    def __len__(self) -> int:
+        return len(self.satellite)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PreciseEphemeris:
+    """Positions and clocks from SP3, E epochs by N satellites.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (E,)
+        GPS time (files in another time system are converted).
+    satellite : ndarray of str, shape (N,)
+    position_ecef_m : ndarray, shape (E, N, 3) [m]
+        NaN where the file has none (0.000000).
+    clock_s : ndarray, shape (E, N) [s]
+        NaN where the file has none (999999.999999).
+    source : str
+        The files it was read from.
+    """
+
+    time: Datetimes
+    satellite: Strings
+    position_ecef_m: Floats
+    clock_s: Floats
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        expected = (len(self.time), len(self.satellite))
+        if self.clock_s.shape != expected or self.position_ecef_m.shape != (*expected, 3):
+            raise ValueError(
+                f"position_ecef_m {self.position_ecef_m.shape} and clock_s {self.clock_s.shape} "
+                f"do not match (epochs, satellites) = {expected}"
+            )
+        for name in ("time", "satellite", "position_ecef_m", "clock_s"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Navigation:
+    """All that navigation files say. Compared and hashed by identity, so that what is prepared from it can be kept.
+
+    Attributes
+    ----------
+    kepler : KeplerRecords
+    glonass : GlonassRecords
+    klobuchar : mapping of str to ndarray, shape (8,)
+        Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received.
+        All-zero coefficients mean "not received" and are left out here; `notes` says so.
+    leap_seconds : int or None
+        GPST - UTC [s] as the header says.
+    passed_over : mapping of str to int
+        Records that were read over, counted by what they are ("S", "I", "G CNAV", "duplicate").
+    notes : tuple of str
+        One sentence each: what a reader should know (no ionosphere, week resolved from the clock time).
+    precise : PreciseEphemeris or None
+        When given, used in place of the broadcast orbits and clocks.
+    sources : tuple of str
+        The files it was read from.
+    """
+
+    kepler: KeplerRecords
+    glonass: GlonassRecords
+    klobuchar: Mapping[str, Floats] = field(default_factory=dict)
+    leap_seconds: int | None = None
+    passed_over: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    precise: PreciseEphemeris | None = None
+    sources: tuple[str, ...] = ()
+
+
+@lru_cache(maxsize=8)
+def glonass_channels(navigation: Navigation) -> dict[str, int]:
+    """Frequency channel of each GLONASS satellite, as its records say.
+
+    For logs whose header lacks GLONASS SLOT / FRQ #: the form of `ObservationHeader.glonass_channel`.
+    """
+    records = navigation.glonass
+    return dict(zip(records.satellite.tolist(), records.frequency_channel.tolist(), strict=True))

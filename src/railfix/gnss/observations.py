@@ -1,0 +1,232 @@
+"""Observations of one receiver as frozen arrays: what every stage reads.
+
+Axis 0 is time (epochs), axis 1 is the *channel*: one satellite on one signal. A satellite tracked
+on three signals has three channels, so nothing is padded for signals that a constellation does
+not have. Absent is NaN; 0 is a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import chain, islice
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings
+
+#: Sentences about single faults that are kept; the rest is only counted.
+MAX_PROBLEMS: Final = 50
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array, read-only (a view, so that the caller's own array stays writable)."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationHeader:
+    """What the header of an observation log says.
+
+    Attributes
+    ----------
+    version : float
+        RINEX version, NaN when the log is no RINEX file.
+    marker : str
+    receiver, antenna : str
+        Receiver type and antenna type, as written.
+    approximate_ecef_m : ndarray, shape (3,) [m]
+        APPROX POSITION XYZ; NaN when absent or all zero.
+    antenna_delta_hen_m : ndarray, shape (3,) [m]
+        Antenna height, east and north eccentricity.
+    interval_s : float
+        INTERVAL [s], NaN when absent.
+    glonass_channel : mapping of str to int
+        Frequency channel of GLONASS satellites ("R05" -> 1).
+    leap_seconds : int or None
+    signals : mapping of str to tuple of str
+        Signals announced per constellation, RINEX 3 codes without the type letter ("1C", "2W").
+    receiver_clock_applied : bool
+        RCV CLOCK OFFS APPL: tags, codes and phases are already corrected for the receiver's clock.
+    """
+
+    version: float = float("nan")
+    marker: str = ""
+    receiver: str = ""
+    antenna: str = ""
+    approximate_ecef_m: Floats = field(default_factory=lambda: np.full(3, np.nan))
+    antenna_delta_hen_m: Floats = field(default_factory=lambda: np.zeros(3))
+    interval_s: float = float("nan")
+    glonass_channel: Mapping[str, int] = field(default_factory=dict)
+    leap_seconds: int | None = None
+    signals: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    receiver_clock_applied: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """Raw observations of one receiver, T epochs by M channels.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+        Time tag of the receiver in GPS time, exactly as tagged (never rounded), rising.
+    satellite : ndarray of str, shape (M,)
+        Satellite of each channel, "G01", "J02".
+    signal : ndarray of str, shape (M,)
+        RINEX 3 observation code of each channel without its type letter, "1C", "2I". RINEX 2
+        codes are mapped: C1 -> "1C", P1 -> "1P" (GLONASS) or "1W" (GPS), P2 -> "2W"/"2P", and so on.
+    code_m : ndarray, shape (T, M) [m]
+        Pseudorange.
+    phase_cycles : ndarray, shape (T, M) [cycle]
+    doppler_hz : ndarray, shape (T, M) [Hz]
+        Positive when the satellite approaches.
+    cn0_dbhz : ndarray, shape (T, M) [dB-Hz]
+        Carrier-to-noise density; where only the RINEX 1-9 digit exists, NaN.
+    loss_of_lock : ndarray of uint8, shape (T, M)
+        RINEX loss-of-lock indicator of the phase, 0 where blank or absent.
+    break_before : ndarray of bool, shape (T,)
+        True where nothing may be differenced across the step into this epoch: power failure
+        (epoch flag 1), a new site or moving antenna (2, 3), start of another file with a gap.
+    header : ObservationHeader
+    problems : tuple of str
+        What was broken in the file and passed over, a sentence each (file, line, what); at most
+        `MAX_PROBLEMS`, then one more that says how many more there were. A slice of epochs has none.
+    problem_count : int
+        How many problems there were.
+    passed_over : mapping of str to int
+        What was read over, counted by what it is: broken epochs and satellite lines, duplicate
+        epochs, external events, satellites of constellations unknown or not asked for.
+    """
+
+    time: Datetimes
+    satellite: Strings
+    signal: Strings
+    code_m: Floats
+    phase_cycles: Floats
+    doppler_hz: Floats
+    cn0_dbhz: Floats
+    loss_of_lock: Bytes
+    break_before: Masks
+    header: ObservationHeader = field(default_factory=ObservationHeader)
+    problems: tuple[str, ...] = ()
+    problem_count: int = 0
+    passed_over: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        epochs, channels = len(self.time), len(self.satellite)
+        if len(self.signal) != channels:
+            raise ValueError(f"signal has {len(self.signal)} channels, satellite has {channels}")
+        if len(self.break_before) != epochs:
+            raise ValueError(f"break_before has {len(self.break_before)} epochs, time has {epochs}")
+        for name in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock"):
+            shape = getattr(self, name).shape
+            if shape != (epochs, channels):
+                raise ValueError(f"{name} has shape {shape}, expected {(epochs, channels)} (epochs, channels)")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, frozen(value))
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def system(self) -> Strings:
+        """Constellation letter of each channel, shape (M,)."""
+        return self.satellite.astype("<U1")
+
+    def __getitem__(self, epochs: slice) -> Observations:
+        """A run of epochs (a view); the channels stay."""
+        return Observations(
+            time=self.time[epochs],
+            satellite=self.satellite,
+            signal=self.signal,
+            code_m=self.code_m[epochs],
+            phase_cycles=self.phase_cycles[epochs],
+            doppler_hz=self.doppler_hz[epochs],
+            cn0_dbhz=self.cn0_dbhz[epochs],
+            loss_of_lock=self.loss_of_lock[epochs],
+            break_before=self.break_before[epochs],
+            header=self.header,
+        )
+
+
+def concatenate(parts: Sequence[Observations]) -> Observations:
+    """Parts of one log as a whole; channels are united, absent ones filled with NaN.
+
+    Parameters
+    ----------
+    parts : sequence of Observations
+        At least one, in order of time.
+
+    Returns
+    -------
+    Observations
+        Channels sorted by satellite, then signal. The header is that of the first part, with the
+        signals and GLONASS channels of the others added; problems are joined, counters added.
+    """
+    if not parts:
+        raise ValueError("concatenate needs at least one part")
+    keys = sorted({(str(s), str(g)) for p in parts for s, g in zip(p.satellite, p.signal, strict=True)})
+    column = {key: i for i, key in enumerate(keys)}
+    total = sum(len(p) for p in parts)
+    shape = (total, len(keys))
+    floats = {n: np.full(shape, np.nan) for n in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")}
+    lock = np.zeros(shape, dtype=np.uint8)
+    row = 0
+    for part in parts:
+        columns = [column[str(s), str(g)] for s, g in zip(part.satellite, part.signal, strict=True)]
+        rows = slice(row, row + len(part))
+        for name, target in floats.items():
+            target[rows, columns] = getattr(part, name)
+        lock[rows, columns] = part.loss_of_lock
+        row += len(part)
+    return Observations(
+        time=np.concatenate([p.time for p in parts]),
+        satellite=np.array([k[0] for k in keys], dtype="<U3"),
+        signal=np.array([k[1] for k in keys], dtype="<U2"),
+        loss_of_lock=lock,
+        break_before=np.concatenate([p.break_before for p in parts]),
+        header=_joined_header(parts),
+        problems=_joined_problems(parts),
+        problem_count=sum(p.problem_count for p in parts),
+        passed_over=_joined_counts(parts),
+        **floats,
+    )
+
+
+def _joined_header(parts: Sequence[Observations]) -> ObservationHeader:
+    first = parts[0].header
+    signals = {system: set(names) for system, names in first.signals.items()}
+    channels = dict(first.glonass_channel)
+    for header in {id(p.header): p.header for p in parts}.values():
+        for system, names in header.signals.items():
+            signals.setdefault(system, set()).update(names)
+        channels = {**header.glonass_channel, **channels}
+    joined = {system: tuple(sorted(names)) for system, names in signals.items()}
+    return replace(first, signals=joined, glonass_channel=channels)
+
+
+def _joined_problems(parts: Sequence[Observations]) -> tuple[str, ...]:
+    return capped_problems(
+        chain.from_iterable(p.problems[:MAX_PROBLEMS] for p in parts), count=sum(p.problem_count for p in parts)
+    )
+
+
+def capped_problems(sentences: Iterable[str], *, count: int) -> tuple[str, ...]:
+    """The first `MAX_PROBLEMS` sentences, and one that says how many more of `count` there were."""
+    kept = tuple(islice(sentences, MAX_PROBLEMS))
+    return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept
+
+
+def _joined_counts(parts: Sequence[Observations]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for part in parts:
+        for what, number in part.passed_over.items():
+            counts[what] = counts.get(what, 0) + number
+    return counts

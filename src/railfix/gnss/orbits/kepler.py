@@ -1,0 +1,218 @@
+"""Positions, velocities and clocks of Keplerian broadcast records, any number at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers
+from railfix.core.constants import (
+    EARTH_ROTATION_RATE,
+    EARTH_ROTATION_RATE_BEIDOU,
+    GM_GALILEO,
+    GM_GPS,
+    SPEED_OF_LIGHT,
+)
+from railfix.gnss.navigation import KeplerRecords
+
+#: x, y, z as arrays of their own.
+Components = tuple[Floats, Floats, Floats]
+
+#: Inclination of the frame in which BeiDou GEO records are given [rad] (BDS-SIS-ICD-B1I 3.0, 5.2.4.12).
+_GEO_TILT: Final = np.radians(-5.0)
+#: Gravitational constant [m^3/s^2] by constellation.
+GM: Final[Mapping[str, float]] = {"G": GM_GPS, "J": GM_GPS, "E": GM_GALILEO, "C": GM_GALILEO}
+#: Earth rotation rate [rad/s] by constellation.
+ROTATION: Final[Mapping[str, float]] = {
+    "G": EARTH_ROTATION_RATE,
+    "J": EARTH_ROTATION_RATE,
+    "E": EARTH_ROTATION_RATE,
+    "C": EARTH_ROTATION_RATE_BEIDOU,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Orbits:
+    """Elements of orbits and what follows from them alone, one row an orbit.
+
+    Attributes
+    ----------
+    a, motion, root : ndarray, shape (n,) [m, rad/s, -]
+        Semi-major axis, corrected mean motion, sqrt(1 - e^2).
+    cos_omega, sin_omega, cos_i0, sin_i0 : ndarray, shape (n,)
+        Of the argument of perigee and of the inclination at toe.
+    node : ndarray, shape (n,) [rad]
+        Longitude of the ascending node at toe.
+    node_rate : ndarray, shape (n,) [rad/s]
+    tilted_turn : ndarray, shape (n,) [rad/s]
+        BeiDou GEO: turn of the Earth out of the tilted frame of toe; 0 elsewhere.
+    relativity : ndarray, shape (n,) [s]
+        F e sqrt(A), to be multiplied by sin E.
+    eccentricity, m0, i_dot, cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
+        As `navigation.KeplerRecords`.
+    """
+
+    a: Floats
+    motion: Floats
+    eccentricity: Floats
+    root: Floats
+    m0: Floats
+    cos_omega: Floats
+    sin_omega: Floats
+    cos_i0: Floats
+    sin_i0: Floats
+    i_dot: Floats
+    node: Floats
+    node_rate: Floats
+    tilted_turn: Floats
+    cuc: Floats
+    cus: Floats
+    crc: Floats
+    crs: Floats
+    cic: Floats
+    cis: Floats
+    relativity: Floats
+
+    @classmethod
+    def from_records(cls, records: KeplerRecords) -> Orbits:
+        """Orbits of all records, in their order."""
+        system = records.satellite.astype("<U1").tolist()
+        gm = np.array([GM.get(s, np.nan) for s in system], dtype=np.float64)
+        rotation = np.array([ROTATION.get(s, np.nan) for s in system], dtype=np.float64)
+        geo = np.array([is_beidou_geo(s) for s in records.satellite.tolist()], dtype=bool)
+        a = records.sqrt_a * records.sqrt_a
+        return cls(
+            a=a,
+            motion=np.sqrt(gm / (a * a * a)) + records.delta_n,
+            root=np.sqrt(1.0 - records.eccentricity * records.eccentricity),
+            cos_omega=np.cos(records.omega),
+            sin_omega=np.sin(records.omega),
+            cos_i0=np.cos(records.i0),
+            sin_i0=np.sin(records.i0),
+            node=records.omega0 - rotation * records.toe_sow_s,
+            # GEO records: the node in the inertial frame of toe; the Earth's turn follows at the end.
+            node_rate=records.omega_dot - np.where(geo, 0.0, rotation),
+            tilted_turn=np.where(geo, rotation, 0.0),
+            relativity=-2.0 * np.sqrt(gm) / SPEED_OF_LIGHT**2 * records.eccentricity * records.sqrt_a,
+            **{name: getattr(records, name) for name in _AS_BROADCAST},
+        )
+
+    def take(self, rows: Integers) -> Orbits:
+        """The orbits of some rows, in their order."""
+        return Orbits(**{item.name: getattr(self, item.name)[rows] for item in fields(Orbits)})
+
+
+_AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "cuc", "cus", "crc", "crs", "cic", "cis")
+
+
+def is_beidou_geo(satellite: str) -> bool:
+    """Whether a satellite's records are given in the tilted frame: C01 to C05, C59 to C63 (B1I ICD 3.0, table 4-1).
+
+    The number decides and not the name of the message, which converters are known to mix up.
+    """
+    return satellite[:1] == "C" and (int(satellite[1:]) <= 5 or int(satellite[1:]) >= 59)
+
+
+def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Floats, Floats, Floats]:
+    """Kepler's equation M = E - e sin E.
+
+    Newton's method three times, a fixed number so that no result depends on its neighbours; it has
+    converged to the last digit for e < 0.2 (the largest of any of these satellites is 0.17).
+
+    Returns
+    -------
+    anomaly, sine, cosine : ndarray, shape as the inputs
+        E [rad], sin E and cos E.
+    """
+    anomaly = mean_anomaly
+    sine, cosine = np.sin(anomaly), np.cos(anomaly)
+    for _ in range(2):
+        step = (mean_anomaly - anomaly + eccentricity * sine) / (1.0 - eccentricity * cosine)
+        anomaly = anomaly + step
+        sine, cosine = np.sin(anomaly), np.cos(anomaly)
+    step = (mean_anomaly - anomaly + eccentricity * sine) / (1.0 - eccentricity * cosine)
+    sine, cosine = _turned(sine, cosine, step)
+    return anomaly + step, sine, cosine
+
+
+def _turned(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
+    """Sine and cosine after a small further angle: exact to rounding below 1e-3 rad."""
+    square = angle * angle
+    small_sine = angle * (1.0 - square / 6.0)
+    small_cosine = 1.0 - square * (0.5 - square / 24.0)
+    return sine * small_cosine + cosine * small_sine, cosine * small_cosine - sine * small_sine
+
+
+def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
+    """State of satellites a time after their records' toe (IS-GPS-200, table 20-IV).
+
+    Parameters
+    ----------
+    orbits : Orbits
+        n rows, or one for all instants. The corrections of latitude and inclination are small
+        angles (their fields end at 1.3e-4 rad).
+    since_toe_s : ndarray, shape (n,) [s]
+
+    Returns
+    -------
+    position_m, velocity_mps : tuple of three ndarray, shape (n,)
+        Earth-fixed at that very time.
+    relativity_s : ndarray, shape (n,) [s]
+        F e sqrt(A) sin E, the same as -2 r.v / c^2.
+    """
+    el, t = orbits, since_toe_s
+    _, sin_e, cos_e = eccentric_anomaly(el.m0 + el.motion * t, el.eccentricity)
+    shrink = 1.0 - el.eccentricity * cos_e
+    sin_v, cos_v = el.root * sin_e / shrink, (cos_e - el.eccentricity) / shrink
+    sin_p = sin_v * el.cos_omega + cos_v * el.sin_omega
+    cos_p = cos_v * el.cos_omega - sin_v * el.sin_omega
+    sin_2p, cos_2p = 2.0 * sin_p * cos_p, cos_p * cos_p - sin_p * sin_p
+    sin_u, cos_u = _turned(sin_p, cos_p, el.cus * sin_2p + el.cuc * cos_2p)
+    sin_i, cos_i = _turned(el.sin_i0, el.cos_i0, el.i_dot * t + el.cis * sin_2p + el.cic * cos_2p)
+    r = el.a * shrink + el.crs * sin_2p + el.crc * cos_2p
+
+    e_rate = el.motion / shrink
+    p_rate = e_rate * el.root / shrink
+    u_rate = p_rate * (1.0 + 2.0 * (el.cus * cos_2p - el.cuc * sin_2p))
+    r_rate = el.a * el.eccentricity * sin_e * e_rate + 2.0 * p_rate * (el.crs * cos_2p - el.crc * sin_2p)
+    i_rate = el.i_dot + 2.0 * p_rate * (el.cis * cos_2p - el.cic * sin_2p)
+
+    node = el.node + el.node_rate * t
+    cos_n, sin_n = np.cos(node), np.sin(node)
+    x, y = r * cos_u, r * sin_u
+    x_rate, y_rate = r_rate * cos_u - y * u_rate, r_rate * sin_u + x * u_rate
+    across, lift = y * cos_i, y * sin_i
+    across_rate = y_rate * cos_i - lift * i_rate
+    px, py = x * cos_n - across * sin_n, x * sin_n + across * cos_n
+    position = (px, py, lift)
+    velocity = (
+        x_rate * cos_n - across_rate * sin_n - py * el.node_rate,
+        x_rate * sin_n + across_rate * cos_n + px * el.node_rate,
+        y_rate * sin_i + across * i_rate,
+    )
+    if el.tilted_turn.any():
+        position, velocity = _out_of_tilted_frame(position, velocity, el.tilted_turn, t)
+    return position, velocity, el.relativity * sin_e
+
+
+def _out_of_tilted_frame(
+    position: Components, velocity: Components, turn: Floats, since_toe_s: Floats
+) -> tuple[Components, Components]:
+    """BeiDou GEO: R_z(omega t) R_x(-5 deg) (BDS-SIS-ICD-B1I 3.0, 5.2.4.12); rows that do not turn stay."""
+    cos_x, sin_x = np.cos(_GEO_TILT), np.sin(_GEO_TILT)
+    angle = turn * since_toe_s
+    cos_z, sin_z = np.cos(angle), np.sin(angle)
+
+    def turned(v: Components) -> Components:
+        y, z = cos_x * v[1] + sin_x * v[2], cos_x * v[2] - sin_x * v[1]
+        return cos_z * v[0] + sin_z * y, cos_z * y - sin_z * v[0], z
+
+    place, speed = turned(position), turned(velocity)
+    speed = (speed[0] + turn * place[1], speed[1] - turn * place[0], speed[2])
+    tilted = turn != 0.0
+    x, y, z = (np.where(tilted, new, old) for new, old in zip(place, position, strict=True))
+    vx, vy, vz = (np.where(tilted, new, old) for new, old in zip(speed, velocity, strict=True))
+    return (x, y, z), (vx, vy, vz)

@@ -1,0 +1,134 @@
+"""What is prepared once for a `Navigation`, so that an epoch costs only its own arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
+from railfix.core.timescale import seconds, timedelta
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.orbits.glonass import Integrated
+from railfix.gnss.orbits.kepler import Orbits
+from railfix.gnss.orbits.selection import VALIDITY_S, make_lookup, validity_s
+from railfix.gnss.orbits.signal_health import group_delay_s, unhealthy
+
+#: Channel sets remembered per navigation.
+_PLANS: Final = 64
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A set of channels against the record tables.
+
+    Attributes
+    ----------
+    kepler, glonass : ndarray of int, shape (K,), (R,)
+        Channels of the constellations with Keplerian records, and of GLONASS.
+    preferred, other : ndarray of int, shape (K,)
+        Numbers in the lookup: Galileo's message that carries the channel's clock, and the other
+        one; elsewhere the satellite, and -1.
+    any_other : bool
+    signal : ndarray of int, shape (K,)
+        Row of `group_delay_s` and `unhealthy`.
+    group_delay_s : ndarray, shape (signals, records) [s]
+    unhealthy : ndarray of bool, shape (signals, records)
+    glonass_number : ndarray of int, shape (R,)
+    """
+
+    kepler: Indices
+    glonass: Indices
+    preferred: Integers
+    other: Integers
+    any_other: bool
+    signal: Integers
+    group_delay_s: Floats
+    unhealthy: Masks
+    glonass_number: Integers
+
+
+class Table:
+    """Lookups, orbits and clocks of all records of one `Navigation`."""
+
+    def __init__(self, navigation: Navigation) -> None:
+        kepler, glonass = navigation.kepler, navigation.glonass
+        self.navigation = navigation
+        validity = validity_s(kepler)
+        self.validity = timedelta(validity)
+        galileo = kepler.satellite.astype("<U1") == "E"
+        label = np.where(galileo, np.char.add(np.char.add(kepler.satellite, " "), kepler.message), kepler.satellite)
+        self.lookup = make_lookup(label, kepler.toe, kepler.transmitted, validity)
+        self.orbits = Orbits.from_records(kepler)
+        self.clock = np.stack([kepler.af0_s, kepler.af1, kepler.af2])
+        self.toe_after_toc_s = seconds(kepler.toe - kepler.toc)
+        validity = np.full(len(glonass), VALIDITY_S["R"])
+        self.glonass_validity = timedelta(validity)
+        self.glonass_lookup = make_lookup(glonass.satellite, glonass.toe, glonass.transmitted, validity)
+        self._plans: dict[tuple[bytes, ...], Plan] = {}
+
+    @cached_property
+    def integrated(self) -> Integrated:
+        """GLONASS states at whole steps."""
+        return Integrated.from_records(self.navigation.glonass, VALIDITY_S["R"])
+
+    def plan(self, satellite: Strings, signal: Strings) -> Plan:
+        """The plan of a set of channels, made once."""
+        key = (satellite.tobytes(), signal.tobytes(), str(satellite.dtype).encode(), str(signal.dtype).encode())
+        found = self._plans.get(key)
+        if found is None:
+            while len(self._plans) >= _PLANS:
+                self._plans.pop(next(iter(self._plans)))
+            found = self._plans[key] = self._make_plan(satellite.tolist(), signal.tolist())
+        return found
+
+    def _make_plan(self, satellite: list[str], signal: list[str]) -> Plan:
+        kepler = np.array([i for i, s in enumerate(satellite) if s[:1] in ("G", "J", "E", "C")], dtype=np.intp)
+        glonass = np.array([i for i, s in enumerate(satellite) if s[:1] == "R"], dtype=np.intp)
+        names = [(satellite[i], signal[i]) for i in kepler]
+        codes = sorted({code for _, code in names})
+        number = self.lookup.number
+        first, second = zip(*(_labels(name, code) for name, code in names), strict=True) if names else ((), ())
+        pairs = [(number.get(a, -1), number.get(b, -1)) for a, b in zip(first, second, strict=True)]
+        preferred, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        # A satellite with only the other message has that one first.
+        preferred, other = np.where(preferred < 0, other, preferred), np.where(preferred < 0, -1, other)
+        clock: Literal["broadcast", "ionosphere_free"] = (
+            "ionosphere_free" if self.navigation.precise is not None else "broadcast"
+        )
+        records = self.navigation.kepler
+        return Plan(
+            kepler=kepler,
+            glonass=glonass,
+            preferred=preferred,
+            other=other,
+            any_other=bool((other >= 0).any()),
+            signal=np.array([codes.index(code) for _, code in names], dtype=np.int64),
+            group_delay_s=_rows(lambda code: group_delay_s(records, code, clock=clock), codes, len(records)),
+            unhealthy=_rows(lambda code: unhealthy(records, code), codes, len(records)).astype(bool),
+            glonass_number=np.array(
+                [self.glonass_lookup.number.get(satellite[i], -1) for i in glonass], dtype=np.int64
+            ),
+        )
+
+
+def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], records: int) -> Floats:
+    return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
+
+
+def _labels(satellite: str, signal: str) -> tuple[str, str]:
+    """Names in the lookup, the preferred one first: F/NAV holds the clock of E1 and E5a, I/NAV of E1 and E5b."""
+    if satellite[0] != "E":
+        return satellite, ""
+    messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
+    return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"
+
+
+@lru_cache(maxsize=8)
+def table_of(navigation: Navigation) -> Table:
+    """The table of a `Navigation`, made once."""
+    return Table(navigation)

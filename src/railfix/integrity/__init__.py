@@ -1,0 +1,1 @@
+"""RAIM, protection levels and Stanford diagrams."""

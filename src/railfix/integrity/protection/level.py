@@ -1,0 +1,356 @@
+"""Protection level along the track with fault hypotheses: solution separation over one and two satellites.
+
+While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no
+part, and whose own error has the Gaussian tail of ``sigma_J``. The level L is where the tails of all
+hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
+
+    ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
+
+Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. It is found from above: from the largest
+of three parts, each of which has its share of the risk,
+
+- no fault: ``K_ff sigma_0 + b_0``;
+- one fault, two faults: the largest ``T_J + K sigma_J + b_J``, the share divided in proportion to the priors, so
+  that all hypotheses of a part have one K.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings
+from railfix.integrity.protection.risk import MOST_EXCLUDED, RiskBudget, more_than_two, one_sided_k, pair_sum
+from railfix.integrity.protection.sbas import along_the_line
+from railfix.integrity.protection.separation import Separations, whole, without_constellation, without_one, without_two
+from railfix.integrity.protection.tails import Tails, least_level
+from railfix.integrity.raim import LinearModel
+
+#: Numbers of a pair array that a block of epochs holds.
+_BLOCK_SIZE: Final = 80_000
+#: Separation, over the sigma of the position, below which the two positions are the same.
+_SAME: Final = 1e-9
+
+
+class Cause(IntEnum):
+    """What uses up most of the risk of an epoch at its level, or why there is none."""
+
+    #: The noise of the position without a fault.
+    FAULT_FREE = 0
+    #: A fault of one satellite, or of a constellation.
+    ONE_FAULT = 1
+    #: Faults of two satellites.
+    TWO_FAULTS = 2
+    #: Infinite: a fault that nothing checks is likelier than its share of the risk.
+    UNCHECKED = 3
+    #: Infinite: more faults than are checked are likelier than the risk allows, or too many satellites excluded.
+    BUDGET = 4
+    #: No position.
+    NO_POSITION = 5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtectionLevel:
+    """Levels along the track of T epochs; NaN where there is no position.
+
+    Attributes
+    ----------
+    level_m : ndarray, shape (T,) [m]
+        Where all tails together keep within the risk; at most the largest of the three parts, which have shares
+        of it that need not be used up. Infinite where `cause` says why.
+    fault_free_m, one_fault_m, two_fault_m : ndarray, shape (T,) [m]
+        The parts. 0 where the part's hypotheses fit into its share of the risk unchecked.
+    sigma_m : ndarray, shape (T,) [m]
+        Standard deviation of the position along the track, without a fault.
+    k_fault_free, k_one_fault, k_two_faults : ndarray, shape (T,)
+        Sigmas of each part; -inf where it is not asked for.
+    k_false_alarm : ndarray, shape (T,)
+        Sigmas of the thresholds.
+    separation : ndarray, shape (T,)
+        The largest ``|x_J - x|/T_J``; 0 where nothing can be left out.
+    consistent : ndarray of bool, shape (T,)
+        It is at most 1. Where not the level does not hold. False where there is no position.
+    worst_one : ndarray of int, shape (T,)
+        Channel that sets `one_fault_m`; -1 where none does (a constellation: `worst_constellation`).
+    worst_two : ndarray of int, shape (T, 2)
+        Channels that set `two_fault_m`; -1 where none do.
+    worst_constellation : ndarray of str, shape (T,)
+        Letter of the constellation that sets `one_fault_m`; empty where none does.
+    unchecked_risk : ndarray, shape (T,)
+        Probability of more faults than are checked, taken off the risk.
+    cause : ndarray of int8, shape (T,)
+        `Cause`.
+    """
+
+    level_m: Floats
+    fault_free_m: Floats
+    one_fault_m: Floats
+    two_fault_m: Floats
+    sigma_m: Floats
+    k_fault_free: Floats
+    k_one_fault: Floats
+    k_two_faults: Floats
+    k_false_alarm: Floats
+    separation: Floats
+    consistent: Masks
+    worst_one: Indices
+    worst_two: Indices
+    worst_constellation: Strings
+    unchecked_risk: Floats
+    cause: Codes
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What each epoch spends, T epochs."""
+
+    prior: Floats  # (T, M), 0 where not used
+    groups: tuple[tuple[str, Masks], ...]  # constellations with a prior of their own: letter, members (M,)
+    group_prior: Floats  # (T, C), 0 where absent
+    beyond: Floats
+    fault_free: Floats  # risk of each part
+    one: Floats
+    two: Floats
+    pairs: Masks  # two faults are likelier than their share
+    k_false_alarm: Floats
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One part of the level: T epochs."""
+
+    level_m: Floats
+    k: Floats
+    worst: Indices  # hypothesis; -1
+    separation: Floats
+    tails: Tails  # of what is checked
+    unchecked: Floats  # prior of what is not
+
+
+def along_track_level(
+    model: LinearModel,
+    systems: Sequence[str],
+    *,
+    risk: RiskBudget | None = None,
+    scale: ArrayLike = 1.0,
+    bias_m: ArrayLike | None = None,
+    n_excluded: ArrayLike = 0,
+) -> ProtectionLevel:
+    """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension, up to two satellites).
+
+    Parameters
+    ----------
+    model : LinearModel
+        T epochs on the line (`constrained_model`), after exclusions; 1/weight is the variance of the range.
+    systems : sequence of str, length M
+        Constellation letter of each channel.
+    risk : RiskBudget, optional
+    scale : array_like, shape (T,) or ()
+        Noise scale: multiplies the sigmas of the ranges, not the map error.
+    bias_m : array_like, shape (T, M) or (M,) [m], optional
+        Largest nominal bias of each range, as a paired overbound gives it; none: 0.
+    n_excluded : array_like of int, shape (T,) or ()
+        Satellites that fault detection left out at this epoch (not: what the screens rejected before).
+
+    Returns
+    -------
+    ProtectionLevel
+
+    Raises
+    ------
+    ValueError
+        A model in space, a number of systems that is not that of the channels, a constellation without prior,
+        a scale that is not positive.
+    """
+    along_the_line(model)
+    risk = risk or RiskBudget()
+    epochs, channels = model.root_weight.shape
+    if len(systems) != channels:
+        raise ValueError(f"systems names each channel: {channels} channels, got {len(systems)}")
+    scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (epochs,))
+    if (scale <= 0).any():
+        raise ValueError("the noise scale must be positive")
+    out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
+    bias = None if bias_m is None else np.broadcast_to(np.asarray(bias_m, dtype=np.float64), (epochs, channels))
+    located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
+    plan = _plan(model, systems, risk, out)
+    result = _empty(epochs, plan)
+    for block in _blocks(model, np.flatnonzero(located)):
+        some = None if bias is None else bias[block]
+        _level_of_block(result, block, model.take(block), plan, scale[block], some)
+    return result
+
+
+def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers) -> _Plan:
+    """Divide the risk of each epoch."""
+    prior = model.used * risk.prior(systems)
+    # Excluded satellites count among those that may be faulty, with the largest prior.
+    everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max()], axis=1)
+    letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
+    groups = tuple((s, np.array([t == s for t in systems])) for s in letters)
+    group_prior = np.zeros((len(model), len(groups)))
+    together = np.zeros(len(model))
+    for c, (letter, members) in enumerate(groups):
+        group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
+        # A constellation and a satellite of another: not checked.
+        together += group_prior[:, c] * (everyone.sum(axis=1) - (prior * members).sum(axis=1))
+    beyond = more_than_two(everyone) + together + pair_sum(group_prior)
+    n = np.count_nonzero(model.used, axis=1)
+    left = risk.sample_risk(n, out, beyond)
+    two = risk.two_fault_share * left
+    pairs = pair_sum(prior) > two
+    tests = n + np.where(pairs, n * (n - 1) // 2, 0) + np.count_nonzero(group_prior, axis=1)
+    return _Plan(
+        prior=prior,
+        groups=groups,
+        group_prior=group_prior,
+        beyond=beyond,
+        fault_free=risk.fault_free_share * left,
+        one=risk.one_fault_share * left,
+        two=two,
+        pairs=pairs,
+        k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1))),
+    )
+
+
+def _empty(epochs: int, plan: _Plan) -> ProtectionLevel:
+    """A result without positions."""
+
+    def nan() -> Floats:
+        return np.full(epochs, np.nan)
+
+    return ProtectionLevel(
+        level_m=nan(),
+        fault_free_m=nan(),
+        one_fault_m=nan(),
+        two_fault_m=nan(),
+        sigma_m=nan(),
+        k_fault_free=nan(),
+        k_one_fault=nan(),
+        k_two_faults=nan(),
+        k_false_alarm=nan(),
+        separation=nan(),
+        consistent=np.zeros(epochs, dtype=bool),
+        worst_one=np.full(epochs, -1, dtype=np.intp),
+        worst_two=np.full((epochs, 2), -1, dtype=np.intp),
+        worst_constellation=np.full(epochs, "", dtype="<U1"),
+        unchecked_risk=plan.beyond,
+        cause=np.full(epochs, Cause.NO_POSITION, dtype=np.int8),
+    )
+
+
+def _blocks(model: LinearModel, rows: Indices) -> Iterator[Indices]:
+    """Epochs of like numbers of satellites together: no block is wider than it must be."""
+    used = np.count_nonzero(model.used[rows], axis=1)
+    rows = rows[np.argsort(used, kind="stable")]
+    widest = int(used.max(initial=1))
+    size = max(1, _BLOCK_SIZE // (widest * widest))
+    return (rows[first : first + size] for first in range(0, len(rows), size))
+
+
+def _level_of_block(
+    result: ProtectionLevel, rows: Indices, model: LinearModel, plan: _Plan, scale: Floats, bias: Floats | None
+) -> None:
+    """Levels of a block of epochs with positions; written into `result`."""
+    all_of = whole(model, scale, bias)
+    sigma = all_of.sigma_m
+    k_fault_free, k_false_alarm = one_sided_k(plan.fault_free[rows] / 2.0), plan.k_false_alarm[rows]
+    fault_free = k_fault_free * sigma + all_of.bias_m
+    prior = np.take_along_axis(plan.prior[rows], all_of.channel, axis=1) * all_of.used
+
+    singles, single_prior = [without_one(all_of)], [prior]
+    for c, (_, members) in enumerate(plan.groups):
+        singles.append(without_constellation(model, members, all_of, bias))
+        single_prior.append(plan.group_prior[rows, c : c + 1])
+    one = _part(_beside(singles), np.concatenate(single_prior, axis=1), plan.one[rows], k_false_alarm, sigma)
+
+    n, pairs = prior.shape[1], plan.pairs[rows]
+    first, second = np.triu_indices(n, 1)
+    two = _nothing(len(rows))
+    if pairs.any() and n > 1:
+        pair_prior = prior[:, first] * prior[:, second] * pairs[:, None]
+        two = _part(without_two(all_of, first, second), pair_prior, plan.two[rows], k_false_alarm, sigma)
+
+    noise = Tails(offset_m=all_of.bias_m[:, None], sigma_m=sigma[:, None], weight=np.full((len(rows), 1), 2.0))
+    left = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] - one.unchecked - two.unchecked
+    left = left - np.where(pairs, 0.0, pair_sum(prior))
+    above = np.maximum(np.maximum(fault_free, one.level_m), two.level_m)
+    level, spender = least_level(above, [noise, one.tails, two.tails], left)
+    result.level_m[rows], result.sigma_m[rows] = level, sigma
+    result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = fault_free, one.level_m, two.level_m
+    result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k_fault_free, one.k, two.k
+    result.k_false_alarm[rows] = k_false_alarm
+    result.separation[rows] = np.maximum(one.separation, two.separation)
+    result.consistent[rows] = result.separation[rows] <= 1.0
+    at = np.arange(len(rows))
+    single = (one.worst >= 0) & (one.worst < n)
+    result.worst_one[rows] = np.where(single, all_of.channel[at, np.where(single, one.worst, 0)], -1)
+    letters = np.array([*(letter for letter, _ in plan.groups), ""])
+    result.worst_constellation[rows] = letters[np.where(one.worst >= n, one.worst - n, len(plan.groups))]
+    if n > 1:
+        places = np.stack([first, second], axis=1)[np.maximum(two.worst, 0)]
+        found = np.take_along_axis(all_of.channel, places, axis=1)
+        result.worst_two[rows] = np.where(two.worst[:, None] >= 0, found, -1)
+    infinite = np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET)
+    result.cause[rows] = np.where(np.isinf(level), infinite, spender)
+    result.unchecked_risk[rows] = plan.beyond[rows]
+
+
+def _beside(parts: list[Separations]) -> Separations:
+    """Hypotheses of several kinds, one after the other."""
+    names = [item.name for item in fields(Separations)]
+    return Separations(**{name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in names})
+
+
+def _nothing(epochs: int) -> _Part:
+    """A part without hypotheses."""
+    zero, empty = np.zeros(epochs), np.zeros((epochs, 0))
+    return _Part(
+        level_m=zero,
+        k=np.full(epochs, -np.inf),
+        worst=np.full(epochs, -1, dtype=np.intp),
+        separation=zero,
+        tails=Tails(offset_m=empty, sigma_m=empty, weight=empty),
+        unchecked=zero,
+    )
+
+
+def _part(apart: Separations, prior: Floats, budget: Floats, k_false_alarm: Floats, sigma: Floats) -> _Part:
+    """The level that the hypotheses of one part ask for.
+
+    What nothing checks goes into the risk with its whole prior; the rest of it is for what is checked.
+    """
+    blind = (prior > 0) & np.isinf(apart.sigma_m)
+    checked = (prior > 0) & ~blind
+    unchecked = (prior * blind).sum(axis=1)
+    total = (prior * checked).sum(axis=1)
+    left = budget - unchecked
+    needed = unchecked + total > budget
+    k = np.where(needed, one_sided_k(left / np.where(total > 0, total, np.inf)), -np.inf)
+    k = np.where(needed & (left > 0) & (total == 0), -np.inf, k)
+    usable = checked & np.isfinite(k)[:, None]
+    threshold = k_false_alarm[:, None] * apart.separation_sigma_m
+    offset = np.where(blind, 0.0, threshold + apart.bias_m)
+    tails = Tails(offset_m=offset, sigma_m=np.where(blind, 1.0, apart.sigma_m), weight=prior * checked)
+    with np.errstate(invalid="ignore"):
+        each = np.where(usable, offset + k[:, None] * tails.sigma_m, -np.inf)
+    spent = needed & (left <= 0)
+    culprits = np.where(np.any(blind, axis=1, keepdims=True), blind, checked)
+    each = np.where(spent[:, None] & culprits, np.inf, each)
+    level = np.maximum(each.max(axis=1), 0.0)
+    worst = np.where(each.max(axis=1) > -np.inf, np.argmax(each, axis=1), -1)
+    moving = checked & (apart.separation_sigma_m > _SAME * sigma[:, None])
+    ratio = np.where(moving, np.abs(apart.moved_m) / np.where(moving, threshold, 1.0), 0.0)
+    return _Part(
+        level_m=level,
+        k=k,
+        worst=np.asarray(worst, dtype=np.intp),
+        separation=ratio.max(axis=1),
+        tails=tails,
+        unchecked=unchecked,
+    )

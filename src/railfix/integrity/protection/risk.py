@@ -1,0 +1,192 @@
+"""The risk that a protection level may leave, and what it is spent on.
+
+Integrity is promised for an hour, a level is computed for an epoch: the risk of the hour is divided
+by the number of independent samples in it. What an epoch may risk is divided among the hypotheses:
+no fault, one, two; more than two are not checked, their whole probability is taken off beforehand.
+P1 2.4 sets out from 1e-7 an hour (RTCA DO-229D).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtri
+from scipy.stats import norm
+
+from railfix.core.arrays import Floats
+
+#: RTCA DO-229D appendix J, horizontal, precision approach: one dimension, 2e-9 an approach.
+K_H_PA: Final = 6.0
+#: RTCA DO-229D appendix J, horizontal, en route to non-precision approach: two dimensions (Rayleigh), 5e-9 a sample.
+K_H_NPA: Final = 6.18
+#: RTCA DO-229D appendix J, vertical: one dimension, two-sided 1e-7.
+K_V: Final = 5.33
+
+#: Probability that a satellite is faulty at a time: 1e-5 an hour for an hour for GPS, 3e-5 for Galileo (EU-U.S.
+#: Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the Galileo service definition after it); the
+#: others as Galileo, for want of a commitment that is as old.
+SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
+    {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
+)
+#: Exclusions after which a level is still given (P1 2.3(4) excludes up to two satellites).
+MOST_EXCLUDED: Final = 2
+
+
+def k_factor(risk: float) -> float:
+    """Sigmas that an error in one dimension exceeds, on either side, with this probability.
+
+    Two-sided, along a line: 1e-7 gives 5.33, 1e-8 gives 5.73. Not the Rayleigh factor of a
+    horizontal position.
+
+    Parameters
+    ----------
+    risk : float
+        Of one sample, both sides together.
+    """
+    if not 0.0 < risk <= 1.0:
+        raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
+    return float(norm.isf(risk / 2.0))
+
+
+def one_sided_k(probability: Floats) -> Floats:
+    """Sigmas that noise exceeds on one side with this probability; -inf from 1 on, inf at 0 and below."""
+    return np.asarray(-ndtri(np.clip(probability, 0.0, 1.0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskBudget:
+    """Integrity risk, its shares, and the probabilities of faults.
+
+    Attributes
+    ----------
+    risk_per_hour : float
+        Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 an hour.
+    samples_per_hour : float
+        Independent samples in an hour: 3600 s over the correlation time of the errors. 360 takes 10 s:
+        multipath of a moving train changes within seconds, that of a standing one within tens of seconds,
+        SBAS corrections within minutes (DO-229D appendix J counts 10 samples an hour). More samples are
+        the safe side; from 10 to 3600 the fault-free K grows by 0.9.
+    fault_free_share, one_fault_share, two_fault_share : float
+        Of what an epoch may risk; together at most 1. The level is the largest of the three parts, and a
+        share twice as large lowers a K of 6 by 0.1, one of 3 by 0.2: thirds.
+    exclusion_share : float
+        Of the risk, kept for epochs with one and (as much again) with two satellites excluded.
+    false_alarm : float
+        Probability in an epoch that noise alone makes the separations inconsistent; P4: 1e-3.
+    satellite_prior : mapping of str to float
+        Probability that a satellite of a constellation (its letter) is faulty at a time: its own signal.
+    local_prior : float
+        Probability that a satellite's range is off at a time by local causes that the screens left, on top of
+        that: multipath, interference. An assumption until measured on the line (P1 7).
+    constellation_prior : mapping of str to float
+        Probability of a fault that many satellites of a constellation share; a constellation that is not
+        named has none, and the level does not cover one.
+    """
+
+    risk_per_hour: float = 1e-7
+    samples_per_hour: float = 360.0
+    fault_free_share: float = 1.0 / 3.0
+    one_fault_share: float = 1.0 / 3.0
+    two_fault_share: float = 1.0 / 3.0
+    exclusion_share: float = 0.1
+    false_alarm: float = 1e-3
+    satellite_prior: Mapping[str, float] = field(default_factory=lambda: dict(SATELLITE_PRIOR))
+    local_prior: float = 1e-5
+    constellation_prior: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("risk_per_hour", "false_alarm"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} is a probability between 0 and 1, got {getattr(self, name)}")
+        if not 0.0 < self.samples_per_hour < np.inf:
+            raise ValueError(f"samples_per_hour must be positive, got {self.samples_per_hour}")
+        shares = (self.fault_free_share, self.one_fault_share, self.two_fault_share)
+        if not (min(shares) > 0.0 and sum(shares) <= 1.0 + 1e-12):
+            raise ValueError(f"the three shares must be positive and add up to 1 at most, got {shares}")
+        if not 0.0 <= self.exclusion_share < 0.5:
+            raise ValueError(f"exclusion_share lies from 0 to below 0.5, got {self.exclusion_share}")
+        priors = [self.local_prior, *self.satellite_prior.values(), *self.constellation_prior.values()]
+        if not all(0.0 <= p < 1.0 for p in priors):
+            raise ValueError("every prior is a probability from 0 to below 1")
+
+    @property
+    def risk_per_sample(self) -> float:
+        """What an epoch may risk, exclusions and unchecked faults included."""
+        return self.risk_per_hour / self.samples_per_hour
+
+    @property
+    def sample_k(self) -> float:
+        """K of a level without fault hypotheses: the whole risk of a sample, two-sided."""
+        return k_factor(self.risk_per_sample)
+
+    def prior(self, systems: Sequence[str]) -> Floats:
+        """Fault probability of each channel, shape (M,): of the satellite and of what is around the antenna.
+
+        Raises
+        ------
+        ValueError
+            Where a constellation has no prior.
+        """
+        unknown = sorted(set(systems) - set(self.satellite_prior))
+        if unknown:
+            raise ValueError(f"satellite_prior has no value for constellation {unknown[0]!r}: add one")
+        return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
+
+    def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
+        """What an epoch may risk in the set that is left after exclusions, any shape.
+
+        More faults than are checked are taken off once. Every set that exclusion could have left is a way
+        to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
+        satellites. 0 beyond `MOST_EXCLUDED`, and where nothing is left.
+
+        Parameters
+        ----------
+        n_used : array_like of int
+            Satellites left.
+        n_excluded : array_like of int
+            Satellites that fault detection took out.
+        beyond : array_like
+            Probability of more faults than are checked, among all satellites.
+        """
+        used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
+        if (out < 0).any():
+            raise ValueError("n_excluded is a count, got a negative one")
+        each = [
+            np.full(used.shape, 1.0 - 2.0 * self.exclusion_share),
+            self.exclusion_share / (used + 1.0),
+            self.exclusion_share / ((used + 2.0) * (used + 1.0) / 2.0),
+        ]
+        left = np.maximum(self.risk_per_sample - np.asarray(beyond, dtype=np.float64), 0.0)
+        return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
+
+    def require(self, systems: Sequence[str]) -> None:
+        """Refuse a budget that more than two faults among these satellites already spend.
+
+        Raises
+        ------
+        ValueError
+            Says what is over what.
+        """
+        spent = float(more_than_two(self.prior(systems)[None])[0])
+        if spent >= self.risk_per_sample:
+            raise ValueError(
+                f"more than two of {len(systems)} satellites are faulty with probability {spent:.2g} a sample, "
+                f"all that the risk allows is {self.risk_per_sample:.2g}: lower samples_per_hour or the priors, "
+                "or allow more risk"
+            )
+
+
+def pair_sum(prior: Floats) -> Floats:
+    """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""
+    return np.asarray((prior.sum(axis=1) ** 2 - (prior**2).sum(axis=1)) / 2.0)
+
+
+def more_than_two(prior: Floats) -> Floats:
+    """Bound of the probability of three faults or more: the sum over triples of their product, shape (T, M) to (T,)."""
+    one, two, three = (np.sum(prior**k, axis=1) for k in (1, 2, 3))
+    return np.asarray(np.maximum((one**3 - 3.0 * one * two + 2.0 * three) / 6.0, 0.0))

@@ -1,0 +1,223 @@
+"""How far, and how surely, the position moves without one satellite, a pair, or a constellation.
+
+With the whitened model of `raim` (residuals ``nu``, their projector S, gains g of the along-track
+position x) leaving out the channels J moves the position by ``x_J - x = -g_J^T S_JJ^-1 nu_J``, with
+variance ``g_J^T S_JJ^-1 g_J``, which is also what J took off the variance of the position:
+``sigma_J^2 = sigma_0^2 + var(x_J - x)``. Nothing is solved again.
+
+The noise scale s multiplies the ranges, not the map error. Of each variance the part of the map, |a|^2
+with a the response of the position to one sigma across and up, is therefore taken apart:
+``s^2 (var - |a|^2) + |a|^2``, and ``a_J = a + sum c_j u_j``, ``c = S_JJ^-1 g_J``, u_j what a channel has of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
+from railfix.integrity.raim.model import LinearModel, compact
+
+#: Effect on the position, in its own sigmas, below which a satellite has none.
+_NO_EFFECT: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Whole:
+    """The position of all satellites: T epochs, n channels in use side by side."""
+
+    channel: Indices  # (T, n) channel of the model
+    used: Masks  # (T, n)
+    projector: Floats  # (T, n, n)
+    residual: Floats  # (T, n)
+    gain_m: Floats  # (T, n)
+    map_gain_m: Floats  # (T, n, 2) what each channel has of the response to the map error
+    map_m: Floats  # (T, 2) response to one sigma of map error across and up
+    variance_m2: Floats  # (T,) of the weights, scale 1
+    scale: Floats  # (T,)
+    range_bias: Floats | None  # (T, n) largest nominal bias of each range, over its sigma
+
+    @property
+    def sigma_m(self) -> Floats:
+        """Standard deviation, shape (T,)."""
+        return np.sqrt(scaled(self.variance_m2, self.map_m, self.scale))
+
+    @property
+    def bias_m(self) -> Floats:
+        """Largest movement by nominal biases, shape (T,)."""
+        if self.range_bias is None:
+            return np.zeros(len(self.channel))
+        return np.asarray((np.abs(self.gain_m) * self.range_bias).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class Separations:
+    """Positions without each of K subsets, T epochs by K; sigma infinite where the rest does not determine one."""
+
+    sigma_m: Floats  # of the position without the subset
+    separation_sigma_m: Floats  # of its distance from the position of all
+    moved_m: Floats  # that distance, signed
+    bias_m: Floats  # its largest movement by nominal biases
+
+
+def scaled(variance_m2: Floats, map_m: Floats, scale: Floats) -> Floats:
+    """Variance with the noise scale, of one without (last axis of `map_m` is across and up)."""
+    from_map = map_m[..., 0] ** 2 + map_m[..., 1] ** 2
+    square = scale**2 if variance_m2.ndim == 1 else scale[:, None] ** 2
+    return np.asarray(np.maximum(square * (variance_m2 - from_map) + from_map, 0.0))
+
+
+def whole(model: LinearModel, scale: Floats, bias_m: Floats | None) -> Whole:
+    """The parts that every subset asks for.
+
+    Parameters
+    ----------
+    model : LinearModel
+        T epochs with a position, on the line.
+    scale : ndarray, shape (T,)
+    bias_m : ndarray, shape (T, M) [m], or None
+    """
+    parts = compact(model)
+    root = np.sqrt(np.einsum("ii->i", model.prior))[1:]
+    gain = np.take_along_axis(model.design @ model.covariance_m2, parts.channel[..., None], axis=1)
+    range_bias = None
+    if bias_m is not None:
+        range_bias = np.take_along_axis(np.abs(bias_m) * model.root_weight, parts.channel, axis=1)
+        range_bias = np.where(parts.used, range_bias, 0.0)
+    return Whole(
+        channel=parts.channel,
+        used=parts.used,
+        projector=parts.projector,
+        residual=parts.residual,
+        gain_m=parts.gain_m[..., 0],
+        map_gain_m=-gain[..., 1:] * root,
+        map_m=-model.covariance_m2[:, 0, 1:] * root,
+        variance_m2=model.covariance_m2[:, 0, 0],
+        scale=scale,
+        range_bias=range_bias,
+    )
+
+
+def without_one(all_of: Whole) -> Separations:
+    """Each channel left out, K = n."""
+    share, gain = np.einsum("tii->ti", all_of.projector), all_of.gain_m
+    checked = share > LEAST_REDUNDANCY
+    weight = np.where(checked, gain / np.where(checked, share, 1.0), 0.0)
+    blind = ~checked & (np.abs(gain) > _NO_EFFECT * np.sqrt(all_of.variance_m2)[:, None])
+    bias = np.zeros(gain.shape)
+    if all_of.range_bias is not None:
+        left = gain[:, None, :] - weight[:, :, None] * all_of.projector
+        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
+    return _separations(
+        all_of, weight * gain, weight[..., None] * all_of.map_gain_m, -weight * all_of.residual, bias, blind
+    )
+
+
+def without_two(all_of: Whole, first: Indices, second: Indices) -> Separations:
+    """Pairs of places (K,) in the compact arrays left out.
+
+    Two that only vouch for each other (both of a clock of their own) have a singular S_JJ. Where the error
+    that no residual shows does not move the position, what the residuals show of the pair is used; where it
+    does, nothing bounds it.
+    """
+    n, gain = all_of.channel.shape[1], all_of.gain_m
+    share = np.einsum("tii->ti", all_of.projector)
+    a, c = share[:, first], share[:, second]
+    b = np.take(all_of.projector.reshape(-1, n * n), first * n + second, axis=1)
+    one, two = gain[:, first], gain[:, second]
+    product = a * c
+    determinant = product - b * b
+    regular = (np.minimum(a, c) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
+    inverse = 1.0 / np.where(regular, determinant, 1.0)
+    weight_one, weight_two = (c * one - b * two) * inverse, (a * two - b * one) * inverse
+    blind = np.zeros(regular.shape, dtype=bool)
+    if not regular.all():
+        t, k = np.nonzero(~regular)
+        # S_JJ = (x, y)(x, y)^T; (y, -x) is what no residual shows.
+        x, y = np.sqrt(np.maximum(a[t, k], 0.0)), np.copysign(np.sqrt(np.maximum(c[t, k], 0.0)), b[t, k])
+        size = x**2 + y**2
+        seen = size > LEAST_REDUNDANCY
+        hidden = np.where(seen, np.abs(y * one[t, k] - x * two[t, k]), np.hypot(one[t, k], two[t, k]))
+        limit = _NO_EFFECT * np.sqrt(all_of.variance_m2[t]) * np.where(seen, np.sqrt(size), 1.0)
+        blind[t, k] = hidden > limit
+        shown = np.where(seen, (x * one[t, k] + y * two[t, k]) / np.where(seen, size, 1.0) ** 2, 0.0)
+        weight_one[t, k], weight_two[t, k] = x * shown, y * shown
+    moved = -(weight_one * all_of.residual[:, first] + weight_two * all_of.residual[:, second])
+    response = (
+        weight_one[..., None] * all_of.map_gain_m[:, first] + weight_two[..., None] * all_of.map_gain_m[:, second]
+    )
+    bias = np.zeros(one.shape)
+    if all_of.range_bias is not None:
+        left = gain[:, None, :] - weight_one[..., None] * all_of.projector[:, first]
+        left -= weight_two[..., None] * all_of.projector[:, second]
+        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
+    return _separations(all_of, weight_one * one + weight_two * two, response, moved, bias, blind)
+
+
+def without_constellation(model: LinearModel, members: Masks, all_of: Whole, bias_m: Floats | None) -> Separations:
+    """A whole constellation left out, K = 1: the information of the rest, inverted (3 x 3).
+
+    Its channels share a clock. With ``S' = I - R K R^T`` of the clocks alone, r the 1/sigma of the members
+    and kappa the variance of their clock, ``S'_JJ = I - kappa r r^T``, and the information that goes is
+    ``B_J^T S'_JJ^-1 B_J``. Where the clock is theirs alone r is what no residual shows, and moves nothing.
+
+    Parameters
+    ----------
+    model : LinearModel
+        T epochs.
+    members : ndarray of bool, shape (M,)
+    all_of : Whole
+        Of this model.
+    bias_m : ndarray, shape (T, M) [m], or None
+    """
+    clock = int(model.clock[members][0])
+    root = np.where(members, model.root_weight, 0.0)
+    design = model.design * members[:, None]
+    kappa, mass = model.clock_covariance_m2[:, clock, clock], (root**2).sum(axis=1)
+    alone = 1.0 - kappa * mass <= LEAST_REDUNDANCY
+    more = np.where(alone, 0.0, kappa / np.where(alone, 1.0, 1.0 - kappa * mass))
+    pull = np.matmul(root[:, None, :], design)[:, 0]  # B_J^T r
+    gone = design.swapaxes(1, 2) @ design + more[:, None, None] * pull[:, :, None] * pull[:, None, :]
+    covariance = model.covariance_m2
+    left = np.eye(3) - covariance @ gone
+    blind = ~(np.linalg.det(left) > LEAST_REDUNDANCY)
+    left[blind] = np.eye(3)
+    row = np.linalg.solve(left, covariance[:, :, :1])[..., 0]  # first row of the covariance without them
+    # Misfits with the clocks taken out, and what they ask of the place without the members.
+    misfit = model.residual + np.matmul(model.design, model.step_m[..., None])[..., 0]
+    own = np.where(members, misfit, 0.0)
+    ask = np.matmul(model.misfit[:, None, :], model.design)[:, 0] - np.matmul(own[:, None, :], design)[:, 0]
+    ask -= (more * (root * own).sum(axis=1))[:, None] * pull
+    moved = (row * ask).sum(axis=1) - model.step_m[:, 0]
+    prior = np.sqrt(np.einsum("ii->i", model.prior))[1:]
+    bias = np.zeros(len(model))
+    if bias_m is not None:
+        between = model.clock_covariance_m2[:, clock][:, model.clock] * model.root_weight
+        response = np.matmul(model.design, row[..., None])[..., 0]
+        response += ((1.0 + more * mass) * (row * pull).sum(axis=1))[:, None] * between
+        bias = (np.abs(np.where(members, 0.0, response)) * np.abs(bias_m) * model.root_weight).sum(axis=1)
+    return _separations(
+        all_of,
+        (row[:, 0] - covariance[:, 0, 0])[:, None],
+        (-row[:, 1:] * prior - all_of.map_m)[:, None],
+        moved[:, None],
+        bias[:, None],
+        blind[:, None],
+    )
+
+
+def _separations(
+    all_of: Whole, square: Floats, response: Floats, moved: Floats, bias: Floats, blind: Masks
+) -> Separations:
+    """From the variance of the distance (T, K), and its response to the map error (T, K, 2)."""
+    apart = np.sqrt(scaled(square, response, all_of.scale))
+    total = scaled(all_of.variance_m2[:, None] + square, all_of.map_m[:, None] + response, all_of.scale)
+    return Separations(
+        sigma_m=np.where(blind, np.inf, np.sqrt(total)),
+        separation_sigma_m=np.where(blind, np.inf, apart),
+        moved_m=np.where(blind, 0.0, moved),
+        bias_m=np.where(blind, 0.0, bias),
+    )

@@ -1,0 +1,36 @@
+"""RAIM: fault detection, exclusion of up to two satellites, reliability (P1 2.3(4); P4).
+
+One `LinearModel` serves the position on the line and the one in space::
+
+    found = detect(got.wsse, got.residual_m, ranges.n_used - ranges.n_clocks - 1, scale=scale)
+    failing = np.flatnonzero(found.detected)
+    model = constrained_model(ranges.take(failing), trajectory, got.arc_m[failing])
+    exclusion = exclude(model, scale=scale[failing])
+    # solve again without what `exclusion.excluded` marks, then
+    level = reliability(constrained_model(ranges, trajectory, got.arc_m), scale=scale).protection_level_m
+
+The noise scale multiplies the sigmas of the ranges after the fit: the fit itself, and with it the
+balance between ranges and map error, stays that of the weights.
+"""
+
+from railfix.integrity.raim.detection import Detection, RaimLimits, detect, threshold
+from railfix.integrity.raim.exclusion import Exclusion, Outcome, exclude, worst_channel
+from railfix.integrity.raim.model import LinearModel, constrained_model, point_model
+from railfix.integrity.raim.reliability import Reliability, noncentrality, reliability
+
+__all__ = [
+    "Detection",
+    "Exclusion",
+    "LinearModel",
+    "Outcome",
+    "RaimLimits",
+    "Reliability",
+    "constrained_model",
+    "detect",
+    "exclude",
+    "noncentrality",
+    "point_model",
+    "reliability",
+    "threshold",
+    "worst_channel",
+]

@@ -1,0 +1,206 @@
+"""Fault detection: is the sum of squared residuals what noise explains?
+
+P4 tests ``T = sqrt(WSSE)`` against ``T_D = sigma0 sqrt(T_CS)``, where T_CS leaves the false-alarm
+rate to the right of it under the chi-square distribution; the squares of both are compared here.
+P1 2.3(4) and table 6 compare the sum of squared residuals in metres with a fixed 100 m^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from railfix.core.arrays import Floats, Integers, Masks
+
+#: Degrees of freedom are tabulated in steps of this many.
+_TABLE_STEP: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaimLimits:
+    """Limits of detection, exclusion and reliability.
+
+    Attributes
+    ----------
+    mode : {"chi_square", "fixed"}
+        Threshold from a false-alarm rate (P4), or P1's fixed limit on the sum of squared residuals.
+    false_alarm : float
+        Probability that noise alone is called a fault; P4: 0.001. An excluded satellite's own
+        error must be over what noise reaches with this probability (chi-square mode).
+    missed_detection : float
+        Probability that a fault of the minimal detectable size stays undetected. P4 gives no value.
+    fixed_limit_m2 : float
+        P1 table 6 ("FDE 2 SAT, 100 m2"), on the sum of squared residuals and on the square of an
+        excluded satellite's own error (fixed mode).
+    max_excluded : int
+        Satellites excluded at an epoch at most: 0, 1 or 2 (P1 2.3(4): 2).
+    min_redundancy : int
+        Degrees of freedom that must be left after an exclusion, so that the rest is checked.
+    separation_risk : float
+        Probability that noise makes the true exclusion fit this much worse than another one
+        (chi-square, one degree of freedom). Another exclusion of as many satellites that passes
+        and fits nearly as well makes the epoch inseparable.
+    same_position_m : float
+        Exclusions whose positions differ by less than this do not stand against each other: either
+        way the position is the same (the two satellites of a clock of their own). 0: they always do.
+    noise_risk : float
+        Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0,
+        which is P4's ``HSlope sigma0 sqrt(lambda)``.
+    alarm_limit_m : float
+        Protection levels above it alarm. P4 takes an error within a car length, 20 m, as acceptable.
+    faults : int
+        Simultaneous faults that the protection level covers: 1 (P4) or 2.
+    """
+
+    mode: Literal["chi_square", "fixed"] = "chi_square"
+    false_alarm: float = 1e-3
+    missed_detection: float = 1e-3
+    fixed_limit_m2: float = 100.0
+    max_excluded: int = 2
+    min_redundancy: int = 1
+    separation_risk: float = 1e-3
+    same_position_m: float = 0.0
+    noise_risk: float = 1e-3
+    alarm_limit_m: float = 20.0
+    faults: int = 1
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("chi_square", "fixed"):
+            raise ValueError(f"mode is chi_square or fixed, got {self.mode!r}")
+        for name in ("false_alarm", "missed_detection"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise ValueError(f"{name} is a probability between 0 and 1, got {getattr(self, name)}")
+        if not self.false_alarm + self.missed_detection < 1.0:
+            raise ValueError("false_alarm and missed_detection must add up to less than 1")
+        for name in ("separation_risk", "noise_risk"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} is a probability above 0, at most 1, got {getattr(self, name)}")
+        if self.max_excluded not in (0, 1, 2):
+            raise ValueError(f"max_excluded is 0, 1 or 2, got {self.max_excluded}")
+        if self.faults not in (1, 2):
+            raise ValueError(f"faults is 1 or 2, got {self.faults}")
+        if self.min_redundancy < 1:
+            raise ValueError(f"min_redundancy must be at least 1, got {self.min_redundancy}")
+        if not (self.fixed_limit_m2 > 0.0 and self.alarm_limit_m > 0.0 and self.same_position_m >= 0.0):
+            raise ValueError("fixed_limit_m2 and alarm_limit_m must be positive, same_position_m not negative")
+
+    @cached_property
+    def separation(self) -> float:
+        """WSSE by which another exclusion must fit worse, in noise variances."""
+        return float(chi2.isf(self.separation_risk, 1))
+
+    @cached_property
+    def own_error(self) -> float:
+        """Square of an excluded satellite's own error over its sigma that noise does not reach."""
+        return float(chi2.isf(self.false_alarm, 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection:
+    """Verdict on T epochs.
+
+    Attributes
+    ----------
+    statistic : ndarray, shape (T,)
+        WSSE over the noise scale squared; in fixed mode the sum of squared residuals [m^2].
+        NaN where there is no position.
+    threshold : ndarray, shape (T,)
+        What it is compared with; NaN where not testable.
+    freedom : ndarray of int, shape (T,)
+        Degrees of freedom.
+    detected : ndarray of bool, shape (T,)
+        The statistic is at or over the threshold.
+    testable : ndarray of bool, shape (T,)
+        At least one range is redundant.
+    """
+
+    statistic: Floats
+    threshold: Floats
+    freedom: Integers
+    detected: Masks
+    testable: Masks
+
+
+def detect(
+    wsse: ArrayLike,
+    residual_m: ArrayLike,
+    freedom: ArrayLike,
+    *,
+    limits: RaimLimits | None = None,
+    scale: ArrayLike = 1.0,
+) -> Detection:
+    """Test the residuals of positions (P4: ``T >= T_D`` accepts that there is a fault).
+
+    Takes what the solvers return, or the attributes of these names of a `LinearModel`.
+
+    Parameters
+    ----------
+    wsse : array_like, shape (T,)
+        Weighted sum of squared residuals; NaN where there is no position.
+    residual_m : array_like, shape (T, M) [m]
+        Residuals, 0 (or NaN) where not used; asked for in fixed mode only. Those of a `LinearModel`
+        allow for the map error, those of a `Constrained` position do not: the same only where the
+        map is taken as exact, as in P1 (a sigma of a millimetre).
+    freedom : array_like of int, shape (T,)
+        Ranges beyond the unknowns: on the line ``ranges.n_used - ranges.n_clocks - 1``, in space - 3.
+    limits : RaimLimits, optional
+    scale : array_like, shape (T,) or ()
+        Noise scale: standard deviation of this receiver's ranges over the sigmas of the weights.
+        Not used in fixed mode.
+
+    Returns
+    -------
+    Detection
+    """
+    limits = limits or RaimLimits()
+    freedom = np.asarray(freedom, dtype=np.int64)
+    if limits.mode == "chi_square":
+        statistic = np.asarray(wsse, dtype=np.float64) / np.asarray(scale, dtype=np.float64) ** 2
+    else:
+        squares = np.nansum(np.asarray(residual_m, dtype=np.float64) ** 2, axis=1)
+        statistic = np.where(np.isfinite(wsse), squares, np.nan)
+    testable = (freedom >= 1) & np.isfinite(statistic)
+    limit = np.where(testable, threshold(freedom, limits=limits), np.nan)
+    return Detection(
+        statistic=statistic,
+        threshold=limit,
+        freedom=freedom,
+        detected=statistic >= limit,
+        testable=testable,
+    )
+
+
+def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
+    """Threshold of the statistic by degrees of freedom; NaN below 1.
+
+    P4: false alarm 0.001 and 3 degrees of freedom give T_CS = 16.27, T_D = sqrt(T_CS) = 4.03.
+
+    Parameters
+    ----------
+    freedom : array_like of int, any shape
+    limits : RaimLimits, optional
+
+    Returns
+    -------
+    ndarray, same shape
+    """
+    limits = limits or RaimLimits()
+    freedom = np.asarray(freedom, dtype=np.int64)
+    if limits.mode == "fixed":
+        return np.where(freedom >= 1, limits.fixed_limit_m2, np.nan)
+    size = int(freedom.max(initial=0)) // _TABLE_STEP + 1
+    return np.asarray(_chi_square_table(limits.false_alarm, size * _TABLE_STEP)[np.maximum(freedom, 0)])
+
+
+@lru_cache(maxsize=64)
+def _chi_square_table(false_alarm: float, size: int) -> Floats:
+    """Chi-square thresholds of 0 (NaN) to size - 1 degrees of freedom."""
+    table = np.full(size, np.nan)
+    table[1:] = chi2.isf(false_alarm, np.arange(1, size))
+    table.flags.writeable = False
+    return table

@@ -1,0 +1,244 @@
+"""Reliability: what stays undetected, and how far it moves the position.
+
+P4: with noncentrality lambda the test misses a fault with the stated probability; the bias in the
+test statistic is then ``sigma0 sqrt(lambda)``, which P4 calls MDB. In the range of satellite i it is
+``sigma_i sqrt(lambda / r_ii)``, because only the share r_ii of its square reaches the statistic.
+``slope_i`` is what the position moves for each unit of the statistic's root; the protection level
+is the largest slope times ``sigma0 sqrt(lambda)`` (P4: ``HPL = HSlope_max sigma0 sqrt(lambda)``),
+and K sigma for the noise of the position. P4's slides vary the direction of a bias of latitude,
+longitude and height; a fault is in a satellite, so the satellites are gone through.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq
+from scipy.stats import chi2, ncx2, norm
+
+from railfix.core.arrays import Floats, Indices, Masks
+from railfix.integrity.raim.detection import RaimLimits
+from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
+from railfix.integrity.raim.model import LinearModel, compact
+
+#: Effect on the position, in its own sigmas, below which a satellite has none.
+_NO_EFFECT: Final = 1e-6
+#: Numbers of a pair array that a block of epochs holds.
+_BLOCK_SIZE: Final = 40_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reliability:
+    """Reliability of T epochs by M channels, for the chi-square test.
+
+    Attributes
+    ----------
+    noncentrality : ndarray, shape (T,)
+        lambda of the epoch's degrees of freedom; NaN where not testable.
+    minimal_detectable_bias_m : ndarray, shape (T, M) [m]
+        Range error that the test misses with the stated probability; infinite where nothing checks
+        the range, NaN where not used or not testable.
+    slope_m : ndarray, shape (T, M) [m]
+        Movement of the position for one unit of the root of the statistic; NaN where not used.
+    pair_slope_m : ndarray, shape (T,) [m]
+        Largest such movement by errors of two satellites; NaN unless two faults are asked for.
+    worst : ndarray of int, shape (T,)
+        Channel of the largest slope; -1 where there is none.
+    position_sigma_m : ndarray, shape (T,) [m]
+        Standard deviation along the line; in space along the longest axis of the horizontal ellipse.
+    fault_level_m : ndarray, shape (T,) [m]
+        Movement by a fault that the test misses with the stated probability: slope sqrt(lambda).
+    noise_level_m : ndarray, shape (T,) [m]
+        K sigma.
+    protection_level_m : ndarray, shape (T,) [m]
+        Their sum; infinite where a satellite is unchecked, or where there is a position but no
+        redundancy; NaN where there is no position.
+    available : ndarray of bool, shape (T,)
+        The protection level is finite.
+    alarm : ndarray of bool, shape (T,)
+        It is not known to be within the alarm limit.
+    """
+
+    noncentrality: Floats
+    minimal_detectable_bias_m: Floats
+    slope_m: Floats
+    pair_slope_m: Floats
+    worst: Indices
+    position_sigma_m: Floats
+    fault_level_m: Floats
+    noise_level_m: Floats
+    protection_level_m: Floats
+    available: Masks
+    alarm: Masks
+
+
+def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
+    """Detectable biases, slopes and protection levels of the satellites that are used.
+
+    Parameters
+    ----------
+    model : LinearModel
+        T epochs, after exclusions.
+    limits : RaimLimits, optional
+        Of the chi-square test, whatever the mode.
+    scale : array_like, shape (T,) or ()
+        Noise scale, as in `detect`; it does not touch the map error in `position_sigma_m`.
+
+    Returns
+    -------
+    Reliability
+    """
+    limits = limits or RaimLimits()
+    scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))
+    located = np.asarray(np.isfinite(model.covariance_m2).all(axis=(1, 2)))
+    sigma = _longest_axis(model.position_covariance_m2(scale))
+    root = np.sqrt(noncentrality(model.freedom, limits=limits))
+    root[~located] = np.nan
+    share = model.redundancy
+    checked = share > LEAST_REDUNDANCY
+    with np.errstate(divide="ignore"):
+        own = np.where(model.used & located[:, None], 1.0 / np.sqrt(np.where(checked, share, 0.0)), np.nan)
+    bias = model.sigma_m * (scale * root)[:, None] * own
+    slope = _single_slopes(model, share, scale, sigma)
+    effective = np.where(np.isnan(slope), -1.0, slope)
+    largest = effective.max(axis=1, initial=-1.0)
+    worst = np.where(largest >= 0, np.argmax(effective, axis=1), -1) if slope.shape[1] else np.full(len(model), -1)
+    largest = np.where(largest >= 0, largest, np.nan)
+    pair = np.full(len(model), np.nan)
+    if limits.faults == 2:
+        pair = _pair_slopes(model, scale, sigma)
+        largest = np.fmax(largest, pair)
+    # No redundancy: nothing is detected, whatever the size.
+    fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
+    noise = _noise_factor(limits.noise_risk, model.interest) * sigma
+    level = fault + noise
+    return Reliability(
+        noncentrality=root**2,
+        minimal_detectable_bias_m=bias,
+        slope_m=slope,
+        pair_slope_m=pair,
+        worst=np.asarray(worst, dtype=np.intp),
+        position_sigma_m=sigma,
+        fault_level_m=fault,
+        noise_level_m=noise,
+        protection_level_m=level,
+        available=np.isfinite(level),
+        alarm=~(level <= limits.alarm_limit_m),
+    )
+
+
+def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
+    """Noncentrality lambda that the chi-square test misses with `missed_detection` (P4).
+
+    Parameters
+    ----------
+    freedom : array_like of int, any shape
+    limits : RaimLimits, optional
+
+    Returns
+    -------
+    ndarray, same shape
+        NaN below 1 degree of freedom.
+    """
+    limits = limits or RaimLimits()
+    freedom = np.asarray(freedom, dtype=np.int64)
+    values, which = np.unique(freedom, return_inverse=True)
+    found = [_noncentrality(int(v), limits.false_alarm, limits.missed_detection) if v >= 1 else np.nan for v in values]
+    return np.array(found, dtype=np.float64)[which].reshape(freedom.shape)
+
+
+@lru_cache(maxsize=1024)
+def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
+    """The lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
+    limit = float(chi2.isf(false_alarm, freedom))
+
+    def excess(value: float) -> float:
+        return math.log(max(float(ncx2.cdf(limit, freedom, value)), 1e-300)) - math.log(missed_detection)
+
+    upper = limit + 10.0
+    while excess(upper) > 0:
+        upper *= 2.0
+    return float(brentq(excess, 1e-12, upper, xtol=1e-9, rtol=1e-12))
+
+
+def _noise_factor(risk: float, components: int) -> float:
+    """K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane."""
+    return float(norm.isf(risk / 2.0)) if components == 1 else math.sqrt(-2.0 * math.log(risk))
+
+
+def _longest_axis(covariance: Floats) -> Floats:
+    """Root of the largest eigenvalue of 1 x 1 or 2 x 2 matrices, shape (T,)."""
+    if covariance.shape[1] == 1:
+        return np.asarray(np.sqrt(covariance[:, 0, 0]))
+    return np.asarray(np.sqrt(_largest_eigenvalue(covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1])))
+
+
+def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
+    """Of symmetric matrices ((a, b), (b, c))."""
+    return np.asarray((a + c) / 2.0 + np.hypot((a - c) / 2.0, b))
+
+
+def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floats) -> Floats:
+    """Slopes of single satellites, shape (T, M) [m]."""
+    effect = np.sqrt((model.gain_m**2).sum(axis=2))
+    checked = share > LEAST_REDUNDANCY
+    unchecked = np.where(effect > _NO_EFFECT * sigma[:, None], np.inf, 0.0)
+    slope = np.where(checked, effect / np.sqrt(np.where(checked, share, 1.0)), unchecked)
+    located = np.isfinite(sigma)[:, None]
+    return np.where(model.used & located, scale[:, None] * slope, np.nan)
+
+
+def _pair_slopes(model: LinearModel, scale: Floats, sigma: Floats) -> Floats:
+    """Largest slope by errors of any two satellites, shape (T,) [m]; NaN where fewer than two are used.
+
+    The largest ``|G^T b|^2 / (b^T S_EE b)`` over errors b of the pair: the largest eigenvalue of
+    ``G^T S_EE^-1 G`` with the gains G of the two (2 x k).
+    """
+    result = np.full(len(model), np.nan)
+    rows = np.flatnonzero(np.isfinite(sigma) & (np.count_nonzero(model.used, axis=1) >= 2))
+    for block in _blocks(model, rows):
+        result[block] = scale[block] * _pair_block(model.take(block), sigma[block])
+    return result
+
+
+def _blocks(model: LinearModel, rows: Indices) -> Iterator[Indices]:
+    width = int(np.count_nonzero(model.used[rows], axis=1).max(initial=1))
+    size = max(1, _BLOCK_SIZE // (width * width))
+    return (rows[first : first + size] for first in range(0, len(rows), size))
+
+
+def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
+    parts = compact(model)
+    n = parts.channel.shape[1]
+    i, j = np.triu_indices(n, 1)
+    share = np.einsum("tii->ti", parts.projector)
+    a, b, c = share[:, i], parts.projector[:, i, j], share[:, j]
+    product = a * c
+    determinant = product - b * b
+    both = parts.used[:, i] & parts.used[:, j]
+    regular = both & (np.minimum(a, c) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
+    first, second = parts.gain_m[:, i], parts.gain_m[:, j]
+
+    # Entries of G^T adj(S_EE) G, over the determinant.
+    def entry(k: int, m: int) -> Floats:
+        cross = first[..., k] * second[..., m] + second[..., k] * first[..., m]
+        return np.asarray(c * first[..., k] * first[..., m] - b * cross + a * second[..., k] * second[..., m])
+
+    wide = parts.gain_m.shape[2] == 2
+    whole = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
+    squared = np.where(regular, whole / np.where(regular, determinant, 1.0), 0.0)
+
+    # Errors that no residual shows at all: (sqrt c, -+ sqrt a). Without effect on the position the pair
+    # adds nothing to its single satellites.
+    x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
+    hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)
+    blind = both & ~regular & (hidden > _NO_EFFECT * sigma[:, None] * np.hypot(x, y))
+    single = np.nanmax(_single_slopes(model, model.redundancy, np.ones(len(model)), sigma), axis=1)
+    largest = np.sqrt(np.maximum(squared.max(axis=1), 0.0))
+    return np.asarray(np.maximum(np.where(blind.any(axis=1), np.inf, largest), single))

@@ -1,0 +1,256 @@
+"""Stanford diagram on the along-track axis: the error against the level that was to bound it.
+
+Every epoch is in one region. With an alarm limit AL, the level PL and the absolute error:
+
+- no position: neither is there;
+- unjudged: a level, but no reference to take an error from;
+- nominal: error <= PL <= AL;
+- misleading: PL < error <= AL;
+- hazardously misleading: PL <= AL < error;
+- unavailable: PL > AL, error <= PL;
+- unavailable and misleading: PL > AL, error > PL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
+
+#: Epochs whose distance is over this many usual intervals stand across a gap.
+_GAP: Final = 1.5
+
+
+class Region(IntEnum):
+    """Where an epoch lies in the diagram."""
+
+    NO_POSITION = 0
+    NOMINAL = 1
+    MISLEADING = 2
+    HAZARDOUS = 3
+    UNAVAILABLE = 4
+    UNAVAILABLE_MISLEADING = 5
+    UNJUDGED = 6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Continuity:
+    """Does what is available stay so? Windows that start at an available epoch.
+
+    Attributes
+    ----------
+    window_s : float [s]
+    windows : int
+        Windows that the run covers to their end.
+    kept : int
+        Those in which every epoch is available and none is missing.
+    probability : float
+        kept / windows; NaN without windows.
+    """
+
+    window_s: float
+    windows: int
+    kept: int
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """The run in blocks of time: errors stay alike for tens of seconds, so a block is worth an epoch of statistics.
+
+    Attributes
+    ----------
+    start : ndarray of datetime64[ns], shape (B,)
+        Blocks with epochs.
+    epochs : ndarray of int, shape (B,)
+    available : ndarray of int, shape (B,)
+        Those with a level within the alarm limit.
+    misleading : ndarray of int, shape (B,)
+        Those whose error is over the level.
+    """
+
+    start: Datetimes
+    epochs: Integers
+    available: Integers
+    misleading: Integers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stanford:
+    """Stanford diagram of T epochs.
+
+    Attributes
+    ----------
+    alarm_limit_m : float [m]
+    region : ndarray of int8, shape (T,)
+        `Region`.
+    counts : dict of Region to int
+        Epochs of each region; they add up to T.
+    available_rate : float
+        Epochs with a level within the alarm limit, judged or not / T.
+    misleading_rate : float
+        Epochs whose error is over the level / epochs with both; NaN without any.
+    beyond : ndarray of int
+        Indices of the epochs whose error is over the level, the largest excess first.
+    continuity : tuple of Continuity
+        One a window.
+    blocks : Blocks
+    edges_m : ndarray, shape (N + 1,) [m]
+        Of the bins of error and level alike; the last bin holds all that is larger, its upper edge is infinite.
+    histogram : ndarray of int, shape (N, N)
+        Epochs by bin of the absolute error (axis 0) and of the level (axis 1).
+    """
+
+    alarm_limit_m: float
+    region: Codes
+    counts: dict[Region, int]
+    available_rate: float
+    misleading_rate: float
+    beyond: Indices
+    continuity: tuple[Continuity, ...]
+    blocks: Blocks
+    edges_m: Floats
+    histogram: Integers
+
+
+def stanford(
+    time: Datetimes,
+    error_m: ArrayLike,
+    level_m: ArrayLike,
+    *,
+    alarm_limit_m: float,
+    windows_s: Sequence[float] = (15.0, 60.0),
+    block_s: float = 60.0,
+    bin_m: float | None = None,
+    bins: int = 100,
+) -> Stanford:
+    """Sort epochs into the diagram.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64, shape (T,)
+        Ascending; every epoch of the run, with a position or without.
+    error_m : array_like, shape (T,) [m]
+        Along the track, signed or not; NaN where there is no position or no reference.
+    level_m : array_like, shape (T,) [m]
+        Protection level; infinite where no error can be excluded, NaN where there is no position.
+        Where there is an error but no level the position is not vouched for: as infinite.
+    alarm_limit_m : float [m]
+    windows_s : sequence of float [s]
+        Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.
+    block_s : float [s]
+        Length of the blocks, from the first epoch.
+    bin_m : float, optional [m]
+        Width of the bins; default: twice the alarm limit over `bins`.
+    bins : int
+        Bins of an axis.
+
+    Returns
+    -------
+    Stanford
+
+    Raises
+    ------
+    ValueError
+        On arrays of different lengths, times that do not ascend, a negative level, limits that are not positive.
+    """
+    time = time.astype("datetime64[ns]")
+    error, level = np.abs(np.asarray(error_m, dtype=np.float64)), np.asarray(level_m, dtype=np.float64)
+    if not len(time) == len(error) == len(level):
+        raise ValueError(f"one time, error and level an epoch: got {len(time)}, {len(error)} and {len(level)}")
+    if (np.diff(time) <= np.timedelta64(0, "ns")).any():
+        raise ValueError("times must ascend")
+    if (level < 0).any():
+        raise ValueError("a level cannot be negative")
+    width = 2.0 * alarm_limit_m / bins if bin_m is None else bin_m
+    if not min(alarm_limit_m, block_s, width, bins, *windows_s) > 0:
+        raise ValueError("alarm_limit_m, windows_s, block_s, bin_m and bins must be positive")
+    judged = ~np.isnan(error)
+    bound = np.where(np.isnan(level), np.inf, level)
+    beyond, within = judged & (error > bound), bound <= alarm_limit_m
+    region = np.select(
+        [
+            ~judged & np.isnan(level),
+            ~judged,
+            ~within & beyond,
+            ~within,
+            beyond & (error > alarm_limit_m),
+            beyond,
+        ],
+        [
+            Region.NO_POSITION,
+            Region.UNJUDGED,
+            Region.UNAVAILABLE_MISLEADING,
+            Region.UNAVAILABLE,
+            Region.HAZARDOUS,
+            Region.MISLEADING,
+        ],
+        Region.NOMINAL,
+    ).astype(np.int8)
+    excess = np.where(beyond, error - bound, -np.inf)
+    edges = np.append(width * np.arange(bins), np.inf)
+    place = np.searchsorted(edges[1:-1], error[judged], side="right")
+    other = np.searchsorted(edges[1:-1], bound[judged], side="right")
+    number = int(judged.sum())
+    return Stanford(
+        alarm_limit_m=alarm_limit_m,
+        region=region,
+        counts={r: int(np.count_nonzero(region == r)) for r in Region},
+        available_rate=float(np.mean(within)) if len(time) else np.nan,
+        misleading_rate=int(beyond.sum()) / number if number else np.nan,
+        beyond=np.argsort(-excess, kind="stable")[: int(beyond.sum())],
+        continuity=tuple(_continuity(time, within, window) for window in windows_s),
+        blocks=_blocks(time, within, beyond, block_s),
+        edges_m=edges,
+        histogram=np.bincount(place * bins + other, minlength=bins * bins).reshape(bins, bins),
+    )
+
+
+def _nanoseconds(value_s: float) -> np.timedelta64:
+    return np.timedelta64(round(value_s * 1e9), "ns")
+
+
+def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuity:
+    """Windows ``[t, t + window]`` from each available epoch; a gap in the times breaks one."""
+    if len(time) < 2:
+        return Continuity(window_s=window_s, windows=0, kept=0, probability=np.nan)
+    step = np.diff(time)
+    across = step > _GAP * np.median(step.astype(np.int64)) * np.timedelta64(1, "ns")
+    broken = np.concatenate([[0], np.cumsum(~available[1:] | across)])
+    until = time + _nanoseconds(window_s)
+    started = available & (until <= time[-1])
+    last = np.searchsorted(time, until, side="right") - 1
+    # A window that ends inside a gap is broken too: the next epoch is across it.
+    ends = np.append(across, False)[last] & (until > time[last])
+    kept = started & (broken[last] == broken) & ~ends
+    windows = int(started.sum())
+    return Continuity(
+        window_s=window_s,
+        windows=windows,
+        kept=int(kept.sum()),
+        probability=int(kept.sum()) / windows if windows else np.nan,
+    )
+
+
+def _blocks(time: Datetimes, available: Masks, beyond: Masks, block_s: float) -> Blocks:
+    """Counts by block of time."""
+    if not len(time):
+        none = np.zeros(0, dtype=np.int64)
+        return Blocks(start=time, epochs=none, available=none, misleading=none)
+    number, which = np.unique((time - time[0]) // _nanoseconds(block_s), return_inverse=True)
+
+    def count(mask: Masks) -> Integers:
+        return np.bincount(which[mask], minlength=len(number)).astype(np.int64)
+
+    return Blocks(
+        start=time[0] + number * _nanoseconds(block_s),
+        epochs=count(np.ones(len(time), dtype=bool)),
+        available=count(available),
+        misleading=count(beyond),
+    )

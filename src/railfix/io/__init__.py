@@ -1,0 +1,1 @@
+"""Readers and writers: files and bytes to arrays, and back."""

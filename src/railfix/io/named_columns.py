@@ -1,0 +1,200 @@
+"""Text tables whose columns have names: the shape of the CSV files that railfix reads.
+
+Comma separated, UTF-8 with or without a byte order mark, LF or CR LF. Lines that begin with ``#``
+are comments; those above the header line may carry ``# key: value``. Every complaint names the
+line.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers
+from railfix.core.errors import InputFileError
+
+
+def read_text(path: str | PathLike[str]) -> str:
+    """Text of a file, or one sentence on why there is none.
+
+    Raises
+    ------
+    InputFileError
+        Missing, a folder, unreadable, empty, binary, or not UTF-8.
+    """
+    file = Path(path)
+    try:
+        content = file.read_bytes()
+    except FileNotFoundError:
+        raise InputFileError(path, "there is no such file") from None
+    except IsADirectoryError:
+        raise InputFileError(path, "this is a folder; give the file itself") from None
+    except OSError as error:
+        raise InputFileError(path, f"the file cannot be read ({error.strerror})") from None
+    if not content.strip():
+        raise InputFileError(path, "the file is empty")
+    if b"\0" in content:
+        raise InputFileError(path, "this is a binary file; a text file was expected")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise InputFileError(path, "this is not UTF-8 text; save the file as UTF-8", line=line) from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedColumns:
+    """A table as text, with the line number of each row.
+
+    Attributes
+    ----------
+    path : str
+    metadata : dict of str
+        ``# key: value`` comments above the header; of a repeated key the values, joined by "; ".
+    header_line : int
+    line : ndarray of int, shape (n,)
+        1-based line number of each row.
+    cells : dict of list of str
+        Cells of each column, stripped.
+    """
+
+    path: str
+    metadata: dict[str, str]
+    header_line: int
+    line: Integers
+    cells: dict[str, list[str]]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.cells
+
+    def error(self, row: int, message: str) -> InputFileError:
+        """An error that names the line of a row."""
+        return InputFileError(self.path, message, line=int(self.line[row]))
+
+    def numbers(self, name: str, *, blank: float | None = None) -> Floats:
+        """One column as finite numbers.
+
+        Parameters
+        ----------
+        name : str
+        blank : float, optional
+            Value of an empty cell, and ``nan`` is allowed; without it both are errors.
+
+        Raises
+        ------
+        InputFileError
+            A cell is empty, not a number, or not finite (``inf`` is allowed where `blank` is infinite).
+        """
+        cells = self.cells[name]
+        if blank is not None:
+            cells = [cell or repr(blank) for cell in cells]
+        try:
+            values = np.array(cells, dtype=np.float64)
+        except ValueError:
+            row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+            what = f"'{cells[row]}' is not a number" if cells[row] else "the cell is empty"
+            raise self.error(row, f"column {name}: {what}; a number was expected") from None
+        given = np.array([bool(cell) for cell in self.cells[name]], dtype=np.bool_)
+        bad = given & np.isinf(values) if blank is None or not np.isinf(blank) else np.zeros_like(given)
+        bad |= np.isnan(values) & (blank is None)
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise self.error(row, f"column {name}: '{cells[row]}' is not a finite number; remove or mend the row")
+        return values
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _split_comment(line: str) -> tuple[str, str] | None:
+    key, colon, value = line.lstrip("#").partition(":")
+    return (key.strip().lower(), value.strip()) if colon else None
+
+
+def read_named_columns(path: str | PathLike[str]) -> NamedColumns:
+    """Read a comma-separated table with a header line of column names.
+
+    Raises
+    ------
+    InputFileError
+        No text, no header, a column name twice, a row with another number of cells.
+    """
+    return parse_named_columns(read_text(path), path)
+
+
+def parse_named_columns(text: str, path: str | PathLike[str]) -> NamedColumns:
+    """The same from the text of the file; `path` is for the messages."""
+    metadata: dict[str, str] = {}
+    header: list[str] = []
+    header_line = 0
+    rows: list[list[str]] = []
+    numbers: list[int] = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not line.strip():
+            continue
+        if line.startswith("#"):
+            if not header and (pair := _split_comment(line)):
+                key, value = pair
+                metadata[key] = f"{metadata[key]}; {value}" if key in metadata else value
+            continue
+        cells = [cell.strip() for cell in next(csv.reader([line]))]
+        if not header:
+            header, header_line = cells, number
+            continue
+        if len(cells) != len(header):
+            message = f"{len(cells)} cells where the header (line {header_line}) has {len(header)} columns"
+            raise InputFileError(path, message, line=number)
+        rows.append(cells)
+        numbers.append(number)
+    _check_header(path, header, header_line)
+    return NamedColumns(
+        path=str(path),
+        metadata=metadata,
+        header_line=header_line,
+        line=np.array(numbers, dtype=np.int64),
+        cells={name: [row[i] for row in rows] for i, name in enumerate(header)},
+    )
+
+
+def _check_header(path: str | PathLike[str], header: list[str], line: int) -> None:
+    if not header:
+        raise InputFileError(path, "there is no header line with the names of the columns")
+    if all(_is_number(cell) for cell in header):
+        raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
+    twice = sorted({name for name in header if header.count(name) > 1})
+    if twice:
+        raise InputFileError(path, f"column {twice[0]!r} occurs twice in the header", line=line)
+
+
+def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
+    """Names that are close to a known one but not it, with that one.
+
+    Examples
+    --------
+    >>> misspelt(["lattitude_deg", "remark"], ["latitude_deg", "height_m"])
+    {'lattitude_deg': 'latitude_deg'}
+    """
+    known = list(known)
+    found: dict[str, str] = {}
+    for name in names:
+        if name in known:
+            continue
+        lowered = name.lower().replace(" ", "_")
+        close = difflib.get_close_matches(lowered, known, n=1, cutoff=0.75)
+        if close:
+            found[name] = close[0]
+    return found

@@ -1,0 +1,213 @@
+"""Positions from a receiver's NMEA 0183 log: GGA for the place, RMC or ZDA for the date.
+
+Heights are those of GGA above the geoid plus the geoid's separation that the same sentence carries.
+A receiver that writes minutes with five decimals tells places to 2 cm only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes
+from railfix.core.errors import InputFileError
+from railfix.core.files import read_text_lines
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.timescale import utc_to_gpst
+from railfix.gnss.observations import capped_problems
+from railfix.io.position_log import PositionLog, read_positions
+
+#: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); all others are 0, no position.
+QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
+_DAY_S: Final = 86_400.0
+_NS: Final = 1e9
+
+
+@dataclass(frozen=True)
+class _Place:
+    """One GGA sentence: line, seconds of the day, quality, latitude, longitude, ellipsoidal height."""
+
+    line: int
+    of_day_s: float
+    quality: int
+    geodetic: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class _Date:
+    """One RMC or ZDA sentence: line, seconds of the day, day."""
+
+    line: int
+    of_day_s: float
+    day: np.datetime64
+
+
+def read_nmea(
+    path: str | PathLike[str],
+    *,
+    on_error: Literal["strict", "lenient"] = "strict",
+    date: np.datetime64 | None = None,
+) -> PositionLog:
+    """Read the GGA sentences of an NMEA log.
+
+    Parameters
+    ----------
+    path : path
+        Text, .gz too; sentences of other kinds are read over.
+    on_error : {"strict", "lenient"}
+        What to do with a sentence whose checksum or fields are wrong: an error, or a note.
+    date : datetime64, optional
+        UTC date of the first GGA, for logs without RMC and ZDA.
+
+    Returns
+    -------
+    PositionLog
+        Times in GPS time; qualities as RTKLIB numbers them (`QUALITY`), 1 a fix.
+
+    Raises
+    ------
+    InputFileError
+        No GGA, a broken sentence, no date, or heights without the geoid's separation.
+    """
+    problems: list[InputFileError] = []
+    places: list[_Place] = []
+    dates: list[_Date] = []
+    for number, fields in _sentences(path, problems):
+        kind = fields[0][2:]
+        try:
+            if kind == "GGA":
+                places.append(_gga(number, fields))
+            elif kind in _DATED and fields[1] and (found := _DATED[kind](number, fields)):
+                dates.append(found)
+        except (ValueError, IndexError) as error:
+            reason = str(error) if str(error).startswith("height") else f"a field of {kind} is not what it should be"
+            problems.append(InputFileError(path, reason, line=number))
+    if problems and on_error == "strict":
+        raise problems[0]
+    if not places:
+        raise InputFileError(path, "there is no GGA sentence; an NMEA log with GGA was expected")
+    if date is not None:
+        dates = [_Date(places[0].line, places[0].of_day_s, date.astype("datetime64[D]"))]
+    if not dates:
+        raise InputFileError(path, "there is no RMC or ZDA sentence, so the date is not known; log one, or give a date")
+    notes = capped_problems((str(problem) for problem in problems), count=len(problems))
+    return PositionLog(
+        path=str(path),
+        time=_times(places, dates, chained=date is not None),
+        ecef_m=ecef_from_geodetic(*np.array([place.geodetic for place in places]).T),
+        quality=np.array([place.quality for place in places], dtype=np.int64),
+        sigma_m=np.full((len(places), 3), np.nan),
+        line=np.array([place.line for place in places], dtype=np.int64),
+        notes=(f"{path}: times converted from UTC to GPS time", *notes),
+    )
+
+
+def _sentences(path: str | PathLike[str], problems: list[InputFileError]) -> Iterator[tuple[int, list[str]]]:
+    """Line number and fields of every sentence whose checksum agrees."""
+    for number, line in enumerate(read_text_lines(path), start=1):
+        text = line.strip()
+        if not text:
+            continue
+        body, star, told = text[1:].partition("*")
+        if text[0] != "$" or not star:
+            what = "has no checksum" if text[0] == "$" else "does not begin with $"
+            problems.append(InputFileError(path, f"this sentence {what}; NMEA 0183 was expected", line=number))
+            continue
+        total = 0
+        for byte in body.encode("latin-1"):
+            total ^= byte
+        if told[:2].upper() != f"{total:02X}":
+            problems.append(InputFileError(path, f"the checksum is {told[:2]}, {total:02X} was expected", line=number))
+            continue
+        yield number, body.split(",")
+
+
+def _of_day(text: str) -> float:
+    return int(text[:2]) * 3600.0 + int(text[2:4]) * 60.0 + float(text[4:])
+
+
+def _angle(text: str, side: str, negative: str, degrees: int) -> float:
+    if side not in ("N", "S", "E", "W"):
+        raise ValueError("side")
+    value = int(text[:degrees]) + float(text[degrees:]) / 60.0
+    return -value if side == negative else value
+
+
+def _gga(line: int, fields: list[str]) -> _Place:
+    quality = QUALITY.get(int(fields[6] or 0), 0)
+    place = (np.nan, np.nan, np.nan)
+    if fields[2] and fields[4]:
+        if not fields[9] or not fields[11]:
+            raise ValueError("height or geoid separation is missing in GGA; let the receiver write both")
+        latitude, longitude = _angle(fields[2], fields[3], "S", 2), _angle(fields[4], fields[5], "W", 3)
+        if abs(latitude) > 90.0 or abs(longitude) > 180.0:
+            raise ValueError("range")
+        place = (latitude, longitude, float(fields[9]) + float(fields[11]))
+    return _Place(line, _of_day(fields[1]) if fields[1] else np.nan, quality, place)
+
+
+def _rmc(line: int, fields: list[str]) -> _Date | None:
+    text = fields[9]
+    if not text:
+        return None
+    year = int(text[4:6])
+    return _Date(line, _of_day(fields[1]), _day(year + (1900 if year >= 80 else 2000), text[2:4], text[:2]))
+
+
+def _zda(line: int, fields: list[str]) -> _Date | None:
+    return _Date(line, _of_day(fields[1]), _day(int(fields[4]), fields[3], fields[2])) if fields[4] else None
+
+
+def _day(year: int, month: str, day: str) -> np.datetime64:
+    return np.datetime64(f"{year:04d}-{int(month):02d}-{int(day):02d}", "D")
+
+
+_DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rmc, "ZDA": _zda}
+
+
+def _times(places: list[_Place], dates: list[_Date], *, chained: bool) -> Datetimes:
+    """GPS time of each place: the day that puts it nearest to the date sentence before it (or the first).
+
+    With one date for the whole log (`chained`), a day is added at every midnight.
+    """
+    of_day = np.array([place.of_day_s for place in places])
+    line = np.array([place.line for place in places])
+    if chained:
+        step = np.diff(of_day, prepend=of_day[:1])
+        days = np.cumsum(np.nan_to_num(step) < -_DAY_S / 2)
+        base = np.full(len(places), dates[0].day, dtype="datetime64[D]")
+    else:
+        row = np.maximum(np.searchsorted([date.line for date in dates], line, side="right") - 1, 0)
+        base = np.array([date.day for date in dates], dtype="datetime64[D]")[row]
+        days = -np.rint((of_day - np.array([date.of_day_s for date in dates])[row]) / _DAY_S)
+        days = np.nan_to_num(days).astype(np.int64)
+    known = np.isfinite(of_day)
+    since = np.rint(np.where(known, of_day, 0.0) * _NS).astype(np.int64).astype("timedelta64[ns]")
+    utc = base.astype("datetime64[ns]") + days.astype("timedelta64[D]") + since
+    return np.where(known, utc_to_gpst(utc), np.datetime64("NaT", "ns"))
+
+
+def read_any_positions(
+    path: str | PathLike[str],
+    *,
+    on_error: Literal["strict", "lenient"] = "strict",
+    date: np.datetime64 | None = None,
+) -> PositionLog:
+    """A log of positions of any kind: NMEA by its ending (``.nmea``, ``.nma``, ``.gga``), else `read_positions`.
+
+    Parameters
+    ----------
+    path : path
+    on_error : {"strict", "lenient"}
+    date : datetime64, optional
+        For NMEA; see `read_nmea`.
+    """
+    name = Path(path).name.lower().removesuffix(".gz")
+    if name.endswith((".nmea", ".nma", ".gga")):
+        return read_nmea(path, on_error=on_error, date=date)
+    return read_positions(path)

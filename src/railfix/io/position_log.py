@@ -1,0 +1,318 @@
+"""Positions from elsewhere: RTKLIB ``.pos`` files and CSV with named columns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.timescale import from_week, timedelta, utc_to_gpst
+from railfix.io.named_columns import NamedColumns, misspelt, read_named_columns, read_text
+
+#: RTKLIB's solution quality (RTKLIB manual 2.4.2, B.1).
+QUALITY_NAMES: Final = {1: "fix", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
+#: Columns of a CSV log; coordinates are geodetic or ECEF.
+CSV_COLUMNS: Final = ("time_gpst", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality", "ratio")
+_GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
+_CARTESIAN: Final = ("x_m", "y_m", "z_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionLog:
+    """Positions of one antenna in the order of the file, n rows.
+
+    Attributes
+    ----------
+    path : str
+    time : ndarray of datetime64[ns], shape (n,)
+        GPS time; NaT where the log has none.
+    ecef_m : ndarray, shape (n, 3) [m]
+        NaN where a row has no position.
+    quality : ndarray of int, shape (n,)
+        RTKLIB's Q (see `QUALITY_NAMES`), or the log's own number; -1 where it has none.
+    sigma_m : ndarray, shape (n, 3) [m]
+        Standard deviations north, east, up; NaN where the log has none.
+    line : ndarray of int, shape (n,)
+        Line number of each row in the file.
+    notes : tuple of str
+    ratio : ndarray, shape (n,), or None
+        Ratio of the ambiguities' test, where the log has it.
+    """
+
+    path: str
+    time: Datetimes
+    ecef_m: Floats
+    quality: Integers
+    sigma_m: Floats
+    line: Integers
+    notes: tuple[str, ...] = ()
+    ratio: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.ecef_m)
+
+    @property
+    def has_quality(self) -> bool:
+        """Whether the log tells a quality."""
+        return bool((self.quality >= 0).any())
+
+
+def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PositionLog:
+    """Read a log of positions: CSV by its ending, else RTKLIB's solution format.
+
+    Parameters
+    ----------
+    path : path
+    columns : mapping of str, optional
+        For CSV whose columns have other names: railfix's name to the file's, for example
+        ``{"latitude_deg": "Lat"}``.
+
+    Raises
+    ------
+    InputFileError
+        The file is not a log of positions, or a line of it is broken.
+    SettingsError
+        `columns` names a column that railfix does not know.
+    """
+    if Path(path).suffix.lower() == ".csv":
+        return _read_csv(path, dict(columns or {}))
+    if columns:
+        raise SettingsError(f"{path}: columns can be renamed in a .csv file only")
+    return read_rtklib_positions(path)
+
+
+# --- CSV ---------------------------------------------------------------------
+
+
+def _read_csv(path: str | PathLike[str], columns: dict[str, str]) -> PositionLog:
+    unknown = sorted(set(columns) - set(CSV_COLUMNS))
+    if unknown:
+        raise SettingsError(f"{path}: column {unknown[0]!r} is unknown; expected one of {', '.join(CSV_COLUMNS)}")
+    return positions_of_table(_renamed(read_named_columns(path), columns))
+
+
+def positions_of_table(table: NamedColumns) -> PositionLog:
+    """Positions of a table that has been read already; see `read_positions`."""
+    path = table.path
+    close = misspelt(table.cells, CSV_COLUMNS)
+    absent = {right: wrong for wrong, right in close.items() if right not in table}
+    geodetic, cartesian = (all(name in table for name in names) for names in (_GEODETIC, _CARTESIAN))
+    if not geodetic and not cartesian:
+        for name in (*_GEODETIC, *_CARTESIAN):
+            if name in absent:
+                message = f"column {absent[name]!r} is unknown; is {name!r} meant?"
+                raise InputFileError(path, message, line=table.header_line)
+        raise InputFileError(
+            path,
+            "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
+            f"{', '.join(table.cells)}",
+            line=table.header_line,
+        )
+    if not len(table):
+        raise InputFileError(path, "there is no position below the header")
+    values = np.stack([table.numbers(n, blank=np.nan) for n in (_GEODETIC if geodetic else _CARTESIAN)], axis=-1)
+    if geodetic:
+        _check_latitude(table, values)
+    quality = table.numbers("quality", blank=-1.0) if "quality" in table else np.full(len(table), -1.0)
+    return PositionLog(
+        path=str(path),
+        time=positions_times(table),
+        ecef_m=ecef_from_geodetic(*values.T) if geodetic else values,
+        quality=np.where(np.isfinite(quality), quality, -1.0).astype(np.int64),
+        sigma_m=np.full((len(table), 3), np.nan),
+        line=table.line,
+        ratio=table.numbers("ratio", blank=np.nan) if "ratio" in table else None,
+    )
+
+
+def _renamed(table: NamedColumns, columns: dict[str, str]) -> NamedColumns:
+    cells = dict(table.cells)
+    for ours, theirs in columns.items():
+        if theirs not in table.cells:
+            message = f"there is no column {theirs!r} (asked for as {ours}); the columns are {', '.join(table.cells)}"
+            raise InputFileError(table.path, message, line=table.header_line)
+        cells[ours] = table.cells[theirs]
+    return NamedColumns(
+        path=table.path, metadata=table.metadata, header_line=table.header_line, line=table.line, cells=cells
+    )
+
+
+def _check_latitude(table: NamedColumns, geodetic: Floats) -> None:
+    outside = np.abs(geodetic[:, 0]) > 90.0
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise table.error(row, f"latitude_deg {geodetic[row, 0]:g} is over 90; are latitude and longitude swapped?")
+
+
+def positions_times(table: NamedColumns) -> Datetimes:
+    """The column ``time_gpst``; NaT where it is blank or absent."""
+    if "time_gpst" not in table:
+        return np.full(len(table), np.datetime64("NaT", "ns"))
+    cells = table.cells["time_gpst"]
+    for row, cell in enumerate(cells):
+        if cell.endswith("Z") or "+" in cell:
+            raise table.error(row, f"time_gpst '{cell}' carries a time zone; GPS time without one was expected")
+    try:
+        return np.array([cell or "NaT" for cell in cells], dtype="datetime64[ns]")
+    except ValueError:
+        row = next(i for i, cell in enumerate(cells) if not _is_time(cell))
+        raise table.error(row, f"time_gpst '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
+
+
+def _is_time(cell: str) -> bool:
+    try:
+        np.datetime64(cell or "NaT", "ns")
+    except ValueError:
+        return False
+    return True
+
+
+# --- RTKLIB ------------------------------------------------------------------
+
+
+def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
+    """Read RTKLIB's solution format in any of its time and coordinate forms.
+
+    Time as week and seconds or as calendar date, in GPST, UTC or JST; coordinates as degrees,
+    as degrees, minutes, seconds, or ECEF. Baselines (e/n/u) and heights above the geoid are
+    refused, for they do not say where on the ellipsoid the antenna is.
+
+    References
+    ----------
+    RTKLIB manual 2.4.2, appendix B.1.
+    """
+    lines = read_text(path).splitlines()
+    header = [line for line in lines if line.startswith("%")]
+    rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]
+    scale, names = _rtklib_header(path, header)
+    if not rows:
+        raise InputFileError(path, "there is no position below the header")
+    number = np.array([i for i, _ in rows], dtype=np.int64)
+    fields = [line.replace(",", " ").replace(";", " ").split() for _, line in rows]
+    sexagesimal = any("(d'" in name for name in names[:2])
+    fixed = 2 + (7 if sexagesimal else 3)
+    for line, row in zip(number, fields, strict=True):
+        if len(row) < fixed + 1:
+            message = f"{len(row)} fields; time, coordinates and quality were expected"
+            raise InputFileError(path, message, line=int(line))
+    time = _rtklib_times(path, number, [(row[0], row[1]) for row in fields], scale)
+    width = min(len(row) for row in fields)
+    values = _rtklib_numbers(path, number, [row[2:width] for row in fields])
+    coordinates, rest = values[:, : fixed - 2], values[:, fixed - 2 :]
+    return PositionLog(
+        path=str(path),
+        time=time,
+        ecef_m=_rtklib_ecef(path, number, coordinates, names),
+        quality=rest[:, 0].astype(np.int64),
+        sigma_m=_rtklib_sigma(rest, names),
+        line=number,
+        notes=() if scale == "GPST" else (f"{path}: times converted from {scale} to GPS time",),
+        ratio=_rtklib_ratio(rest, names),
+    )
+
+
+def _rtklib_header(path: str | PathLike[str], header: list[str]) -> tuple[str, list[str]]:
+    """Time scale, and the names of the columns after the time."""
+    for line in header:
+        if "lat/lon/height=" in line and "geodetic" in line.split("lat/lon/height=")[1].split(",")[0]:
+            raise InputFileError(path, "the heights are above the geoid; write it with out-height=ellipsoidal")
+    for line in header:
+        names = line[1:].replace(",", " ").replace(";", " ").split()
+        if names[:1] and names[0] in ("GPST", "UTC", "JST"):
+            if any("baseline" in name for name in names):
+                raise InputFileError(
+                    path, "these are baselines (e/n/u); write it with out-solformat=llh or out-solformat=xyz"
+                )
+            if len(names) < 5 or not (names[1].startswith("latitude") or names[1].startswith("x-ecef")):
+                break
+            return names[0], names[1:]
+    raise InputFileError(
+        path,
+        "there is no RTKLIB header line such as '%  GPST  latitude(deg) longitude(deg)  height(m)  Q ...'; a .pos file "
+        "written with out-outhead=on, or a .csv was expected",
+    )
+
+
+def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple[str, str]], scale: str) -> Datetimes:
+    calendar = "/" in cells[0][0]
+    try:
+        if calendar:
+            time = np.array([f"{d.replace('/', '-')}T{t}" for d, t in cells], dtype="datetime64[ns]")
+        else:
+            time = from_week([int(w) for w, _ in cells], [float(s) for _, s in cells])
+    except ValueError:
+        form = "2021/09/22 06:30:00.000" if calendar else "2176 282600.000"
+        for line, (first, second) in zip(number, cells, strict=True):
+            try:
+                if calendar:
+                    np.datetime64(f"{first.replace('/', '-')}T{second}", "ns")
+                else:
+                    int(first), float(second)
+            except ValueError:
+                message = f"'{first} {second}' is no time such as {form}"
+                raise InputFileError(path, message, line=int(line)) from None
+        raise
+    if scale == "JST":
+        time = time - timedelta(9 * 3600.0)
+    return time if scale == "GPST" else utc_to_gpst(time)
+
+
+def _rtklib_numbers(path: str | PathLike[str], number: Integers, fields: list[list[str]]) -> Floats:
+    try:
+        return np.array(fields, dtype=np.float64)
+    except ValueError:
+        for line, row in zip(number, fields, strict=True):
+            for cell in row:
+                try:
+                    float(cell)
+                except ValueError:
+                    raise InputFileError(path, f"'{cell}' is not a number", line=int(line)) from None
+        raise
+
+
+def _rtklib_ecef(path: str | PathLike[str], number: Integers, values: Floats, names: list[str]) -> Floats:
+    if names[0].startswith("x-ecef"):
+        return values
+    if values.shape[1] == 7:
+        sign = np.where(np.signbit(values[:, [0, 3]]), -1.0, 1.0)
+        degrees = np.abs(values[:, [0, 3]]) + values[:, [1, 4]] / 60.0 + values[:, [2, 5]] / 3600.0
+        latitude, longitude = (sign * degrees).T
+    else:
+        latitude, longitude = values[:, 0], values[:, 1]
+    outside = np.abs(latitude) > 90.0
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise InputFileError(path, f"latitude {latitude[row]:g} is over 90 degrees", line=int(number[row]))
+    return ecef_from_geodetic(latitude, longitude, values[:, -1])
+
+
+def _rtklib_sigma(rest: Floats, names: list[str]) -> Floats:
+    """Standard deviations north, east, up, where the file has the columns sdn, sde, sdu."""
+    after = [name.split("(")[0] for name in names[3:]]
+    if not {"sdn", "sde", "sdu"} <= set(after[: rest.shape[1]]):
+        return np.full((len(rest), 3), np.nan)
+    return rest[:, [after.index(name) for name in ("sdn", "sde", "sdu")]]
+
+
+def _rtklib_ratio(rest: Floats, names: list[str]) -> Floats | None:
+    """The column ``ratio``, where the file has it."""
+    after = [name.split("(")[0] for name in names[3:]]
+    return rest[:, after.index("ratio")] if "ratio" in after[: rest.shape[1]] else None
+
+
+def write_positions_csv(path: str | PathLike[str], time: Datetimes, ecef_m: Floats) -> None:
+    """Write positions as CSV with the columns that `read_positions` reads."""
+    latitude, longitude, height = geodetic_from_ecef(ecef_m)
+    rows = zip(np.datetime_as_string(time, unit="ns"), latitude, longitude, height, strict=True)
+    lines = [
+        "time_gpst,latitude_deg,longitude_deg,height_m",
+        *(f"{t},{a:.10f},{b:.10f},{h:.4f}" for t, a, b, h in rows),
+    ]
+    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")

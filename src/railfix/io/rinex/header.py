@@ -1,0 +1,368 @@
+"""Header of a RINEX observation file, and header records that come in the middle of it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import ByteStream
+from railfix.gnss.observations import ObservationHeader
+from railfix.io.rinex.observations_signals import SYSTEMS, Column, columns_of
+
+#: Time systems of TIME OF FIRST OBS, and what a file of one constellation means without one.
+TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
+_DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
+#: Key of the types of a RINEX 2 file, which are those of every constellation.
+ALL: Final = ""
+#: A header is never longer; a file that goes on has none.
+_MAX_HEADER_BYTES: Final = 4 << 20
+_FILE_TYPES: Final = {
+    "N": "a RINEX navigation file; give it with --nav",
+    "G": "a RINEX navigation file (GLONASS); give it with --nav",
+    "H": "a RINEX navigation file (SBAS); give it with --nav",
+    "L": "a RINEX navigation file (Galileo); give it with --nav",
+    "J": "a RINEX navigation file (QZSS); give it with --nav",
+    "E": "a RINEX navigation file (Galileo); give it with --nav",
+    "B": "a RINEX file of SBAS broadcast data",
+    "M": "a RINEX meteorological file",
+    "C": "a RINEX clock file",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RinexHeader:
+    """What is needed to read the lines after the header.
+
+    Attributes
+    ----------
+    system : str
+        Constellation letter of the file, "M" when mixed.
+    time_system : str
+        One of `TIME_SYSTEMS`.
+    types : mapping of str to tuple of str
+        Announced types by constellation letter; RINEX 2 has one entry, `ALL`.
+    scale : mapping of (str, str) to float
+        SYS / SCALE FACTOR by constellation and type.
+    public : ObservationHeader
+        What is handed on.
+    """
+
+    version: float
+    system: str
+    time_system: str = "GPS"
+    types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    public: ObservationHeader = field(default_factory=ObservationHeader)
+
+    def types_of(self, system: str) -> tuple[str, ...] | None:
+        """Announced types of a constellation, None when it is not announced."""
+        return self.types.get(ALL if self.version < 3.0 else system)
+
+    def columns(self, system: str) -> tuple[Column, ...]:
+        """Wanted columns of the satellites' lines of a constellation."""
+        return columns_of(self.types_of(system) or (), system=system, version=self.version, scale=self.scale)
+
+
+def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
+    """Lines of the header up to END OF HEADER, and the bytes read after it.
+
+    Raises
+    ------
+    InputFileError
+        The file is no RINEX observation file, or its header does not end.
+    """
+    data = b""
+    found = -1
+    while found < 0:
+        block = stream.read(1 << 16)
+        data += block
+        if len(data) >= 80 or not block:
+            _check_kind(stream.path, data[:200].decode("latin-1").split("\n")[0].rstrip("\r"))
+        found = data.find(b"END OF HEADER")
+        if found < 0 and (not block or len(data) > _MAX_HEADER_BYTES):
+            message = "the header has no END OF HEADER; the file is cut short or is no RINEX observation file"
+            raise InputFileError(stream.path, message)
+    end = data.find(b"\n", found)
+    end = len(data) if end < 0 else end + 1
+    lines = [line.rstrip("\r") for line in data[:end].decode("latin-1").removesuffix("\n").split("\n")]
+    return lines, data[end:]
+
+
+def _check_kind(path: str, line: str) -> None:
+    if line[60:].strip() != "RINEX VERSION / TYPE":
+        if re.match(r"#[a-d][PV]", line):
+            raise InputFileError(path, "is an SP3 orbit file, a RINEX observation file was expected", line=1)
+        if line.startswith(("$G", "$P", "%")):
+            what = "an NMEA log" if line.startswith("$") else "a position log"
+            raise InputFileError(path, f"looks like {what}, a RINEX observation file was expected", line=1)
+        raise InputFileError(path, "is not a RINEX file (its first line has no RINEX VERSION / TYPE)", line=1)
+    kind = line[20:21].upper()
+    if kind != "O":
+        what = _FILE_TYPES.get(kind, f"a RINEX file of unknown type '{kind}'")
+        raise InputFileError(path, f"is {what} (an observation file was expected)", line=1)
+
+
+def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
+    """The header of an observation file.
+
+    Parameters
+    ----------
+    path : str
+        For error messages.
+    lines : sequence of str
+        Up to END OF HEADER.
+    notes : list of str, optional
+        Where given, records that do not change how the file is read and cannot be read themselves
+        (INTERVAL, APPROX POSITION XYZ, ...) are noted there and passed over instead of raised.
+
+    Raises
+    ------
+    InputFileError
+        Version not supported, types missing or miscounted, a number is none.
+    """
+    version = _version(path, lines[0])
+    system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
+    if system not in SYSTEMS + "M":
+        raise InputFileError(path, f"satellite system '{system}' is none of {', '.join(SYSTEMS)} or M", line=1)
+    start = RinexHeader(
+        version=version,
+        system=system,
+        time_system=_DEFAULT_TIME[system],
+        public=ObservationHeader(version=version),
+    )
+    header = apply_records(path, start, lines[1:], first_line=2, notes=notes)
+    if not header.types:
+        wanted = "# / TYPES OF OBSERV" if version < 3.0 else "SYS / # / OBS TYPES"
+        raise InputFileError(path, f"the header has no {wanted} record; the observations cannot be told apart")
+    return header
+
+
+def _version(path: str, line: str) -> float:
+    try:
+        version = float(line[:9])
+    except ValueError as error:
+        raise InputFileError(path, f"RINEX version '{line[:9].strip()}' is no number", line=1) from error
+    if not 2.0 <= version < 5.0:
+        message = f"RINEX version {version:.2f} is not supported; 2.10 to 2.12, 3.00 to 3.05 and 4.00 to 4.02 are"
+        raise InputFileError(path, message, line=1)
+    return version
+
+
+def apply_records(
+    path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, notes: list[str] | None = None
+) -> RinexHeader:
+    """The header after further header records, as epoch flags 2 to 4 bring them in the middle.
+
+    Parameters are those of `parse_header`; `first_line` is the 1-based number of ``lines[0]``.
+    """
+    reader = _Records(path, header, notes)
+    for number, line in enumerate(lines, start=first_line):
+        reader.read(line, number)
+    return reader.finish()
+
+
+class _Records:
+    """Header records one by one, into a copy of a header."""
+
+    def __init__(self, path: str, header: RinexHeader, notes: list[str] | None) -> None:
+        self._path = path
+        self._header = header
+        self._notes = notes
+        self._line = 0
+        self._types = dict(header.types)
+        self._scale = dict(header.scale)
+        self._channels = dict(header.public.glonass_channel)
+        self._changes: dict[str, Any] = {}
+        self._announced: dict[str, tuple[int, int]] = {}
+        self._current = ALL
+        self._fresh: set[str] = set()
+        self._scaling: tuple[str, float, int] | None = None
+
+    def read(self, line: str, number: int) -> None:
+        """One line."""
+        self._line = number
+        label = line[60:80].strip()
+        text = f"{line[:60]:<60}"
+        if label in _LAYOUT:
+            _LAYOUT[label](self, text)
+        elif label in _OTHER:
+            try:
+                _OTHER[label](self, text)
+            except ValueError as error:
+                message = f"{label}: '{text.strip()}' cannot be read as the numbers expected"
+                if self._notes is None:
+                    raise InputFileError(self._path, message, line=number) from error
+                self._notes.append(f"{self._path}, line {number}: {message}; the record was passed over")
+
+    def finish(self) -> RinexHeader:
+        """The header with all records applied."""
+        for system, (count, line) in self._announced.items():
+            found = len(self._types[system])
+            if found != count:
+                of = f"of {system} " if system else ""
+                message = f"{count} observation types {of}are announced, {found} are listed"
+                raise InputFileError(self._path, message, line=line)
+        changes = dict(self._changes)
+        time_system = str(changes.pop("time_system", self._header.time_system))
+        header = replace(self._header, types=self._types, scale=self._scale, time_system=time_system)
+        public = replace(
+            header.public,
+            signals=_signals(header),
+            glonass_channel=self._channels,
+            **changes,
+        )
+        return replace(header, public=public)
+
+    def _fail(self, message: str) -> InputFileError:
+        return InputFileError(self._path, message, line=self._line)
+
+    def _count(self, text: str, what: str) -> int:
+        if not text.strip().isdigit():
+            raise self._fail(f"{what}: the number of types '{text.strip()}' is no whole number")
+        return int(text)
+
+    def types_2(self, text: str) -> None:
+        """# / TYPES OF OBSERV."""
+        if text[:6].strip():
+            self._announced[ALL] = (self._count(text[:6], "# / TYPES OF OBSERV"), self._line)
+            self._types[ALL] = ()
+        elif ALL not in self._announced:
+            raise self._fail("# / TYPES OF OBSERV: the number of types is missing")
+        self._extend(ALL, [text[k : k + 6].strip() for k in range(6, 60, 6)], r"[CPLDSTX][0-9A-D]")
+
+    def types_3(self, text: str) -> None:
+        """SYS / # / OBS TYPES."""
+        if text[0] != " ":
+            self._current = text[0]
+            self._announced[text[0]] = (self._count(text[3:6], "SYS / # / OBS TYPES"), self._line)
+            self._types[text[0]] = ()
+        elif self._current not in self._announced:
+            raise self._fail("SYS / # / OBS TYPES: the constellation letter is missing")
+        self._extend(self._current, [text[k : k + 3].strip() for k in range(7, 59, 4)], r"[CLDSXI][0-9][A-Z]?")
+
+    def _extend(self, system: str, names: list[str], pattern: str) -> None:
+        names = [name for name in names if name]
+        for name in names:
+            if not re.fullmatch(pattern, name):
+                raise self._fail(f"'{name}' is no observation type")
+        self._types[system] += tuple(names)
+
+    def scale_factor(self, text: str) -> None:
+        """SYS / SCALE FACTOR."""
+        names = [text[k : k + 3].strip() for k in range(11, 59, 4)]
+        names = [name for name in names if name]
+        if text[0] != " ":
+            factor = text[2:6].strip()
+            if factor not in ("1", "10", "100", "1000"):
+                raise self._fail(f"SYS / SCALE FACTOR: '{factor}' is none of 1, 10, 100, 1000")
+            count = text[8:10].strip()
+            if count.strip("0"):
+                self._scaling = (text[0], float(factor), self._count(count, "SYS / SCALE FACTOR"))
+            else:
+                names = list(self._types.get(text[0], ()))
+                self._scaling = (text[0], float(factor), len(names))
+        if self._scaling is None:
+            raise self._fail("SYS / SCALE FACTOR: the constellation letter is missing")
+        system, scale, left = self._scaling
+        if len(names) != min(left, 12) and text[8:10].strip("0 "):
+            raise self._fail(
+                f"SYS / SCALE FACTOR: {min(left, 12)} observation types were expected, {len(names)} are listed"
+            )
+        for name in names:
+            self._scale[system, name] = scale
+        self._scaling = (system, scale, left - len(names))
+
+    def time_of_first(self, text: str) -> None:
+        """TIME OF FIRST OBS: its time system; the time itself is that of the first epoch."""
+        name = text[48:51].strip()
+        if name and name not in TIME_SYSTEMS:
+            raise self._fail(f"TIME OF FIRST OBS: time system '{name}' is none of {', '.join(TIME_SYSTEMS)}")
+        if name:
+            self._changes["time_system"] = name
+
+    def strength_unit(self, text: str) -> None:
+        """SIGNAL STRENGTH UNIT."""
+        unit = text[:20].strip().upper()
+        if unit not in ("DBHZ", ""):
+            raise self._fail(f"SIGNAL STRENGTH UNIT: '{unit}' was found, DBHZ was expected")
+
+    def glonass_slots(self, text: str) -> None:
+        """GLONASS SLOT / FRQ #."""
+        for satellite, channel in re.findall(r"R([ \d]\d)\s+([+-]?\d+)", text[3:]):
+            self._channels[f"R{int(satellite):02d}"] = int(channel)
+
+    def position(self, text: str) -> None:
+        """APPROX POSITION XYZ."""
+        xyz = _three(text)
+        self._changes["approximate_ecef_m"] = xyz if xyz.any() else np.full(3, np.nan)
+
+    def delta(self, text: str) -> None:
+        """ANTENNA: DELTA H/E/N."""
+        self._changes["antenna_delta_hen_m"] = _three(text)
+
+    def interval(self, text: str) -> None:
+        """INTERVAL."""
+        value = float(text[:10])
+        self._changes["interval_s"] = value if value > 0.0 and math.isfinite(value) else math.nan
+
+    def leap_seconds(self, text: str) -> None:
+        """LEAP SECONDS."""
+        self._changes["leap_seconds"] = int(text[:6])
+
+    def clock_applied(self, text: str) -> None:
+        """RCV CLOCK OFFS APPL."""
+        self._changes["receiver_clock_applied"] = int(text[:6]) == 1
+
+    def marker(self, text: str) -> None:
+        """MARKER NAME."""
+        self._changes["marker"] = text.strip()
+
+    def receiver(self, text: str) -> None:
+        """REC # / TYPE / VERS."""
+        self._changes["receiver"] = text[20:40].strip()
+
+    def antenna(self, text: str) -> None:
+        """ANT # / TYPE."""
+        self._changes["antenna"] = text[20:40].strip()
+
+
+_LAYOUT: Final = {
+    "# / TYPES OF OBSERV": _Records.types_2,
+    "SYS / # / OBS TYPES": _Records.types_3,
+    "SYS / SCALE FACTOR": _Records.scale_factor,
+    "TIME OF FIRST OBS": _Records.time_of_first,
+    "SIGNAL STRENGTH UNIT": _Records.strength_unit,
+}
+_OTHER: Final = {
+    "GLONASS SLOT / FRQ #": _Records.glonass_slots,
+    "APPROX POSITION XYZ": _Records.position,
+    "ANTENNA: DELTA H/E/N": _Records.delta,
+    "INTERVAL": _Records.interval,
+    "LEAP SECONDS": _Records.leap_seconds,
+    "RCV CLOCK OFFS APPL": _Records.clock_applied,
+    "MARKER NAME": _Records.marker,
+    "REC # / TYPE / VERS": _Records.receiver,
+    "ANT # / TYPE": _Records.antenna,
+}
+
+
+def _three(text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    values = np.array([float(text[k : k + 14]) for k in (0, 14, 28)])
+    if not np.isfinite(values).all():
+        raise ValueError("not finite")
+    return values
+
+
+def _signals(header: RinexHeader) -> dict[str, tuple[str, ...]]:
+    if header.version >= 3.0:
+        systems = sorted(header.types)
+    else:
+        systems = list(SYSTEMS) if header.system == "M" else [header.system]
+    signals = {s: tuple(sorted({c.signal for c in header.columns(s)})) for s in systems}
+    return {system: names for system, names in signals.items() if names}

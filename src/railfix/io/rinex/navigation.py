@@ -1,0 +1,235 @@
+"""RINEX navigation files of versions 2, 3 and 4: broadcast orbits, clocks and ionosphere.
+
+GPS, QZSS, Galileo, BeiDou and GLONASS records in the messages that carry the classic parameters
+(LNAV, I/NAV, F/NAV, D1, D2, FDMA) are read; everything else is passed over and counted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from os import PathLike
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import read_text_lines
+from railfix.gnss.navigation import Navigation
+from railfix.io.rinex.navigation_header import Gathered, read_header
+from railfix.io.rinex.navigation_records import (
+    FIELDS,
+    RawRecord,
+    first_fault,
+    glonass_records,
+    kepler_records,
+    number,
+)
+
+FilePath = str | PathLike[str]
+
+#: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
+#: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
+_LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
+#: Classic messages by constellation as RINEX 4 names them.
+_MESSAGES: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV", "FNAV"), "C": ("D1", "D2"), "R": ("FDMA",)}
+#: Constellations whose records are known and passed over: SBAS, NavIC.
+_PASSED_OVER: Final = ("S", "I")
+#: Width of a number.
+_WIDTH: Final = 19
+#: ``> EPH G01 LNAV`` (RINEX 4.02, table A7).
+_TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z][ \d]\d) *(\S*)")
+
+
+def read_navigation(
+    paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict", "lenient"] = "strict"
+) -> Navigation:
+    """All records of one or several navigation files.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        Plain, gzip, compress.
+    on_error : {"strict", "lenient"}
+        A broken record stops the reading, or is counted in `passed_over` and named in `notes`.
+
+    Returns
+    -------
+    Navigation
+        Without `precise` (`sp3.read_sp3` reads that, `dataclasses.replace` puts it in).
+
+    Raises
+    ------
+    InputFileError
+        A file is missing, is no navigation file, or (strict) a record is broken; or no file holds
+        a usable record.
+    """
+    files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
+    if not files:
+        raise ValueError("at least one navigation file is needed")
+    gathered = Gathered(lenient=on_error == "lenient")
+    for path in files:
+        _read_file(path, gathered)
+    if not gathered.records:
+        names = ", ".join(str(p) for p in files)
+        raise InputFileError(names, "has no usable GPS, QZSS, Galileo, BeiDou or GLONASS record")
+    return Navigation(
+        kepler=kepler_records([r for r in gathered.records if r.system != "R"]),
+        glonass=glonass_records([r for r in gathered.records if r.system == "R"]),
+        klobuchar=gathered.received_klobuchar(),
+        leap_seconds=gathered.leap_seconds,
+        passed_over=dict(gathered.passed_over),
+        notes=tuple(dict.fromkeys(gathered.notes)),
+        sources=tuple(str(p) for p in files),
+    )
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Lines of one record: where they stand, what names the satellite, the message (empty before RINEX 4)."""
+
+    line: int
+    name: str
+    message: str
+    text: list[str]
+
+
+def _read_file(path: FilePath, gathered: Gathered) -> None:
+    lines = read_text_lines(path)
+    version, kind, begin = read_header(path, lines, gathered)
+    if not any(line.strip() for line in lines[begin:]):
+        raise InputFileError(path, "has a header but no record; the file is cut short, give the whole one")
+    blocks = _blocks_4(path, lines, begin, gathered) if version >= 4.0 else _blocks(path, lines, begin, version, kind)
+    for block in blocks:
+        try:
+            record = _record(path, block, version, gathered)
+        except InputFileError as error:
+            gathered.refuse(error)
+        else:
+            if record is not None:
+                gathered.add(record)
+
+
+def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
+    """Records of versions 2 and 3: they begin where a line does not begin with blanks."""
+    starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
+    _refuse_stray(path, lines, begin, starts)
+    letter = {"N": "G", "G": "R", "H": "S"}[kind] if version < 3.0 else ""
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
+        text = lines[start]
+        name = letter + text[:2] if letter and not text[:1].isalpha() else text[:3]
+        yield _Block(start + 1, name, "", lines[start:end])
+
+
+def _refuse_stray(path: FilePath, lines: list[str], begin: int, starts: list[int]) -> None:
+    for i in range(begin, starts[0] if starts else len(lines)):
+        if lines[i].strip():
+            raise InputFileError(path, f"{lines[i].strip()!r} stands before the first record", line=i + 1)
+
+
+def _blocks_4(path: FilePath, lines: list[str], begin: int, gathered: Gathered) -> Iterator[_Block]:
+    """Ephemerides of version 4; ionosphere is kept, other records are counted."""
+    starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
+    _refuse_stray(path, lines, begin, starts)
+    for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
+        title = _TITLE.match(lines[start])
+        text = lines[start + 1 : end]
+        try:
+            if title is None:
+                what = f"{lines[start].strip()!r} is no '> EPH G01 LNAV': record type, satellite, message"
+                raise InputFileError(path, what, line=start + 1)
+            kind, name, message = title.groups()
+            if kind == "EPH":
+                yield _Block(start + 2, name, message, text)
+            elif kind == "ION":
+                _ionosphere_4(path, name[0], message, text, start + 2, gathered)
+            else:
+                gathered.passed_over[kind] += 1
+        except InputFileError as error:
+            gathered.refuse(error)
+
+
+def _ionosphere_4(path: FilePath, letter: str, message: str, text: list[str], line: int, gathered: Gathered) -> None:
+    """Klobuchar coefficients of version 4 (RINEX 4.02, table A34); other models are counted."""
+    if letter not in "GCJ" or message not in ("LNAV", "D1D2"):
+        gathered.passed_over[f"ION {letter} {message}"] += 1
+        return
+    if len(text) < 3:
+        raise InputFileError(path, f"ionosphere record has {len(text)} lines, 3 are due; the file is cut", line=line)
+    try:
+        fields = [(text[0], 23 + 19 * i) for i in range(3)] + [(text[1], 4 + 19 * i) for i in range(4)] + [(text[2], 4)]
+        values = [number(row[column : column + _WIDTH]) for row, column in fields]
+    except ValueError:
+        raise InputFileError(path, "ionosphere record holds no number where one is due", line=line) from None
+    gathered.keep_ionosphere(letter, "A", values[:4])
+    gathered.keep_ionosphere(letter, "B", values[4:])
+
+
+def _record(path: FilePath, block: _Block, version: float, gathered: Gathered) -> RawRecord | None:
+    """One record, or None where it is of a kind that is passed over, which is counted."""
+    system, digits = block.name[:1], block.name[1:].strip()
+    if system not in (*_LINES, *_PASSED_OVER) or not (digits.isdigit() and int(digits)):
+        raise InputFileError(path, f"{block.name!r} is no satellite", line=block.line - (version >= 4.0))
+    satellite = f"{system}{int(digits):02d}"
+    if system in _PASSED_OVER or (block.message and block.message not in _MESSAGES[system]):
+        gathered.passed_over[f"{system} {block.message}".strip()] += 1
+        return None
+    fewest, most = _LINES[system]
+    # A line of blank fields belongs to its record, one more than are due does not.
+    count = next((k for k in range(len(block.text), fewest, -1) if block.text[k - 1].strip()), fewest)
+    count = min(count, len(block.text))
+    if not fewest <= count <= most:
+        fault = "the file is cut or damaged" if count < fewest else "the line that begins the next record is damaged"
+        raise InputFileError(
+            path, f"record of {satellite} has {count} lines, {fewest} are due; {fault}", line=block.line
+        )
+    first = block.text[0]
+    try:
+        epoch = _epoch_2(first) if version < 3.0 else _epoch_3(first)
+    except ValueError:
+        what = f"epoch {first[3 : 22 if version < 3.0 else 23].strip()!r} of {satellite} is no date and time"
+        raise InputFileError(path, what, line=block.line) from None
+    numbers = _numbers(path, block, satellite, shift=19 if version >= 3.0 else 18)
+    record = RawRecord(system, satellite, block.message, epoch, numbers, version)
+    fault_at = first_fault(record)
+    if fault_at is not None:
+        field, message = fault_at
+        raise InputFileError(path, f"record of {satellite}: {message}", line=block.line + (field + 1) // 4)
+    return record
+
+
+def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> list[float]:
+    """Numbers of a record in the order of the file; blank is NaN."""
+    names = FIELDS[satellite[0]]
+    numbers: list[float] = []
+    for k, name in enumerate(names):
+        # Three numbers stand on the first line, after satellite and time; four on each of the others.
+        row, place = divmod(k + 1, 4)
+        text = block.text[row]
+        column = shift - 15 + _WIDTH * place
+        try:
+            numbers.append(number(text[column : column + _WIDTH]))
+        except ValueError:
+            what = f"record of {satellite}: {name} {text[column : column + _WIDTH].strip()!r} is no number"
+            raise InputFileError(path, what, line=block.line + row) from None
+    return numbers
+
+
+def _epoch_2(line: str) -> np.datetime64:
+    year = int(line[2:5])
+    year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0
+    return _instant(year, line[5:8], line[8:11], line[11:14], line[14:17], line[17:22])
+
+
+def _epoch_3(line: str) -> np.datetime64:
+    return _instant(int(line[4:8]), line[8:11], line[11:14], line[14:17], line[17:20], line[20:23])
+
+
+def _instant(year: int, month: str, day: str, hour: str, minute: str, second: str) -> np.datetime64:
+    seconds = float(second)
+    if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):
+        raise ValueError(year, second)
+    minute_start = datetime(year, int(month), int(day), int(hour), int(minute))
+    return np.datetime64(minute_start, "ns") + np.timedelta64(round(seconds * 1e9), "ns")

@@ -1,0 +1,207 @@
+"""Raw navigation records as the arrays of `railfix.gnss.navigation`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers, Strings
+from railfix.core.timescale import bdt_to_gpst, nearest_week, seconds, timedelta, utc_to_gpst
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords
+
+#: Numbers of a Keplerian record in the order of the file, the three of the clock first.
+_KEPLER: Final = (
+    "af0_s af1 af2 iode crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot "
+    "i_dot data_source week flag accuracy_m health group_delay_1_s group_delay_2_s transmitted fit"
+).split()
+#: Numbers of a GLONASS record in the order of the file.
+_GLONASS: Final = (
+    "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
+    "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
+).split()
+#: Names of the numbers of a record by constellation.
+FIELDS: Final[Mapping[str, Sequence[str]]] = {**dict.fromkeys("GJEC", _KEPLER), "R": _GLONASS}
+#: Numbers without which there is no orbit or no clock.
+_NEEDED: Final = frozenset(
+    "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
+    "clock_bias x x_velocity y y_velocity z z_velocity".split()
+)
+#: What numbers lie between, with room to spare: clocks within a second; orbits between 10 000 and 70 000 km;
+#: angles within a turn; harmonic corrections that are small angles; time in its week.
+_BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
+    "sqrt_a": (3.1e3, 8.4e3),
+    "eccentricity": (0.0, 0.3),
+    "toe_sow_s": (0.0, 604_800.0),
+    **{
+        name: (-limit, limit)
+        for names, limit in (
+            ("af0_s clock_bias", 1.0),
+            ("m0 omega0 i0 omega", 7.0),
+            ("delta_n omega_dot i_dot af1 af2 relative_frequency", 1e-6),
+            ("cuc cus cic cis", 1e-3),
+            ("crc crs", 1e5),
+            ("x_velocity y_velocity z_velocity", 10.0),
+            ("x_acceleration y_acceleration z_acceleration", 1e-6),
+        )
+        for name in names.split()
+    },
+}
+#: Any other number.
+_OTHERS_BETWEEN: Final = (-1e10, 1e10)
+#: Distance of a satellite from the Earth's centre [km]: above its surface.
+_RADIUS_KM: Final = (6_400.0, 70_000.0)
+_BLANK: Final = float("nan")
+#: RINEX writes 0.9999E9 for a number that is not known.
+_UNKNOWN: Final = 0.99e9
+#: Transmission times further than this from toe are no transmission times [s].
+_TRANSMISSION_S: Final = 2 * 86_400.0
+
+
+@dataclass(frozen=True)
+class RawRecord:
+    """One record as it stands in a file: epoch in the constellation's own time, numbers in file order."""
+
+    system: str
+    satellite: str
+    message: str
+    epoch: np.datetime64
+    numbers: list[float]
+    version: float
+
+
+def number(text: str) -> float:
+    """One FORTRAN number; blank and 0.9999E9 are NaN, always the same one, so that equal records compare equal.
+
+    Raises
+    ------
+    ValueError
+        It is no finite number.
+    """
+    text = text.strip()
+    if not text:
+        return _BLANK
+    value = float(text.replace("D", "E").replace("d", "e"))
+    if not np.isfinite(value):
+        raise ValueError(f"{text!r} is no number")
+    return _BLANK if _UNKNOWN < abs(value) < 1.01e9 else value
+
+
+def first_fault(record: RawRecord) -> tuple[int, str] | None:
+    """Index of the first number that cannot be, and what is wrong with it; None for a sound record."""
+    for k, (name, value) in enumerate(zip(FIELDS[record.system], record.numbers, strict=True)):
+        if name in _NEEDED and np.isnan(value):
+            return k, f"{name} is blank"
+        low, high = _BETWEEN.get(name, _OTHERS_BETWEEN)
+        if value < low or value > high:
+            return k, f"{name} is {value:g}, it lies between {low:g} and {high:g}"
+    if record.system == "R":
+        radius = float(np.linalg.norm(record.numbers[3:15:4]))
+        low, high = _RADIUS_KM
+        if not low <= radius <= high:
+            return 3, f"x, y, z is {radius:g} km from the Earth's centre, it lies between {low:g} and {high:g}"
+    return None
+
+
+def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
+    """Records of GPS, QZSS, Galileo and BeiDou.
+
+    Rates, corrections, health and issues that are blank are 0, as RINEX has it; group delays and accuracies are NaN.
+    """
+    table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_KEPLER))
+    column = dict(zip(_KEPLER, table.T, strict=True))
+    satellite = np.array([r.satellite for r in raw], dtype="<U3")
+    system = satellite.astype("<U1")
+    own = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
+    toe = nearest_week(column["toe_sow_s"], own)
+    # The clock reference time, not the week of the file, tells the week: converted files are 1024 weeks off.
+    said = column["transmitted"]
+    usable = np.abs(np.where(np.isnan(said), np.inf, said)) < 2 * 604_800
+    sent = nearest_week(np.where(usable, said, 0.0), toe)
+    usable &= np.abs(seconds(sent - toe)) <= _TRANSMISSION_S
+    beidou = system == "C"
+    gps_like = np.isin(system, ["G", "J"])
+    integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
+    # IODC stands where Galileo and BeiDou have their second group delay; BeiDou's AODC where GPS has the fit interval.
+    iodc = np.select([gps_like, beidou], [column["group_delay_2_s"], column["fit"]], column["iode"])
+    return KeplerRecords(
+        satellite=satellite,
+        message=_messages(raw, system, integers["data_source"], satellite),
+        toc=np.where(beidou, bdt_to_gpst(own), own),
+        toe=np.where(beidou, bdt_to_gpst(toe), toe),
+        transmitted=np.where(usable, np.where(beidou, bdt_to_gpst(sent), sent), np.datetime64("NaT", "ns")),
+        iode=integers["iode"],
+        iodc=_integers(iodc),
+        health=integers["health"],
+        data_source=np.where(system == "E", integers["data_source"], 0),
+        accuracy_m=column["accuracy_m"],
+        group_delay_1_s=column["group_delay_1_s"],
+        group_delay_2_s=np.where(gps_like, np.nan, column["group_delay_2_s"]),
+        fit_interval_h=_fit_interval(system, column["fit"]),
+        **{
+            name: np.nan_to_num(column[name])
+            for name in (
+                "af0_s af1 af2 sqrt_a eccentricity m0 delta_n omega0 i0 omega omega_dot i_dot "
+                "cuc cus crc crs cic cis toe_sow_s"
+            ).split()
+        },
+    )
+
+
+def _integers(values: Floats) -> Integers:
+    return np.nan_to_num(values).astype(np.int64)
+
+
+def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satellite: Strings) -> Strings:
+    """Message names; before RINEX 4 from the data-source bits of Galileo and the GEO numbers of BeiDou."""
+    number = np.array([int(s[1:]) for s in satellite.tolist()], dtype=np.int64)
+    geo = (number <= 5) | (number >= 59)
+    fnav = ((source & 0b010) != 0) & ((source & 0b101) == 0)
+    derived = np.select(
+        [system == "E", (system == "C") & geo, system == "C"], [np.where(fnav, "FNAV", "INAV"), "D2", "D1"], "LNAV"
+    )
+    said = np.array([r.message for r in raw], dtype="<U4")
+    return np.where(said != "", said, derived).astype("<U4")
+
+
+def _fit_interval(system: Strings, fit: Floats) -> Floats:
+    """Fit interval [h]: GPS in hours (0 and the flag 0 mean 4, the flag 1 six), QZSS by flag (0: 2 h, 1: 4 h)."""
+    fit = np.nan_to_num(fit)
+    gps = np.where(fit == 0, 4.0, np.where(fit == 1, 6.0, fit))
+    qzss = np.where(fit == 0, 2.0, np.where(fit == 1, 4.0, fit))
+    return np.select([system == "G", system == "J"], [np.clip(gps, 4.0, 26.0), np.clip(qzss, 2.0, 26.0)], np.nan)
+
+
+def glonass_records(raw: Sequence[RawRecord]) -> GlonassRecords:
+    """Records of GLONASS: UTC becomes GPS time, kilometres become metres."""
+    table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_GLONASS))
+    state = table[:, 3:15].reshape(-1, 3, 4)
+    utc = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
+    toe = utc_to_gpst(utc)
+    frame = table[:, 2]
+    known = np.isfinite(frame) & (np.abs(frame) < 1e6)
+    # RINEX 2 counts the seconds of the day, RINEX 3 and 4 those of the week; both are UTC.
+    day = utc.astype("datetime64[D]").astype("datetime64[ns]")
+    of_day = day + timedelta(np.where(known, frame % 86_400.0, 0.0))
+    nearest_day = of_day + np.rint(seconds(utc - of_day) / 86_400.0).astype(np.int64).astype("timedelta64[D]")
+    old = np.array([r.version < 3.0 for r in raw], dtype=bool)
+    sent = np.where(old, nearest_day, nearest_week(np.where(known, frame, 0.0), utc))
+    known &= np.abs(seconds(sent - utc)) < 86_400.0
+    arrays: dict[str, Any] = {
+        "position_ecef_m": state[:, :, 0] * 1e3,
+        "velocity_ecef_mps": state[:, :, 1] * 1e3,
+        "acceleration_ecef_mps2": np.nan_to_num(state[:, :, 2]) * 1e3,
+    }
+    return GlonassRecords(
+        satellite=np.array([r.satellite for r in raw], dtype="<U3"),
+        toe=toe,
+        transmitted=np.where(known, utc_to_gpst(sent), np.datetime64("NaT", "ns")),
+        clock_bias_s=np.nan_to_num(table[:, 0]),
+        relative_frequency=np.nan_to_num(table[:, 1]),
+        health=_integers(state[:, 0, 3]),
+        frequency_channel=_integers(state[:, 1, 3]),
+        age_days=np.nan_to_num(state[:, 2, 3]),
+        **arrays,
+    )

@@ -1,0 +1,239 @@
+"""Observation files of one receiver, RINEX 2, 3 and 4, as `Observations`.
+
+A log is one file or several; several are put in order of their first epochs and joined. Reading in
+pieces and reading as a whole run through the same lines: the whole is the pieces concatenated.
+
+What is broken, in "strict" ends the reading with an `InputFileError` that names file and line; in
+"lenient" it is passed over, counted and told of in `Observations.problems`:
+
+========================================================= =======================================
+broken                                                    passed over in lenient
+========================================================= =======================================
+epoch line; number of lines that follow it                the epoch
+time tag not after the one before, or ahead of all after  the epoch
+last epoch incomplete; compressed data end early          the epoch; the rest of the file
+satellite name; a field; a line too long; a satellite     the satellite in this epoch
+twice, or of a constellation without announced types
+header record that does not change how the file is read   the record
+========================================================= =======================================
+
+An error in the header that changes how the file is read is raised in both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from os import PathLike
+from typing import Final, get_args
+
+import numpy as np
+
+from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.files import FilePath
+from railfix.gnss.observations import Observations, concatenate
+from railfix.io.rinex.observations_blocks import BlockReader, Wanted
+from railfix.io.rinex.observations_log import OnError
+from railfix.io.rinex.observations_signals import SYSTEMS
+
+#: Epochs of a piece unless asked otherwise.
+DEFAULT_EPOCHS: Final = 3600
+_PEEK_BYTES: Final = 1 << 16
+#: A step between files is a gap when it is longer than this many intervals.
+_GAP_INTERVALS: Final = 1.5
+
+Paths = FilePath | Sequence[FilePath]
+
+
+def read_observations(
+    path: Paths,
+    *,
+    on_error: OnError = "strict",
+    systems: Iterable[str] | None = None,
+    start: np.datetime64 | str | None = None,
+    end: np.datetime64 | str | None = None,
+) -> Observations:
+    """Read the observation file or files of one receiver.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        RINEX 2.10 to 2.12, 3.00 to 3.05, 4.00 to 4.02; plain, ``.gz``, ``.Z``, Hatanaka (CRX) plain
+        or in one of these, told by content. Several files are put in order of time and joined.
+    on_error : {"strict", "lenient"}
+        What to do about what is broken, see above.
+    systems : iterable of str, optional
+        Constellation letters wanted ("GEJ"); all by default.
+    start, end : datetime64 or ISO 8601 str, optional
+        Epochs from `start` up to, not including, `end`, GPS time.
+
+    Returns
+    -------
+    Observations
+        Channels with at least one observation. 0.000 and blank are absent (NaN).
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is something else, has no epochs; in strict anything broken.
+    MismatchError
+        No epoch lies between `start` and `end`.
+
+    Notes
+    -----
+    Use `scan_observations` for logs that do not fit into memory.
+    """
+    wanted = _wanted(on_error=on_error, systems=systems, start=start, end=end)
+    return concatenate(list(_runs(_as_list(path), wanted)))
+
+
+def scan_observations(
+    path: Paths,
+    *,
+    epochs: int = DEFAULT_EPOCHS,
+    on_error: OnError = "strict",
+    systems: Iterable[str] | None = None,
+    start: np.datetime64 | str | None = None,
+    end: np.datetime64 | str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Iterator[Observations]:
+    """Read the observation file or files of one receiver in pieces.
+
+    Parameters
+    ----------
+    path, on_error, systems, start, end
+        As `read_observations`, of which this is the other form: the pieces concatenated are the whole.
+    epochs : int
+        Epochs of a piece; the last may have fewer.
+    progress : callable, optional
+        Called with the part of the files that has been read, 0 to 1, as the reading goes on.
+
+    Yields
+    ------
+    Observations
+        Each piece has the channels that occur in it. Memory is that of a piece and one block of text.
+
+    Raises
+    ------
+    InputFileError, MismatchError
+        As `read_observations`, when the place is reached.
+    """
+    if epochs < 1:
+        raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
+    wanted = _wanted(on_error=on_error, systems=systems, start=start, end=end)
+    return _pieces(_runs(_as_list(path), wanted, progress), epochs)
+
+
+def _as_list(path: Paths) -> list[str]:
+    paths = [path] if isinstance(path, str | PathLike) else list(path)
+    if not paths:
+        raise ValueError("no observation file was given")
+    return [str(p) for p in paths]
+
+
+def _wanted(
+    *,
+    on_error: OnError,
+    systems: Iterable[str] | None,
+    start: np.datetime64 | str | None,
+    end: np.datetime64 | str | None,
+) -> Wanted:
+    if on_error not in get_args(OnError):
+        raise ValueError(f"on_error is '{on_error}', 'strict' or 'lenient' was expected")
+    letters = None if systems is None else frozenset(systems)
+    if letters is not None and (not letters or not letters <= set(SYSTEMS)):
+        raise ValueError(f"systems is {sorted(letters)}, letters out of {SYSTEMS} were expected")
+    limits = {}
+    for name, time in (("start_ns", start), ("end_ns", end)):
+        if time is not None:
+            limits[name] = int(np.asarray(time, dtype="datetime64[ns]").astype(np.int64))
+    return Wanted(on_error=on_error, systems=letters, **limits)
+
+
+def _runs(paths: list[str], wanted: Wanted, progress: Callable[[float], None] | None = None) -> Iterator[Observations]:
+    """Runs of epochs of all files, in order of time; at least one, and some epoch in all."""
+    paths = paths if len(paths) == 1 else _in_order_of_time(paths, wanted)
+    last: Observations | None = None
+    reader: BlockReader | None = None
+    found = 0
+    for k, path in enumerate(paths):
+        before, reader = reader, BlockReader(path, wanted, **({} if reader is None else {"after_ns": reader.last_ns}))
+        joint = before is not None and before.epochs > 0
+        for run in reader.blocks():
+            if joint and len(run):
+                run = _with_break_at_gap(last, run)
+                joint = False
+            found += len(run)
+            last = run if len(run) else last
+            if progress is not None:
+                progress((k + reader.share) / len(paths))
+            yield run
+        if not reader.epochs and wanted.on_error == "strict":
+            raise InputFileError(path, "has a header but no epochs; the recording is empty or cut short")
+    if reader is not None and not found:
+        if not reader.epochs:
+            raise InputFileError(reader.path, "has no epoch that can be used; see it with on_error='strict'")
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+
+
+def _in_order_of_time(paths: list[str], wanted: Wanted) -> list[str]:
+    peek = replace(wanted, on_error="lenient", systems=None, start_ns=Wanted.start_ns, end_ns=Wanted.end_ns)
+    firsts = []
+    for path in paths:
+        with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:
+            firsts.append(next((run.time[0] for run in runs if len(run)), np.datetime64("NaT", "ns")))
+    return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
+
+
+def _with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
+    """A break before the first epoch of a further file, unless it follows at the log's own interval."""
+    if last is None:
+        return run
+    interval = run.header.interval_s
+    if np.isnan(interval) and len(last) > 1:
+        interval = float((last.time[-1] - last.time[-2]) / np.timedelta64(1, "s"))
+    step = float((run.time[0] - last.time[-1]) / np.timedelta64(1, "s"))
+    if step <= _GAP_INTERVALS * interval:
+        return run
+    before = run.break_before.copy()
+    before[0] = True
+    return replace(run, break_before=before)
+
+
+def _pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
+    """Runs cut and joined to pieces of equal length; problems go with the piece being collected."""
+    waiting: list[Observations] = []
+    length = 0
+    for run in runs:
+        waiting.append(run)
+        length += len(run)
+        if length > epochs:
+            whole = concatenate(waiting)
+            rest = (length - 1) // epochs * epochs  # the last piece waits: what the end of the file says goes with it
+            for k, first in enumerate(range(0, rest, epochs)):
+                piece = without_empty_channels(whole[first : first + epochs])
+                yield _with_problems(piece, whole) if k == 0 else piece
+            waiting, length = [without_empty_channels(whole[rest:])], length - rest
+    yield without_empty_channels(concatenate(waiting))
+
+
+def _with_problems(piece: Observations, source: Observations) -> Observations:
+    return replace(piece, problems=source.problems, problem_count=source.problem_count, passed_over=source.passed_over)
+
+
+def without_empty_channels(observations: Observations) -> Observations:
+    """Without the channels that have neither an observation nor a loss-of-lock digit."""
+    used = observations.loss_of_lock.any(axis=0)
+    arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")
+    for name in arrays:
+        used |= ~np.isnan(getattr(observations, name)).all(axis=0)
+    if used.all():
+        return observations
+    return replace(
+        observations,
+        satellite=observations.satellite[used],
+        signal=observations.signal[used],
+        loss_of_lock=observations.loss_of_lock[:, used],
+        **{name: getattr(observations, name)[:, used] for name in arrays},
+    )

@@ -1,0 +1,241 @@
+"""Where the epochs of a block of lines are: which lines belong to which epoch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Integers, Masks
+from railfix.io.rinex.observations_lines import EpochLines, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
+from railfix.io.rinex.observations_log import EPOCHS, FaultLog
+
+#: An epoch never has more lines than its three-digit count tells, so this many are no epoch.
+_MAX_LINES = 1100 * 6
+_CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
+
+
+@dataclass(frozen=True)
+class Epochs:
+    """Records of a block in the order of the file, shape (n,) each: epochs and events.
+
+    Attributes
+    ----------
+    line : ndarray of int64
+        Index of the epoch line.
+    flag, count : ndarray of int64
+    time_ns : ndarray of int64
+        Time tag since 1970 in the file's time system (0 for events).
+    """
+
+    line: Integers
+    flag: Integers
+    count: Integers
+    time_ns: Integers
+
+    def __getitem__(self, which: slice | Masks | Integers) -> Epochs:
+        return Epochs(self.line[which], self.flag[which], self.count[which], self.time_ns[which])
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+
+def find_epochs(
+    lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
+) -> tuple[Epochs, int]:
+    """Complete records of a block, and the number of lines they (and what is broken) take.
+
+    Parameters
+    ----------
+    lines : Lines
+        Complete lines from a record's first line on.
+    version : float
+        RINEX version.
+    lines_per_satellite : int
+        RINEX 2: lines of five observations each that a satellite has.
+    at_end : bool
+        Whether the file ends with these lines; if not, the last epoch waits for the next block.
+    log : FaultLog
+    """
+    if version >= 3.0:
+        return _find_marked(lines, version=version, at_end=at_end, log=log)
+    return _find_unmarked(lines, lines_per_satellite=lines_per_satellite, at_end=at_end, log=log)
+
+
+def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
+    """RINEX 3 and 4: epoch lines begin with ``>``."""
+    n = len(lines)
+    line = np.flatnonzero(lines.data[lines.start] == ord(">"))
+    before = int(line[0]) if len(line) else n
+    if before and (at_end or len(line) or n > _MAX_LINES):
+        log.fault(EPOCHS, int(lines.number[0]), _no_epoch(lines, 0, version))
+    if not len(line):
+        return _none(), (n if at_end or n > _MAX_LINES else 0)
+    head = read_epoch_lines(lines, line, version=version)
+    room = np.diff(line, append=n) - 1
+    done = n
+    waits = not at_end and not (len(line) == 1 and n > _MAX_LINES)
+    if waits:
+        done = int(line[-1])
+        line, room = line[:-1], room[:-1]
+        head = _first(head, len(line))
+    broken = head.flaw != 0
+    if at_end and len(line) and not room[-1] and lines.length[line[-1]] < epoch_width(version):
+        log.fault(EPOCHS, int(lines.number[-1]), _CUT_EPOCH_LINE)
+        line, room, broken, head = line[:-1], room[:-1], broken[:-1], _first(head, len(line) - 1)
+    log.faults(
+        EPOCHS,
+        lines.number[line[broken]],
+        lambda i: flaw_text(lines, int(line[broken][i]), int(head.flaw[broken][i]), version=version),
+    )
+    wrong = ~broken & (head.count != room)
+    if at_end and len(line) and wrong[-1] and head.count[-1] > room[-1]:
+        wrong[-1] = False
+        broken[-1] = True
+        log.fault(EPOCHS, int(lines.number[-1]), _truncated(int(head.count[-1]), int(room[-1]), lines, int(line[-1])))
+    log.faults(
+        EPOCHS,
+        lines.number[line[wrong]],
+        lambda i: f"the epoch announces {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
+    )
+    return Epochs(line, head.flag, head.count, head.time_ns)[~broken & ~wrong], done
+
+
+def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
+    """RINEX 2: an epoch line is told by the point in its seconds, and by where the one before ends.
+
+    Column 19 of a line of observations lies among the leading digits of its second field, so that
+    a point there is found in epoch lines only (and in records of an event, which are stepped over).
+    """
+    n = len(lines)
+    long = np.flatnonzero(lines.length >= epoch_width(2.0))
+    likely = long[lines.data[lines.start[long] + 18] == ord(".")]
+    read = read_epoch_lines(lines, likely, version=2.0)
+    fine = read.flaw == 0
+    line = likely[fine]
+    head = EpochLines(*(getattr(read, name)[fine] for name in ("flag", "count", "time_ns", "flaw")))
+    event = (head.flag >= 2) & (head.flag <= 5)
+    satellite_lines = np.maximum(-(-head.count // 12), 1) - 1 + head.count * lines_per_satellite
+    following = line + 1 + np.where(event, head.count, satellite_lines)
+    walk = _Walk(lines, line, following, event, head, log)
+    stop = n
+    if not at_end and len(line) and (line[-1] > 0 or n <= _MAX_LINES):
+        stop = int(line[-1])
+    elif not at_end and not len(line) and n <= _MAX_LINES:
+        return _none(), 0
+    return walk.run(stop, at_end=at_end)
+
+
+class _Walk:
+    """Steps from record to record; epochs that follow each other without a gap are one step."""
+
+    def __init__(
+        self, lines: Lines, line: Integers, following: Integers, event: Masks, head: EpochLines, log: FaultLog
+    ) -> None:
+        self._lines, self._line, self._following, self._event = lines, line, following, event
+        self._head, self._log = head, log
+        self._bound = np.append(line[1:], len(lines))[: len(line)]
+        self._breaks = np.flatnonzero(following != self._bound)
+        self._kept = np.zeros(len(line), dtype=np.bool_)
+        self._events: list[tuple[int, int, int]] = []
+
+    def run(self, stop: int, *, at_end: bool) -> tuple[Epochs, int]:
+        """Walk from line 0 to `stop`; see `find_epochs`."""
+        position = 0
+        while position < stop:
+            k = int(np.searchsorted(self._line, position))
+            if k < len(self._line) and self._line[k] == position:
+                reached = self._run_of_epochs(k, stop, at_end=at_end)
+            else:
+                reached = self._other(position, k, at_end=at_end)
+            if reached == position:
+                break
+            position = reached
+        return self._table(), position
+
+    def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
+        """Epochs from the k-th on up to the first that is not followed by another; where to go on."""
+        later = self._breaks[np.searchsorted(self._breaks, k) :]
+        last = int(later[0]) if len(later) else len(self._line) - 1
+        beyond = int(np.searchsorted(self._line, stop))
+        if last >= beyond:
+            self._kept[k:beyond] = True
+            return stop
+        self._kept[k:last] = True
+        position, end, bound = int(self._line[last]), int(self._following[last]), int(self._bound[last])
+        if end <= bound or (self._event[last] and end <= len(self._lines)):
+            self._kept[last] = True
+            return end
+        if last + 1 == len(self._line):
+            if not at_end:
+                return position
+            needed = end - position - 1
+            message = _truncated(needed, len(self._lines) - position - 1, self._lines, position)
+            self._log.fault(EPOCHS, int(self._lines.number[-1]), message)
+            return len(self._lines)
+        message = (
+            f"the epoch of {self._head.count[last]} satellites needs {end - position - 1} lines, "
+            f"{bound - position - 1} follow before the next epoch"
+        )
+        self._log.fault(EPOCHS, int(self._lines.number[position]), message)
+        return bound
+
+    def _other(self, position: int, k: int, *, at_end: bool) -> int:
+        """A line where an epoch line should be and is none: an event without time, or broken."""
+        event = event_line(self._lines, position)
+        if event is not None:
+            end = position + 1 + event[1]
+            if end <= len(self._lines):
+                self._events.append((position, *event))
+                return end
+            if not at_end:
+                return position
+            message = _truncated(event[1], len(self._lines) - position - 1, self._lines, position)
+            self._log.fault(EPOCHS, int(self._lines.number[-1]), message)
+            return len(self._lines)
+        rest = self._lines.length[position:]
+        if at_end and k == len(self._line) and not rest.any():
+            return len(self._lines)
+        cut = at_end and len(rest) == 1 and rest[0] < epoch_width(2.0)
+        message = _CUT_EPOCH_LINE if cut else _no_epoch(self._lines, position, 2.0)
+        self._log.fault(EPOCHS, int(self._lines.number[position]), message)
+        return int(self._line[k]) if k < len(self._line) else len(self._lines)
+
+    def _table(self) -> Epochs:
+        kept = self._kept
+        epochs = Epochs(self._line[kept], self._head.flag[kept], self._head.count[kept], self._head.time_ns[kept])
+        if not self._events:
+            return epochs
+        extra = np.array(self._events, dtype=np.int64).reshape(-1, 3)
+        line = np.concatenate([epochs.line, extra[:, 0]])
+        order = np.argsort(line, kind="stable")
+        return Epochs(
+            line[order],
+            np.concatenate([epochs.flag, extra[:, 1]])[order],
+            np.concatenate([epochs.count, extra[:, 2]])[order],
+            np.concatenate([epochs.time_ns, np.zeros(len(extra), dtype=np.int64)])[order],
+        )
+
+
+def _none() -> Epochs:
+    nothing = np.zeros(0, dtype=np.int64)
+    return Epochs(nothing, nothing, nothing, nothing)
+
+
+def _first(head: EpochLines, count: int) -> EpochLines:
+    return EpochLines(head.flag[:count], head.count[:count], head.time_ns[:count], head.flaw[:count])
+
+
+def _no_epoch(lines: Lines, line: int, version: float) -> str:
+    if version < 3.0 and lines.length[line] >= epoch_width(version):
+        head = read_epoch_lines(lines, np.array([line]), version=version)
+        if lines.data[lines.start[line] + 18] == ord(".") and head.flaw[0]:
+            return flaw_text(lines, line, int(head.flaw[0]), version=version)
+    return f"an epoch line was expected, found '{lines.text(line)[:40].rstrip()}'"
+
+
+def _truncated(needed: int, found: int, lines: Lines, line: int) -> str:
+    return (
+        f"the file ends in the middle of an epoch: the one of line {lines.number[line]} needs {needed} lines, "
+        f"{found} are there"
+    )

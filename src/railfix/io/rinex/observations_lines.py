@@ -1,0 +1,208 @@
+"""A block of text as lines, and its epoch lines as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Integers, Masks
+from railfix.io.rinex.observations_fields import PADDING
+
+_DAY_NS: Final = 86_400_000_000_000
+_BLANK: Final = ord(" ")
+_ZERO: Final = ord("0")
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Lines of a block of text.
+
+    Attributes
+    ----------
+    data : ndarray of uint8
+        The text, followed by blanks so that fixed columns may be read over the end of a line.
+    start, length : ndarray of int64, shape (n,)
+        Where each line starts, and its length without line end (LF or CR LF).
+    stop : ndarray of int64, shape (n,)
+        Where the next line starts.
+    number : ndarray of int64, shape (n,)
+        1-based line numbers in the (decompressed) file.
+    """
+
+    data: Bytes
+    start: Integers
+    length: Integers
+    stop: Integers
+    number: Integers
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def text(self, line: int) -> str:
+        """One line as text."""
+        first = int(self.start[line])
+        return self.data[first : first + int(self.length[line])].tobytes().decode("latin-1")
+
+    def columns(self, lines: Integers, width: int) -> Bytes:
+        """The first `width` characters of some lines, blank beyond their ends, shape (n, width)."""
+        items = np.ndarray((len(self.data) - width + 1,), dtype=f"V{width}", buffer=self.data, strides=(1,))
+        text: Bytes = items[self.start[lines]].view(np.uint8).reshape(len(lines), width)
+        short = np.flatnonzero(self.length[lines] < width)
+        if len(short):
+            beyond = np.arange(width) >= self.length[lines[short], None]
+            text[short] = np.where(beyond, _BLANK, text[short])
+        return text
+
+    def __getitem__(self, some: slice) -> Lines:
+        """Some of the lines, of the same text."""
+        return Lines(self.data, self.start[some], self.length[some], self.stop[some], self.number[some])
+
+
+def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
+    """Lines of a block that ends with a line end.
+
+    Parameters
+    ----------
+    text : bytes
+    first_number : int
+        Line number of the first line.
+    keep_blank : bool
+        Whether a line without any character is a line (RINEX 2: a satellite without observations).
+    """
+    data = np.frombuffer(text + b" " * PADDING, dtype=np.uint8)
+    end = np.flatnonzero(data == ord("\n"))
+    start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
+    length = end - start
+    if b"\r" in text:
+        length -= (length > 0) & (data[end - 1] == ord("\r"))
+    number = np.arange(first_number, first_number + len(end))
+    lines = Lines(data, start, length, end + 1, number)
+    if keep_blank or not (length == 0).any():
+        return lines
+    kept = length > 0
+    return Lines(data, start[kept], length[kept], end[kept] + 1, number[kept])
+
+
+@dataclass(frozen=True)
+class EpochLines:
+    """Epoch lines as numbers, shape (n,) each.
+
+    Attributes
+    ----------
+    flag, count : ndarray of int64
+        Epoch flag, and number of satellites (or of records, for events); -1 where unreadable.
+    time_ns : ndarray of int64
+        Time tag since 1970 in the file's time system; 0 where unreadable.
+    flaw : ndarray of int64
+        Index into `FLAWS`, 0 where the line is in order.
+    """
+
+    flag: Integers
+    count: Integers
+    time_ns: Integers
+    flaw: Integers
+
+
+FLAWS: Final = (
+    "",
+    "the epoch line is shorter than {width} characters",
+    "the epoch flag '{flag}' is none of 0 to 6",
+    "the number of satellites '{count}' is no number",
+    "the fields of the epoch line are not in their columns",
+    "the year is no number",
+    "the month is none of 1 to 12",
+    "the day does not exist in its month",
+    "the hour is none of 0 to 23",
+    "the minute is none of 0 to 59",
+    "the seconds are not from 0 to below 60",
+)
+_SHORT, _FLAG, _COUNT, _PLACES = 1, 2, 3, 4
+
+
+def epoch_width(version: float) -> int:
+    """Characters up to the number of satellites."""
+    return 35 if version >= 3.0 else 32
+
+
+def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochLines:
+    """Epoch lines as numbers; events (flags 2 to 5) may lack the time.
+
+    RINEX 3 and 4 write ``> yyyy mm dd hh mm ss.sssssss  f nnn``, RINEX 2 the same without the
+    mark and with a year of two digits (80 to 99 are 19xx).
+    """
+    width = epoch_width(version)
+    text = lines.columns(which, width)
+    at = width - 35
+    flag, flag_ok = _number(text[:, 31 + at : 32 + at])
+    count, count_ok = _number(text[:, 32 + at : 35 + at])
+    year_from = 2 if version >= 3.0 else 1
+    year, year_ok = _number(text[:, year_from : 6 + at])
+    if version < 3.0:
+        year = year + np.where(year >= 80, 1900, 2000)
+    parts = [_number(text[:, first + at : first + at + 2]) for first in (7, 10, 13, 16, 19)]
+    (month, month_ok), (day, day_ok), (hour, hour_ok), (minute, minute_ok), (second, second_ok) = parts
+    fraction, fraction_ok = _fraction(text[:, 22 + at : 29 + at])
+    gaps = [first + at for first in (6, 9, 12, 15, 18, 29, 30)] + [0 if version < 3.0 else 1]
+    placed = (text[:, gaps] == _BLANK).all(axis=1) & (text[:, 21 + at] == ord("."))
+    month_ok &= (month >= 1) & (month <= 12)
+    months = (year - 1970) * 12 + np.where(month_ok, month, 1) - 1
+    first_day = months.astype("M8[M]").astype("M8[D]").astype(np.int64)
+    next_month = (months + 1).astype("M8[M]").astype("M8[D]").astype(np.int64)
+    day_ok &= (day >= 1) & (day <= next_month - first_day)
+    flag_ok &= flag <= 6
+    event = flag_ok & (flag >= 2) & (flag <= 5)
+    checks = (
+        lines.length[which] >= width,
+        flag_ok,
+        count_ok,
+        placed | event,
+        (year_ok & (year > 1969) & (year < 2200)) | event,
+        month_ok | event,
+        day_ok | event,
+        (hour_ok & (hour < 24)) | event,
+        (minute_ok & (minute < 60)) | event,
+        (second_ok & fraction_ok & (second < 60)) | event,
+    )
+    flaw = np.zeros(len(which), dtype=np.int64)
+    for code, fine in reversed(list(enumerate(checks, start=1))):
+        flaw[~fine] = code
+    seconds = ((first_day + day - 1) * 24 + hour) * 3600 + minute * 60 + second
+    time_ns = np.where((flaw == 0) & ~event, seconds * 1_000_000_000 + fraction * 100, 0)
+    known = flaw != _SHORT
+    return EpochLines(np.where(flag_ok & known, flag, -1), np.where(count_ok & known, count, -1), time_ns, flaw)
+
+
+def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
+    """What is wrong with an epoch line."""
+    width = epoch_width(version)
+    text = f"{lines.text(line):<{width}}"
+    message = FLAWS[flaw].format(width=width, flag=text[width - 4], count=text[width - 3 : width])
+    return f"{message} ('{text[:width].rstrip()}')"
+
+
+def _number(text: Bytes) -> tuple[Integers, Masks]:
+    """Right-aligned digits of each row as a number, and whether they are that."""
+    digits = text.astype(np.int64) - _ZERO
+    is_digit = (digits >= 0) & (digits <= 9)
+    blank = text == _BLANK
+    fine = (is_digit | blank).all(axis=1) & is_digit[:, -1] & ~(is_digit[:, :-1] & blank[:, 1:]).any(axis=1)
+    weights = 10 ** np.arange(text.shape[1] - 1, -1, -1)
+    return np.where(fine, np.where(is_digit, digits, 0) @ weights, 0), fine
+
+
+def _fraction(text: Bytes) -> tuple[Integers, Masks]:
+    """Left-aligned decimals of each row as a number of units of the last one."""
+    _, fine = _number(text[:, ::-1])
+    digits = np.where(text == _BLANK, 0, text.astype(np.int64) - _ZERO)
+    return digits @ (10 ** np.arange(text.shape[1] - 1, -1, -1)), fine
+
+
+def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
+    """Flag and count of a RINEX 2 event line without a time; None when it is none."""
+    text = f"{lines.text(line):<32}"
+    flag, count = text[28], text[29:32].strip()
+    if text[:26].strip() or flag not in "2345" or not count.isdigit():
+        return None
+    return int(flag), int(count)

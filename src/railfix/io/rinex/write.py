@@ -1,0 +1,295 @@
+"""Writers of RINEX 3.04 observation and navigation files.
+
+Text is put together as bytes of whole blocks of epochs, never value by value, so that an hour at
+10 Hz takes seconds, and a log of any length is written piece by piece in bounded memory.
+
+The same arrays give the same bytes: packed files carry no time of writing, and the header's date
+is blank unless `created` is given.
+
+Source: RINEX 3.04, tables A2, A3 (observations), A5 to A15 (navigation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
+from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.io.rinex.header_text import header_line, program_line
+from railfix.io.rinex.packing import Packing, open_target
+from railfix.io.rinex.write_navigation import write_navigation
+
+__all__ = ["write_navigation", "write_observations"]
+
+
+#: Kinds of observable, the letter before the signal, and the array that holds it.
+KINDS: Final[dict[str, str]] = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
+#: Epochs that are turned into text at once.
+_BLOCK_EPOCHS: Final = 1024
+#: Bytes of an epoch line with its line end, and of one observation (F14.3, LLI, SSI).
+_EPOCH_WIDTH: Final = 36
+_FIELD_WIDTH: Final = 16
+_BLANK: Final = ord(" ")
+#: ``_FOUR[n]`` is n as four digits.
+_FOUR: Final = (np.arange(10_000)[:, None] // (1000, 100, 10, 1) % 10 + ord("0")).astype(np.uint8)
+
+
+def write_observations(
+    observations: Observations | Iterable[Observations],
+    path: str | PathLike[str],
+    *,
+    packing: Packing | None = None,
+    observables: Mapping[str, Sequence[str]] | None = None,
+    header: ObservationHeader | None = None,
+    comments: Sequence[str] = (),
+    run_by: str = "",
+    created: np.datetime64 | None = None,
+) -> None:
+    """Write a RINEX 3.04 observation file; it appears whole or not at all.
+
+    Parameters
+    ----------
+    observations : Observations, or iterable of them
+        A log, or its pieces in order of time. An epoch without any observation is written with 0
+        satellites. NaN is left blank; `break_before` becomes epoch flag 1.
+    path : path-like
+    packing : {"plain", "gz", "crx", "crx.gz"}, optional
+        Without it the name tells: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
+    observables : mapping of str to sequence of str, optional
+        Columns of each constellation (``{"G": ["C1C", "L1C"]}``). Without it C, L, D and S of
+        every signal among the channels of the first piece.
+    header : ObservationHeader, optional
+        Without it that of the first piece.
+    comments : sequence of str
+        Each at most 60 characters.
+    run_by : str
+    created : datetime64, optional
+        UTC; blank without it.
+
+    Raises
+    ------
+    ValueError
+        No epoch; a time tag finer than 100 ns; a value too large for F14.3; a channel that has no column.
+    OutputError
+        The file cannot be written.
+    """
+    pieces = iter([observations] if isinstance(observations, Observations) else observations)
+    first = next((piece for piece in pieces if len(piece)), None)
+    if first is None:
+        raise ValueError("there is no epoch to write")
+    header = header or first.header
+    columns = _columns(first, observables)
+    with open_target(path, packing=packing) as target:
+        target.write(_observation_header(first, header, columns, program_line(run_by, created), comments))
+        for piece in chain([first], pieces):
+            for block in _text_blocks(piece, columns):
+                target.write(block)
+
+
+def _columns(first: Observations, asked: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
+    if asked is not None:
+        wrong = [o for names in asked.values() for o in names if len(o) != 3 or o[0] not in KINDS]
+        if wrong:
+            raise ValueError(f"observable {wrong[0]!r} is none; expected C, L, D or S and a signal, as in 'C1C'")
+        return {system: tuple(names) for system, names in asked.items()}
+    pairs = sorted(set(zip(first.system.tolist(), first.signal.tolist(), strict=True)))
+    columns: dict[str, tuple[str, ...]] = {}
+    for system, signal in pairs:
+        columns[system] = (*columns.get(system, ()), *(kind + signal for kind in KINDS))
+    return columns
+
+
+# ---------------------------------------------------------------- header
+
+
+def _calendar(time: np.datetime64) -> tuple[int, int, int, int, int, int]:
+    """Year, month, day, hour, minute and the rest in 100 ns of one instant."""
+    values = _split_time(np.array([time], dtype="datetime64[ns]"))
+    year, month, day, hour, minute, ticks = (int(v[0]) for v in values)
+    return year, month, day, hour, minute, ticks
+
+
+def _observation_header(
+    first: Observations,
+    header: ObservationHeader,
+    columns: Mapping[str, Sequence[str]],
+    stamp: str,
+    comments: Sequence[str],
+) -> bytes:
+    systems = list(columns)
+    letter = systems[0] if len(systems) == 1 else "M"
+    place = np.nan_to_num(header.approximate_ecef_m)
+    year, month, day, hour, minute, ticks = _calendar(first.time[0])
+    date = f"{year:6d}{month:6d}{day:6d}{hour:6d}{minute:6d}{ticks // 10_000_000:5d}.{ticks % 10_000_000:07d}"
+    lines = [
+        header_line(f"{'3.04':>9}{'':11}{'OBSERVATION DATA':<20}{letter:<20}", "RINEX VERSION / TYPE"),
+        stamp,
+        *(header_line(comment, "COMMENT") for comment in comments),
+        header_line(header.marker, "MARKER NAME"),
+        header_line("", "MARKER NUMBER"),
+        header_line("", "OBSERVER / AGENCY"),
+        header_line(f"{'':20}{header.receiver[:20]:<20}", "REC # / TYPE / VERS"),
+        header_line(f"{'':20}{header.antenna[:20]:<20}", "ANT # / TYPE"),
+        header_line("".join(f"{v:14.4f}" for v in place), "APPROX POSITION XYZ"),
+        header_line("".join(f"{v:14.4f}" for v in header.antenna_delta_hen_m), "ANTENNA: DELTA H/E/N"),
+    ]
+    for system, names in columns.items():
+        for start in range(0, len(names), 13):
+            lead = f"{system}  {len(names):3d}" if start == 0 else " " * 6
+            lines.append(header_line(lead + "".join(f" {o}" for o in names[start : start + 13]), "SYS / # / OBS TYPES"))
+    lines.append(header_line("DBHZ", "SIGNAL STRENGTH UNIT"))
+    if np.isfinite(header.interval_s):
+        lines.append(header_line(f"{header.interval_s:10.3f}", "INTERVAL"))
+    lines.append(header_line(f"{date}     GPS", "TIME OF FIRST OBS"))
+    lines.append(header_line("", "SYS / PHASE SHIFT"))
+    if "R" in columns or header.glonass_channel:
+        lines += _glonass_slots(header.glonass_channel)
+    if header.leap_seconds is not None:
+        lines.append(header_line(f"{header.leap_seconds:6d}", "LEAP SECONDS"))
+    lines.append(header_line("", "END OF HEADER"))
+    return "".join(lines).encode("ascii")
+
+
+def _glonass_slots(channels: Mapping[str, int]) -> list[str]:
+    items = [f"{name:3} {number:2d} " for name, number in sorted(channels.items())]
+    lines = []
+    for start in range(0, max(len(items), 1), 8):
+        lead = f"{len(items):3d} " if start == 0 else " " * 4
+        lines.append(header_line((lead + "".join(items[start : start + 8])).rstrip(), "GLONASS SLOT / FRQ #"))
+    return [*lines, header_line(" C1C    0.000 C1P    0.000 C2C    0.000 C2P    0.000", "GLONASS COD/PHS/BIS")]
+
+
+# ---------------------------------------------------------------- epochs
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Satellites of one constellation: where each column's values stand among the channels."""
+
+    satellites: tuple[str, ...]
+    columns: tuple[str, ...]
+    #: Channel of each satellite and column, -1 where the satellite has none; shape (S, K).
+    channel: Indices
+
+
+def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_Rows]:
+    names, signals = piece.satellite.tolist(), piece.signal.tolist()
+    place = {key: i for i, key in enumerate(zip(names, signals, strict=True))}
+    for name, signal in place:
+        if not any(column[1:] == signal for column in columns.get(name[0], ())):
+            raise ValueError(f"channel {name} {signal} has no column; name it in `observables`")
+    rows = []
+    for system in sorted(columns):
+        satellites = tuple(sorted({name for name in names if name[0] == system}))
+        if satellites:
+            channel = [[place.get((name, column[1:]), -1) for column in columns[system]] for name in satellites]
+            rows.append(_Rows(satellites, tuple(columns[system]), np.array(channel, dtype=np.intp)))
+    return rows
+
+
+def _text_blocks(piece: Observations, columns: Mapping[str, Sequence[str]]) -> Iterator[bytes]:
+    rows = _rows(piece, columns)
+    for start in range(0, len(piece), _BLOCK_EPOCHS):
+        part = piece[start : start + _BLOCK_EPOCHS]
+        texts, keeps = zip(*(_satellite_lines(part, row) for row in rows), strict=True) if rows else ((), ())
+        count = sum((keep[:, :, 0].sum(axis=1) for keep in keeps), np.zeros(len(part), dtype=np.int64))
+        head = _epoch_lines(part.time, part.break_before, count)
+        flat = [head, *(t.reshape(len(part), -1) for t in texts)]
+        kept = [np.ones(head.shape, dtype=bool), *(k.reshape(len(part), -1) for k in keeps)]
+        yield np.concatenate(flat, axis=1)[np.concatenate(kept, axis=1)].tobytes()
+
+
+def _satellite_lines(part: Observations, row: _Rows) -> tuple[Bytes, Masks]:
+    """Lines of one constellation, shape (T, S, width), and which bytes of them are written."""
+    epochs, satellites, width = len(part), len(row.satellites), 3 + _FIELD_WIDTH * len(row.columns) + 1
+    text = np.full((epochs, satellites, width), _BLANK, dtype=np.uint8)
+    text[:, :, :3] = np.array(row.satellites, dtype="S3").view(np.uint8).reshape(satellites, 3)
+    end = np.zeros((epochs, satellites), dtype=np.int64)
+    for k, column in enumerate(row.columns):
+        channel = row.channel[:, k]
+        at = 3 + _FIELD_WIDTH * k
+        value = np.where(channel >= 0, getattr(part, KINDS[column[0]])[:, channel], np.nan)
+        present = np.isfinite(value)
+        text[:, :, at : at + 14] = _fixed_3(value)
+        end[present] = at + 14
+        if column[0] == "L":
+            lock = np.where(channel >= 0, part.loss_of_lock[:, channel], 0)
+            flagged = present & (lock > 0)
+            text[:, :, at + 14][flagged] = lock[flagged] % 10 + ord("0")
+            end[flagged] = at + 15
+    keep = np.arange(width) <= end[:, :, None]
+    keep[end == 0] = False
+    np.put_along_axis(text, end[:, :, None], ord("\n"), axis=2)
+    return text, keep
+
+
+def _fixed_3(value: Floats) -> Bytes:
+    """Values as F14.3, shape (..., 14); NaN is blank.
+
+    Rounded half to even on the value times 1000, as near as its own last bit allows.
+    """
+    present = np.isfinite(value)
+    thousandths = np.rint(np.abs(np.where(present, value, 0.0)) * 1e3).astype(np.int64)
+    negative = present & (value < 0) & (thousandths > 0)
+    # Ten places before the point, nine of them behind a sign.
+    if (thousandths >= np.where(negative, 10**12, 10**13)).any():
+        raise ValueError("a value has too many digits for the F14.3 of RINEX")
+    high, low = np.divmod(thousandths, 10**8)
+    middle, last = np.divmod(low, 10**4)
+    digits = np.concatenate([_FOUR[high // 10**4], _FOUR[high % 10**4], _FOUR[middle], _FOUR[last]], axis=-1)
+    text = np.empty((*value.shape, 14), dtype=np.uint8)
+    text[..., :10], text[..., 10], text[..., 11:] = digits[..., 3:13], ord("."), digits[..., 13:]
+    blanks = np.zeros(value.shape, dtype=np.int8)
+    for power in range(4, 13):
+        blanks += thousandths < 10**power
+    text[..., :9][np.arange(9, dtype=np.int8) < blanks[..., None]] = _BLANK
+    text[..., :9][negative[..., None] & (np.arange(9, dtype=np.int8) == blanks[..., None] - 1)] = ord("-")
+    text[~present] = _BLANK
+    return text
+
+
+def _split_time(time: ArrayLike) -> tuple[Integers, ...]:
+    """Year, month, day, hour, minute and the rest in 100 ns."""
+    tags = np.asarray(time, dtype="datetime64[ns]")
+    month = tags.astype("datetime64[M]")
+    day = tags.astype("datetime64[D]")
+    ticks, finer = np.divmod((tags - day).astype(np.int64), 100)
+    if finer.any() or np.isnat(tags).any():
+        raise ValueError("a time tag is NaT or finer than 100 ns, which the F11.7 of RINEX cannot hold")
+    minutes, ticks = np.divmod(ticks, 60 * 10_000_000)
+    months = month.astype(np.int64)
+    return (
+        months // 12 + 1970,
+        months % 12 + 1,
+        (day - month.astype("datetime64[D]")).astype(np.int64) + 1,
+        minutes // 60,
+        minutes % 60,
+        ticks,
+    )
+
+
+def _epoch_lines(time: Datetimes, flag: Masks, count: Integers) -> Bytes:
+    """``> yyyy mm dd hh mm ss.sssssss  f nnn`` with line ends, shape (T, 36)."""
+    year, month, day, hour, minute, ticks = _split_time(time)
+    text = np.full((len(time), _EPOCH_WIDTH), _BLANK, dtype=np.uint8)
+    text[:, 0], text[:, -1] = ord(">"), ord("\n")
+    text[:, 2:6] = _FOUR[year]
+    for at, value in ((7, month), (10, day), (13, hour), (16, minute)):
+        text[:, at : at + 2] = _FOUR[value][:, 2:]
+    second, ticks = np.divmod(ticks, 10_000_000)
+    text[:, 19:21] = _FOUR[second][:, 2:]
+    text[second < 10, 19] = _BLANK
+    text[:, 21] = ord(".")
+    text[:, 22:25], text[:, 25:29] = _FOUR[ticks // 10_000][:, 1:], _FOUR[ticks % 10_000]
+    text[:, 31] = np.where(flag, ord("1"), ord("0"))
+    text[:, 32:35] = _FOUR[count][:, 1:]
+    text[count < 100, 32] = _BLANK
+    text[count < 10, 33] = _BLANK
+    return text

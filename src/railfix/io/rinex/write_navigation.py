@@ -1,0 +1,184 @@
+"""Writer of RINEX 3.04 navigation files (RINEX 3.04, tables A5 to A15)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.constants import BDT_MINUS_GPST_S
+from railfix.core.timescale import BDT_EPOCH, GPS_EPOCH, SECONDS_PER_WEEK, gpst_minus_utc, seconds, timedelta, to_week
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.io.rinex.header_text import header_line, program_line
+from railfix.io.rinex.packing import Packing, open_target
+
+#: What RINEX writes for a transmission time that is not known.
+UNKNOWN_TRANSMISSION_S: Final = 0.9999e9
+#: Name of a constellation's Klobuchar coefficients.
+_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}
+_BLANK: Final = " " * 19
+
+
+def write_navigation(
+    navigation: Navigation,
+    path: str | PathLike[str],
+    *,
+    packing: Packing | None = None,
+    comments: Sequence[str] = (),
+    run_by: str = "",
+    created: np.datetime64 | None = None,
+) -> None:
+    """Write a RINEX 3.04 navigation file; it appears whole or not at all.
+
+    Records stand in order of clock time, then satellite. What `Navigation` does not hold (L2 code
+    and P flags, the GLONASS status words) is written as 0; NaN as blank; an unknown transmission
+    time as 0.9999E9. `precise` is not written.
+
+    Parameters
+    ----------
+    navigation : Navigation
+    path : path-like
+    packing : {"plain", "gz"}, optional
+        Without it the name tells (``.gz``).
+    comments : sequence of str
+        Each at most 60 characters.
+    run_by : str
+    created : datetime64, optional
+        UTC; blank without it.
+
+    Raises
+    ------
+    ValueError
+        Hatanaka packing, which is for observations alone; a record of an unknown message.
+    OutputError
+        The file cannot be written.
+    """
+    if packing is not None and packing.startswith("crx"):
+        raise ValueError("navigation files have no Hatanaka form; use packing 'plain' or 'gz'")
+    kepler, glonass = navigation.kepler, navigation.glonass
+    letters = sorted({str(s)[0] for s in (*kepler.satellite, *glonass.satellite)})
+    kind = letters[0] if len(letters) == 1 else "M"
+    head = [
+        header_line(f"{'3.04':>9}{'':11}{'N: GNSS NAV DATA':<20}{kind:<20}", "RINEX VERSION / TYPE"),
+        program_line(run_by, created),
+        *(header_line(comment, "COMMENT") for comment in comments),
+    ]
+    for letter, values in sorted(navigation.klobuchar.items()):
+        for part, half in (("A", values[:4]), ("B", values[4:])):
+            text = f"{_IONOSPHERE[letter]}{part} " + "".join(f"{v:12.4E}" for v in half)
+            head.append(header_line(text, "IONOSPHERIC CORR"))
+    if navigation.leap_seconds is not None:
+        head.append(header_line(f"{navigation.leap_seconds:6d}", "LEAP SECONDS"))
+    head.append(header_line("", "END OF HEADER"))
+    body = np.concatenate([_kepler_text(kepler), _glonass_text(glonass)])
+    order = np.lexsort(
+        (np.concatenate([kepler.satellite, glonass.satellite]), np.concatenate([kepler.toc, glonass.toe]))
+    )
+    with open_target(path, packing=packing) as target:
+        target.write("".join(head).encode("ascii"))
+        target.write("".join(body[order].tolist()).encode("ascii"))
+
+
+def _field(values: Floats) -> Strings:
+    """D19.12, blank for NaN."""
+    return np.where(np.isfinite(values), np.char.mod("%19.12E", np.nan_to_num(values)), _BLANK)
+
+
+def _records(satellite: Strings, time: Datetimes, fields: Sequence[Floats]) -> Strings:
+    """Text of whole records: satellite, time, three clock fields, then four fields a line.
+
+    Blank fields at the end of a line are left out, as receivers do.
+    """
+    text = np.char.add(satellite, _calendar_text(time))
+    for i, values in enumerate(fields):
+        if i >= 3 and i % 4 == 3:
+            text = np.char.add(np.char.rstrip(text), "\n    ")
+        text = np.char.add(text, _field(values))
+    return np.char.add(np.char.rstrip(text), "\n")
+
+
+def _calendar_text(time: Datetimes) -> Strings:
+    """`` yyyy mm dd hh mm ss``."""
+    text = np.datetime_as_string(time, unit="s")
+    for mark in ("-", ":", "T"):
+        text = np.char.replace(text, mark, " ")
+    return np.char.add(" ", text)
+
+
+def _kepler_text(records: KeplerRecords) -> Strings:
+    if len(records) == 0:
+        return np.empty(0, dtype="<U1")
+    letter = records.satellite.astype("<U1")
+    unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
+    if unknown.size:
+        raise ValueError(f"Keplerian records of constellation {unknown[0]!r} have no RINEX form")
+    beidou, galileo = letter == "C", letter == "E"
+    navstar = ~(beidou | galileo)
+    shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
+    toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
+    week, sent = _week_and_transmission(records, shift, beidou)
+    # BeiDou's spare field between two others is 0: a blank there stops some readers.
+    zero, none = np.zeros(len(records)), np.full(len(records), np.nan)
+    # QZSS writes the flag: 0 for two hours, 1 for longer.
+    fit = np.where(
+        letter == "J",
+        np.where(np.isnan(records.fit_interval_h), np.nan, records.fit_interval_h > 2.0),
+        records.fit_interval_h,
+    )
+    first, second = records.group_delay_1_s, records.group_delay_2_s
+    fields = (
+        records.af0_s, records.af1, records.af2,
+        records.iode, records.crs, records.delta_n, records.m0,
+        records.cuc, records.eccentricity, records.cus, records.sqrt_a,
+        records.toe_sow_s, records.cic, records.omega0, records.cis,
+        records.i0, records.crc, records.omega, records.omega_dot,
+        records.i_dot, np.where(galileo, records.data_source, zero), week, np.where(navstar, zero, none),
+        records.accuracy_m, records.health, first, np.where(navstar, records.iodc, second),
+        sent, np.where(navstar, fit, np.where(beidou, records.iodc, none)),
+    )  # fmt: skip
+    return _records(records.satellite, toc, [np.asarray(f, dtype=np.float64) for f in fields])
+
+
+def _week_and_transmission(
+    records: KeplerRecords, shift: NDArray[np.timedelta64], beidou: Masks
+) -> tuple[Floats, Floats]:
+    """Week of toe in the constellation's own count, and seconds of that week at transmission."""
+    week, _ = to_week(records.toe + shift)
+    origin = np.where(beidou, BDT_EPOCH, GPS_EPOCH)
+    # Both counts of weeks begin on a Sunday.
+    own = week - np.asarray((origin - GPS_EPOCH) // np.timedelta64(7, "D"), dtype=np.int64)
+    start = GPS_EPOCH + (week * SECONDS_PER_WEEK).astype("timedelta64[s]")
+    sent = seconds(records.transmitted + shift - start)
+    return own.astype(np.float64), np.where(np.isnan(sent), UNKNOWN_TRANSMISSION_S, sent)
+
+
+def _glonass_text(records: GlonassRecords) -> Strings:
+    if len(records) == 0:
+        return np.empty(0, dtype="<U1")
+    toe, sent = _utc(records.toe), _utc(records.transmitted)
+    frame = seconds(sent - GPS_EPOCH)
+    place, speed, push = (
+        values / 1e3 for values in (records.position_ecef_m, records.velocity_ecef_mps, records.acceleration_ecef_mps2)
+    )
+    fields: list[Floats] = [
+        records.clock_bias_s,
+        records.relative_frequency,
+        np.where(np.isnan(frame), UNKNOWN_TRANSMISSION_S, frame % SECONDS_PER_WEEK),
+    ]
+    last = (records.health, records.frequency_channel, records.age_days)
+    for axis, extra in enumerate(last):
+        fields += [place[:, axis], speed[:, axis], push[:, axis], extra.astype(np.float64)]
+    return _records(records.satellite, toe, fields)
+
+
+def _utc(time: Datetimes) -> Datetimes:
+    """GPS time as UTC."""
+    known = np.where(np.isnat(time), GPS_EPOCH, time)
+    leap = gpst_minus_utc(known).astype("timedelta64[s]")
+    # The table is asked in UTC: within seconds of a leap second ask again.
+    leap = gpst_minus_utc(known - leap).astype("timedelta64[s]")
+    return np.where(np.isnat(time), np.datetime64("NaT", "ns"), known - leap)

@@ -1,0 +1,182 @@
+"""Tables of the sensors on board: tachometer pulses and longitudinal acceleration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Datetimes, Floats
+from railfix.core.errors import InputFileError
+from railfix.core.files import read_bytes
+from railfix.core.timescale import seconds
+from railfix.io.named_columns import NamedColumns, parse_named_columns
+from railfix.io.position_log import positions_times
+
+#: How times are written.
+_ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"
+
+#: Rows of a table further apart than this leave what lies between them unknown [s].
+LONGEST_STEP_S = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pulses:
+    """Cumulated pulses of a tachometer, P rows.
+
+    Attributes
+    ----------
+    path : str
+    time : ndarray of datetime64[ns], shape (P,)
+    count : ndarray, shape (P,)
+        Falling where the train runs backward and the table can tell.
+    kind : {"count", "pulse", "distance"}
+        Rows are readings of a counter, or single pulses, or metres run.
+    signed : bool
+        Whether the count falls anywhere: then it tells the direction.
+    """
+
+    path: str
+    time: Datetimes
+    count: Floats
+    kind: str
+    signed: bool
+
+    def at(self, time: Datetimes) -> Floats:
+        """Count at instants, linearly; NaN outside and where the table has a hole while the train runs."""
+        at, known = seconds(time - self.time[0]), seconds(self.time - self.time[0])
+        found = np.interp(at, known, self.count, left=np.nan, right=np.nan)
+        after = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+        hole = (known[after] - known[after - 1] > LONGEST_STEP_S) & (self.kind != "pulse")
+        hole &= self.count[after] != self.count[after - 1]
+        hole &= (at != known[after]) & (at != known[after - 1])
+        return np.where(hole, np.nan, found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Acceleration:
+    """Longitudinal acceleration toward the vehicle's front, A rows.
+
+    Attributes
+    ----------
+    path : str
+    time : ndarray of datetime64[ns], shape (A,)
+    acceleration_mps2 : ndarray, shape (A,) [m/s2]
+    kind : {"motion", "specific_force"}
+        Whether the gravity of gradients is in it, as an accelerometer measures it.
+    """
+
+    path: str
+    time: Datetimes
+    acceleration_mps2: Floats
+    kind: str
+
+    def mean_over(self, time: Datetimes) -> Floats:
+        """Mean from each instant to the next, shape (len(time) - 1,) [m/s2]; NaN where the table has a hole."""
+        known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
+        step = np.diff(known)
+        gained = np.concatenate(
+            [[0.0], np.cumsum(step * (self.acceleration_mps2[1:] + self.acceleration_mps2[:-1]) / 2.0)]
+        )
+        holes = np.concatenate([[0], np.cumsum(step > LONGEST_STEP_S)])
+        total = np.interp(at, known, gained, left=np.nan, right=np.nan)
+        before = holes[np.clip(np.searchsorted(known, at[:-1], side="right") - 1, 0, len(known) - 1)]
+        after = holes[np.clip(np.searchsorted(known, at[1:], side="left"), 0, len(known) - 1)]
+        return np.where(before == after, np.diff(total) / np.diff(at), np.nan)
+
+
+def read_pulses(path: str | PathLike[str]) -> Pulses:
+    """Read a tachometer's table: CSV (or the same as .parquet) with ``time_gpst`` and what was counted.
+
+    ``count`` is a counter's reading (falling when it runs backward, never wrapping), ``distance_m`` metres run;
+    with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives pulses their sign.
+
+    Raises
+    ------
+    InputFileError
+        No such table, times that do not rise, a direction other than 1 and -1.
+    """
+    table = _table(path)
+    time = _rising_times(table)
+    kind = "count" if "count" in table else "distance" if "distance_m" in table else "pulse"
+    if kind == "pulse":
+        count = np.arange(len(table), dtype=np.float64)
+    else:
+        count = table.numbers("count" if kind == "count" else "distance_m")
+    if "direction" in table:
+        direction = table.numbers("direction")
+        wrong = ~np.isin(direction, (-1.0, 1.0))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise table.error(row, f"direction is {direction[row]:g}; 1 or -1 was expected")
+        count = np.cumsum(np.diff(count, prepend=count[0]) * direction)
+    falling = bool((np.diff(count) < 0).any())
+    return Pulses(path=str(path), time=time, count=count, kind=kind, signed=falling or "direction" in table)
+
+
+def read_acceleration(path: str | PathLike[str]) -> Acceleration:
+    """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
+
+    ``specific_force_mps2`` is what an accelerometer measures (gravity on gradients is taken off by the map), and
+    so is ``force_forward_mps2`` of the simulator; ``acceleration_mps2`` is that of the motion alone.
+
+    Raises
+    ------
+    InputFileError
+        None or several of the columns, or times that do not rise.
+    """
+    table = _table(path)
+    kinds = {
+        "specific_force_mps2": "specific_force",
+        "force_forward_mps2": "specific_force",
+        "acceleration_mps2": "motion",
+    }
+    found = [name for name in kinds if name in table]
+    if len(found) != 1:
+        raise InputFileError(
+            path,
+            f"one column of {', '.join(kinds)} was expected; the columns are {', '.join(table.cells)}",
+            line=table.header_line,
+        )
+    return Acceleration(
+        path=str(path),
+        time=_rising_times(table),
+        acceleration_mps2=table.numbers(found[0]),
+        kind=kinds[found[0]],
+    )
+
+
+def _table(path: str | PathLike[str]) -> NamedColumns:
+    if Path(path).suffix == ".parquet":
+        try:
+            return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO), path)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise InputFileError(path, f"cannot be read as a Parquet table ({error})") from None
+    try:
+        text = read_bytes(Path(path)).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputFileError(path, "this is not UTF-8 text; save the file as UTF-8") from None
+    return parse_named_columns(text, path)
+
+
+def _rising_times(table: NamedColumns) -> Datetimes:
+    if "time_gpst" not in table:
+        raise InputFileError(
+            table.path,
+            f"there is no column time_gpst; the columns are {', '.join(table.cells)}",
+            line=table.header_line,
+        )
+    time = positions_times(table)
+    if len(time) < 2:
+        raise InputFileError(table.path, "fewer than two rows")
+    bad = np.isnat(time)
+    if bad.any():
+        raise table.error(int(np.argmax(bad)), "there is no time")
+    bad[1:] = np.diff(time) <= np.timedelta64(0, "ns")
+    if bad.any():
+        raise table.error(int(np.argmax(bad)), "the time does not rise; sort the table and leave out doubles")
+    return time

@@ -1,0 +1,128 @@
+"""Least squares along a chain of instants: the Kalman smoother without a loop over epochs.
+
+A block-tridiagonal information matrix is solved by cyclic reduction: every second instant is eliminated,
+which leaves a chain of half the length, down to one. On the way back each eliminated instant gets its
+value and covariance from its two neighbours. The result is that of a forward-backward
+(Rauch-Tung-Striebel) smoother, in log2(N) passes over the arrays.
+
+References
+----------
+R. A. Sweet, A cyclic reduction algorithm for solving block tridiagonal systems, 1977,
+doi:10.1137/0714050. H. E. Rauch, F. Tung, C. T. Striebel, 1965, doi:10.2514/3.3166.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chain:
+    """Normal equations of N instants with n unknowns each, while terms are added.
+
+    Attributes
+    ----------
+    diagonal : ndarray, shape (N, n, n)
+        Information of each instant.
+    upper : ndarray, shape (N - 1, n, n)
+        Of each instant with the next.
+    right : ndarray, shape (N, n)
+    """
+
+    diagonal: Floats
+    upper: Floats
+    right: Floats
+
+    @classmethod
+    def empty(cls, instants: int, unknowns: int) -> Chain:
+        """No information yet."""
+        square = (unknowns, unknowns)
+        return cls(
+            diagonal=np.zeros((instants, *square)),
+            upper=np.zeros((max(instants - 1, 0), *square)),
+            right=np.zeros((instants, unknowns)),
+        )
+
+    def add_single(self, rows: Indices, coefficients: Floats, value: Floats, weight: Floats) -> None:
+        """Scalar observations ``coefficients . x_row = value``, shapes (m,), (n,) or (m, n), (m,), (m,)."""
+        a = np.broadcast_to(coefficients, (len(rows), self.right.shape[1]))
+        np.add.at(self.diagonal, rows, weight[:, None, None] * a[:, :, None] * a[:, None, :])
+        np.add.at(self.right, rows, (weight * value)[:, None] * a)
+
+    def add_steps(self, before: Floats, after: Floats, value: Floats, weight: Floats) -> None:
+        """Conditions ``before x_k + after x_{k+1} = value`` on every step.
+
+        Parameters
+        ----------
+        before, after : ndarray, shape (N - 1, m, n)
+        value : ndarray, shape (N - 1, m)
+        weight : ndarray, shape (N - 1, m, m)
+            Inverse covariance.
+        """
+        weighed_before, weighed_after = (np.swapaxes(a, 1, 2) @ weight for a in (before, after))
+        self.diagonal[:-1] += weighed_before @ before
+        self.diagonal[1:] += weighed_after @ after
+        self.upper[:] += weighed_before @ after
+        self.right[:-1] += np.einsum("kij,kj->ki", weighed_before, value)
+        self.right[1:] += np.einsum("kij,kj->ki", weighed_after, value)
+
+    def solve(self) -> tuple[Floats, Floats]:
+        """Values and covariances of every instant, shapes (N, n) and (N, n, n).
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            Something is not determined.
+        """
+        value, covariance, _ = _reduced(self.diagonal, self.upper, self.right)
+        return value, covariance
+
+
+def _reduced(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Floats, Floats]:
+    """Values, covariances, and covariances of neighbours."""
+    count = len(diagonal)
+    if count == 1:
+        whole = np.asarray(np.linalg.inv(diagonal), dtype=np.float64)
+        return np.einsum("kij,kj->ki", whole, right), whole, np.zeros((0, *diagonal.shape[1:]))
+    # Every odd instant has a left neighbour, and all but perhaps the last a right one.
+    odd = np.arange(1, count, 2)
+    inner = odd[odd + 1 < count]
+    inverse = np.asarray(np.linalg.inv(diagonal[odd]), dtype=np.float64)
+    left = upper[odd - 1]
+    rightward = np.zeros_like(left)
+    rightward[: len(inner)] = upper[inner]
+    to_left = inverse @ np.swapaxes(left, 1, 2)
+    to_right = inverse @ rightward
+    part = np.einsum("kij,kj->ki", inverse, right[odd])
+    evens = (count + 1) // 2
+    fewer, driven = diagonal[::2].copy(), right[::2].copy()
+    m = len(inner)
+    fewer[: len(odd)] -= left @ to_left
+    fewer[1 : m + 1] -= np.swapaxes(rightward[:m], 1, 2) @ to_right[:m]
+    driven[: len(odd)] -= np.einsum("kij,kj->ki", left, part)
+    driven[1 : m + 1] -= np.einsum("kji,kj->ki", rightward[:m], part[:m])
+    joined = -(left[:m] @ to_right[:m])
+    fewer = 0.5 * (fewer + np.swapaxes(fewer, 1, 2))
+    value_even, covariance_even, across = _reduced(fewer, joined[: evens - 1], driven)
+    # Back: x = D^-1 b - (D^-1 U_l^T) x_l - (D^-1 U_r) x_r. Beyond the end x_r has no part.
+    value = np.empty_like(right)
+    covariance, beside = np.empty_like(diagonal), np.empty_like(upper)
+    value[::2], covariance[::2] = value_even, covariance_even
+    at_left, at_right = np.arange(len(odd)), np.minimum(np.arange(len(odd)) + 1, evens - 1)
+    value[odd] = (
+        part
+        - np.einsum("kij,kj->ki", to_left, value_even[at_left])
+        - np.einsum("kij,kj->ki", to_right, value_even[at_right])
+    )
+    between = np.zeros_like(left)
+    between[:m] = across[:m]
+    with_left = -(covariance_even[at_left] @ np.swapaxes(to_left, 1, 2) + between @ np.swapaxes(to_right, 1, 2))
+    with_right = -(to_left @ between + to_right @ covariance_even[at_right])
+    covariance[odd] = inverse - to_left @ with_left - to_right @ np.swapaxes(with_right, 1, 2)
+    beside[odd - 1] = with_left
+    beside[inner] = with_right[:m]
+    return value, covariance, beside

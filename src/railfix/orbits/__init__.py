@@ -1,5 +1,0 @@
-"""Satellite orbits and clocks, broadcast and precise, as arrays over (epoch, channel)."""
-
-from railfix.orbits.states import SatelliteStates, satellite_states
-
-__all__ = ["SatelliteStates", "satellite_states"]

@@ -1,0 +1,1 @@
+"""Positions of a log or stream, epoch by epoch: settings, processor, results."""

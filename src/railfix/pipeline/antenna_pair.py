@@ -1,0 +1,141 @@
+"""Two antennas of one vehicle: which epochs belong together, where the antennas are against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.reasons import Reason
+from railfix.pipeline.corrected_ranges import Prepared
+from railfix.screens import (
+    AntennaPairLimits,
+    Screened,
+    antenna_pair_screen,
+    on_channels,
+    pair_channels,
+    pair_epochs,
+    spacing_direction,
+)
+from railfix.track.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spacing:
+    """The two antennas of one vehicle at P instants.
+
+    Attributes
+    ----------
+    front_ecef_m, rear_ecef_m : ndarray, shape (P, 3) [m]
+        NaN where the vehicle's place is unknown or there is no vehicle.
+    along_m : ndarray, shape (P,) [m]
+        Chainage of the front antenna less that of the rear one: negative where the vehicle's front
+        looks to falling chainage.
+    """
+
+    front_ecef_m: Floats
+    rear_ecef_m: Floats
+    along_m: Floats
+
+
+def spacing_at(front: Trajectory, rear: Trajectory, front_arc_m: Floats) -> Spacing:
+    """Both antennas where the front one is at arcs of its path, shape (P,).
+
+    Parameters
+    ----------
+    front, rear : Trajectory
+        Of one vehicle on one track (`vehicle.antenna_trajectory`).
+    front_arc_m : ndarray, shape (P,) [m]
+        NaN where unknown.
+
+    Returns
+    -------
+    Spacing
+    """
+    rear_arc = rear.arc_of_body(front.body_at(front_arc_m))
+    return Spacing(
+        front_ecef_m=front.at_arc(front_arc_m),
+        rear_ecef_m=rear.at_arc(rear_arc),
+        along_m=front.chainage_at(front_arc_m) - rear.chainage_at(rear_arc),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaPair:
+    """What two antennas have in common, P epochs.
+
+    Attributes
+    ----------
+    prepared : mapping of str to Prepared
+        "front" and "rear".
+    front_epoch, rear_epoch : ndarray of int, shape (P,)
+        Epochs of each that belong together.
+    spacing : Spacing
+        At the place that the front antenna sees its satellites from.
+    """
+
+    prepared: Mapping[str, Prepared]
+    front_epoch: Indices
+    rear_epoch: Indices
+    spacing: Spacing
+
+
+def pair_antennas(
+    front: Prepared, rear: Prepared, front_path: Trajectory, rear_path: Trajectory, *, tolerance_s: float
+) -> AntennaPair:
+    """Match the epochs of two antennas by their time tags.
+
+    Parameters
+    ----------
+    front, rear : Prepared
+    front_path, rear_path : Trajectory
+    tolerance_s : float [s]
+        Largest difference of the tags.
+
+    Returns
+    -------
+    AntennaPair
+    """
+    one, two = pair_epochs(front.observations.time, rear.observations.time, tolerance_s=tolerance_s)
+    arc, _ = front_path.nearest(front.anchor_ecef_m[one])
+    return AntennaPair(
+        prepared={"front": front, "rear": rear},
+        front_epoch=one,
+        rear_epoch=two,
+        spacing=spacing_at(front_path, rear_path, arc),
+    )
+
+
+def screen_antenna_pair(pair: AntennaPair, limits: AntennaPairLimits) -> None:
+    """Compare the codes of two antennas; a satellite that does not fit is refused on both.
+
+    Parameters
+    ----------
+    pair : AntennaPair
+    limits : AntennaPairLimits
+    """
+    front, rear = pair.prepared["front"], pair.prepared["rear"]
+    one, two = pair.front_epoch, pair.rear_epoch
+    ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
+    heading, gradient, length = spacing_direction(pair.spacing.front_ecef_m, pair.spacing.rear_ecef_m)
+    verdict = antenna_pair_screen(
+        front.corrected_code_m[np.ix_(one, ours)],
+        rear.corrected_code_m[np.ix_(two, theirs)],
+        front.elevation_deg[np.ix_(one, ours)],
+        front.azimuth_deg[np.ix_(one, ours)],
+        satellite=front.satellite[ours],
+        heading_deg=heading,
+        gradient_permille=gradient,
+        spacing_m=length,
+        tag_difference=rear.observations.time[two] - front.observations.time[one],
+        range_rate_mps=-SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[np.ix_(one, ours)],
+        limits=limits,
+    )
+    for antenna, epochs, channels in ((front, one, ours), (rear, two, theirs)):
+        metric = np.full(antenna.reason.shape, np.nan)
+        metric[np.ix_(epochs, channels)] = verdict.metric
+        reject = on_channels(verdict.reject, antenna.reason.shape, epochs, channels)
+        antenna.screened("antenna_pair", Screened(metric=metric, reject=reject), Reason.ANTENNA_PAIR)

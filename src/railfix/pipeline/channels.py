@@ -1,0 +1,106 @@
+"""The channels of a log against the settings: worked out once for each set of channels that comes along.
+
+A log of a day has few sets of channels, and live epochs come with the same one again and again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.reasons import Reason
+from railfix.gnss.navigation import Navigation, glonass_channels
+from railfix.gnss.observations import Observations, frozen
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.pipeline.config import Config
+from railfix.positioning.normal_equations import clock_groups
+from railfix.ranges.weights import channel_order
+
+#: Sets of channels remembered.
+_REMEMBERED: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channels:
+    """M channels of a log, and the K of them that settings allow.
+
+    Attributes
+    ----------
+    columns : ndarray of int, shape (K,)
+        Where they stand in the observations, those of one clock side by side, a satellite's best signal first.
+    satellite, signal : ndarray of str, shape (K,)
+    groups : tuple of slice
+        Channels of one receiver clock.
+    clocks : tuple of str
+        Letter of each receiver clock.
+    frequency_hz : ndarray, shape (K,) [Hz]
+    left_out : ndarray of int64, shape (M,)
+        Reason of the channels that settings leave out, 0 for the others.
+    member : ndarray of int64, shape (M, S)
+        1 where a channel is of a satellite, S satellites.
+    """
+
+    columns: Indices
+    satellite: Strings
+    signal: Strings
+    groups: tuple[slice, ...]
+    clocks: tuple[str, ...]
+    frequency_hz: Floats
+    left_out: Integers
+    member: Integers
+
+
+class ChannelBook:
+    """Channels by what a log calls them.
+
+    Parameters
+    ----------
+    config : Config
+    navigation : Navigation
+        Tells the frequencies of GLONASS satellites where a log does not.
+    """
+
+    def __init__(self, config: Config, navigation: Navigation) -> None:
+        self._config = config
+        self._glonass = glonass_channels(navigation)
+        self._known: dict[tuple[object, ...], Channels] = {}
+
+    def of(self, obs: Observations) -> Channels:
+        """Channels of some observations."""
+        key = (
+            obs.satellite.tobytes(),
+            obs.signal.tobytes(),
+            obs.satellite.dtype.str,
+            obs.signal.dtype.str,
+            tuple(obs.header.glonass_channel.items()),
+        )
+        found = self._known.get(key)
+        if found is None:
+            while len(self._known) >= _REMEMBERED:
+                self._known.pop(next(iter(self._known)))
+            found = self._known[key] = self._worked_out(obs)
+        return found
+
+    def _worked_out(self, obs: Observations) -> Channels:
+        systems = self._config.systems
+        columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=self._config.signals)
+        satellite, signal = obs.satellite[columns], obs.signal[columns]
+        groups = clock_groups(satellite.astype("<U1"))
+        left_out = np.where(np.isin(obs.system, systems), Reason.OTHER_SIGNAL_TAKEN, Reason.SYSTEM_NOT_SELECTED)
+        left_out[columns] = Reason.USED
+        names, which = np.unique(obs.satellite, return_inverse=True)
+        frequency = carrier_frequency_hz(satellite, signal, {**self._glonass, **obs.header.glonass_channel})
+        return Channels(
+            columns=frozen(columns),
+            satellite=frozen(satellite),
+            signal=frozen(signal),
+            groups=groups,
+            clocks=tuple(CLOCK_GROUP[str(satellite[group.start])[0]] for group in groups),
+            frequency_hz=frozen(frequency),
+            left_out=frozen(left_out.astype(np.int64)),
+            member=frozen((which[:, None] == np.arange(len(names))).astype(np.int64)),
+        )

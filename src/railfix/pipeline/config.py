@@ -1,0 +1,322 @@
+"""Settings of a run: one frozen model, from Python or from TOML, misspelt keys refused.
+
+Each room owns its limits; this module only puts them side by side under the names that the
+configuration file uses::
+
+    preset = "default"
+    systems = ["G", "J", "E", "C"]
+    min_satellites = 3
+
+    [elevation]
+    mask_deg = 15.0
+
+    [noise]
+    model = "elevation"
+
+A preset names a set of settings; single ones stand over it.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import fields
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.integrity.protection import RiskBudget
+from railfix.integrity.raim import RaimLimits
+from railfix.positioning.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
+from railfix.positioning.constrained import ConstrainedLimits
+from railfix.positioning.intersystem_bias import ClockOffsetLimits
+from railfix.positioning.section_search import SectionLimits
+from railfix.positioning.single_point import SinglePointLimits
+from railfix.ranges.sbas import SbasLimits
+from railfix.ranges.weights import CodeNoise, NominalErrors
+from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
+
+#: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
+DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
+    "G": ("1C", "1W", "1P", "1X", "1L", "1S"),
+    "J": ("1C", "1X", "1L", "1S", "1Z"),
+    "E": ("1C", "1X", "1B", "1Z", "1A"),
+    "C": ("2I", "2X", "2Q"),
+    "R": ("1C", "1P"),
+}
+
+
+#: Names of the screens, in the order in which they are asked.
+SCREENS: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
+
+
+#: Settings that are the limits of a room.
+ROOMS: Final = (
+    "noise",
+    "nominal",
+    "sbas_limits",
+    "risk",
+    "elevation",
+    "cn0",
+    "doppler",
+    "antenna_pair",
+    "raim",
+    "antenna_spacing",
+    "clock_offsets",
+    "single_point",
+    "section",
+    "constrained",
+    "slips",
+    "smoothing",
+    "continuity",
+    "phase",
+)
+
+#: Settings by the name of their preset. "strict": certainty before rate. "p1": table 6 of P1 to the
+#: letter, for geodetic receivers at 10 Hz.
+PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
+    "default": {},
+    "strict": {"largest_sigma_m": 10.0, "failed_checks": "drop"},
+    "p1": {
+        "largest_sigma_m": 1e6,
+        "map_plan_sigma_m": 1e-3,
+        "map_height_sigma_m": 1e-3,
+        "min_satellites": 3,
+        "failed_checks": "drop",
+        "elevation": {"mask_deg": 20.0},
+        "cn0": {"floor_dbhz": 30.0, "deficit_dbhz": 10.0},
+        "doppler": {"mode": "fixed", "step_m": 1.5, "hold_s": 0.0},
+        "antenna_pair": {"limit_m": 5.0},
+        "raim": {"mode": "fixed", "fixed_limit_m2": 100.0, "max_excluded": 2},
+        "antenna_spacing": {"limit_m": 5.0},
+    },
+}
+
+
+class Config(BaseModel):
+    """Settings of the positioning, each with its default and where that comes from.
+
+    Attributes
+    ----------
+    preset : {"default", "strict", "p1"}
+        Settings that all others stand over. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
+        and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m, RAIM with two satellites and
+        100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not say (weights, noise, clock
+        offsets, ambiguous sections, receivers' clocks) is as in "default".
+    systems : tuple of str
+        Constellations used. GLONASS is left out by default: its channels have code biases of
+        metres between them.
+    signals : mapping of str to tuple of str
+        Signals of each constellation in order of preference; the first one observed is used.
+    screens : tuple of str
+        Screens that are on; health and validity of the satellites are no screens and always asked.
+    cn0_curve : path or None
+        File of the mean C/N0 over elevation (``railfix cn0-curve``); without it the floor alone judges.
+    failed_checks : {"keep", "drop"}
+        Coordinates of positions that a check has failed (`reasons.CHECK_FAILED`): kept beside the
+        status that says so, or dropped as P1 does.
+    largest_sigma_m : float
+        The knob between rate and certainty: a position whose own ranges vouch for less than this
+        (`AntennaResult.own_sigma_m`) is called uncertain and counts as a failed check. P4 takes a car
+        length, 20 m, as acceptable; the preset "strict" asks for 10 m and drops failed checks.
+    min_satellites : int
+        Satellites asked for (P1 3.2: 3; 2 is possible and doubtful on curves).
+    dilution_limit : float
+        Largest along-track dilution [m/m] that still counts as a position.
+    off_map_m, off_map_risk : float
+        A position is called off the map when the 3-D one lies further than this from the line and
+        noise explains it with less than this probability.
+    ionosphere : {"klobuchar", "off"}
+    troposphere : {"saastamoinen", "off"}
+    max_ephemeris_age_s : float or None
+        Tighter limit on the age of a record than its own validity.
+    map_plan_sigma_m, map_height_sigma_m : float or None
+        In place of the track's own map error (P1 4.1(3): 0.30 m and 0.60 m).
+    noise_prior : float
+        Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
+        being estimated; infinite holds the scale at 1.
+    sbas : tuple of path
+        Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
+        one are refused. None: no SBAS.
+    sbas_prn : int or "best"
+        GEO whose messages are used; "best" is the one with the most usable fast corrections.
+    sbas_limits : SbasLimits
+        Time-outs, message type 0, what to do where degradation data are missing.
+    error_model : path or None
+        Errors by direction and C/N0 (``railfix error-model``): their overbounds take the place of `noise` as weights,
+        and the protection level rests on them. Without it the level rests on `noise` times the scale estimated
+        so far, which promises nothing about tails.
+    nominal : NominalErrors
+        What a model of local errors alone leaves out, where no SBAS tells it.
+    protection : {"on", "off"}
+        Whether positions get a protection level along the line with its parts (`railfix.integrity.protection`).
+    risk : RiskBudget
+        Integrity risk per hour, its shares, and the probabilities of faults that the level stands for.
+    alarm_limit_m : float
+        Protection level from which on a position is not available. P4 takes a car length, 20 m.
+    raim_protection : {"on", "off"}
+        Whether positions also get P4's level: the largest slope times the bias that the test misses.
+    noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
+        Limits of the weights and the screens.
+    clock_offsets, single_point, section, constrained
+        Limits of the rooms of these names.
+    carrier : {"off", "smoothed", "float"}
+        Use of the carrier phase (A5): none; codes smoothed by it; or code and phase together with float
+        ambiguities, from this and earlier epochs. On recordings smoothing helps most on a phone, float
+        ambiguities under open sky; in towns, where arcs last seconds, neither takes off large errors.
+    phase_sigma_m : float
+        Standard deviation of a phase at the zenith, what multipath does to it included.
+    slips, smoothing, continuity, phase
+        Limits of the rooms of the carrier phase.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
+
+    preset: Literal["default", "strict", "p1"] = "default"
+    systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
+    signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
+    screens: tuple[Literal["elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing"], ...] = SCREENS
+    cn0_curve: Path | None = None
+    failed_checks: Literal["keep", "drop"] = "keep"
+    largest_sigma_m: float = Field(default=20.0, gt=0)
+    min_satellites: int = Field(default=3, ge=2)
+    dilution_limit: float = Field(default=20.0, gt=0)
+    off_map_m: float = Field(default=200.0, gt=0)
+    off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
+    ionosphere: Literal["klobuchar", "off"] = "klobuchar"
+    troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
+    max_ephemeris_age_s: float | None = Field(default=None, gt=0)
+    map_plan_sigma_m: float | None = Field(default=None, gt=0)
+    map_height_sigma_m: float | None = Field(default=None, gt=0)
+    noise_prior: float = Field(default=100.0, gt=0)
+    noise: CodeNoise = Field(default_factory=CodeNoise)
+    cn0: Cn0Limits = Field(default_factory=lambda: Cn0Limits(floor_dbhz=None))
+    doppler: DopplerLimits = Field(default_factory=lambda: DopplerLimits(mode="receiver", prior_epochs=5.0))
+    antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
+    antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
+    raim: RaimLimits = Field(default_factory=RaimLimits)
+    sbas: tuple[Path, ...] = ()
+    sbas_prn: int | Literal["best"] = "best"
+    sbas_limits: SbasLimits = Field(default_factory=SbasLimits)
+    error_model: Path | None = None
+    nominal: NominalErrors = Field(default_factory=NominalErrors)
+    protection: Literal["on", "off"] = "on"
+    risk: RiskBudget = Field(default_factory=RiskBudget)
+    alarm_limit_m: float = Field(default=20.0, gt=0)
+    raim_protection: Literal["on", "off"] = "off"
+    carrier: Literal["off", "smoothed", "float"] = "off"
+    phase_sigma_m: float = Field(default=0.01, gt=0)
+    slips: SlipLimits = Field(default_factory=SlipLimits)
+    smoothing: SmoothingLimits = Field(default_factory=SmoothingLimits)
+    continuity: ContinuityLimits = Field(default_factory=ContinuityLimits)
+    phase: PhaseLimits = Field(default_factory=PhaseLimits)
+    clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
+    elevation: ElevationLimits = Field(default_factory=ElevationLimits)
+    single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)
+    section: SectionLimits = Field(default_factory=SectionLimits)
+    constrained: ConstrainedLimits = Field(default_factory=ConstrainedLimits)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_preset(cls, values: Any) -> Any:
+        """The settings given over those of the preset; an unknown preset is left to its own field to refuse."""
+        if not isinstance(values, dict):
+            return values
+        return _over(PRESETS.get(str(values.get("preset", "default")), {}), values)
+
+    @field_validator("systems")
+    @classmethod
+    def _some_system_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not value or len(set(value)) != len(value):
+            raise ValueError("name at least one constellation, each once")
+        return value
+
+    @field_validator("screens")
+    @classmethod
+    def _screens_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if len(set(value)) != len(value):
+            raise ValueError("name each screen once")
+        return tuple(name for name in SCREENS if name in value)
+
+    @field_validator(*ROOMS, mode="before")
+    @classmethod
+    def _known_keys(cls, value: Any, info: ValidationInfo) -> Any:
+        """Refuse misspelt settings of a room; those left out keep this model's defaults, not the room's."""
+        if isinstance(value, dict) and info.field_name:
+            default = cls.model_fields[info.field_name].get_default(call_default_factory=True)
+            known = {item.name for item in fields(default)}
+            unknown = sorted(set(value) - known)
+            if unknown:
+                raise ValueError(f"unknown setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
+            return {name: getattr(default, name) for name in known} | value
+        return value
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        plain: dict[str, Any] = TypeAdapter(Config).dump_python(self, mode="json")
+        return plain
+
+
+def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings over those of a preset; groups key by key, limits given as an object whole."""
+    both = {**preset, **values}
+    for name, group in preset.items():
+        given = values.get(name)
+        if isinstance(group, Mapping) and isinstance(given, Mapping):
+            both[name] = {**group, **given}
+    return both
+
+
+def parse_config(values: dict[str, Any], *, source: str = "settings") -> Config:
+    """A configuration from plain values.
+
+    Raises
+    ------
+    SettingsError
+        Names the source, the setting, and what was expected.
+    """
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        known = sorted(Config.model_fields)
+        if first["type"] == "extra_forbidden":
+            raise SettingsError(f"{source}: unknown setting {where}; known are {', '.join(known)}") from None
+        message = first["msg"].removeprefix("Value error, ")
+        raise SettingsError(f"{source}: setting {where}: {message}, got {first['input']!r}") from None
+
+
+def load_config(path: str | PathLike[str]) -> Config:
+    """A configuration from a TOML file.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, or no TOML.
+    SettingsError
+        A setting is misspelt or out of range.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read as a configuration file ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputFileError(path, "is no text file; a configuration is TOML") from None
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputFileError(path, f"is no valid TOML: {error}") from None
+    return parse_config(values, source=str(path))

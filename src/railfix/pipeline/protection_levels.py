@@ -1,0 +1,130 @@
+"""The protection level of the positions: which sigmas, biases and probabilities it rests on."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Codes, Floats, Masks
+from railfix.core.reasons import CHECK_FAILED, Status
+from railfix.integrity.protection import ProtectionLevel, RiskBudget, along_track_level, availability
+from railfix.integrity.protection import Status as LevelStatus
+from railfix.integrity.raim import Outcome, constrained_model
+from railfix.pipeline.config import Config
+from railfix.pipeline.corrected_ranges import Prepared
+from railfix.pipeline.results import Protection, Raim
+from railfix.positioning.constrained import Constrained
+from railfix.positioning.normal_equations import Ranges
+from railfix.track.trajectory import Trajectory
+
+#: What a level rests on: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
+#: satellites' own faults as well (ARAIM).
+KINDS: Final = ("sbas", "separation")
+
+
+def kind_of(config: Config) -> str:
+    """Which of `KINDS` the levels of a run are."""
+    return KINDS[0] if config.sbas else KINDS[1]
+
+
+def level_facts(config: Config) -> dict[str, Any]:
+    """What the levels of a run rest on, as plain values; empty where they are off."""
+    if config.protection == "off":
+        return {}
+    risk = risk_of(config)
+    sigmas = "noise settings times the receiver's estimated scale, 1 at least: no promise about tails"
+    return {
+        "kind": kind_of(config),
+        "sigmas": sigmas if config.error_model is None else str(config.error_model),
+        "alarm_limit_m": config.alarm_limit_m,
+        "risk_per_hour": risk.risk_per_hour,
+        "samples_per_hour": risk.samples_per_hour,
+        "risk_per_sample": risk.risk_per_sample,
+        "k_of_whole_risk": round(risk.sample_k, 3),
+        "satellite_prior": dict(risk.satellite_prior),
+        "local_prior": risk.local_prior,
+        "false_alarm": risk.false_alarm,
+    }
+
+
+def risk_of(config: Config) -> RiskBudget:
+    """The budget in force: with SBAS the satellites' own faults are its business, what is left is local."""
+    if kind_of(config) == "separation":
+        return config.risk
+    return replace(config.risk, satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
+
+
+def protect(
+    one: Prepared,
+    ranges: Ranges,
+    trajectory: Trajectory,
+    constrained: Constrained,
+    raim: Raim,
+    scale: Floats,
+    config: Config,
+) -> Protection:
+    """Levels of the positions of a chunk.
+
+    Parameters
+    ----------
+    one : Prepared
+    ranges : Ranges
+        What the positions were solved with.
+    trajectory : Trajectory
+    constrained : Constrained
+    raim : Raim
+    scale : ndarray, shape (T,)
+        The receiver's noise scale; an error model stands for itself and is not scaled.
+    config : Config
+
+    Returns
+    -------
+    Protection
+    """
+    faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
+    arc = np.where(faulty, np.nan, constrained.arc_m)
+    model = constrained_model(ranges, trajectory, arc, section=np.maximum(constrained.section, 0))
+    level = along_track_level(
+        model,
+        [name[0] for name in one.satellite.tolist()],
+        risk=risk_of(config),
+        scale=_level_scale(scale, config),
+        bias_m=None if config.error_model is None else one.bias_m,
+        n_excluded=raim.excluded.sum(axis=1),
+    )
+    status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    return Protection(level=level, status=status, kind=kind_of(config))
+
+
+def _level_scale(scale: Floats, config: Config) -> Floats | float:
+    """What the sigmas of the ranges are multiplied by: those of a model stand; quiet residuals shrink none."""
+    return 1.0 if config.error_model is not None else np.maximum(scale, 1.0)
+
+
+def judged(protection: Protection, status: Codes, has: Masks, config: Config) -> Protection:
+    """Levels beside the verdicts on the positions.
+
+    A level stands for the place that the ranges were linearised at. Where another place explains them as
+    well, or the position is off the map, it is of no use: unavailable. Where a check has failed: alarm.
+
+    Parameters
+    ----------
+    protection : Protection
+    status : ndarray of int8, shape (T,)
+        `reasons.Status`.
+    has : ndarray of bool, shape (T,)
+        Epochs that keep their coordinates; the others lose the level, too.
+    config : Config
+    """
+    values = {}
+    for item in fields(ProtectionLevel):
+        value = getattr(protection.level, item.name)
+        values[item.name] = np.where(has, value, np.nan) if value.dtype == np.float64 else value
+    level = ProtectionLevel(**values)
+    verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
+    verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
+    doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP])
+    verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
+    return Protection(level=level, status=verdict.astype(np.int8), kind=protection.kind)

@@ -1,0 +1,228 @@
+"""What the pipeline returns: every intermediate result, and the state that one chunk leaves to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.gnss.orbits import SatelliteStates
+from railfix.integrity.protection import ProtectionLevel
+from railfix.pipeline.carrier_phase import CarrierState
+from railfix.positioning.carrier import PhasePositions
+from railfix.positioning.constrained import Constrained
+from railfix.positioning.intersystem_bias import OffsetState
+from railfix.positioning.section_search import Section
+from railfix.positioning.single_point import SinglePoint
+from railfix.screens import DopplerState, Screened
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Rows = TypeVar("Rows", bound="DataclassInstance")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Raim:
+    """Detection and exclusion of T epochs.
+
+    Attributes
+    ----------
+    outcome : ndarray of int8, shape (T,)
+        `raim.Outcome`.
+    statistic, threshold : ndarray, shape (T,)
+        Before any exclusion; in noise variances, or in m^2 with the fixed limit.
+    excluded : ndarray of bool, shape (T, K)
+    own_error_m : ndarray, shape (T, K) [m]
+        Error of the channels that stand against the rest; NaN elsewhere.
+    protection_level_m : ndarray, shape (T,) [m]
+        `raim.reliability` of the ranges left; infinite where a fault of one of them would not show, NaN
+        where there is no position, where a fault is left in it, or where that or the screen is off.
+    """
+
+    outcome: Codes
+    statistic: Floats
+    threshold: Floats
+    excluded: Masks
+    own_error_m: Floats
+    protection_level_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protection:
+    """Protection levels of T epochs.
+
+    Attributes
+    ----------
+    level : ProtectionLevel
+        NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
+    status : ndarray of int8, shape (T,)
+        `protection.Status` against `Config.alarm_limit_m`.
+    kind : str
+        What the levels rest on: "sbas" or "separation" (`protecting.KINDS`).
+    """
+
+    level: ProtectionLevel
+    status: Codes
+    kind: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaState:
+    """What one antenna's epochs leave to the next.
+
+    Attributes
+    ----------
+    log_variance_sum, log_variance_weight : float
+        Sums behind the noise scale: the receiver's post-fit variance against the weights, averaged
+        as a logarithm so that multipath does not carry it.
+    offsets : OffsetState
+        What is known of the offsets between the clocks of the constellations.
+    doppler : DopplerState or None
+        The last epoch that the Doppler screen has seen.
+    carrier : CarrierState or None
+        What the carrier phase has left, where it is used.
+    """
+
+    log_variance_sum: float = 0.0
+    log_variance_weight: float = 0.0
+    offsets: OffsetState = field(default_factory=OffsetState)
+    doppler: DopplerState | None = None
+    carrier: CarrierState | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """What a chunk leaves to the next, by antenna."""
+
+    antennas: Mapping[str, AntennaState] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AntennaResult:
+    """All that was found for one antenna, T epochs by M channels (those of the observations given).
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite, signal : ndarray of str, shape (M,)
+    status : ndarray of int8, shape (T,)
+        `reasons.Status`.
+    chainage_m, kilometrage_m, arc_m : ndarray, shape (T,) [m]
+        Along the line (reference point named by the trajectory), its own marking, and along the
+        antenna's trajectory. NaN where the status has no position.
+    along_sigma_m : ndarray, shape (T,) [m]
+        Standard deviation along the line, the receiver's noise scale and the map error included.
+    own_sigma_m : ndarray, shape (T,) [m]
+        What the ranges of the epoch itself vouch for: standard deviation along the line by the larger
+        of the receiver's noise and what these ranges show, widened as Student's t is where few of them
+        are redundant. Also where the position is dropped.
+    noise_scale : ndarray, shape (T,)
+        Standard deviation of this receiver's ranges against the one the weights assume, as
+        estimated from the epochs before.
+    ecef_m : ndarray, shape (T, 3) [m]
+        Antenna.
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+    n_used, n_rejected : ndarray of int, shape (T,)
+        Satellites used; satellites with a code that were not used.
+    conventional_ecef_m : ndarray, shape (T, 3) [m]
+        3-D single point from the same ranges.
+    conventional_arc_m, conventional_chainage_m, conventional_offset_m : ndarray, shape (T,) [m]
+        Nearest point of the trajectory to it, and how far that is.
+    reason : ndarray of int64, shape (T, M)
+        `reasons.Reason` bits, 0 = used.
+    elevation_deg, azimuth_deg, cn0_dbhz, sigma_m, corrected_code_m, residual_m : ndarray, shape (T, M)
+        NaN where unknown; residuals of the position on the line.
+    satellites : SatelliteStates
+        Of the channels in `columns`.
+    columns : ndarray of int, shape (K,)
+        Channels that settings allow, in the order of the intermediate results below.
+    screens : mapping of str to Screened
+        Metric and verdict of each screen that was on, by name, shape (T, K); "antenna_spacing", which
+        judges positions, has shape (T,).
+    single_point : SinglePoint
+        The conventional position: every constellation with a clock of its own.
+    section : Section
+    constrained : Constrained
+    phase : PhasePositions or None
+        Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
+    raim : Raim
+        Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
+    protection : Protection or None
+        Protection levels along the line; None where they are off.
+    clocks : tuple of str
+        Letter of each receiver clock of the results above, length G.
+    clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
+        What was known before each epoch of that clock against the reference clock.
+    """
+
+    time: Datetimes
+    satellite: Strings
+    signal: Strings
+    status: Codes
+    chainage_m: Floats
+    kilometrage_m: Floats
+    arc_m: Floats
+    along_sigma_m: Floats
+    own_sigma_m: Floats
+    noise_scale: Floats
+    ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    n_used: Integers
+    n_rejected: Integers
+    conventional_ecef_m: Floats
+    conventional_arc_m: Floats
+    conventional_chainage_m: Floats
+    conventional_offset_m: Floats
+    reason: Bits
+    elevation_deg: Floats
+    azimuth_deg: Floats
+    cn0_dbhz: Floats
+    sigma_m: Floats
+    corrected_code_m: Floats
+    residual_m: Floats
+    satellites: SatelliteStates
+    columns: Indices
+    screens: Mapping[str, Screened]
+    single_point: SinglePoint
+    section: Section
+    constrained: Constrained
+    phase: PhasePositions | None
+    raim: Raim
+    protection: Protection | None
+    clocks: tuple[str, ...]
+    clock_offset_m: Floats
+    clock_offset_sigma_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Results of one chunk.
+
+    Attributes
+    ----------
+    antennas : mapping of str to AntennaResult
+    notes : tuple of str
+        What was asked for and what was used in its place, one sentence each.
+    """
+
+    antennas: Mapping[str, AntennaResult]
+    notes: tuple[str, ...]
+
+
+def patched(whole: Rows, epochs: Indices, part: Rows) -> Rows:
+    """The same result with some epochs replaced, by index; every field has the epochs on axis 0."""
+    values = {}
+    for item in fields(whole):
+        array = np.array(getattr(whole, item.name))
+        array[epochs] = getattr(part, item.name)
+        values[item.name] = array
+    return replace(whole, **values)

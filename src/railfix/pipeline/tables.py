@@ -1,0 +1,369 @@
+"""Results as tables: polars for files and analysis, xarray for arrays with names.
+
+Times are GPS time without a time zone, to the nanosecond. Absent values are null in polars and
+NaN in xarray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from railfix.core.arrays import Floats
+from railfix.core.reasons import Reason, Status, reason_text
+from railfix.integrity.protection import Cause
+from railfix.integrity.protection import Status as LevelStatus
+from railfix.integrity.raim import Outcome
+from railfix.pipeline.processor import AntennaResult, Result
+from railfix.pipeline.protection_levels import KINDS
+from railfix.screens import DopplerScreened
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+#: Words of the column ``status``.
+STATUS_TYPE: Final = pl.Enum([s.text for s in Status])
+#: Words of the column ``raim_outcome``.
+OUTCOME_TYPE: Final = pl.Enum([o.name.lower() for o in Outcome])
+#: Words of the column ``protection_kind``.
+KIND_TYPE: Final = pl.Enum(KINDS)
+#: Words of the column ``protection_cause``, and of ``protection_status``.
+CAUSE_TYPE: Final = pl.Enum([c.name.lower() for c in Cause])
+LEVEL_STATUS_TYPE: Final = pl.Enum([s.name.lower() for s in LevelStatus])
+#: Decimals written to CSV: 0.1 mm, and the same in degrees.
+CSV_DECIMALS_M: Final = 4
+CSV_DECIMALS_DEG: Final = 9
+
+#: Columns of the table of positions, with their unit and meaning.
+POSITION_COLUMNS: Final[dict[str, str]] = {
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "status": "what became of the epoch",
+    "chainage_m": "distance along the line from the first point of the track",
+    "kilometrage_m": "the line's own marking, where the track has one",
+    "along_sigma_m": "standard deviation along the line",
+    "own_sigma_m": "standard deviation that the ranges of the epoch itself vouch for; `uncertain` over its limit",
+    "latitude_deg": "antenna, WGS 84",
+    "longitude_deg": "antenna, WGS 84",
+    "height_m": "antenna, above the ellipsoid",
+    "x_m": "antenna, ECEF",
+    "y_m": "antenna, ECEF",
+    "z_m": "antenna, ECEF",
+    "n_used": "satellites used",
+    "n_rejected": "satellites with a pseudorange that were not used",
+    "noise_scale": "noise of this receiver against what the weights assume, estimated so far",
+    "raim_outcome": "what RAIM made of the ranges: "
+    "`passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
+    "raim_statistic": "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
+    "raim_threshold": "what it is compared with; a fault is detected from there on",
+    "raim_level_m": "P4's level: error by a fault that RAIM misses, and by noise; infinite where a satellite is "
+    "unchecked, empty where a fault is left or `raim_protection` is off",
+    "protection_level_m": "along the line: the error exceeds it with the stated risk, all hypotheses together; "
+    "infinite where `protection_cause` says why, empty where a fault is left",
+    "protection_fault_free_m": "what noise without a fault asks for by itself, of its share of the risk; "
+    "`protection_level_m` spends the whole risk on the sum of all and may be smaller than a part",
+    "protection_one_fault_m": "the same for a fault of one satellite; 0 where that is less likely than its share",
+    "protection_two_faults_m": "the same for faults of two satellites; 0 where that is less likely than its share",
+    "protection_k_fault_free": "sigmas that the first part stands for",
+    "protection_k_one_fault": "sigmas that the second part stands for, beside its threshold",
+    "protection_k_two_faults": "sigmas that the third part stands for, beside its threshold",
+    "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
+    "protection_kind": "what it rests on: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
+    "hypotheses of satellites' own faults as well",
+    "protection_cause": "what sets the level: "
+    "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
+    "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
+    "the place; `alarm`: the ranges contradict the level, or a check has failed",
+    "metric_antenna_spacing_m": "screen `antenna_spacing`: distance of the two positions less that of the antennas",
+    "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
+    "conventional_offset_m": "distance of the 3-D single point from that point",
+    "conventional_x_m": "3-D single point, ECEF",
+    "conventional_y_m": "3-D single point, ECEF",
+    "conventional_z_m": "3-D single point, ECEF",
+}
+
+#: Columns of the table of observations, with their unit and meaning.
+OBSERVATION_COLUMNS: Final[dict[str, str]] = {
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "satellite": "`G01`, `J02`",
+    "signal": "RINEX 3 code without its type letter, `1C`",
+    "reason": "bits of `railfix.core.reasons.Reason`, 0 = used",
+    "reason_text": "their names joined by `+`, `used` for 0",
+    "residual_m": "corrected pseudorange minus what the position on the line and the clock explain",
+    "elevation_deg": "elevation of the satellite",
+    "azimuth_deg": "azimuth of the satellite, from north over east",
+    "cn0_dbhz": "carrier-to-noise density",
+    "sigma_m": "standard deviation that the weights assume",
+    "corrected_code_m": "pseudorange, satellite clock, group delay and atmosphere applied",
+    "metric_cn0_deficit_dbhz": "screen `cn0`: mean at the elevation less C/N0",
+    "metric_doppler_m": "screen `doppler`: change of the pseudorange against its Doppler since the epoch before",
+    "limit_doppler_m": "screen `doppler`: what the size of that is compared with",
+    "metric_antenna_pair_m": "screen `antenna_pair`: pseudorange rear less front, against what their spacing explains",
+    "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty",
+}
+
+#: Results with one value an epoch, and with one an epoch and channel.
+_OF_EPOCH: Final = (
+    *(
+        "chainage_m",
+        "kilometrage_m",
+        "arc_m",
+        "along_sigma_m",
+        "own_sigma_m",
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+    ),
+    *("n_used", "n_rejected", "noise_scale", "conventional_chainage_m", "conventional_offset_m"),
+)
+_OF_CHANNEL: Final = (
+    *("reason", "residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"),
+)
+
+
+def _floats(values: Floats) -> pl.Series:
+    """A column of floats, NaN as null."""
+    return pl.Series(values=np.ascontiguousarray(values, dtype=np.float64), nan_to_null=True)
+
+
+def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
+    """One row an epoch of one antenna, also where there is no position.
+
+    Parameters
+    ----------
+    name : str
+        Goes into the column ``antenna``.
+    result : AntennaResult
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `POSITION_COLUMNS`.
+    """
+    epochs = len(result.time)
+    words = pl.Series(values=[s.text for s in Status], dtype=STATUS_TYPE)
+    columns: dict[str, pl.Series] = {
+        "time_gpst": pl.Series(values=np.array(result.time)),
+        "antenna": pl.Series(values=[name], dtype=pl.String).new_from_index(0, epochs),
+        "status": words.gather(pl.Series(values=result.status.astype(np.uint32))),
+    }
+    for column in (
+        "chainage_m",
+        "kilometrage_m",
+        "along_sigma_m",
+        "own_sigma_m",
+        "latitude_deg",
+        "longitude_deg",
+        "height_m",
+    ):
+        columns[column] = _floats(getattr(result, column))
+    for axis, column in enumerate(("x_m", "y_m", "z_m")):
+        columns[column] = _floats(result.ecef_m[:, axis])
+    columns["n_used"] = pl.Series(values=result.n_used.astype(np.int16))
+    columns["n_rejected"] = pl.Series(values=result.n_rejected.astype(np.int16))
+    columns["noise_scale"] = _floats(result.noise_scale)
+    columns |= _raim_columns(result)
+    columns["conventional_chainage_m"] = _floats(result.conventional_chainage_m)
+    columns["conventional_offset_m"] = _floats(result.conventional_offset_m)
+    for axis, column in enumerate(("conventional_x_m", "conventional_y_m", "conventional_z_m")):
+        columns[column] = _floats(result.conventional_ecef_m[:, axis])
+    return pl.DataFrame(columns)
+
+
+def _raim_columns(result: AntennaResult) -> dict[str, pl.Series]:
+    """Verdicts on the positions: RAIM, and the spacing of the antennas."""
+    words = pl.Series(values=[o.name.lower() for o in Outcome], dtype=OUTCOME_TYPE)
+    spacing = result.screens.get("antenna_spacing")
+    return {
+        "raim_outcome": words.gather(pl.Series(values=result.raim.outcome.astype(np.uint32))),
+        "raim_statistic": _floats(result.raim.statistic),
+        "raim_threshold": _floats(result.raim.threshold),
+        "raim_level_m": _floats(result.raim.protection_level_m),
+        **_protection_columns(result),
+        "metric_antenna_spacing_m": _floats(np.full(len(result), np.nan) if spacing is None else spacing.metric),
+    }
+
+
+#: Columns of the protection level by its fields.
+_OF_LEVEL: Final = {
+    "protection_level_m": "level_m",
+    "protection_fault_free_m": "fault_free_m",
+    "protection_one_fault_m": "one_fault_m",
+    "protection_two_faults_m": "two_fault_m",
+    "protection_k_fault_free": "k_fault_free",
+    "protection_k_one_fault": "k_one_fault",
+    "protection_k_two_faults": "k_two_faults",
+    "protection_separation": "separation",
+}
+
+
+def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
+    """The protection level, its parts, and what it means; all null where it is off."""
+    found, epochs = result.protection, len(result)
+    words = {
+        "protection_cause": (CAUSE_TYPE, None if found is None else found.level.cause),
+        "protection_status": (LEVEL_STATUS_TYPE, None if found is None else found.status),
+    }
+    columns = {
+        name: _floats(np.full(epochs, np.nan) if found is None else getattr(found.level, field))
+        for name, field in _OF_LEVEL.items()
+    }
+    named = pl.Series(values=[None if found is None else found.kind], dtype=KIND_TYPE)
+    columns["protection_kind"] = named.new_from_index(0, epochs)
+    for name, (kind, values) in words.items():
+        if values is None:
+            columns[name] = pl.Series(values=[None], dtype=kind).new_from_index(0, epochs)
+        else:
+            listed = pl.Series(values=kind.categories, dtype=kind)
+            columns[name] = listed.gather(pl.Series(values=values.astype(np.uint32)))
+    return columns
+
+
+def positions_table(result: Result) -> pl.DataFrame:
+    """One row an epoch and antenna, in order of time, then of the antennas as given.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `POSITION_COLUMNS`.
+    """
+    parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
+    whole = pl.concat(parts)
+    return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
+
+
+def antenna_observations(name: str, result: AntennaResult) -> pl.DataFrame:
+    """One row an epoch and channel that was observed, of one antenna.
+
+    Parameters
+    ----------
+    name : str
+        Goes into the column ``antenna``.
+    result : AntennaResult
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `OBSERVATION_COLUMNS`.
+    """
+    epoch, channel = np.nonzero((result.reason & Reason.NOT_OBSERVED) == 0)
+    reason = result.reason[epoch, channel]
+    values, inverse = np.unique(reason, return_inverse=True)
+    texts = pl.Series(values=[reason_text(int(v)) for v in values], dtype=pl.String)
+    of_channel = pl.Series(values=channel.astype(np.uint32))
+    columns: dict[str, pl.Series] = {
+        "time_gpst": pl.Series(values=result.time[epoch]),
+        "antenna": pl.Series(values=[name], dtype=pl.String).new_from_index(0, len(epoch)),
+        "satellite": pl.Series(values=result.satellite.tolist(), dtype=pl.String).gather(of_channel),
+        "signal": pl.Series(values=result.signal.tolist(), dtype=pl.String).gather(of_channel),
+        "reason": pl.Series(values=reason.astype(np.int32)),
+        "reason_text": texts.gather(pl.Series(values=inverse.astype(np.uint32))),
+    }
+    for column in ("residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"):
+        columns[column] = _floats(getattr(result, column)[epoch, channel])
+    for column, measured in screen_metrics(result).items():
+        columns[column] = _floats(measured[epoch, channel])
+    return pl.DataFrame(columns)
+
+
+def screen_metrics(result: AntennaResult) -> dict[str, Floats]:
+    """What the screens measured of each channel, by column of `OBSERVATION_COLUMNS`.
+
+    Parameters
+    ----------
+    result : AntennaResult
+
+    Returns
+    -------
+    dict of str to ndarray, shape (T, M)
+        NaN where a screen was off or could not judge. Elevation and C/N0 themselves are columns of the result.
+    """
+    doppler = result.screens.get("doppler")
+    measured = {
+        "metric_cn0_deficit_dbhz": _metric(result, "cn0_curve"),
+        "metric_doppler_m": _metric(result, "doppler"),
+        "limit_doppler_m": doppler.limit_m if isinstance(doppler, DopplerScreened) else None,
+        "metric_antenna_pair_m": _metric(result, "antenna_pair"),
+        "raim_own_error_m": result.raim.own_error_m,
+    }
+    whole = {name: np.full(result.reason.shape, np.nan) for name in measured}
+    for name, values in measured.items():
+        if values is not None:
+            whole[name][:, result.columns] = values
+    return whole
+
+
+def _metric(result: AntennaResult, screen: str) -> Floats | None:
+    return result.screens[screen].metric if screen in result.screens else None
+
+
+def observations_table(result: Result) -> pl.DataFrame:
+    """One row an epoch, antenna and channel that was observed, in order of time, antenna, satellite.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `OBSERVATION_COLUMNS`.
+    """
+    parts = [antenna_observations(name, antenna) for name, antenna in result.antennas.items()]
+    whole = pl.concat(parts)
+    return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
+
+
+def rounded(table: pl.DataFrame) -> pl.DataFrame:
+    """A table with its floats rounded to what CSV files get: 0.1 mm, 1e-9 deg."""
+    floats = [name for name, kind in table.schema.items() if kind == pl.Float64]
+    return table.with_columns(
+        pl.col(name).round(CSV_DECIMALS_DEG if name.endswith("_deg") else CSV_DECIMALS_M) for name in floats
+    )
+
+
+def to_xarray(result: AntennaResult, *, attributes: Mapping[str, Any] | None = None) -> xr.Dataset:
+    """Results of one antenna as arrays with named axes.
+
+    Parameters
+    ----------
+    result : AntennaResult
+    attributes : mapping, optional
+        Put on the dataset (name of the antenna, provenance).
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions ``time``, ``channel`` and ``xyz``; ``satellite`` and ``signal`` are coordinates
+        of ``channel``.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        xarray is not installed (``pip install railfix[notebook]``).
+    """
+    try:
+        import xarray as xr
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError("xarray is not installed; pip install 'railfix[notebook]'") from error
+    words = np.array([s.text for s in Status])
+    data: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {"status": (("time",), words[result.status])}
+    data |= {name: (("time",), getattr(result, name)) for name in _OF_EPOCH}
+    data |= {name: (("time", "xyz"), getattr(result, name)) for name in ("ecef_m", "conventional_ecef_m")}
+    data |= {name: (("time", "channel"), getattr(result, name)) for name in _OF_CHANNEL}
+    coordinates = {
+        "time": result.time,
+        "satellite": ("channel", result.satellite),
+        "signal": ("channel", result.signal),
+        "xyz": ["x", "y", "z"],
+    }
+    return xr.Dataset(data, coords=coordinates, attrs=dict(attributes or {}))

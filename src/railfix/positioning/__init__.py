@@ -1,0 +1,1 @@
+"""Positions from corrected pseudoranges: normal equations without clocks, section search, constrained fix."""

@@ -1,0 +1,352 @@
+"""Positions along the line from code and phase over a run of epochs: one least squares.
+
+P4's observation model with the map's constraint: unknown are the distance and the clocks of every
+epoch and one constant an arc of phase. The epochs' own unknowns are eliminated, so that the
+normal matrix is as large as there are arcs, whatever the number of epochs.
+
+`phase_run` uses the whole run for each of its epochs, later ones too: for logs. `phase_positions`
+in `filtered` uses the past alone: for live use.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.timescale import GPS_EPOCH, seconds
+from railfix.positioning.carrier.observation_model import (
+    Linearised,
+    OwnUnknowns,
+    PhaseClocks,
+    Phases,
+    linearise,
+    own_clock,
+    own_unknowns,
+    reduce,
+    shifted,
+)
+from railfix.positioning.normal_equations import Ranges
+from railfix.track.trajectory import Trajectory
+
+#: Sigma of an ambiguity against its first value [m]: keeps matrices regular, says nothing.
+FREE_AMBIGUITY_M: Final = 1e4
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseLimits:
+    """How phases are trusted, and for how long.
+
+    Attributes
+    ----------
+    clocks : {"own", "shared"}
+        Whether the phases have a clock of their own or, as P4 writes, that of the codes.
+    drift_m : float
+        Random walk of an ambiguity in one second [m/sqrt(s)]: what ionosphere, satellite orbit and
+        clock, and multipath move a phase against the others. Without it, phases that drift by
+        centimetres while satellites move by hundredths of a radian outvote the codes by metres.
+        With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities constant.
+    hop_s : float
+        The walk is taken in steps at multiples of this time since the GPS epoch.
+    correlation_s : float
+        Code errors of a real receiver last for tens of seconds (multipath, delays): epochs nearer
+        to each other than this tell the ambiguities the same thing again. The variance that the
+        ambiguities bring is multiplied by correlation / interval, up to that of codes alone. The
+        positions do not change. 0 for noise that is white, as a simulated one.
+    tolerance_m : float
+        `phase_run`: last step along the line.
+    max_iterations : int
+        `phase_run`: linearisations.
+    passes : int
+        `phase_positions`: linearisations, each with its own memory, so that no result depends on
+        how a log is cut.
+    forget_s : float
+        `phase_positions`: an arc not seen for so long begins anew.
+    largest_sigma_m : float
+        Epochs whose noise along the line is larger have no position.
+    """
+
+    clocks: PhaseClocks = "own"
+    drift_m: float = 0.01
+    hop_s: float = 10.0
+    correlation_s: float = 20.0
+    tolerance_m: float = 1e-4
+    max_iterations: int = 8
+    passes: int = 2
+    forget_s: float = 600.0
+    largest_sigma_m: float = 1e3
+
+    def __post_init__(self) -> None:
+        for name in ("hop_s", "tolerance_m", "forget_s", "largest_sigma_m"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not (self.drift_m >= 0.0 and self.correlation_s >= 0.0):
+            raise ValueError("drift_m and correlation_s must not be negative")
+        if self.max_iterations < 1 or self.passes < 1:
+            raise ValueError("max_iterations and passes must be at least 1")
+        if self.clocks not in ("own", "shared"):
+            raise ValueError(f"clocks must be own or shared, got {self.clocks!r}")
+
+
+def hop_of(time: Datetimes, limits: PhaseLimits) -> Integers:
+    """Number of the hop that each time lies in."""
+    nanoseconds = (time.astype("datetime64[ns]") - GPS_EPOCH).astype(np.int64)
+    return np.asarray(nanoseconds // round(limits.hop_s * 1e9), dtype=np.int64)
+
+
+def repeats_of(time: Datetimes, limits: PhaseLimits) -> Floats:
+    """Epochs that tell the same thing as each epoch, shape (T,); 1 for the first."""
+    step = np.append(np.nan, seconds(np.diff(time)))
+    with np.errstate(divide="ignore"):
+        share = limits.correlation_s / step
+    return np.asarray(np.maximum(1.0, np.where(np.isnan(share), 1.0, share)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArcAmbiguities:
+    """Constants of arcs, A of them (`phase_run` with a drift: of stretches of arcs inside a hop).
+
+    Attributes
+    ----------
+    arc_id : ndarray of int64, shape (A,)
+    ambiguity_m : ndarray, shape (A,) [m]
+        Phase less range less clock: whole cycles, phase wind-up and delays of the signal. With
+        clocks of the phases' own, known up to a constant common to all: zero in the mean of the
+        corrections to their first values, and the covariance is against that mean.
+    covariance_m2 : ndarray, shape (A, A) [m^2]
+        From noise; a map that is off adds to it.
+    """
+
+    arc_id: Integers
+    ambiguity_m: Floats
+    covariance_m2: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhasePositions:
+    """Positions along the line from code and phase, T epochs by M channels.
+
+    Attributes
+    ----------
+    arc_m : ndarray, shape (T,) [m]
+        Along the trajectory, within its ends; NaN where there was no place to start from, or the
+        satellites do not tell.
+    sigma_m, noise_sigma_m : ndarray, shape (T,) [m]
+        Standard deviation with the map's error, and of noise alone.
+    clock_m : ndarray, shape (T, G) [m]
+        Receiver clock of each group; NaN where there is no position.
+    code_residual_m, phase_residual_m : ndarray, shape (T, M) [m]
+        Observed less computed; NaN where not used.
+    ambiguity_m, ambiguity_sigma_m : ndarray, shape (T, M) [m]
+        Of the arc of each used phase, as known at the epoch.
+    n_codes, n_phases : ndarray of int, shape (T,)
+        Used.
+    arcs : ArcAmbiguities
+        All arcs of the run (`phase_run`), or those alive after the last epoch (`phase_positions`).
+    iterations : int
+    """
+
+    arc_m: Floats
+    sigma_m: Floats
+    noise_sigma_m: Floats
+    clock_m: Floats
+    code_residual_m: Floats
+    phase_residual_m: Floats
+    ambiguity_m: Floats
+    ambiguity_sigma_m: Floats
+    n_codes: Integers
+    n_phases: Integers
+    arcs: ArcAmbiguities
+    iterations: int
+
+
+def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats) -> tuple[Ranges, Phases, Floats]:
+    """The same with nothing used at epochs without a place, and any place on the line there.
+
+    Raises
+    ------
+    ValueError
+        Shapes differ, or a used phase has no arc.
+    """
+    shape = ranges.code_m.shape
+    if phases.phase_m.shape != shape or phases.weight.shape != shape or phases.arc_id.shape != shape:
+        raise ValueError(f"phases have shape {phases.phase_m.shape}, expected that of the ranges {shape}")
+    if np.any((phases.weight > 0) & (phases.arc_id < 0)):
+        raise ValueError("a phase with weight has no arc (arc_id is negative)")
+    at = np.isfinite(arc_m)
+    if at.all():
+        return ranges, phases, np.clip(arc_m, 0.0, trajectory.arc_m[-1])
+    without = Ranges(
+        sat_ecef_m=ranges.sat_ecef_m,
+        code_m=ranges.code_m,
+        weight=np.where(at[:, None], ranges.weight, 0.0),
+        groups=ranges.groups,
+        ties=ranges.ties,
+    )
+    silent = Phases(phase_m=phases.phase_m, weight=np.where(at[:, None], phases.weight, 0.0), arc_id=phases.arc_id)
+    return without, silent, np.where(at, np.clip(arc_m, 0.0, trajectory.arc_m[-1]), 0.0)
+
+
+def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
+    """Inverse of normal matrices of ambiguities, shape (..., A, A).
+
+    With a clock of the phases' own nothing tells a constant common to all ambiguities. It is fixed
+    by asking that the `held` ones (1, others 0; shape (..., A)) are zero in the mean: no difference
+    between them changes by that, and no digits are lost.
+    """
+    size = matrix.shape[-1]
+    count = np.maximum(held.sum(axis=-1), 1.0)
+    level = np.einsum("...i,...ii->...", held, matrix) / count**2
+    full = matrix + level[..., None, None] * held[..., :, None] * held[..., None, :]
+    full = full + np.eye(size) * FREE_AMBIGUITY_M**-2.0
+    return np.linalg.inv(full).astype(np.float64, copy=False)
+
+
+def moved(arc_m: Floats, own: OwnUnknowns, trajectory: Trajectory) -> Floats:
+    """Places after a step along the line, within its ends."""
+    return np.asarray(np.clip(arc_m + own.step_m, 0.0, trajectory.arc_m[-1]))
+
+
+def assembled(
+    arc_m: Floats,
+    started: Masks,
+    own: OwnUnknowns,
+    lin: Linearised,
+    ambiguity_m: Floats,
+    variance_m2: Floats,
+    arcs: ArcAmbiguities,
+    *,
+    iterations: int,
+    limits: PhaseLimits,
+) -> PhasePositions:
+    """Everything side by side, NaN where there is nothing."""
+    has = started & (own.noise_sigma_m <= limits.largest_sigma_m)
+    code, phase = lin.code_weight > 0, lin.phase_weight > 0
+    return PhasePositions(
+        arc_m=np.where(has, arc_m, np.nan),
+        sigma_m=np.where(has, own.sigma_m, np.nan),
+        noise_sigma_m=np.where(has, own.noise_sigma_m, np.nan),
+        clock_m=np.where(has[:, None], own.clock_m, np.nan),
+        code_residual_m=np.where(code & has[:, None], own.code_residual_m, np.nan),
+        phase_residual_m=np.where(phase & has[:, None], own.phase_residual_m, np.nan),
+        ambiguity_m=np.where(phase, ambiguity_m, np.nan),
+        ambiguity_sigma_m=np.where(phase, np.sqrt(np.where(phase, variance_m2, 1.0)), np.nan),
+        n_codes=np.count_nonzero(code, axis=1).astype(np.int64),
+        n_phases=np.count_nonzero(phase, axis=1).astype(np.int64),
+        arcs=arcs,
+        iterations=iterations,
+    )
+
+
+def phase_run(
+    time: Datetimes,
+    ranges: Ranges,
+    phases: Phases,
+    trajectory: Trajectory,
+    arc_m_start: Floats,
+    *,
+    limits: PhaseLimits | None = None,
+) -> PhasePositions:
+    """Positions of a run of epochs, all observations of the run in one least squares.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    ranges : Ranges
+        T epochs: corrected codes with their weights, satellites, clocks, ties between clocks.
+    phases : Phases
+    trajectory : Trajectory
+    arc_m_start : ndarray, shape (T,) [m]
+        Where each epoch starts from (the constrained position of codes alone); NaN leaves it out.
+    limits : PhaseLimits, optional
+
+    Returns
+    -------
+    PhasePositions
+        Memory: T x M x M and A x A numbers for A arcs; cut long logs into runs of minutes.
+    """
+    limits = limits or PhaseLimits()
+    started = np.isfinite(arc_m_start)
+    ranges, phases, arc = startable(ranges, phases, trajectory, arc_m_start)
+    used = phases.weight > 0
+    # Row-major: the first place of an arc is its first epoch.
+    walk = _walk(hop_of(time, limits), used, phases.arc_id, limits)
+    first, column, count = walk.first, walk.column, len(walk.arc_id)
+    index = np.full(used.shape, count, dtype=np.intp)
+    index[used] = column
+    base = np.zeros(count + 1)
+    iteration = 0
+    while True:
+        lin = linearise(ranges, phases, trajectory, arc, clocks=limits.clocks)
+        if iteration == 0:
+            base[:count] = lin.phase_m[used][first]
+        lin = shifted(lin, base[index])
+        value, covariance = _solved(lin, index, walk.links)
+        among = covariance[index[:, :, None], index[:, None, :]]
+        own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
+        after = moved(arc, own, trajectory)
+        step = float(np.abs(after - arc)[started].max(initial=0.0))
+        arc, iteration = after, iteration + 1
+        if step <= limits.tolerance_m or iteration >= limits.max_iterations:
+            break
+    total = base + value[:, 0]
+    arcs = ArcAmbiguities(arc_id=walk.arc_id, ambiguity_m=total[:count], covariance_m2=covariance[:count, :count])
+    return assembled(
+        arc, started, own, lin, total[index], np.diagonal(covariance)[index], arcs,
+        iterations=iteration, limits=limits,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Walk:
+    """Unknowns of a run: one a stretch of an arc inside a hop, linked to the next of its arc.
+
+    `first` is the place of each arc's first value among the used phases, `column` the unknown of
+    each of them, `links` the information of the random walk between unknowns, shape (A, A).
+    """
+
+    arc_id: Integers
+    first: Indices
+    column: Indices
+    links: Floats
+
+
+def _walk(hop: Integers, used: Masks, arc_id: Integers, limits: PhaseLimits) -> _Walk:
+    """Unknowns of the arcs' ambiguities, and what the walk between them says."""
+    when = np.broadcast_to(hop[:, None], used.shape)[used] if limits.drift_m > 0.0 else np.zeros(used.sum(), np.int64)
+    # Row-major: the first place of an arc is its first epoch.
+    pairs = np.stack([arc_id[used], when], axis=1)
+    stretches, column = np.unique(pairs, axis=0, return_inverse=True)
+    ids, first = np.unique(arc_id[used], return_index=True)
+    links = np.zeros((len(stretches), len(stretches)))
+    next_one = np.flatnonzero(stretches[1:, 0] == stretches[:-1, 0])
+    if limits.drift_m > 0.0:
+        steps = (stretches[next_one + 1, 1] - stretches[next_one, 1]) * limits.hop_s
+        weight = 1.0 / (limits.drift_m**2 * steps)
+        for one, two, sign in ((0, 0, 1), (1, 1, 1), (0, 1, -1), (1, 0, -1)):
+            np.add.at(links, (next_one + one, next_one + two), sign * weight)
+    return _Walk(
+        arc_id=stretches[:, 0],
+        first=first[np.searchsorted(ids, stretches[:, 0])],
+        column=column.reshape(-1),
+        links=links,
+    )
+
+
+def _solved(lin: Linearised, index: Indices, links: Floats) -> tuple[Floats, Floats]:
+    """Ambiguities less their first values with their responses to the map, and their covariance.
+
+    Shapes (A + 1, 3) and (A + 1, A + 1): the last one stands for channels without a phase.
+    """
+    part, count = reduce(lin), len(links)
+    matrix = np.zeros((count + 1, count + 1))
+    right = np.zeros((count + 1, 3))
+    np.add.at(matrix, (index[:, :, None], index[:, None, :]), part.matrix)
+    np.add.at(right, index, part.right)
+    matrix[:-1, :-1] += links
+    matrix[-1], matrix[:, -1], right[-1] = 0.0, 0.0, 0.0
+    held = np.append(np.ones(count), 0.0) if own_clock(lin) else np.zeros(count + 1)
+    covariance = inverse_of_arcs(matrix, held)
+    return covariance @ right, covariance

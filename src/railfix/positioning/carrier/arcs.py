@@ -1,0 +1,70 @@
+"""Names of unbroken stretches of phase.
+
+An arc's name is a whole number that no other arc of a run has: the channel's five letters and how
+many arcs that channel has had. So it can cross from chunk to chunk, whatever the channels' order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Integers, Masks, Strings
+
+#: Bits of the count in an arc's name; the channel's letters stand above.
+COUNT_BITS: Final = 23
+#: No phase, no arc.
+NO_ARC: Final = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArcState:
+    """Arcs that each channel has had so far, by channel code."""
+
+    count: Mapping[int, int] = field(default_factory=dict)
+
+
+def channel_code(satellite: str, signal: str) -> int:
+    """A channel's letters as one number: ``G05`` on ``1C``."""
+    return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
+
+
+def number_arcs(
+    slip: Masks,
+    has_phase: Masks,
+    satellite: Strings,
+    signal: Strings,
+    state: ArcState | None = None,
+) -> tuple[Integers, ArcState]:
+    """The arc that each phase belongs to.
+
+    Parameters
+    ----------
+    slip : ndarray of bool, shape (T, M)
+        Where arcs begin (`slips.find_slips`, and what other tests add).
+    has_phase : ndarray of bool, shape (T, M)
+    satellite, signal : ndarray of str, shape (M,)
+    state : ArcState, optional
+
+    Returns
+    -------
+    ndarray of int64, shape (T, M)
+        `NO_ARC` where there is no phase.
+    ArcState
+    """
+    before = dict(state.count) if state else {}
+    codes = [channel_code(str(a), str(b)) for a, b in zip(satellite.tolist(), signal.tolist(), strict=True)]
+    first = np.array([before.get(code, 0) for code in codes], dtype=np.int64)
+    count = first + np.cumsum(slip & has_phase, axis=0, dtype=np.int64)
+    names = np.array(codes, dtype=np.int64) << COUNT_BITS
+    if len(count):
+        before.update({code: int(c) for code, c in zip(codes, count[-1], strict=True)})
+    return np.where(has_phase, names + count, NO_ARC), ArcState(count=before)
+
+
+def channel_of(arc_id: Integers) -> Integers:
+    """Channel code of each arc."""
+    return np.asarray(arc_id >> COUNT_BITS)

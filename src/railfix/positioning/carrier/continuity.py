@@ -1,0 +1,264 @@
+"""Phase jumps against the line: what one epoch's change of the phases says of itself.
+
+Between two epochs the antenna moved by one unknown distance along a known line and the clock by
+one unknown; every further satellite is a check, good to a centimetre at any rate of the log and
+without Dopplers. Where they do not agree, the worst channel is taken out until the others do, and
+one that then fits comes back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.geodesy import range_with_rotation
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import frozen
+from railfix.track.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContinuityLimits:
+    """Limits of the test.
+
+    Attributes
+    ----------
+    phase_m, drift_mps : float
+        Standard deviation of a change of phase: at once, and for each second between the epochs
+        (satellite clocks, delays).
+    aside_m : float
+        Standard deviation across the line and in height of the change of place at once (map points).
+    across_share, up_share : float
+        The same as shares of the way: a position that is 5 m off sees the line turned by 0.017 on a
+        curve of 300 m radius, and by 0.0025 on a vertical one of 2000 m.
+    sigmas : float
+        A channel is out from so many standard deviations of its own residual on.
+    refused : int
+        Channels that may be taken out; where more would have to be, none is kept as joined.
+    max_gap_s : float
+        Longest interval that is judged.
+    """
+
+    phase_m: float = 0.012
+    drift_mps: float = 0.008
+    aside_m: float = 0.02
+    across_share: float = 0.02
+    up_share: float = 0.003
+    sigmas: float = 4.5
+    refused: int = 8
+    max_gap_s: float = 31.0
+
+    def __post_init__(self) -> None:
+        for name in ("phase_m", "drift_mps", "aside_m", "across_share", "up_share", "sigmas", "max_gap_s"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.refused < 0:
+            raise ValueError(f"refused must not be negative, got {self.refused}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContinuityState:
+    """The last epoch of a chunk, by channel.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+    channels : tuple of (str, str)
+    phase_m : ndarray, shape (M,) [m]
+        Corrected phase; NaN where not used.
+    sat_ecef_m : ndarray, shape (M, 3) [m]
+    arc_m : float
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    channels: tuple[tuple[str, str], ...] = ()
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))
+    sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    arc_m: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackJumps:
+    """Verdict on the change of each phase into its epoch, T epochs by M channels.
+
+    Attributes
+    ----------
+    jump : ndarray of bool, shape (T, M)
+        True where the phase does not fit: its arc begins anew.
+    metric_m : ndarray, shape (T, M) [m]
+        Change of phase less what the channels kept say; NaN where not judged.
+    judged : ndarray of bool, shape (T, M)
+    moved_m : ndarray, shape (T,) [m]
+        Way along the line since the epoch before, from the phases; NaN where not known.
+    moved_sigma_m : ndarray, shape (T,) [m]
+    """
+
+    jump: Masks
+    metric_m: Floats
+    judged: Masks
+    moved_m: Floats
+    moved_sigma_m: Floats
+
+
+def track_jumps(
+    time: Datetimes,
+    satellite: Strings,
+    signal: Strings,
+    phase_m: Floats,
+    sat_ecef_m: Floats,
+    slip: Masks,
+    trajectory: Trajectory,
+    arc_m: Floats,
+    state: ContinuityState | None = None,
+    *,
+    limits: ContinuityLimits | None = None,
+) -> tuple[TrackJumps, ContinuityState]:
+    """Phases that jump against the others and the line.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite, signal : ndarray of str, shape (M,)
+    phase_m : ndarray, shape (T, M) [m]
+        Corrected phases (`observation_model.corrected_phase_m`), NaN where not used.
+    sat_ecef_m : ndarray, shape (T, M, 3) [m]
+        Satellites where there is a phase.
+    slip : ndarray of bool, shape (T, M)
+        Slips already known: not judged again.
+    trajectory : Trajectory
+    arc_m : ndarray, shape (T,) [m]
+        Positions of codes alone, good to some metres; NaN: the epoch cannot judge nor be judged.
+    state : ContinuityState, optional
+    limits : ContinuityLimits, optional
+
+    Returns
+    -------
+    TrackJumps
+    ContinuityState
+    """
+    limits, state = limits or ContinuityLimits(), state or ContinuityState()
+    channels = tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
+    place = {key: i for i, key in enumerate(state.channels)}
+    at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
+    last_phase, last_sat = np.full(len(channels), np.nan), np.full((len(channels), 3), np.nan)
+    last_phase[at >= 0], last_sat[at >= 0] = state.phase_m[at[at >= 0]], state.sat_ecef_m[at[at >= 0]]
+
+    phase = np.concatenate([last_phase[None], phase_m])
+    sats = np.concatenate([last_sat[None], sat_ecef_m])
+    arc = np.r_[state.arc_m, arc_m]
+    dt = seconds(np.diff(np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), time])))
+    able = np.isfinite(arc[1:]) & np.isfinite(arc[:-1]) & (dt <= limits.max_gap_s)
+    judged = able[:, None] & ~slip & np.isfinite(phase[1:]) & np.isfinite(phase[:-1])
+
+    distance, los, axes = _around(sats, trajectory, arc)
+    change = np.diff(phase - distance, axis=0)
+    way = np.diff(arc)
+    design = np.concatenate([-np.matmul(los[1:], axes[1:].swapaxes(1, 2)), np.ones((*change.shape, 1))], axis=-1)
+    sigma = np.hypot(limits.phase_m, limits.drift_mps * np.where(able, dt, 0.0))
+    share = np.array([limits.across_share, limits.up_share])
+    aside = np.hypot(limits.aside_m, share * np.where(able, way, 0.0)[:, None])
+    kept, residual, step, variance, decided = _consistent(design, change, judged, sigma, aside, limits)
+    jump = judged & ~(kept & decided[:, None])
+    known = able & decided & np.isfinite(variance)
+    after = state
+    if len(time):
+        after = ContinuityState(
+            time=time[-1],
+            channels=channels,
+            phase_m=frozen(phase_m[-1].copy()),
+            sat_ecef_m=frozen(sat_ecef_m[-1].copy()),
+            arc_m=float(arc_m[-1]),
+        )
+    found = TrackJumps(
+        jump=jump,
+        metric_m=np.where(judged, residual, np.nan),
+        judged=judged,
+        moved_m=np.where(known, way + step, np.nan),
+        moved_sigma_m=np.where(known, np.sqrt(np.where(known, variance, 1.0)), np.nan),
+    )
+    return found, after
+
+
+def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, Floats, Floats]:
+    """Ranges, lines of sight and axes (along, across, up) at places on the line."""
+    safe = np.where(np.isfinite(arc), arc, 0.0)
+    section, along = trajectory.segment_at(safe)
+    where = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
+    distance, los = range_with_rotation(sats, where[:, None, :])
+    axes = np.stack([trajectory.tangent[section], trajectory.across[section], trajectory.up[section]], axis=1)
+    return distance, los, axes
+
+
+def _consistent(
+    design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
+) -> tuple[Masks, Floats, Floats, Floats, Masks]:
+    """Channels that agree, the worst taken out one by one.
+
+    Returns the mask of those kept, residuals of all, step along the line with its variance, and
+    where the rest agrees. Where there is nothing to check with, all are kept.
+    """
+    design = np.where(judged[..., None], design, 0.0)
+    change = np.where(judged, change, 0.0)
+    prior = np.zeros((len(change), 4, 4))
+    prior[:, 0, 0] = prior[:, 3, 3] = 1e-12
+    prior[:, [1, 2], [1, 2]] = aside**-2.0
+    fit = _fitted(design, change, judged, sigma, prior)
+    kept = judged.copy()
+    decided = np.ones(len(change), dtype=bool)
+    at = np.flatnonzero((fit.size > limits.sigmas).any(axis=1))
+    if len(at):
+        part = design[at], change[at], sigma[at], prior[at]
+        kept[at], decided[at] = _worst_out(*part, judged[at], limits)
+        # One that was taken out for another's sake comes back.
+        back = judged[at] & (_fitted(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
+        kept[at], again = _worst_out(*part, back, limits)
+        decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.refused)
+        fit = _fitted(design, change, kept, sigma, prior)
+    return kept, fit.residual, fit.step, fit.variance, decided
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Residuals of all channels, their size in sigmas (of one kept: its own; of one not: its prediction's)."""
+
+    residual: Floats
+    size: Floats
+    step: Floats
+    variance: Floats
+
+
+def _fitted(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floats) -> _Fit:
+    """Least squares of the kept channels of each epoch."""
+    weight = kept / sigma[:, None] ** 2
+    inverse = np.linalg.inv(np.matmul((design * weight[..., None]).swapaxes(1, 2), design) + prior)
+    right = np.matmul((weight * change)[:, None, :], design)[:, 0]
+    x = np.matmul(inverse, right[..., None])[..., 0]
+    residual = change - np.matmul(design, x[..., None])[..., 0]
+    spread = np.einsum("tmi,tij,tmj->tm", design, inverse, design)
+    own = sigma[:, None] ** 2
+    # Of a channel that nothing checks no variance is left: it cannot be judged.
+    checked = np.where(kept, own - spread, own + spread)
+    size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
+    return _Fit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
+
+
+def _worst_out(
+    design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
+) -> tuple[Masks, Masks]:
+    """Kept channels after taking out the worst one by one, and where the rest agrees."""
+    kept = kept.copy()
+    active = np.arange(len(kept))
+    for _ in range(limits.refused + 1):
+        fit = _fitted(design[active], change[active], kept[active], sigma[active], prior[active])
+        size = np.where(kept[active], fit.size, 0.0)
+        worst = np.argmax(size, axis=1)
+        bad = size[np.arange(len(active)), worst] > limits.sigmas
+        kept[active[bad], worst[bad]] = False
+        active = active[bad]
+        if not len(active):
+            break
+    decided = np.ones(len(kept), dtype=bool)
+    decided[active] = False
+    return kept, decided

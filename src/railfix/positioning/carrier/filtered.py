@@ -1,0 +1,305 @@
+"""Positions along the line from code and phase, each epoch from the past alone.
+
+The normal matrix of the running arcs' ambiguities is what one epoch leaves to the next; each epoch
+adds what it says, and at multiples of a hop the ambiguities walk a little. Ambiguities of ended
+arcs are eliminated. So the state is as small as there are channels, a live epoch costs the same
+however long the run, and any cutting into chunks gives the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.timescale import GPS_EPOCH, seconds
+from railfix.positioning.carrier.ambiguities import (
+    FREE_AMBIGUITY_M,
+    ArcAmbiguities,
+    PhaseLimits,
+    PhasePositions,
+    assembled,
+    hop_of,
+    inverse_of_arcs,
+    moved,
+    repeats_of,
+    startable,
+)
+from railfix.positioning.carrier.arcs import channel_of
+from railfix.positioning.carrier.observation_model import (
+    Linearised,
+    Phases,
+    linearise,
+    own_clock,
+    own_unknowns,
+    reduce,
+    shifted,
+)
+from railfix.positioning.normal_equations import Ranges
+from railfix.track.trajectory import Trajectory
+
+#: Epochs computed together: what bounds the memory.
+SEGMENT_EPOCHS: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class Memory:
+    """What the epochs so far say of the running arcs, A of them.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Of the last epoch, NaT before the first.
+    arc_id : ndarray of int64, shape (A,)
+    seen : ndarray of datetime64[ns], shape (A,)
+    first_m : ndarray, shape (A,) [m]
+        First values of the ambiguities.
+    matrix : ndarray, shape (A, A) [1/m^2]
+    right : ndarray, shape (A, 3) [1/m]
+        Of the observations, and of a map off across and in height.
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
+    first_m: Floats = field(default_factory=lambda: np.empty(0))
+    matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    right: Floats = field(default_factory=lambda: np.empty((0, 3)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhaseState:
+    """One memory a pass of linearisation; none before the first epoch."""
+
+    memories: tuple[Memory, ...] = ()
+
+
+def phase_positions(
+    time: Datetimes,
+    ranges: Ranges,
+    phases: Phases,
+    trajectory: Trajectory,
+    arc_m_start: Floats,
+    state: PhaseState | None = None,
+    *,
+    limits: PhaseLimits | None = None,
+) -> tuple[PhasePositions, PhaseState]:
+    """Positions of a chunk of epochs, each from its own and earlier observations.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    ranges : Ranges
+        Corrected codes with their weights, satellites, clocks, ties between clocks.
+    phases : Phases
+        Arcs named by `arcs.number_arcs`: of one channel only the newest runs.
+    trajectory : Trajectory
+    arc_m_start : ndarray, shape (T,) [m]
+        Where each epoch starts from (the constrained position of codes alone); NaN leaves it out.
+    state : PhaseState, optional
+    limits : PhaseLimits, optional
+
+    Returns
+    -------
+    PhasePositions
+    PhaseState
+        Any cutting into chunks gives the same within rounding (1e-9 m).
+    """
+    limits = limits or PhaseLimits()
+    memories = state.memories if state and state.memories else (Memory(),) * limits.passes
+    if len(memories) != limits.passes:
+        raise ValueError(f"the state has {len(memories)} passes, the limits ask for {limits.passes}")
+    started = np.isfinite(arc_m_start)
+    ranges, phases, arc = startable(ranges, phases, trajectory, arc_m_start)
+    cuts = _cuts(hop_of(time, limits), phases)
+    after: list[Memory] = []
+    pieces: list[PhasePositions] = []
+    for before in memories:
+        pieces, places, memory = [], [], before
+        for rows in cuts:
+            inputs = _Inputs(time[rows], ranges.take(rows), phases.take(rows), arc[rows], started[rows])
+            piece, place, memory = _segment(inputs, trajectory, memory, limits)
+            pieces.append(piece)
+            places.append(place)
+        after.append(memory)
+        arc = np.concatenate(places)
+    return _joined(pieces), PhaseState(memories=tuple(after))
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """What one segment is computed from."""
+
+    time: Datetimes
+    ranges: Ranges
+    phases: Phases
+    arc_m: Floats
+    started: Masks
+
+
+def _cuts(hop: Integers, phases: Phases) -> list[Indices]:
+    """Epochs of segments: inside a hop, and with not many more arcs than channels.
+
+    Where else the cuts lie changes nothing but rounding: ending an arc early or late is the same.
+    """
+    epochs, channels = phases.arc_id.shape
+    new = np.ones((epochs, channels), dtype=bool)
+    new[1:] = phases.arc_id[1:] != phases.arc_id[:-1]
+    begun = np.cumsum(np.count_nonzero(new & (phases.weight > 0), axis=1))
+    ends = np.append(np.flatnonzero(np.diff(hop)) + 1, epochs)
+    cuts, first = [], 0
+    while first < epochs:
+        known = begun[first - 1] if first else 0
+        within = int(np.searchsorted(begun, known + 2 * channels, side="right"))
+        hop_end = int(ends[np.searchsorted(ends, first, side="right")])
+        last = min(first + SEGMENT_EPOCHS, max(within, first + 1), hop_end)
+        cuts.append(np.arange(first, last))
+        first = last
+    return cuts or [np.arange(0)]
+
+
+def _segment(
+    inputs: _Inputs, trajectory: Trajectory, memory: Memory, limits: PhaseLimits
+) -> tuple[PhasePositions, Floats, Memory]:
+    """Positions and places of one segment, and the memory it leaves."""
+    phases = inputs.phases
+    used = phases.weight > 0
+    lin = linearise(inputs.ranges, phases, trajectory, inputs.arc_m, clocks=limits.clocks)
+    memory = _walked(memory, inputs.time, limits)
+    ids, first, column = np.unique(phases.arc_id[used], return_index=True, return_inverse=True)
+    memory = _with_arcs(memory, ids, lin.phase_m[used][first])
+    place = np.searchsorted(memory.arc_id, ids)
+    count = len(memory.arc_id)
+    index = np.full(used.shape, count, dtype=np.intp)
+    index[used] = place[column]
+    base = np.append(memory.first_m, 0.0)
+    lin = shifted(lin, base[index])
+
+    matrix, right, kept = _accumulated(lin, index, memory)
+    row = np.arange(len(matrix))[:, None]
+    held = np.zeros((len(matrix), count + 1))
+    held[row, index] = own_clock(lin)
+    covariance = np.zeros((len(matrix), count + 1, count + 1))
+    covariance[:, :count, :count] = inverse_of_arcs(matrix, held[:, :count])
+    value = np.zeros((len(matrix), count + 1, 3))
+    value[:, :count] = covariance[:, :count, :count] @ right
+    among = covariance[row[:, None], index[:, :, None], index[:, None, :]]
+    before = np.asarray([memory.time], dtype="datetime64[ns]")
+    repeats = repeats_of(np.concatenate([before, inputs.time]), limits)[1:]
+    own = own_unknowns(lin, value[row, index], among, trajectory, repeats=repeats)
+    arc = moved(inputs.arc_m, own, trajectory)
+    seen = memory.seen.copy()
+    if len(ids):
+        last_row = np.zeros(len(ids), dtype=np.intp)
+        np.maximum.at(last_row, column, np.nonzero(used)[0])
+        seen[place] = inputs.time[last_row]
+    now = inputs.time[-1] if len(inputs.time) else memory.time
+    left = _without(replace(kept, time=now, seen=seen), _superseded(memory.arc_id))
+    end = value[-1, :count, 0] if len(value) else np.zeros(count)
+    last = covariance[-1, :count, :count] if len(value) else np.zeros((count, count))
+    running = np.isin(memory.arc_id, left.arc_id)
+    arcs = ArcAmbiguities(
+        arc_id=left.arc_id,
+        ambiguity_m=(memory.first_m + end)[running],
+        covariance_m2=last[np.ix_(running, running)],
+    )
+    piece = assembled(
+        arc, inputs.started, own, lin,
+        base[index] + value[row, index, 0], covariance[row, index, index], arcs,
+        iterations=limits.passes, limits=limits,
+    )  # fmt: skip
+    return piece, arc, left
+
+
+def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
+    """The memory with room for more arcs, sorted by name; known ones keep their first values."""
+    new = ~np.isin(ids, memory.arc_id)
+    if not new.any():
+        return memory
+    arc_id = np.concatenate([memory.arc_id, ids[new]])
+    order = np.argsort(arc_id)
+    count, old = len(arc_id), len(memory.arc_id)
+    matrix, right = np.zeros((count, count)), np.zeros((count, 3))
+    matrix[:old, :old], right[:old] = memory.matrix, memory.right
+    never = np.full(count - old, np.datetime64("NaT", "ns"))
+    return replace(
+        memory,
+        arc_id=arc_id[order],
+        seen=np.concatenate([memory.seen, never])[order],
+        first_m=np.concatenate([memory.first_m, first_m[new]])[order],
+        matrix=matrix[np.ix_(order, order)],
+        right=right[order],
+    )
+
+
+def _accumulated(lin: Linearised, index: Indices, memory: Memory) -> tuple[Floats, Floats, Memory]:
+    """Normal equations at each epoch, its own part included, and the memory after the last one."""
+    part = reduce(lin)
+    epochs, count = len(index), len(memory.arc_id)
+    row = np.arange(epochs)[:, None]
+    # One more row and column takes what has no phase.
+    own = np.zeros((epochs, count + 1, count + 4))
+    own[row[:, None], index[:, :, None], index[:, None, :]] = part.matrix
+    own[row, index, count + 1 :] = part.right
+    own = np.delete(own[:, :count], count, axis=2)
+    carried = np.concatenate([memory.matrix, memory.right], axis=1)
+    # cumsum from the carried sums: the same additions in the same order however epochs are cut.
+    sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
+    kept = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
+    return sums[1:, :, :count], sums[1:, :, count:], kept
+
+
+def _walked(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
+    """The memory at a later hop: arcs not seen for long forgotten, the others a little less certain."""
+    if not len(time) or not len(memory.arc_id):
+        return memory
+    before, now = hop_of(np.array([memory.time, time[0]]), limits)
+    if now == before:
+        return memory
+    begin = GPS_EPOCH + np.timedelta64(int(now) * round(limits.hop_s * 1e9), "ns")
+    memory = _without(memory, seconds(begin - memory.seen) > limits.forget_s)
+    variance = limits.drift_m**2 * float(now - before) * limits.hop_s
+    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda, also where Lambda is singular.
+    both = np.concatenate([memory.matrix, memory.right], axis=1)
+    both = np.linalg.solve(np.eye(len(both)) + variance * memory.matrix, both)
+    matrix, right = both[:, : len(both)], both[:, len(both) :]
+    return replace(memory, matrix=0.5 * (matrix + matrix.T), right=right)
+
+
+def _superseded(arc_id: Integers) -> Masks:
+    """Arcs, sorted, that are not the newest of their channel."""
+    older = np.zeros(len(arc_id), dtype=bool)
+    older[:-1] = channel_of(arc_id[1:]) == channel_of(arc_id[:-1])
+    return older
+
+
+def _without(memory: Memory, ends: Masks) -> Memory:
+    """The memory with some arcs eliminated: what they said of the others stays."""
+    runs = ~ends
+    if runs.all():
+        return memory
+    inner = memory.matrix[np.ix_(ends, ends)]
+    inner = inner + np.eye(len(inner)) * FREE_AMBIGUITY_M**-2.0
+    across = memory.matrix[np.ix_(runs, ends)]
+    both = np.linalg.solve(inner, np.concatenate([across.T, memory.right[ends]], axis=1))
+    size = np.count_nonzero(runs)
+    return replace(
+        memory,
+        arc_id=memory.arc_id[runs],
+        seen=memory.seen[runs],
+        first_m=memory.first_m[runs],
+        matrix=memory.matrix[np.ix_(runs, runs)] - across @ both[:, :size],
+        right=memory.right[runs] - across @ both[:, size:],
+    )
+
+
+def _joined(pieces: list[PhasePositions]) -> PhasePositions:
+    """Segments as a whole; the arcs are those of the last."""
+    arrays: dict[str, Any] = {
+        item.name: np.concatenate([getattr(p, item.name) for p in pieces])
+        for item in fields(PhasePositions)
+        if item.name not in ("arcs", "iterations")
+    }
+    return replace(pieces[-1], **arrays)

@@ -1,0 +1,339 @@
+"""P4's observation equations, linearised, the unknowns of each epoch eliminated.
+
+Per epoch t and channel i, around a place on the line::
+
+    code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
+    phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
+
+with d along the section, m1 and m2 the map's error across the track and in height (prior: the
+map's sigmas), b_g the receiver clock of the constellation. P4 writes the same clock for code and
+phase, b = b_g (`clocks="shared"`). Telephones do not keep that: the codes of all satellites jump
+against the phases by tens of metres from epoch to epoch. A clock of the phases' own, one for all
+constellations because constants between them are part of the N, costs one unknown an epoch and
+leaves the N known up to a constant common to all. Only the N are common to epochs: with
+``L`` the normal matrix of an epoch's own unknowns and ``C`` what couples them to the N, the epoch
+adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur complement).
+
+The ionosphere delays the code and advances the phase (P4's signs). Corrected ranges and phases
+have the model's delay taken off with either sign; what the model misses is taken up by N at the
+arc's begin and drifts by twice its change from there on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.geodesy import range_with_rotation
+from railfix.positioning.normal_equations import ClockTies, Ranges
+from railfix.track.trajectory import Trajectory
+
+PhaseClocks = Literal["own", "shared"]
+
+#: Own unknowns of an epoch before the clocks: along, across, up.
+PLACE: Final = 3
+#: Sigma of an own unknown of which nothing is known [m]: keeps matrices regular where no satellite tells.
+_FREE_M: Final = 1e5
+#: Least sigma of a tie between clocks [m].
+_LEAST_TIE_M: Final = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phases:
+    """Corrected phases of an antenna beside its `Ranges`: T epochs by M channels.
+
+    Attributes
+    ----------
+    phase_m : ndarray, shape (T, M) [m]
+        Phase times wavelength, corrected like the code: + satellite clock - troposphere +
+        ionosphere (`corrected_phase_m`); any value where the weight is 0.
+    weight : ndarray, shape (T, M) [1/m^2]
+        1/sigma^2, 0 for what is not used. Where it is not 0, `Ranges.sat_ecef_m` must be the
+        satellite, whether its code is used or not.
+    arc_id : ndarray of int64, shape (T, M)
+        The same number along an unbroken stretch of one channel's phase, and nowhere else
+        (`arcs.number_arcs`).
+    """
+
+    phase_m: Floats
+    weight: Floats
+    arc_id: Integers
+
+    def take(self, epochs: Masks | Indices | slice) -> Phases:
+        """The phases of some epochs."""
+        return Phases(phase_m=self.phase_m[epochs], weight=self.weight[epochs], arc_id=self.arc_id[epochs])
+
+
+def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats, troposphere_m: Floats) -> Floats:
+    """Phase corrected to geometry, receiver clock and a constant, shape (T, M) [m].
+
+    Parameters
+    ----------
+    phase_m : ndarray, shape (T, M) [m]
+        `Slips.phase_m`.
+    sat_clock_m : ndarray, shape (T, M) [m]
+        c times the satellite clock. Group delays are of the code, and constant on an arc.
+    ionosphere_m, troposphere_m : ndarray, shape (T, M) [m]
+        Delays of the code: the phase is advanced by the ionosphere.
+    """
+    return phase_m + sat_clock_m + ionosphere_m - troposphere_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linearised:
+    """Epochs around their places, own unknowns ``x = [along, across, up, clocks]`` (P of them).
+
+    Attributes
+    ----------
+    code_design, phase_design : ndarray, shape (T, M, P)
+    groups : int
+        Clocks of the codes; a clock of the phases comes after them.
+    code_weight, phase_weight : ndarray, shape (T, M) [1/m^2]
+    code_m, phase_m : ndarray, shape (T, M) [m]
+        Observed less computed, less `clock_m`.
+    clock_m, phase_clock_m : ndarray, shape (T,) [m]
+        First values of the epoch's clocks, taken off codes and phases.
+    known : ndarray, shape (T, P, P)
+        What is known beside the observations: the map's errors, ties between clocks.
+    inverse : ndarray, shape (T, P, P)
+        Inverse of the normal matrix of the own unknowns.
+    right : ndarray, shape (T, P)
+        Right-hand side of the own unknowns.
+    coupling : ndarray, shape (T, P, M)
+        Normal matrix between own unknowns and each channel's ambiguity.
+    prior : ndarray, shape (2,) [1/m^2]
+        Of the map's errors.
+    """
+
+    code_design: Floats
+    phase_design: Floats
+    groups: int
+    code_weight: Floats
+    phase_weight: Floats
+    code_m: Floats
+    phase_m: Floats
+    clock_m: Floats
+    phase_clock_m: Floats
+    known: Floats
+    inverse: Floats
+    right: Floats
+    coupling: Floats
+    prior: Floats
+
+
+def linearise(
+    ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats, *, clocks: PhaseClocks = "own"
+) -> Linearised:
+    """Observation equations around places on the line.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        T epochs.
+    phases : Phases
+    trajectory : Trajectory
+    arc_m : ndarray, shape (T,) [m]
+        Finite and on the line.
+    clocks : {"own", "shared"}
+        Whether phases have a clock of their own or that of the codes of their constellation.
+    """
+    section, along = trajectory.segment_at(arc_m)
+    place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
+    axes = np.stack([trajectory.tangent[section], trajectory.across[section], trajectory.up[section]], axis=1)
+    groups = len(ranges.groups)
+    unknowns = PLACE + groups + (clocks == "own")
+    for_code = np.zeros((*ranges.code_m.shape, unknowns))
+    for_code[..., :PLACE] = -np.matmul(los, axes.swapaxes(1, 2))
+    for_phase = for_code.copy()
+    for g, group in enumerate(ranges.groups):
+        for_code[:, group, PLACE + g] = 1.0
+        for_phase[:, group, PLACE + g if clocks == "shared" else -1] = 1.0
+
+    w, v = ranges.weight, phases.weight
+    code, clock = _level(ranges.code_m - distance, w)
+    phase = np.where(v > 0, phases.phase_m - distance - clock[:, None], 0.0)
+    prior = np.array([trajectory.sigma_plan_m**-2.0, trajectory.sigma_height_m**-2.0])
+    known = np.zeros((len(code), unknowns, unknowns))
+    # What no satellite of an epoch tells: the matrix stays regular, the sigma says so.
+    for free in (0, *range(PLACE, unknowns)):
+        known[:, free, free] = _FREE_M**-2.0
+    known[:, 1, 1], known[:, 2, 2] = prior
+    matrix = np.matmul((for_code * w[..., None]).swapaxes(1, 2), for_code)
+    matrix += np.matmul((for_phase * v[..., None]).swapaxes(1, 2), for_phase)
+    right = np.matmul((w * code)[:, None, :], for_code)[:, 0]
+    right += np.matmul((v * phase)[:, None, :], for_phase)[:, 0]
+    if ranges.ties is not None:
+        tie, tied = _ties(ranges.ties)
+        known[:, PLACE : PLACE + groups, PLACE : PLACE + groups] += tie
+        right[:, PLACE : PLACE + groups] += tied
+    return Linearised(
+        code_design=for_code,
+        phase_design=for_phase,
+        groups=groups,
+        code_weight=w,
+        phase_weight=v,
+        code_m=code,
+        phase_m=phase,
+        clock_m=clock,
+        phase_clock_m=clock,
+        known=known,
+        inverse=np.linalg.inv(matrix + known),
+        right=right,
+        coupling=(for_phase * v[..., None]).swapaxes(1, 2),
+        prior=prior,
+    )
+
+
+def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Values less their weighted mean of each epoch, 0 where the weight is, and the mean."""
+    used = np.where(weight > 0, values, 0.0)
+    total = weight.sum(axis=1)
+    mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
+    return np.where(weight > 0, used - mean[:, None], 0.0), mean
+
+
+def _ties(ties: ClockTies) -> tuple[Floats, Floats]:
+    """What is known of the clocks against each other, a common clock eliminated: matrix and right-hand side.
+
+    The first value of the clocks, the same for all groups, does not show in these differences.
+    """
+    mass = 1.0 / np.maximum(ties.sigma_m, _LEAST_TIE_M) ** 2
+    share = mass / mass.sum(axis=1, keepdims=True)
+    matrix = mass[:, :, None] * (np.eye(mass.shape[1]) - share[:, None, :])
+    return matrix, np.einsum("tgh,th->tg", matrix, ties.offset_m)
+
+
+def own_clock(lin: Linearised) -> bool:
+    """Whether the phases have a clock of their own."""
+    return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
+
+
+def shifted(lin: Linearised, first_m: Floats) -> Linearised:
+    """The same with first values of the ambiguities taken off the phases, shape (T, M).
+
+    What is left in common (a clock of their own, milliseconds off) is taken off too.
+    """
+    phase = np.where(lin.phase_weight > 0, lin.phase_m - first_m, 0.0)
+    clock = np.zeros(len(phase))
+    if own_clock(lin):
+        phase, clock = _level(phase, lin.phase_weight)
+    moved = np.matmul((lin.phase_weight * (phase - lin.phase_m))[:, None, :], lin.phase_design)[:, 0]
+    return replace(lin, phase_m=phase, right=lin.right + moved, phase_clock_m=lin.phase_clock_m + clock)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reduced:
+    """What each epoch says of the ambiguities of its channels.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (T, M, M) [1/m^2]
+    right : ndarray, shape (T, M, 3) [1/m]
+        Right-hand sides: of the observations, and of a map that is 1 m off across and in height.
+    """
+
+    matrix: Floats
+    right: Floats
+
+
+def reduce(lin: Linearised) -> Reduced:
+    """Schur complement of each epoch's own unknowns.
+
+    A map off by 1 m changes code and phase alike by columns of their designs; against its
+    prior this leaves ``prior_k C^T L^-1 e_k`` on the right.
+    """
+    gain = np.matmul(lin.inverse, lin.coupling)
+    # As a sum of squares of what the own unknowns leave: never negative, and errors of the inverse
+    # enter squared; diag(v) - C^T L^-1 C would lose all digits where an epoch says little.
+    left = [
+        (lin.code_weight, -np.matmul(lin.code_design, gain)),
+        (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),
+    ]
+    matrix = np.matmul(gain.swapaxes(1, 2), np.matmul(lin.known, gain))
+    for weight, rows in left:
+        matrix += np.matmul((rows * weight[..., None]).swapaxes(1, 2), rows)
+    matrix *= ((lin.phase_weight > 0)[:, :, None]) & ((lin.phase_weight > 0)[:, None, :])
+    right = np.empty((*lin.phase_m.shape, 3))
+    right[..., 0] = lin.phase_weight * lin.phase_m - np.matmul(lin.right[:, None, :], gain)[:, 0]
+    right[..., 1:] = (gain[:, 1:PLACE] * lin.prior[:, None]).swapaxes(1, 2)
+    return Reduced(matrix=matrix, right=right)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnUnknowns:
+    """Each epoch's own unknowns, given the ambiguities.
+
+    Attributes
+    ----------
+    step_m : ndarray, shape (T,) [m]
+        Along the line from the place of linearisation.
+    noise_sigma_m, sigma_m : ndarray, shape (T,) [m]
+        From noise alone, and with the map's error.
+    clock_m : ndarray, shape (T, G) [m]
+    code_residual_m, phase_residual_m : ndarray, shape (T, M) [m]
+        0 where the weight is 0.
+    """
+
+    step_m: Floats
+    noise_sigma_m: Floats
+    sigma_m: Floats
+    clock_m: Floats
+    code_residual_m: Floats
+    phase_residual_m: Floats
+
+
+def own_unknowns(
+    lin: Linearised, ambiguity_m: Floats, covariance_m2: Floats, trajectory: Trajectory, *, repeats: Floats
+) -> OwnUnknowns:
+    """Back-substitution of each epoch.
+
+    The map is off by the same over a run: that does not average, unlike what the estimator assumes
+    (independent from epoch to epoch, so that phases cannot claim more than the map is good for).
+    The sigma therefore takes the response of the position to a map that is off at all epochs
+    together, in place of the share that an epoch alone has.
+
+    Parameters
+    ----------
+    lin : Linearised
+    ambiguity_m : ndarray, shape (T, M, 3) [m]
+        Of each channel, and its response to a map 1 m off across and in height.
+    covariance_m2 : ndarray, shape (T, M, M) [m^2]
+    trajectory : Trajectory
+    repeats : ndarray, shape (T,)
+        Epochs with the same code errors: the ambiguities' variance is larger by that.
+    """
+    used = lin.phase_weight > 0
+    known = np.where(used[..., None], ambiguity_m, 0.0)
+    x = np.matmul(lin.inverse, (lin.right - np.matmul(lin.coupling, known[..., :1])[..., 0])[..., None])[..., 0]
+    # Response of the distance along the line to the ambiguities, and to the map.
+    row = -np.matmul(lin.inverse[:, :1], lin.coupling)[:, 0]
+    from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
+    from_noise = lin.inverse[:, 0, 0] + from_arcs
+    # With the same errors again and again the phases help no more than not at all.
+    most = np.maximum(_variance_of_codes(lin), from_noise)
+    from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)
+    alone = -lin.inverse[:, 0, 1:PLACE] * lin.prior
+    together = alone + np.matmul(row[:, None, :], known[..., 1:])[:, 0]
+    sigma = np.array([trajectory.sigma_plan_m, trajectory.sigma_height_m])
+    alone_m2, together_m2 = ((part**2 @ sigma**2) for part in (alone, together))
+    noise_m2 = np.maximum(from_noise - alone_m2, 0.0)
+    code = np.where(lin.code_weight > 0, lin.code_m - np.matmul(lin.code_design, x[..., None])[..., 0], 0.0)
+    phase = lin.phase_m - np.matmul(lin.phase_design, x[..., None])[..., 0] - known[..., 0]
+    return OwnUnknowns(
+        step_m=x[:, 0],
+        noise_sigma_m=np.sqrt(noise_m2),
+        sigma_m=np.sqrt(noise_m2 + np.maximum(alone_m2, together_m2)),
+        clock_m=x[:, PLACE : PLACE + lin.groups] + lin.clock_m[:, None],
+        code_residual_m=code,
+        phase_residual_m=np.where(used, phase, 0.0),
+    )
+
+
+def _variance_of_codes(lin: Linearised) -> Floats:
+    """Variance along the line of each epoch's codes alone, the map's error included, shape (T,) [m^2]."""
+    matrix = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
+    return np.asarray(np.linalg.inv(matrix + lin.known)[:, 0, 0])

@@ -1,0 +1,295 @@
+"""Where the phase of a channel cannot be joined to the epoch before: cycle slips and gaps.
+
+Each epoch is judged against the one just before it. The phase's change is compared with what the
+mean of the two Dopplers says, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``; where
+that cannot judge, with the change of the code. What is common to the channels is the receiver's
+clock and is taken off as their median, so that a clock step is no slip.
+
+What is assumed of a clock step: it is common to all channels of an epoch; codes follow the time
+tags (a RINEX pseudorange is tag less transmit time), so that the true interval is the tags' less
+the step seen in the codes; phases either step with the codes or run on, and a difference between
+the two is a whole number of milliseconds, which `Slips.phase_m` adds to the phases.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntFlag
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations, frozen
+from railfix.gnss.signals import carrier_frequency_hz
+
+#: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
+MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
+#: A common change of the codes from which on the interval is corrected for it [m]; below, it is noise.
+_CLOCK_STEP_M: Final = 1e4
+#: Channels needed for a median to stand for the clock.
+_COMMON: Final = 3
+
+
+class SlipReason(IntFlag):
+    """Why the phase of an epoch and channel begins anew. 0 = joined to the epoch before."""
+
+    JOINED = 0
+    #: No phase at this epoch: nothing begins.
+    NO_PHASE = 1 << 0
+    #: A phase, but none of this channel at the epoch before.
+    FIRST = 1 << 1
+    #: Bit 0 of the receiver's loss-of-lock indicator.
+    LOSS_OF_LOCK = 1 << 2
+    #: Bit 1 of it (half a cycle not resolved) is not what it was at the epoch before.
+    HALF_CYCLE = 1 << 3
+    #: The epoch before is longer ago than the limit.
+    GAP = 1 << 4
+    #: The log says that nothing may be differenced into this epoch.
+    BREAK = 1 << 5
+    #: The phase's change is not that of the Dopplers.
+    DOPPLER = 1 << 6
+    #: The phase's change is not that of the code, where Dopplers cannot judge.
+    CODE = 1 << 7
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipLimits:
+    """Limits of the tests, in metres for an interval dt in seconds.
+
+    The Doppler test refuses a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
+    of the phases, noise of the mean Doppler, and what the trapezoid of the Dopplers misses of a
+    motion with that jerk. One cycle on L1 (0.19 m) is seen up to intervals of about 1 s, two to
+    1.5 s; a test on the track (`continuity.track_jumps`) has no such end.
+
+    Attributes
+    ----------
+    max_gap_s : float
+        Longest interval that is bridged: that of a station's log of 30 s.
+    doppler_m, doppler_mps : float
+        On real receivers at 1 Hz the median of the metric is 0.01 to 0.04 m.
+    jerk_mps3 : float
+        Of the antenna; passenger trains stay below 0.5.
+    code_m : float
+        Limit of code less phase where Dopplers are absent, or their own limit is wider than this.
+    """
+
+    max_gap_s: float = 31.0
+    doppler_m: float = 0.05
+    doppler_mps: float = 0.05
+    jerk_mps3: float = 0.5
+    code_m: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("max_gap_s", "doppler_m", "doppler_mps", "jerk_mps3", "code_m"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipState:
+    """The last epoch of a chunk, by channel ("G05", "1C"), and the steps so far.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        NaT before the first epoch.
+    channels : tuple of (str, str)
+    code_m, phase_m, doppler_mps : ndarray, shape (M,)
+        The phase as received, without `step_ms`.
+    half_cycle : ndarray of bool, shape (M,)
+    step_ms : int
+        Whole milliseconds that the codes' clock has stepped and the phases' has not.
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    channels: tuple[tuple[str, str], ...] = ()
+    code_m: Floats = field(default_factory=lambda: np.empty(0))
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))
+    doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
+    half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    step_ms: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slips:
+    """Phases and where their arcs begin, T epochs by M channels.
+
+    Attributes
+    ----------
+    slip : ndarray of bool, shape (T, M)
+        True where there is a phase that may not be joined to the epoch before.
+    reason : ndarray of int64, shape (T, M)
+        `SlipReason` bits.
+    phase_m : ndarray, shape (T, M) [m]
+        Phase times wavelength on the clock of the codes: whole milliseconds that only the codes
+        stepped are added. NaN where there is no phase or its wavelength is unknown.
+    doppler_metric_m, code_metric_m : ndarray, shape (T, M) [m]
+        What the two tests compare with their limits; NaN where they cannot judge.
+    doppler_limit_m : ndarray, shape (T,) [m]
+    clock_step_m : ndarray, shape (T,) [m]
+        Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen.
+    half_cycle : ndarray of bool, shape (T, M)
+        The receiver says that half a cycle is not resolved: harmless to a float ambiguity.
+    """
+
+    slip: Masks
+    reason: Integers
+    phase_m: Floats
+    doppler_metric_m: Floats
+    code_metric_m: Floats
+    doppler_limit_m: Floats
+    clock_step_m: Floats
+    half_cycle: Masks
+
+
+@dataclass(frozen=True)
+class _Changes:
+    """Changes into each epoch, shapes (T, M); dt of shape (T,)."""
+
+    dt: Floats
+    code: Floats
+    phase: Floats
+    range_mps: Floats
+
+
+def median_or_zero(values: Floats) -> Floats:
+    """Median over the channels of each epoch, 0 where fewer than three have one; shape (T,)."""
+    count = np.count_nonzero(np.isfinite(values), axis=1)
+    result = np.zeros(len(values))
+    enough = np.flatnonzero(count >= _COMMON)
+    if len(enough):
+        # NaN sorts last: the middle of the finite ones is found without leaving any out.
+        ranked = np.sort(values[enough], axis=1)
+        row, number = np.arange(len(enough)), count[enough]
+        result[enough] = 0.5 * (ranked[row, (number - 1) // 2] + ranked[row, number // 2])
+    return result
+
+
+def _before(values: Floats, last: Floats) -> Floats:
+    """Values of the epoch before each one; the first comes from the state."""
+    return np.concatenate([last[None], values[:-1]])
+
+
+def _last_row(state: SlipState, channels: tuple[tuple[str, str], ...]) -> dict[str, Floats]:
+    """The state's last epoch in the order of these channels, NaN for new ones."""
+    place = {key: i for i, key in enumerate(state.channels)}
+    at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
+    known = at >= 0
+    rows = {}
+    for name in ("code_m", "phase_m", "doppler_mps", "half_cycle"):
+        row = np.full(len(channels), np.nan)
+        row[known] = getattr(state, name)[at[known]]
+        rows[name] = row
+    return rows
+
+
+def find_slips(
+    observations: Observations,
+    state: SlipState | None = None,
+    *,
+    frequency_hz: Floats | None = None,
+    limits: SlipLimits | None = None,
+) -> tuple[Slips, SlipState]:
+    """Cycle slips of every channel of a chunk.
+
+    A channel's phase begins anew after an epoch without it: what happened meanwhile nobody saw.
+    With fewer than three channels a clock step and a slip look alike, and count as a slip.
+
+    Parameters
+    ----------
+    observations : Observations
+        T epochs, M channels.
+    state : SlipState, optional
+        Left by the chunk before; None at the start of a log.
+    frequency_hz : ndarray, shape (M,), optional [Hz]
+        Carrier of each channel; by default from the log's header alone, where GLONASS may lack its
+        channels.
+    limits : SlipLimits, optional
+
+    Returns
+    -------
+    Slips
+    SlipState
+        Any cutting into chunks gives the same bits.
+    """
+    limits, state = limits or SlipLimits(), state or SlipState()
+    channels = tuple(zip(observations.satellite.tolist(), observations.signal.tolist(), strict=True))
+    last = _last_row(state, channels)
+    if frequency_hz is None:
+        frequency_hz = carrier_frequency_hz(
+            observations.satellite, observations.signal, observations.header.glonass_channel
+        )
+    wavelength = SPEED_OF_LIGHT / frequency_hz
+    phase, doppler = observations.phase_cycles * wavelength, observations.doppler_hz * wavelength
+    times = np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), observations.time])
+    changes = _Changes(
+        dt=seconds(np.diff(times)),
+        code=observations.code_m - _before(observations.code_m, last["code_m"]),
+        phase=phase - _before(phase, last["phase_m"]),
+        range_mps=-0.5 * (doppler + _before(doppler, last["doppler_mps"])),
+    )
+    step, lag_ms, doppler_metric, code_metric = _metrics(changes)
+    dt = np.where(np.isnan(changes.dt), 0.0, changes.dt)
+    doppler_limit = limits.doppler_m + limits.doppler_mps * dt + limits.jerk_mps3 * dt**3 / 12.0
+    half = (observations.loss_of_lock & 2) > 0
+    half_before = _before(half.astype(np.float64), last["half_cycle"])
+    by_doppler = np.isfinite(doppler_metric) & (doppler_limit <= limits.code_m)[:, None]
+
+    has = np.isfinite(phase)
+    reason = np.zeros(phase.shape, dtype=np.int64)
+    for mask, bit in (
+        (np.isnan(changes.phase), SlipReason.FIRST),
+        ((observations.loss_of_lock & 1) > 0, SlipReason.LOSS_OF_LOCK),
+        (half != (half_before > 0), SlipReason.HALF_CYCLE),
+        ((dt > limits.max_gap_s)[:, None], SlipReason.GAP),
+        (observations.break_before[:, None], SlipReason.BREAK),
+        (by_doppler & (np.abs(doppler_metric) > doppler_limit[:, None]), SlipReason.DOPPLER),
+        (~by_doppler & (np.abs(code_metric) > limits.code_m), SlipReason.CODE),
+    ):
+        reason |= np.where(mask & has, int(bit), 0)
+    reason[~has] = SlipReason.NO_PHASE
+    total_ms = np.cumsum(np.r_[state.step_ms, lag_ms])
+    after = state
+    if len(observations):
+        after = SlipState(
+            time=observations.time[-1],
+            channels=channels,
+            code_m=frozen(observations.code_m[-1].copy()),
+            phase_m=frozen(phase[-1].copy()),
+            doppler_mps=frozen(doppler[-1].copy()),
+            half_cycle=frozen(half[-1].copy()),
+            step_ms=int(total_ms[-1]),
+        )
+    slips = Slips(
+        slip=has & (reason != 0),
+        reason=reason,
+        phase_m=phase + (total_ms[1:] * MILLISECOND_M)[:, None],
+        doppler_metric_m=doppler_metric,
+        code_metric_m=code_metric,
+        doppler_limit_m=doppler_limit,
+        clock_step_m=step,
+        half_cycle=half,
+    )
+    return slips, after
+
+
+def _metrics(changes: _Changes) -> tuple[Floats, Integers, Floats, Floats]:
+    """Clock step of the codes, its whole milliseconds that phases lack, and the metrics of both tests."""
+    dt = changes.dt[:, None]
+    moved = np.where(np.isnan(changes.range_mps), 0.0, changes.range_mps) * dt
+    step = median_or_zero(changes.code - moved)
+    step = np.where(np.abs(step) > _CLOCK_STEP_M, step, 0.0)
+    apart = changes.code - changes.phase
+    lag_ms = np.rint(median_or_zero(apart) / MILLISECOND_M).astype(np.int64)
+    apart = apart - (lag_ms * MILLISECOND_M)[:, None]
+    true_dt = dt - (step / SPEED_OF_LIGHT)[:, None]
+    doppler = changes.phase - changes.range_mps * true_dt
+    return (
+        step,
+        lag_ms,
+        doppler - median_or_zero(doppler)[:, None],
+        apart - median_or_zero(apart)[:, None],
+    )

@@ -1,0 +1,317 @@
+r"""Speed along the track from carrier Dopplers.
+
+The range that a signal travels (`geodesy.range_with_rotation`) is ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)``
+with the satellite s at ``t - rho / c``. Its derivative, with A the part of the satellite's velocity and
+``g = d rho / d r``, is ``rho' = (A + g . v) / (1 + A / c)``. A receiver at speed v along the unit tangent e of its
+path measures
+
+    ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
+
+with the drifts of the receiver's and the satellite's clock in m/s and the change of the tropospheric delay.
+Unknown are v and d_r: two numbers an epoch, whatever the number of constellations, for one oscillator drives
+all channels. The ionosphere's change (millimetres a second) is left in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
+from railfix.gnss.navigation import Navigation, glonass_channels
+from railfix.gnss.observations import Observations, frozen
+from railfix.gnss.orbits import satellite_states
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.ranges.atmosphere import saastamoinen_delay_m
+from railfix.ranges.weights import PLAUSIBLE_CODE_M, channel_order, first_available
+
+#: Step over which clocks and elevations are differenced [s].
+_STEP_S: Final = 1.0
+#: Median of the absolute value of a standard normal variable.
+_NORMAL_MEDIAN: Final = 0.6745
+#: Fits with the scale of the one before; the first takes the limits' own noise.
+_PASSES: Final = 3
+#: Mean squares of residuals within this many standard deviations of 1 are what noise makes.
+_TELLING: Final = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DopplerSpeedLimits:
+    """What is used, how it is weighed, what is refused.
+
+    Attributes
+    ----------
+    mask_deg : float
+        Elevation mask.
+    zenith_mps, floor_mps : float
+        ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2`` of a Doppler. Only ratios matter to
+        the speed: the receiver's own size is found from the residuals of the log.
+    outlier : float
+        A Doppler is left out when its residual is over this many of its own standard deviations
+        (the w-test of W. Baarda, 1968); the largest goes first.
+    most_rejected : int
+        Dopplers left out at an epoch at most.
+    min_satellites : int
+        Satellites that must be left; 2 are solved for.
+    """
+
+    mask_deg: float = 10.0
+    zenith_mps: float = 0.03
+    floor_mps: float = 0.02
+    outlier: float = 3.5
+    most_rejected: int = 8
+    min_satellites: int = 4
+
+    def __post_init__(self) -> None:
+        if not min(self.zenith_mps, self.floor_mps, self.outlier) > 0.0:
+            raise ValueError("zenith_mps, floor_mps and outlier must be positive")
+        if self.min_satellites < 3 or self.most_rejected < 0:
+            raise ValueError("min_satellites must be at least 3, most_rejected not negative")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dopplers:
+    """Dopplers of one receiver with their satellites, T epochs by K satellites.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite : ndarray of str, shape (K,)
+        A satellite with several signals has several channels, of which one an epoch has a number.
+    rate_mps : ndarray, shape (T, K) [m/s]
+        ``-lambda D``: positive when the satellite recedes; NaN where absent.
+    cn0_dbhz : ndarray, shape (T, K)
+    sat_ecef_m, earlier_ecef_m : ndarray, shape (T, K, 3) [m]
+        At the instant of transmission, and a second earlier.
+    sat_velocity_mps : ndarray, shape (T, K, 3) [m/s]
+    clock_rate_mps : ndarray, shape (T, K) [m/s]
+        c times the drift of the satellite clock, relativity included.
+    """
+
+    time: Datetimes
+    satellite: Strings
+    rate_mps: Floats
+    cn0_dbhz: Floats
+    sat_ecef_m: Floats
+    earlier_ecef_m: Floats
+    sat_velocity_mps: Floats
+    clock_rate_mps: Floats
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            object.__setattr__(self, item.name, frozen(getattr(self, item.name)))
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DopplerSpeed:
+    """Speed along the track, T epochs.
+
+    Attributes
+    ----------
+    speed_mps, sigma_mps : ndarray, shape (T,) [m/s]
+        + along the tangent; NaN where too few satellites are left.
+    clock_drift_mps : ndarray, shape (T,) [m/s]
+        c times the drift of the receiver clock.
+    residual_mps : ndarray, shape (T, K) [m/s]
+        Measured less fitted, of used and refused Dopplers; NaN elsewhere.
+    used, rejected : ndarray of bool, shape (T, K)
+    n_used : ndarray of int, shape (T,)
+    scale : float
+        Standard deviation of the receiver's Dopplers against that of the limits, over the whole log.
+    """
+
+    speed_mps: Floats
+    sigma_mps: Floats
+    clock_drift_mps: Floats
+    residual_mps: Floats
+    used: Masks
+    rejected: Masks
+    n_used: Integers
+    scale: float
+
+
+def dopplers_of_log(
+    obs: Observations,
+    navigation: Navigation,
+    *,
+    systems: Sequence[str],
+    signals: Mapping[str, Sequence[str]],
+) -> Dopplers:
+    """Dopplers of a log with the satellites that they come from; one signal a satellite and epoch.
+
+    Parameters
+    ----------
+    obs : Observations
+    navigation : Navigation
+    systems : sequence of str
+        Constellations asked for.
+    signals : mapping of str to sequence of str
+        Signals of each constellation in order of preference.
+
+    Returns
+    -------
+    Dopplers
+        Without Dopplers of unhealthy satellites, of unknown carriers, and of channels without a code, which
+        tells the instant of transmission.
+    """
+    columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
+    satellite, signal = obs.satellite[columns], obs.signal[columns]
+    code, doppler = obs.code_m[:, columns], obs.doppler_hz[:, columns]
+    channel = {**glonass_channels(navigation), **obs.header.glonass_channel}
+    wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(satellite, signal, channel)
+    known = np.isfinite(doppler) & np.isfinite(wavelength) & (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
+    code = np.where(first_available(satellite, known), code, np.nan)
+    now = satellite_states(obs.time, satellite, signal, code, navigation)
+    # The same records at another instant: a second earlier along the same orbit and clock.
+    before = satellite_states(obs.time, satellite, signal, code + SPEED_OF_LIGHT * _STEP_S, navigation)
+    usable = np.isfinite(now.clock_m) & np.isfinite(before.clock_m) & ~now.unhealthy
+    return Dopplers(
+        time=obs.time,
+        satellite=satellite,
+        rate_mps=np.where(usable, -wavelength * doppler, np.nan),
+        cn0_dbhz=obs.cn0_dbhz[:, columns],
+        sat_ecef_m=now.position_ecef_m,
+        earlier_ecef_m=before.position_ecef_m,
+        sat_velocity_mps=now.velocity_ecef_mps,
+        clock_rate_mps=(now.clock_m - before.clock_m) / _STEP_S,
+    )
+
+
+def doppler_speed(
+    dopplers: Dopplers, ecef_m: Floats, tangent: Floats, *, limits: DopplerSpeedLimits | None = None
+) -> DopplerSpeed:
+    """Weighted least squares of speed along the track and clock drift, all epochs at once.
+
+    Outliers go one by one, the largest first, as long as enough satellites are left. What counts as large
+    is measured by the log itself: its residuals' median gives the scale of the noise, so that neither a
+    phone nor a surveying receiver needs settings. An epoch whose residuals are clearly larger than that
+    gets a larger standard deviation.
+
+    Parameters
+    ----------
+    dopplers : Dopplers
+    ecef_m : ndarray, shape (T, 3) [m]
+        Where the antenna is; 10 m off change a range rate by 2 mm/s. NaN: no speed.
+    tangent : ndarray, shape (T, 3)
+        Unit vector along the track there.
+    limits : DopplerSpeedLimits, optional
+
+    Returns
+    -------
+    DopplerSpeed
+    """
+    limits = limits or DopplerSpeedLimits()
+    shape = (len(dopplers), 3)
+    if ecef_m.shape != shape or tangent.shape != shape:
+        raise ValueError(f"ecef_m and tangent have shapes {ecef_m.shape} and {tangent.shape}, expected {shape}")
+    measured, slope, elevation = _equations(dopplers, ecef_m, tangent)
+    cn0 = np.where(np.isnan(dopplers.cn0_dbhz), 45.0, np.minimum(dopplers.cn0_dbhz, 50.0))
+    sigma = np.hypot(limits.floor_mps, limits.zenith_mps * 10.0 ** ((45.0 - cn0) / 20.0))
+    offered = np.isfinite(measured) & np.isfinite(slope) & (elevation >= limits.mask_deg)
+    measured, slope = np.where(offered, measured, 0.0), np.where(offered, slope, 0.0)
+    scale, used = 1.0, offered
+    fit = _fit(measured, slope, sigma, used)
+    for _ in range(_PASSES):
+        redundant = used & (used.sum(axis=1) >= limits.min_satellites)[:, None]
+        normalised = np.abs(fit.normalised[redundant])
+        scale = float(np.median(normalised)) / _NORMAL_MEDIAN if normalised.size else 1.0
+        scale = max(scale, 1e-6)
+        used, fit = _without_outliers(measured, slope, sigma, offered, scale, limits)
+    count = used.sum(axis=1)
+    solved = (count >= limits.min_satellites) & np.isfinite(fit.variance)
+    freedom = np.maximum(count - 2, 1)
+    excess = fit.wsse / scale**2 / freedom
+    excess = np.where(excess > 1.0 + _TELLING * np.sqrt(2.0 / freedom), excess, 1.0)
+    own = scale * np.sqrt(np.where(solved, fit.variance * excess, np.nan))
+    return DopplerSpeed(
+        speed_mps=np.where(solved, fit.speed, np.nan),
+        sigma_mps=own,
+        clock_drift_mps=np.where(solved, fit.drift, np.nan),
+        residual_mps=np.where(offered & solved[:, None], fit.residual, np.nan),
+        used=used & solved[:, None],
+        rejected=offered & ~used & solved[:, None],
+        n_used=np.where(solved, count, 0),
+        scale=scale,
+    )
+
+
+def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Floats, Floats, Floats]:
+    """Measured ``slope v + drift``, the slope, and elevations, shapes (T, K)."""
+    receiver, along = ecef_m[:, None, :], tangent[:, None, :]
+    sat, velocity = dopplers.sat_ecef_m, dopplers.sat_velocity_mps
+    _, sight = range_with_rotation(sat, receiver)
+    turn = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
+    moving = np.einsum("tki,tki->tk", sight, velocity)
+    moving += turn * (velocity[..., 0] * receiver[..., 1] - velocity[..., 1] * receiver[..., 0])
+    slope = -np.einsum("tki,tki->tk", sight, np.broadcast_to(along, sight.shape))
+    slope += turn * (sat[..., 0] * along[..., 1] - sat[..., 1] * along[..., 0])
+    stretch = 1.0 + moving / SPEED_OF_LIGHT
+    latitude, _, height = geodetic_from_ecef(ecef_m)
+    elevation, _ = elevation_azimuth(sat, ecef_m)
+    earlier, _ = elevation_azimuth(dopplers.earlier_ecef_m, ecef_m)
+    above = elevation > 1.0
+    delays = [saastamoinen_delay_m(latitude, height, np.where(above, e, 45.0)) for e in (elevation, earlier)]
+    troposphere = (delays[0] - delays[1]) / _STEP_S
+    return dopplers.rate_mps + dopplers.clock_rate_mps - troposphere - moving / stretch, slope / stretch, elevation
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Fit:
+    """Speed, drift and variance of the speed (unscaled), residuals, and those over their standard deviation."""
+
+    speed: Floats
+    drift: Floats
+    variance: Floats
+    residual: Floats
+    normalised: Floats
+    wsse: Floats
+
+
+def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _Fit:
+    weight = np.where(used, 1.0 / sigma**2, 0.0)
+    one, h, hh = weight.sum(axis=1), (weight * slope).sum(axis=1), (weight * slope**2).sum(axis=1)
+    y, hy = (weight * measured).sum(axis=1), (weight * slope * measured).sum(axis=1)
+    # Three satellites in one direction leave the speed open; so does a single one.
+    determinant = one * hh - h * h
+    determinant = np.where((used.sum(axis=1) >= 2) & (determinant > 1e-9 * one * hh), determinant, np.nan)
+    speed, drift = (one * hy - h * y) / determinant, (hh * y - h * hy) / determinant
+    residual = measured - slope * speed[:, None] - drift[:, None]
+    fitted = (hh[:, None] - 2.0 * slope * h[:, None] + slope**2 * one[:, None]) / determinant[:, None]
+    own = sigma**2 - np.where(used, fitted, -fitted)
+    with np.errstate(invalid="ignore"):
+        normalised = residual / np.sqrt(np.where(own > 1e-6 * sigma**2, own, np.nan))
+    return _Fit(
+        speed=speed,
+        drift=drift,
+        variance=one / determinant,
+        residual=residual,
+        normalised=np.nan_to_num(normalised),
+        wsse=(weight * residual**2).sum(axis=1),
+    )
+
+
+def _without_outliers(
+    measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
+) -> tuple[Masks, _Fit]:
+    """Leave out the worst Doppler of every epoch that has one, until none does."""
+    used = offered.copy()
+    fit = _fit(measured, slope, sigma, used)
+    for _ in range(limits.most_rejected):
+        size = np.where(used, np.abs(fit.normalised), 0.0)
+        worst = size.argmax(axis=1)
+        epochs = np.flatnonzero(
+            (size.max(axis=1) > limits.outlier * scale) & (used.sum(axis=1) > limits.min_satellites)
+        )
+        if not len(epochs):
+            break
+        used[epochs, worst[epochs]] = False
+        fit = _fit(measured, slope, sigma, used)
+    return used, fit

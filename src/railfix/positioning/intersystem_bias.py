@@ -1,0 +1,128 @@
+"""Offsets between the receiver clocks of the constellations, estimated slowly.
+
+Each constellation costs one satellite for its clock. But a receiver's clocks keep their distance
+(inter-system bias), to a metre over hours; once it is known, it gives that satellite back: one
+satellite of a constellation counts, and a reflected one is seen against all others.
+
+The offset of an epoch is known from the epochs before it alone, so that a live epoch and one of
+a log get the same, however the log is cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes
+from railfix.core.timescale import seconds
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
+from railfix.positioning.single_point import SinglePoint
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockOffsetLimits:
+    """How offsets are trusted.
+
+    Attributes
+    ----------
+    stability_m : float
+        What an offset may differ by from its mean at any epoch; infinite leaves every
+        constellation its own clock. On an urban recording the spread was 1.0 m (Galileo, BeiDou).
+    correlation_s : float
+        Epochs nearer to each other than this say the same thing twice: errors of a standing
+        train are correlated over tens of seconds.
+    """
+
+    stability_m: float = 1.0
+    correlation_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not (self.stability_m > 0.0 and self.correlation_s > 0.0):
+            raise ValueError("stability_m and correlation_s must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetState:
+    """What the epochs so far say, by clock letter.
+
+    Attributes
+    ----------
+    information : mapping of str to float [1/m^2]
+    moment : mapping of str to float [1/m]
+        Information times offset.
+    last : datetime64[ns]
+        Time of the last epoch, NaT before the first.
+    """
+
+    information: Mapping[str, float] = field(default_factory=dict)
+    moment: Mapping[str, float] = field(default_factory=dict)
+    last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+
+
+def tie_clocks(
+    time: Datetimes,
+    clocks: tuple[str, ...],
+    reference: str,
+    ranges: Ranges,
+    free: SinglePoint,
+    state: OffsetState,
+    *,
+    limits: ClockOffsetLimits | None = None,
+) -> tuple[ClockTies, OffsetState]:
+    """Offsets known at each epoch from the epochs before it.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    clocks : tuple of str, length G
+        Letter of each group of `ranges`.
+    reference : str
+        Letter of the clock that the others are told against.
+    ranges : Ranges
+        Without ties.
+    free : SinglePoint
+        Position with every clock on its own, where one range at least is redundant.
+    state : OffsetState
+    limits : ClockOffsetLimits, optional
+
+    Returns
+    -------
+    ClockTies
+    OffsetState
+    """
+    limits = limits or ClockOffsetLimits()
+    epochs = len(time)
+    offset, sigma = np.zeros((epochs, len(clocks))), np.full((epochs, len(clocks)), UNTIED_M)
+    information, moment = dict(state.information), dict(state.moment)
+    step = seconds(np.diff(np.concatenate([np.asarray([state.last], dtype="datetime64[ns]"), time])))
+    fresh = np.clip(np.nan_to_num(step, nan=0.0) / limits.correlation_s, 0.0, 1.0)
+    freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
+    misfit = np.maximum(1.0, free.wsse / freedom)
+    base = clocks.index(reference) if reference in clocks else -1
+    if base >= 0:
+        sigma[:, base] = 0.0
+    for g, letter in enumerate(clocks):
+        if letter == reference:
+            continue
+        weight = np.zeros(epochs)
+        difference = np.zeros(epochs)
+        if base >= 0:
+            one, two = ranges.weight[:, ranges.groups[g]], ranges.weight[:, ranges.groups[base]]
+            usable = (np.count_nonzero(one, axis=1) >= 2) & (np.count_nonzero(two, axis=1) >= 2)
+            usable &= np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
+            variance = misfit * (1.0 / np.maximum(one.sum(axis=1), 1e-12) + 1.0 / np.maximum(two.sum(axis=1), 1e-12))
+            weight = np.where(usable, fresh / np.where(usable, variance, 1.0), 0.0)
+            difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)
+        # Sums up to and without each epoch: the same additions however epochs are cut.
+        known = np.cumsum(np.concatenate([[information.get(letter, 0.0)], weight]))
+        moments = np.cumsum(np.concatenate([[moment.get(letter, 0.0)], weight * difference]))
+        has = known[:-1] > 0.0
+        safe = np.where(has, known[:-1], 1.0)
+        offset[:, g] = np.where(has, moments[:-1] / safe, 0.0)
+        spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
+        sigma[:, g] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
+        information[letter], moment[letter] = float(known[-1]), float(moments[-1])
+    last = time[-1] if epochs else state.last
+    return ClockTies(offset_m=offset, sigma_m=sigma), OffsetState(information=information, moment=moment, last=last)

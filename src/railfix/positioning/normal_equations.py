@@ -1,0 +1,290 @@
+"""Normal equations of ranges with the receiver clocks eliminated.
+
+The single-point position, the constrained position and the section search all ask the same
+question: how well do pseudoranges fit a place, whatever the receiver clock of each constellation
+is? Subtracting the weighted mean of a constellation's satellites from its residuals and design
+rows is the same as solving for that clock (algebraically: the Schur complement of the clock
+block). What is left is a 3 x 3 system in the place alone.
+
+Where the offsets between the clocks are known to some sigma (`ClockTies`), what the means of the
+constellations say about each other is added back: each mean, less its offset, is one more
+observation of a common clock, which is eliminated in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.geodesy import range_with_rotation
+
+#: Sigma of an offset between clocks of which nothing is known [m].
+UNTIED_M: Final = 1e6
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClockTies:
+    """What is known of the clocks of the constellations against each other.
+
+    Attributes
+    ----------
+    offset_m : ndarray, shape (T, G) [m]
+        Receiver clock of each group less a clock common to all; any finite value where unknown.
+    sigma_m : ndarray, shape (T, G) [m]
+        Its standard deviation; `UNTIED_M` where nothing is known.
+    """
+
+    offset_m: Floats
+    sigma_m: Floats
+
+    def take(self, epochs: Masks | Indices) -> ClockTies:
+        """The ties of some epochs, by mask or index."""
+        return ClockTies(offset_m=self.offset_m[epochs], sigma_m=self.sigma_m[epochs])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranges:
+    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels.
+
+    Attributes
+    ----------
+    sat_ecef_m : ndarray, shape (T, M, 3) [m]
+        Satellites in ECEF at transmit time; any finite value where the weight is 0.
+    code_m : ndarray, shape (T, M) [m]
+        Corrected pseudorange (satellite clock, group delay, ionosphere, troposphere applied);
+        any finite value where the weight is 0.
+    weight : ndarray, shape (T, M) [1/m^2]
+        1/sigma^2, 0 for what is not used.
+    groups : tuple of slice
+        Channels that share one receiver clock stand side by side; one slice a clock.
+    ties : ClockTies or None
+        What is known of these clocks against each other; None: nothing.
+    """
+
+    sat_ecef_m: Floats
+    code_m: Floats
+    weight: Floats
+    groups: tuple[slice, ...]
+    ties: ClockTies | None = None
+
+    def __len__(self) -> int:
+        return len(self.code_m)
+
+    def take(self, epochs: Masks | Indices) -> Ranges:
+        """The ranges of some epochs, by mask or index."""
+        return Ranges(
+            sat_ecef_m=self.sat_ecef_m[epochs],
+            code_m=self.code_m[epochs],
+            weight=self.weight[epochs],
+            groups=self.groups,
+            ties=None if self.ties is None else self.ties.take(epochs),
+        )
+
+    @cached_property
+    def n_used(self) -> Integers:
+        """Channels with weight, shape (T,)."""
+        return np.asarray(np.count_nonzero(self.weight, axis=1), dtype=np.int64)
+
+    @cached_property
+    def starts(self) -> Indices:
+        """First channel of each group."""
+        return np.array([group.start for group in self.groups], dtype=np.intp)
+
+    @cached_property
+    def n_clocks(self) -> Integers:
+        """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
+        seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
+        if self.ties is None:
+            return np.asarray(np.count_nonzero(seen, axis=1), dtype=np.int64)
+        tied = self.ties.sigma_m < UNTIED_M
+        return np.asarray(np.count_nonzero(seen & ~tied, axis=1) + np.any(seen & tied, axis=1), dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NormalEquations:
+    """Fit of ranges around a place, the clocks eliminated.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (T, 3, 3) [1/m^2]
+        Normal matrix of the place in ECEF.
+    vector : ndarray, shape (T, 3) [1/m]
+        Right-hand side: the step that lowers `wsse` most is ``matrix^-1 vector``.
+    wsse : ndarray, shape (T,)
+        Weighted sum of squared residuals at the place itself.
+    clock_m : ndarray, shape (T, G) [m]
+        Receiver clock of each group at the place; NaN where the group has no satellite.
+    residual_m : ndarray, shape (T, M) [m]
+        Code - range - clock; 0 where the weight is 0.
+    clock_slope : ndarray, shape (T, 3, G)
+        What a step from the place takes from `clock_m`, by metre of each axis.
+    design : ndarray, shape (T, 3, M)
+        What a step from the place takes from `residual_m`, by metre of each axis.
+    """
+
+    matrix: Floats
+    vector: Floats
+    wsse: Floats
+    clock_m: Floats
+    residual_m: Floats
+    clock_slope: Floats
+    design: Floats
+
+    def after(self, step_m: Floats, epochs: Masks | Indices) -> tuple[Floats, Floats]:
+        """Clocks and residuals of some epochs after a step from their places, to first order.
+
+        A step of 5 m leaves 0.03 mm (the gradient of the Earth's turning, which the design leaves out).
+
+        Parameters
+        ----------
+        step_m : ndarray, shape (n, 3) [m]
+        epochs : ndarray of bool, shape (T,), or of int, shape (n,)
+
+        Returns
+        -------
+        clock_m : ndarray, shape (n, G) [m]
+        residual_m : ndarray, shape (n, M) [m]
+        """
+        step = step_m[:, None, :]
+        clock = self.clock_m[epochs] - np.matmul(step, self.clock_slope[epochs])[:, 0]
+        return clock, self.residual_m[epochs] - np.matmul(step, self.design[epochs])[:, 0]
+
+
+def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
+    """Slices of channels that share a receiver clock.
+
+    Parameters
+    ----------
+    system : sequence of str, length M
+        Constellation letters, those of one clock side by side (QZSS beside GPS).
+
+    Raises
+    ------
+    ValueError
+        When the channels of one clock are not side by side.
+    """
+    clocks = [CLOCK_GROUP[str(letter)] for letter in system]
+    starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
+    if len({clocks[i] for i in starts}) != len(starts):
+        raise ValueError(f"channels of one clock must stand side by side, got {clocks}")
+    return tuple(slice(a, b) for a, b in zip(starts, [*starts[1:], len(clocks)], strict=True))
+
+
+def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
+    """Normal equations of `ranges` linearised at one place an epoch.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        T epochs.
+    place_ecef_m : ndarray, shape (T, 3) [m]
+
+    Returns
+    -------
+    NormalEquations
+    """
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
+    weight, used = ranges.weight, (ranges.weight > 0)[:, None]
+    starts = ranges.starts
+    sizes = np.array([group.stop - group.start for group in ranges.groups], dtype=np.intp)
+    # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
+    rows = np.empty((len(weight), 4, weight.shape[1]))
+    np.negative(los.swapaxes(1, 2), out=rows[:, :3])
+    np.subtract(ranges.code_m, distance, out=rows[:, 3])
+    weighted = rows * weight[:, None]
+    totals = np.add.reduceat(weight, starts, axis=1)
+    seen = totals > 0
+    means = np.add.reduceat(weighted, starts, axis=2) / np.where(seen, totals, 1.0)[:, None]
+    rows -= np.repeat(means, sizes, axis=2)
+    rows *= used
+    np.multiply(rows, weight[:, None], out=weighted)
+    system = np.matmul(weighted, rows.swapaxes(1, 2))
+    if ranges.ties is not None:
+        apart, mass = _between_clocks(means, totals, ranges.ties)
+        system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
+        # A clock lies between what its own satellites and what the others say.
+        shift = apart / (totals * ranges.ties.sigma_m**2 + 1.0)[:, None]
+        means -= shift
+        rows += np.repeat(shift, sizes, axis=2) * used
+    return NormalEquations(
+        matrix=system[:, :3, :3],
+        vector=system[:, :3, 3],
+        wsse=system[:, 3, 3],
+        clock_m=np.where(seen, means[:, 3], np.nan),
+        residual_m=rows[:, 3],
+        clock_slope=means[:, :3],
+        design=rows[:, :3],
+    )
+
+
+def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Floats, Floats]:
+    """Means of the groups (last row: residual) less the common clock, and the weight of each.
+
+    Parameters
+    ----------
+    means : ndarray, shape (T, C, G)
+    totals : ndarray, shape (T, G) [1/m^2]
+        Weight of each mean, 0 where the group has no satellite.
+    ties : ClockTies
+
+    Returns
+    -------
+    apart : ndarray, shape (T, C, G)
+    mass : ndarray, shape (T, G) [1/m^2]
+    """
+    apart = means.copy()
+    apart[:, -1] -= ties.offset_m
+    seen = totals > 0
+    mass = np.where(seen, 1.0 / (1.0 / np.where(seen, totals, 1.0) + ties.sigma_m**2), 0.0)
+    total = mass.sum(axis=1)
+    common = np.matmul(apart, mass[..., None]) / np.where(total > 0, total, 1.0)[:, None, None]
+    apart -= common
+    apart *= seen[:, None]
+    return apart, mass
+
+
+def fit(ranges: Ranges, place_ecef_m: Floats) -> Floats:
+    """Weighted sum of squared residuals at a place, the clocks eliminated, shape (T,).
+
+    The ``q`` of the section search: `normal_equations(...).wsse` without the derivatives.
+    """
+    distance, _ = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
+    result = np.zeros(len(ranges))
+    totals, means = np.empty((2, len(ranges), len(ranges.groups)))
+    for g, group in enumerate(ranges.groups):
+        weight = ranges.weight[:, group]
+        residual = ranges.code_m[:, group] - distance[:, group]
+        totals[:, g] = weight.sum(axis=1)
+        means[:, g] = (weight * residual).sum(axis=1) / np.where(totals[:, g] > 0, totals[:, g], 1.0)
+        result += (weight * (residual - means[:, g, None]) ** 2).sum(axis=1)
+    if ranges.ties is not None:
+        apart, mass = _between_clocks(means[:, None], totals, ranges.ties)
+        result += (mass * apart[:, 0] ** 2).sum(axis=1)
+    return result
+
+
+def inverse_3x3(matrix: Floats) -> Floats:
+    """Inverse of symmetric 3 x 3 matrices by their cofactors, shape (..., 3, 3).
+
+    NaN where a matrix is singular: its determinant, against the cube of its mean diagonal, is
+    below 1e-12 (axes whose information differs by more than six orders of magnitude in sigma).
+    """
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    cofactors = np.empty(matrix.shape)
+    cofactors[..., 0, 0] = d * f - e * e
+    cofactors[..., 1, 1] = a * f - c * c
+    cofactors[..., 2, 2] = a * d - b * b
+    cofactors[..., 0, 1] = cofactors[..., 1, 0] = c * e - b * f
+    cofactors[..., 0, 2] = cofactors[..., 2, 0] = b * e - c * d
+    cofactors[..., 1, 2] = cofactors[..., 2, 1] = b * c - a * e
+    determinant = a * cofactors[..., 0, 0] + b * cofactors[..., 0, 1] + c * cofactors[..., 0, 2]
+    regular = determinant > 1e-12 * ((a + d + f) / 3.0) ** 3
+    determinant = np.where(regular, determinant, np.nan)
+    return cofactors / determinant[..., None, None]

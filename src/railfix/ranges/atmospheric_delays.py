@@ -1,0 +1,100 @@
+"""Delays of the air: where the satellites are seen from, and what the broadcast models say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Bits, Datetimes, Floats
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeenFrom:
+    """Where the satellites stand from a place that is good to some hundred metres: T epochs by K channels.
+
+    Attributes
+    ----------
+    receiver_ecef_m : ndarray, shape (T, 3) [m]
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+        The same.
+    satellite_ecef_m : ndarray, shape (T, K, 3) [m]
+    elevation_deg, azimuth_deg : ndarray, shape (T, K)
+    """
+
+    receiver_ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    satellite_ecef_m: Floats
+    elevation_deg: Floats
+    azimuth_deg: Floats
+
+    @classmethod
+    def of(cls, receiver_ecef_m: Floats, satellite_ecef_m: Floats) -> SeenFrom:
+        """Work out directions and the place on the ellipsoid."""
+        latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
+        elevation, azimuth = elevation_azimuth(satellite_ecef_m, receiver_ecef_m)
+        return cls(
+            receiver_ecef_m=receiver_ecef_m,
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=height,
+            satellite_ecef_m=satellite_ecef_m,
+            elevation_deg=elevation,
+            azimuth_deg=azimuth,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Delays:
+    """Delays of T epochs by K channels, and what is unsure of the corrected codes besides local errors.
+
+    Attributes
+    ----------
+    ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
+        On the channel's own carrier; 0 where a model is off, NaN where SBAS has none.
+    sigma_m : ndarray, shape (T, K) [m]
+        To be added to the local errors; 0 where nothing tells it, NaN where a part of it is unknown.
+    reason : ndarray of int64, shape (T, K)
+        Why a delay is unknown.
+    """
+
+    ionosphere_m: Floats
+    troposphere_m: Floats
+    sigma_m: Floats
+    reason: Bits
+
+
+def modelled_delays(
+    time: Datetimes,
+    seen: SeenFrom,
+    frequency_hz: Floats,
+    *,
+    klobuchar: Floats | None,
+    troposphere: str,
+) -> Delays:
+    """Delays by Klobuchar's and Saastamoinen's models, each where it is on.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    seen : SeenFrom
+    frequency_hz : ndarray, shape (K,) [Hz]
+    klobuchar : ndarray, shape (8,), or None
+        None: off.
+    troposphere : {"saastamoinen", "off"}
+    """
+    shape = seen.elevation_deg.shape
+    ionosphere, air = np.zeros((2, *shape))
+    if klobuchar is not None:
+        ionosphere = klobuchar_delay_m(
+            time, seen.latitude_deg, seen.longitude_deg, seen.elevation_deg, seen.azimuth_deg, klobuchar, frequency_hz
+        )
+    if troposphere == "saastamoinen":
+        air = saastamoinen_delay_m(seen.latitude_deg, seen.height_m, seen.elevation_deg)
+    return Delays(
+        ionosphere_m=ionosphere, troposphere_m=air, sigma_m=np.zeros(shape), reason=np.zeros(shape, dtype=np.int64)
+    )

@@ -1,0 +1,312 @@
+"""Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
+
+The curve belongs to the pair of antenna and receiver: the antenna makes its shape, and receivers
+measure C/N0 each in its own way. It is fitted per constellation and signal; the satellites of BeiDou
+and QZSS stand in two kinds of orbits of different transmit power and are told apart.
+
+Of each bin of elevation the mean is taken without outliers (beyond three robust standard deviations
+from the median). Between the middles of the bins the curve runs by monotone cubic interpolation
+(PCHIP): it never goes beyond the means on either side. Above the highest bin the last mean holds;
+below the lowest bin there is no curve.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import PchipInterpolator
+
+from railfix.core.arrays import Floats, Integers, Masks, Strings
+from railfix.gnss.observations import ObservationHeader, frozen
+
+#: Standard deviation of a normal variable against its median absolute deviation.
+_NORMAL_MAD: Final = 1.482_602_218_505_602
+#: Numbers of BeiDou satellites 36 000 km above (GEO C01-C05, C59-C63; IGSO: CSNO, constellation status).
+_BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
+#: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
+_QZSS_GEO: Final = frozenset({7, 8})
+
+#: Kinds of satellites of one transmit power, and what they are called.
+KINDS: Final[dict[str, str]] = {
+    "G": "GPS",
+    "J": "QZSS",
+    "J-GEO": "QZSS GEO",
+    "E": "Galileo",
+    "C": "BeiDou MEO",
+    "C-HIGH": "BeiDou GEO, IGSO",
+    "R": "GLONASS",
+    "S": "SBAS",
+    "I": "NavIC",
+}
+
+
+def satellite_kind(satellite: str) -> str:
+    """Kind of a satellite, a key of `KINDS`: "C05" -> "C-HIGH", "G05" -> "G"."""
+    letter, number = satellite[0], int(satellite[1:])
+    if letter == "C" and number in _BEIDOU_HIGH:
+        return "C-HIGH"
+    if letter == "J" and number in _QZSS_GEO:
+        return "J-GEO"
+    return letter
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurveFit:
+    """How a curve is fitted.
+
+    Attributes
+    ----------
+    bin_deg : float [deg]
+        Width of the bins of elevation.
+    least_samples : int
+        A bin of fewer samples is left out.
+    least_bins : int
+        A kind and signal of fewer bins gets no curve.
+    clip_sigma : float
+        Samples further from their bin's median, in robust standard deviations, are left out.
+    """
+
+    bin_deg: float = 5.0
+    least_samples: int = 30
+    least_bins: int = 4
+    clip_sigma: float = 3.0
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.bin_deg <= 30.0:
+            raise ValueError(f"bin_deg must lie in [0.1, 30], got {self.bin_deg}")
+        if self.least_samples < 1 or self.least_bins < 2:
+            raise ValueError("least_samples must be at least 1 and least_bins at least 2")
+        if not self.clip_sigma > 0.0:
+            raise ValueError(f"clip_sigma must be positive, got {self.clip_sigma}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cn0Mean:
+    """Mean C/N0 over elevation of one kind of satellites on one signal, B bins.
+
+    Attributes
+    ----------
+    kind : str
+        Key of `KINDS`.
+    signal : str
+    elevation_deg : ndarray, shape (B,) [deg]
+        Middles of the bins, rising.
+    mean_dbhz, spread_db : ndarray, shape (B,) [dB-Hz], [dB]
+        Mean and robust standard deviation.
+    count : ndarray of int, shape (B,)
+        Samples of each bin.
+    """
+
+    kind: str
+    signal: str
+    elevation_deg: Floats
+    mean_dbhz: Floats
+    spread_db: Floats
+    count: Integers
+
+    def __post_init__(self) -> None:
+        for name in ("elevation_deg", "mean_dbhz", "spread_db", "count"):
+            values = getattr(self, name)
+            if values.shape != self.elevation_deg.shape or values.ndim != 1 or not np.isfinite(values).all():
+                raise ValueError(f"{name} must be finite, one number a bin")
+            object.__setattr__(self, name, frozen(values))
+        if len(self.elevation_deg) < 2 or not (np.diff(self.elevation_deg) > 0.0).all():
+            raise ValueError("elevation_deg must rise, over at least two bins")
+
+    @cached_property
+    def _interpolated(self) -> PchipInterpolator:
+        return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
+
+    def at(self, elevation_deg: ArrayLike) -> Floats:
+        """Mean C/N0 at elevations [dB-Hz]; NaN below the lowest bin's lower half and for NaN."""
+        elevation = np.asarray(elevation_deg, dtype=np.float64)
+        lowest, highest = self.elevation_deg[0], self.elevation_deg[-1]
+        half = (self.elevation_deg[1] - lowest) / 2.0
+        inside = np.where(elevation >= lowest - half, np.clip(elevation, lowest, highest), np.nan)
+        return np.asarray(self._interpolated(inside), dtype=np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cn0CurveSource:
+    """What a curve was made from.
+
+    Attributes
+    ----------
+    antenna, receiver, marker : str
+        From the header of the log, as written.
+    files : tuple of (name, SHA-256)
+    start, end : str
+        First and last epoch used, ISO 8601, GPS time.
+    epochs : int
+    position_ecef_m : tuple of float
+        Where the antenna stood.
+    railfix_version : str
+    """
+
+    antenna: str = ""
+    receiver: str = ""
+    marker: str = ""
+    files: tuple[tuple[str, str], ...] = ()
+    start: str = ""
+    end: str = ""
+    epochs: int = 0
+    position_ecef_m: tuple[float, ...] = ()
+    railfix_version: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cn0Curve:
+    """Mean C/N0 over elevation of an antenna and receiver.
+
+    Attributes
+    ----------
+    means : tuple of Cn0Mean
+        One a kind and signal.
+    source : Cn0CurveSource
+    """
+
+    means: tuple[Cn0Mean, ...]
+    source: Cn0CurveSource = field(default_factory=Cn0CurveSource)
+
+    def __post_init__(self) -> None:
+        if len(self._by_key) != len(self.means):
+            raise ValueError("a kind and signal has two curves")
+
+    @cached_property
+    def _by_key(self) -> dict[tuple[str, str], Cn0Mean]:
+        return {(mean.kind, mean.signal): mean for mean in self.means}
+
+    def _of(self, satellite: Strings, signal: Strings) -> list[Cn0Mean | None]:
+        pairs = zip(satellite.tolist(), signal.tolist(), strict=True)
+        return [self._by_key.get((satellite_kind(name), code)) for name, code in pairs]
+
+    def covers(self, satellite: Strings, signal: Strings) -> Masks:
+        """Whether there is a curve for each channel, shape (M,)."""
+        return np.array([mean is not None for mean in self._of(satellite, signal)], dtype=bool)
+
+    def mean_dbhz(self, elevation_deg: ArrayLike, *, satellite: Strings, signal: Strings) -> Floats:
+        """Mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where there is no curve."""
+        elevation = np.asarray(elevation_deg, dtype=np.float64)
+        result = np.full(elevation.shape, np.nan)
+        columns: dict[tuple[str, str], list[int]] = defaultdict(list)
+        for m, mean in enumerate(self._of(satellite, signal)):
+            if mean is not None:
+                columns[mean.kind, mean.signal].append(m)
+        for key, at in columns.items():
+            result[:, at] = self._by_key[key].at(elevation[:, at])
+        return result
+
+    def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
+        """What differs between the log the curve was made from and one it is applied to, a sentence each."""
+        notes = []
+        for what in ("antenna", "receiver"):
+            ours, theirs = _plain(getattr(self.source, what)), _plain(getattr(header, what))
+            if ours != theirs:
+                notes.append(
+                    f"C/N0 curve was made with {what} '{ours or 'not named'}', "
+                    f"this log has '{theirs or 'not named'}': the limits may not fit"
+                )
+        return tuple(notes)
+
+
+def _plain(text: str) -> str:
+    """Type of an antenna or receiver with its blanks evened out."""
+    return " ".join(text.split())
+
+
+class Cn0Samples:
+    """C/N0 and elevation collected piece by piece, by kind and signal, in single precision."""
+
+    def __init__(self) -> None:
+        self._parts: dict[tuple[str, str], list[NDArray[np.float32]]] = defaultdict(list)
+
+    def add(self, cn0_dbhz: ArrayLike, elevation_deg: ArrayLike, satellite: Strings, signal: Strings) -> None:
+        """Take in arrays of shape (T, M); NaN in either is left out."""
+        cn0, elevation = np.asarray(cn0_dbhz), np.asarray(elevation_deg)
+        finite = np.isfinite(cn0) & np.isfinite(elevation) & (elevation >= 0.0)
+        for m, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
+            rows = finite[:, m]
+            if rows.any():
+                pair = np.stack([elevation[rows, m], cn0[rows, m]]).astype(np.float32)
+                self._parts[satellite_kind(name), code].append(pair)
+
+    def keys(self) -> list[tuple[str, str]]:
+        """Kinds and signals of which there are samples."""
+        return sorted(self._parts)
+
+    def of(self, kind: str, signal: str) -> tuple[Floats, Floats]:
+        """Elevation [deg] and C/N0 [dB-Hz] of one kind and signal."""
+        joined = np.concatenate(self._parts[kind, signal], axis=1).astype(np.float64)
+        return joined[0], joined[1]
+
+
+def fit_cn0_curve(
+    samples: Cn0Samples | Iterable[tuple[ArrayLike, ArrayLike, Strings, Strings]],
+    *,
+    fit: CurveFit | None = None,
+    source: Cn0CurveSource | None = None,
+) -> Cn0Curve:
+    """Fit the mean C/N0 over elevation.
+
+    Parameters
+    ----------
+    samples : Cn0Samples or iterable of (cn0_dbhz, elevation_deg, satellite, signal)
+        Arrays of shape (T, M), (T, M), (M,), (M,), from a place with open sky.
+    fit : CurveFit, optional
+    source : Cn0CurveSource, optional
+
+    Returns
+    -------
+    Cn0Curve
+        One curve a kind and signal with bins enough; `Cn0Mean.count` tells the samples of each.
+
+    Raises
+    ------
+    ValueError
+        No kind and signal has samples enough.
+    """
+    fit = fit or CurveFit()
+    if not isinstance(samples, Cn0Samples):
+        collected = Cn0Samples()
+        for part in samples:
+            collected.add(*part)
+        samples = collected
+    means = [_fit_one(key, *samples.of(*key), fit) for key in samples.keys()]  # noqa: SIM118 (no mapping)
+    found = tuple(mean for mean in means if mean is not None)
+    if not found:
+        raise ValueError(
+            f"no constellation and signal has {fit.least_bins} bins of {fit.least_samples} samples over elevation"
+        )
+    return Cn0Curve(means=found, source=source or Cn0CurveSource())
+
+
+def _fit_one(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
+    """Curve of one kind and signal, None where there are too few bins."""
+    which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
+    bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
+    if len(bins) < fit.least_bins:
+        return None
+    rows = [_robust(cn0[which == b], fit.clip_sigma) for b in bins]
+    return Cn0Mean(
+        kind=key[0],
+        signal=key[1],
+        elevation_deg=(np.array(bins, dtype=np.float64) + 0.5) * fit.bin_deg,
+        mean_dbhz=np.array([row[0] for row in rows]),
+        spread_db=np.array([row[1] for row in rows]),
+        count=np.array([np.count_nonzero(which == b) for b in bins], dtype=np.int64),
+    )
+
+
+def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
+    """Mean without outliers, and robust standard deviation."""
+    middle = float(np.median(values))
+    spread = _NORMAL_MAD * float(np.median(np.abs(values - middle)))
+    # C/N0 is told in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
+    kept = values[np.abs(values - middle) <= clip_sigma * max(spread, 0.5)]
+    return float(kept.mean()), spread

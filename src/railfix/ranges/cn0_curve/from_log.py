@@ -1,0 +1,199 @@
+"""A C/N0 curve from an observation log of an antenna that stood under open sky."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix import __version__
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.geodesy import elevation_azimuth
+from railfix.core.timescale import seconds
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.gnss.orbits import satellite_states
+from railfix.io.rinex import read_navigation, scan_observations
+from railfix.ranges.cn0_curve.curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Samples, CurveFit, fit_cn0_curve
+
+#: P1 2.3(1) asks for about a day; below this a note is made [s].
+_SHORT_S: Final = 12 * 3600.0
+#: P1 table 6: signals this far below the mean are refused [dB-Hz].
+_DEFICIT_DBHZ: Final = 10.0
+#: Elevation from which that is looked at [deg], and the share of the calibration itself that is worth a note.
+_LOOKED_AT_DEG, _REFUSED_SHARE = 15.0, 0.01
+#: A satellite further below the horizon than this cannot be seen from where the antenna is said to be [deg].
+_BELOW_DEG: Final = -5.0
+#: Share of satellites below the horizon that is put down to odd records.
+_BELOW_SHARE: Final = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cn0Calibration:
+    """A curve, and what it was made from.
+
+    Attributes
+    ----------
+    curve : Cn0Curve
+    samples : Cn0Samples
+    notes : tuple of str
+    """
+
+    curve: Cn0Curve
+    samples: Cn0Samples
+    notes: tuple[str, ...]
+
+
+def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
+    """Elevation of each channel's satellite from a fixed place, shape (T, M) [deg]; NaN without orbit or code.
+
+    Parameters
+    ----------
+    observations : Observations
+    navigation : Navigation
+    position_ecef_m : ndarray, shape (3,) [m]
+    """
+    names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
+    code = np.full((len(observations), len(names)), np.nan)
+    for m, k in enumerate(which.tolist()):
+        code[:, k] = np.where(np.isnan(code[:, k]), observations.code_m[:, m], code[:, k])
+    states = satellite_states(observations.time, names, observations.signal[first], code, navigation)
+    place = np.broadcast_to(position_ecef_m, (len(observations), 3))
+    elevation, _ = elevation_azimuth(states.position_ecef_m, place)
+    return elevation[:, which]
+
+
+def cn0_curve_from_log(
+    observations: Sequence[Path],
+    navigation: Sequence[Path],
+    *,
+    position_ecef_m: Floats | None = None,
+    fit: CurveFit | None = None,
+    on_error: Literal["strict", "lenient"] = "strict",
+    progress: Callable[[float], None] | None = None,
+) -> Cn0Calibration:
+    """Fit a curve on the log of a receiver whose antenna stood under open sky.
+
+    Parameters
+    ----------
+    observations : sequence of Path
+        RINEX observation files of one receiver, about a day.
+    navigation : sequence of Path
+    position_ecef_m : ndarray, shape (3,) [m], optional
+        Where the antenna stood, to some kilometres; by default what the header says.
+    fit : CurveFit, optional
+    on_error : {"strict", "lenient"}
+        What to do about broken lines of the log.
+    progress : callable, optional
+        Called with the part that has been read, 0 to 1.
+
+    Returns
+    -------
+    Cn0Calibration
+
+    Raises
+    ------
+    InputFileError
+        A file is not what it should be; the log has no C/N0.
+    SettingsError
+        The header has no position and none was given.
+    MismatchError
+        Satellites were tracked that stand below the horizon of the position, or the navigation
+        files have none of them, or too few samples for any curve.
+    """
+    records = read_navigation(list(navigation), on_error=on_error)
+    samples, low = Cn0Samples(), _Horizon()
+    header: ObservationHeader | None = None
+    start, end, epochs = np.datetime64("NaT", "ns"), np.datetime64("NaT", "ns"), 0
+    for part in scan_observations(list(observations), on_error=on_error, progress=progress):
+        if header is None:
+            header, start = part.header, part.time[0]
+            place = _position(header, position_ecef_m, observations[0])
+        end, epochs = part.time[-1], epochs + len(part)
+        elevation = satellite_elevation_deg(part, records, place)
+        low.look(elevation)
+        samples.add(part.cn0_dbhz, elevation, part.satellite, part.signal)
+    if header is None:
+        raise InputFileError(observations[0], "has no epochs")
+    low.judge(observations[0])
+    if not samples.keys():
+        raise InputFileError(observations[0], "has no C/N0 (S1C, S2I, ...); log it in the receiver's RINEX output")
+    source = Cn0CurveSource(
+        antenna=header.antenna,
+        receiver=header.receiver,
+        marker=header.marker,
+        files=tuple((path.name, _sha256(path)) for path in (*observations, *navigation)),
+        start=str(start),
+        end=str(end),
+        epochs=epochs,
+        position_ecef_m=tuple(place.tolist()),
+        railfix_version=__version__,
+    )
+    try:
+        curve = fit_cn0_curve(samples, fit=fit, source=source)
+    except ValueError as error:
+        raise MismatchError(f"{observations[0]}: {error}; give a longer log") from None
+    return Cn0Calibration(curve=curve, samples=samples, notes=_notes(curve, samples, float(seconds(end - start))))
+
+
+class _Horizon:
+    """How many satellites stand where they cannot be seen."""
+
+    def __init__(self) -> None:
+        self.seen = 0
+        self.below = 0
+
+    def look(self, elevation_deg: Floats) -> None:
+        self.seen += int(np.count_nonzero(np.isfinite(elevation_deg)))
+        self.below += int(np.count_nonzero(elevation_deg < _BELOW_DEG))
+
+    def judge(self, path: Path) -> None:
+        if not self.seen:
+            raise MismatchError(f"{path}: the navigation files have no orbit for any satellite and time of this log")
+        if self.below > _BELOW_SHARE * self.seen:
+            share = 100.0 * self.below / self.seen
+            raise MismatchError(
+                f"{path}: {share:.0f} % of the satellites tracked stand below the horizon of the position; "
+                "give the place of the antenna, or the navigation files of this day"
+            )
+
+
+def _position(header: ObservationHeader, given: Floats | None, path: Path) -> Floats:
+    place = header.approximate_ecef_m if given is None else np.asarray(given, dtype=np.float64)
+    if not np.isfinite(place).all():
+        raise SettingsError(f"{path}: the header has no position (APPROX POSITION XYZ); give it with --position")
+    return place
+
+
+def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str, ...]:
+    notes = []
+    if duration_s < _SHORT_S:
+        notes.append(f"the log is {duration_s / 3600.0:.1f} h long; about a day covers all elevations on every side")
+    fitted = {(mean.kind, mean.signal) for mean in curve.means}
+    without = [f"{KINDS.get(kind, kind)} {signal}" for kind, signal in samples.keys() if (kind, signal) not in fitted]  # noqa: SIM118
+    if without:
+        notes.append(f"too few samples over elevation, no curve: {', '.join(without)}")
+    for mean in curve.means:
+        elevation, cn0 = samples.of(mean.kind, mean.signal)
+        high = elevation >= _LOOKED_AT_DEG
+        refused = np.count_nonzero(mean.at(elevation[high]) - cn0[high] > _DEFICIT_DBHZ)
+        if refused > _REFUSED_SHARE * np.count_nonzero(high):
+            share = 100.0 * refused / np.count_nonzero(high)
+            notes.append(
+                f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of this open sky lie "
+                f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; its satellites differ, or the sky is not open"
+            )
+    return tuple(notes)
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read ({error.strerror})") from error

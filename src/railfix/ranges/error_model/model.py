@@ -1,0 +1,166 @@
+"""Error model of pseudoranges on a railway: bias, sigma and overbound by where the satellite stands (P1 7).
+
+The bins are elevation, azimuth relative to the car body and C/N0. P1 names elevation and azimuth; C/N0
+is the strongest predictor of multipath on recordings, so it can be a third axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Floats, Integers
+
+#: Errors that a model can contain.
+COVERS: Final = ("local", "satellite_and_atmosphere")
+#: What a bin was filled from.
+POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorBins:
+    """Where a bin begins and ends.
+
+    Attributes
+    ----------
+    elevation_deg : tuple of float
+        Edges, rising, E + 1 of them.
+    sectors : int
+        Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
+    cn0_dbhz : tuple of float
+        Edges, rising, C + 1 of them; what lies beyond the outer ones belongs to the outer bins. Observations
+        without C/N0 go into the lowest.
+    """
+
+    elevation_deg: tuple[float, ...] = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)
+    sectors: int = 4
+    cn0_dbhz: tuple[float, ...] = (0.0, 30.0, 35.0, 40.0, 45.0, 60.0)
+
+    def __post_init__(self) -> None:
+        for name in ("elevation_deg", "cn0_dbhz"):
+            edges = getattr(self, name)
+            if len(edges) < 2 or not (np.diff(edges) > 0).all():
+                raise ValueError(f"{name} needs at least two rising edges, got {edges}")
+        if self.elevation_deg[0] < 0.0 or self.elevation_deg[-1] > 90.0:
+            raise ValueError(f"elevation_deg must lie within 0 to 90, got {self.elevation_deg}")
+        if self.sectors < 1:
+            raise ValueError(f"sectors must be at least 1, got {self.sectors}")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of bins of elevation, sector and C/N0."""
+        return len(self.elevation_deg) - 1, self.sectors, len(self.cn0_dbhz) - 1
+
+    def index(self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike) -> Integers:
+        """Flat index of the bin of each observation, any shape; -1 where elevation or azimuth is NaN.
+
+        Parameters
+        ----------
+        elevation_deg, relative_azimuth_deg, cn0_dbhz : array_like, shapes that broadcast
+            Azimuth from the car's forward direction, clockwise.
+        """
+        elevation, azimuth, cn0 = np.broadcast_arrays(
+            np.asarray(elevation_deg, dtype=np.float64),
+            np.asarray(relative_azimuth_deg, dtype=np.float64),
+            np.asarray(cn0_dbhz, dtype=np.float64),
+        )
+        known = np.isfinite(elevation) & np.isfinite(azimuth)
+        e = np.searchsorted(self.elevation_deg[1:-1], np.where(known, elevation, 0.0), side="right")
+        width = 360.0 / self.sectors
+        turned = np.mod(np.where(known, azimuth, 0.0) + width / 2.0, 360.0)
+        a = np.minimum((turned // width).astype(np.int64), self.sectors - 1)
+        c = np.searchsorted(self.cn0_dbhz[1:-1], np.where(np.isnan(cn0), -np.inf, cn0), side="right")
+        flat = np.ravel_multi_index((e, a, c), self.shape)
+        return np.where(known, flat, -1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BinStatistics:
+    """Figures of every bin, shape (E, A, C); NaN in bins without samples and without anything to pool.
+
+    Attributes
+    ----------
+    count : ndarray of int
+        Samples of the bin itself.
+    blocks : ndarray of int
+        Passes of a satellite through it, counted once a block of time: samples are correlated.
+    bias_m, sigma_m : ndarray [m]
+        Mean and standard deviation of what the bin was filled from.
+    bound_bias_m, bound_sigma_m : ndarray [m]
+        `overbound.gaussian_overbound` of the same.
+    pooled : ndarray of int
+        Index into `POOLED`: where the bin has too few blocks, a wider set of bins stands for it.
+    """
+
+    count: Integers
+    blocks: Integers
+    bias_m: Floats
+    sigma_m: Floats
+    bound_bias_m: Floats
+    bound_sigma_m: Floats
+    pooled: Integers
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorModelSource:
+    """What a model was made from, for its file.
+
+    Attributes
+    ----------
+    runs : tuple of str
+    base : str
+        Marker of the reference station.
+    conditions : str
+        Screens and corrections under which it holds (`pipeline.conditions_of`).
+    epochs : int
+    start, end, railfix_version : str
+    files : tuple of (str, str)
+        Names and SHA-256.
+    """
+
+    runs: tuple[str, ...] = ()
+    base: str = ""
+    conditions: str = ""
+    epochs: int = 0
+    start: str = ""
+    end: str = ""
+    railfix_version: str = ""
+    files: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErrorModel:
+    """Errors of corrected pseudoranges by bin.
+
+    Attributes
+    ----------
+    bins : ErrorBins
+    before, after : BinStatistics
+        Before and after the screens: the multipath of the line, and what is left of it. The second is what
+        weights and protection level use; the difference is what the screens bought.
+    covers : {"local", "satellite_and_atmosphere"}
+        "local": multipath and receiver noise alone (a reference station took the rest away).
+        "satellite_and_atmosphere": these, too, as they were on those days.
+    source : ErrorModelSource
+    """
+
+    bins: ErrorBins
+    before: BinStatistics
+    after: BinStatistics
+    covers: Literal["local", "satellite_and_atmosphere"]
+    source: ErrorModelSource = field(default_factory=ErrorModelSource)
+
+    def at(
+        self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike
+    ) -> tuple[Floats, Floats]:
+        """Overbounding sigma and bias of observations, shapes as broadcast [m].
+
+        NaN where the direction is unknown or the model has nothing.
+        """
+        index = self.bins.index(elevation_deg, relative_azimuth_deg, cn0_dbhz)
+        inside, safe = index >= 0, np.maximum(index, 0)
+        sigma = np.where(inside, self.after.bound_sigma_m.ravel()[safe], np.nan)
+        return sigma, np.where(inside, self.after.bound_bias_m.ravel()[safe], np.nan)

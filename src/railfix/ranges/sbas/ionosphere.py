@@ -1,0 +1,285 @@
+"""Slant delays from the grid: pierce point, cell, interpolation (DO-229D, A.4.4.10 and A.4.5.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.timescale import seconds
+from railfix.ranges.sbas.degrade import degradation_row
+from railfix.ranges.sbas.grid import COLUMNS, ROWS, GridTables, point_number
+from railfix.ranges.sbas.limits import GIVE_VARIANCE_M2, STOP_S, SbasLimits
+from railfix.ranges.sbas.results import IonosphereDelays, IonosphereState
+from railfix.ranges.sbas.spans import looked_up
+from railfix.ranges.sbas.tables import LONG_AGO, SatelliteTables
+
+#: Earth's radius and height of the layer [km] (DO-229D, A.4.4.10.1).
+EARTH_RADIUS_KM: Final = 6378.1363
+LAYER_HEIGHT_KM: Final = 350.0
+_POLAR_DEG: Final = 75.0
+_GIVE_VARIANCE: Final = np.array([*GIVE_VARIANCE_M2, np.nan])
+_NOT_MONITORED: Final = 15
+_NO_POINT: Final = -1
+
+
+def pierce_point(
+    latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Where signals cross the layer, and how much longer their way in it is than the vertical one.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg : ndarray, shape (T,) [deg]
+    elevation_deg, azimuth_deg : ndarray, shape (T, K) [deg]
+
+    Returns
+    -------
+    latitude_deg, longitude_deg : ndarray, shape (T, K) [deg]
+        Longitude in [-180, 180).
+    obliquity : ndarray, shape (T, K)
+        NaN below the horizon.
+    """
+    elevation, azimuth = np.radians(np.where(elevation_deg > 0.0, elevation_deg, np.nan)), np.radians(azimuth_deg)
+    own_latitude, own_longitude = np.radians(latitude_deg)[:, None], np.radians(longitude_deg)[:, None]
+    ratio = EARTH_RADIUS_KM / (EARTH_RADIUS_KM + LAYER_HEIGHT_KM) * np.cos(elevation)
+    angle = np.pi / 2.0 - elevation - np.arcsin(ratio)
+    latitude = np.arcsin(np.sin(own_latitude) * np.cos(angle) + np.cos(own_latitude) * np.sin(angle) * np.cos(azimuth))
+    aside = np.arcsin(np.clip(np.sin(angle) * np.sin(azimuth) / np.cos(latitude), -1.0, 1.0))
+    north = np.tan(angle) * np.cos(azimuth)
+    over_pole = ((latitude_deg[:, None] > 70.0) & (north > np.tan(np.pi / 2.0 - own_latitude))) | (
+        (latitude_deg[:, None] < -70.0) & (-north > np.tan(np.pi / 2.0 + own_latitude))
+    )
+    longitude = own_longitude + np.where(over_pole, np.pi - aside, aside)
+    return np.degrees(latitude), (np.degrees(longitude) + 180.0) % 360.0 - 180.0, 1.0 / np.sqrt(1.0 - ratio**2)
+
+
+def triangle_weights(x: Floats, y: Floats, missing: int) -> Floats:
+    """Weights of SW, NW, SE, NE without one of them, shape (..., 4); one is negative outside the triangle."""
+    zero = np.zeros_like(x)
+    weights = {
+        0: (zero, 1.0 - x, 1.0 - y, x + y - 1.0),
+        1: (1.0 - x, zero, x - y, y),
+        2: (1.0 - y, y - x, zero, x),
+        3: (1.0 - x - y, y, x, zero),
+    }
+    return np.stack(weights[missing], axis=-1)
+
+
+def _square_weights(x: Floats, y: Floats) -> Floats:
+    return np.stack([(1.0 - x) * (1.0 - y), (1.0 - x) * y, x * (1.0 - y), x * y], axis=-1)
+
+
+def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], tuple[Floats, ...]]]:
+    """South-west corners and sizes of the cells to try, in order (A.4.4.10.2): the small one, then 10 by 10."""
+
+    def small(at: Indices) -> tuple[Floats, ...]:
+        lat, lon = latitude[at], longitude[at]
+        width = np.where(np.abs(lat) >= 60.0, 10.0, 5.0)
+        return np.floor(lat / 5.0) * 5.0, np.floor(lon / width) * width, np.full(lat.shape, 5.0), width
+
+    def large(at: Indices, a: float, b: float) -> tuple[Floats, ...]:
+        ten = np.full(len(at), 10.0)
+        south, west = np.floor((latitude[at] - a) / 10.0) * 10.0 + a, np.floor((longitude[at] - b) / 10.0) * 10.0 + b
+        return south, west, ten, ten
+
+    yield small
+    for b in (0.0, 5.0):
+        for a in (0.0, 5.0):
+            yield partial(large, a=a, b=b)
+
+
+def _choose(
+    grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
+) -> tuple[Integers, Floats, Floats]:
+    """Corner points (M, 4), -1 where not used, and the place in the cell (M,), (M,) below 75 degrees."""
+    point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
+    x, y = np.zeros((2, len(latitude)))
+    open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
+    for cell in _cells(latitude, longitude):
+        at = np.flatnonzero(open_)
+        if not len(at):
+            break
+        s, w, h, b = cell(at)
+        corners = np.stack(
+            [point_number(s, w), point_number(s + h, w), point_number(s, w + b), point_number(s + h, w + b)], axis=1
+        )
+        inside = looked_up(
+            lambda points, when: grid.in_mask(points, when[:, None]), span[at], corners, time[at], ROWS * COLUMNS
+        )
+        u, v = (longitude[at] - w) / b, (latitude[at] - s) / h
+        found = np.asarray(inside.all(axis=1))
+        for missing in range(4):
+            three = np.flatnonzero((inside.sum(axis=1) == 3) & ~inside[:, missing])
+            if len(three):
+                found[three] |= (triangle_weights(u[three], v[three], missing) >= 0.0).all(axis=1)
+        chosen = at[found]
+        point[chosen] = np.where(inside, corners, _NO_POINT)[found]
+        x[chosen], y[chosen] = u[found], v[found]
+        open_[chosen] = False
+    return point, x, y
+
+
+def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
+    """Points and weights at 75 degrees and above; all four are needed."""
+    count = len(latitude)
+    north = latitude >= 0.0
+    sign = np.where(north, 1.0, -1.0)
+    west = np.floor(longitude / 10.0) * 10.0
+    # Points at 85 degrees every 30 degrees where the polar band is sent, else every 90.
+    origin = np.where(north, -180.0, -170.0)
+    fine = np.floor((longitude - origin) / 30.0) * 30.0 + origin
+    pole = np.stack([point_number(sign * 85.0, fine), point_number(sign * 85.0, fine + 30.0)], axis=1)
+    close = grid.in_mask(pole, time[:, None]).all(axis=1)
+    coarse_origin = np.where(north, -180.0, -140.0)
+    coarse = np.floor((longitude - coarse_origin) / 90.0) * 90.0 + coarse_origin
+    step, start = np.where(close, 30.0, 90.0), np.where(close, fine, coarse)
+    cap = np.abs(latitude) > 85.0
+    low = np.stack([point_number(sign * 75.0, west), point_number(sign * 75.0, west + 10.0)], axis=1)
+    high = np.stack([point_number(sign * 85.0, start), point_number(sign * 85.0, start + step)], axis=1)
+    # Around the pole: nearest west, second west, nearest east, second east.
+    around = np.stack([point_number(sign * 85.0, coarse + turn) for turn in (0.0, -90.0, 90.0, 180.0)], axis=1)
+    point = np.where(cap[:, None], around, np.concatenate([low, high], axis=1))
+    x, y = (longitude - west) / 10.0, (np.abs(latitude) - 75.0) / 10.0
+    u = (longitude - start) / step
+    belt = np.stack([(1.0 - y) * (1.0 - x), (1.0 - y) * x, y * (1.0 - u), y * u], axis=1)
+    v = (np.abs(latitude) - 85.0) / 10.0
+    weights = np.where(cap[:, None], _square_weights((longitude - coarse) / 90.0 * (1.0 - 2.0 * v) + v, v), belt)
+    found = np.asarray(grid.in_mask(point, time[:, None]).all(axis=1))
+    return np.where(found[:, None], point, _NO_POINT), np.where(found[:, None], weights, np.nan).reshape(count, 4)
+
+
+def ionosphere(
+    grid: GridTables,
+    tables: SatelliteTables,
+    limits: SbasLimits,
+    time: Datetimes,
+    latitude_deg: Floats,
+    longitude_deg: Floats,
+    elevation_deg: Floats,
+    azimuth_deg: Floats,
+) -> IonosphereDelays:
+    """Delays at epochs; arguments as `SbasCorrections.ionosphere`."""
+    latitude, longitude, obliquity = pierce_point(latitude_deg, longitude_deg, elevation_deg, azimuth_deg)
+    shape = latitude.shape
+    t = np.repeat(np.arange(len(time)), shape[1])
+    when, at_latitude, at_longitude = time[t], latitude.ravel(), longitude.ravel()
+    span = grid.spans.number(time)[t]
+    point, x, y = _choose(grid, when, span, at_latitude, at_longitude)
+    in_cap = np.isfinite(at_latitude) & (np.abs(at_latitude) >= _POLAR_DEG)
+    polar = np.flatnonzero(in_cap)
+    polar_weights = np.full((len(when), 4), np.nan)
+    if len(polar):
+        point[polar], polar_weights[polar] = _choose_polar(grid, when[polar], at_latitude[polar], at_longitude[polar])
+    judged = looked_up(
+        lambda points, then: np.stack(_judge(grid, limits, tables, then, points), axis=-1),
+        span, point, when, ROWS * COLUMNS,
+    )  # fmt: skip
+    row, state = judged[..., 0], judged[..., 1]
+    weights, used = _weights(point, state, x, y, polar_weights, in_cap)
+    delay, variance, known = _values(grid, limits, tables, time, t, row)
+    total = np.where(used[:, None] & (weights > 0.0), weights * delay, 0.0).sum(axis=1)
+    spread = np.where(used[:, None] & (weights > 0.0), weights * variance, 0.0).sum(axis=1)
+    worst = np.select(
+        [
+            (seconds(time - tables.stops.last(time)) < STOP_S)[t],
+            ~(point >= 0).any(axis=1),
+            (state == IonosphereState.DO_NOT_USE).any(axis=1),
+            used & ~known,
+            used,
+            (state == IonosphereState.TIMED_OUT).any(axis=1),
+        ],
+        [
+            IonosphereState.GEO_STOPPED,
+            IonosphereState.NO_GRID,
+            IonosphereState.DO_NOT_USE,
+            IonosphereState.NO_DEGRADATION,
+            IonosphereState.OK,
+            IonosphereState.TIMED_OUT,
+        ],
+        IonosphereState.NOT_MONITORED,
+    ).astype(np.int64)
+    good = (worst == IonosphereState.OK) | (worst == IonosphereState.NO_DEGRADATION)
+    sigma = np.where(worst == IonosphereState.OK, np.sqrt(spread), np.nan)
+    return IonosphereDelays(
+        state=worst.reshape(shape),
+        delay_m=np.where(good, total, np.nan).reshape(shape) * obliquity,
+        sigma_uire_m=sigma.reshape(shape) * obliquity,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        points=np.where(good, (used[:, None] & (weights > 0.0)).sum(axis=1), 0).reshape(shape),
+    )
+
+
+def _judge(
+    grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, point: Integers
+) -> tuple[Integers, Integers]:
+    """Newest delay of each corner, and whether it may be used (M, 4)."""
+    at = time[:, None]
+    row = grid.newest.newest(point, at)
+    if not len(grid.time):
+        return row, np.full(row.shape, IonosphereState.NOT_MONITORED, dtype=np.int64)
+    received = np.where(row >= 0, grid.time[row], LONG_AGO)
+    late = seconds(at - received) > limits.timeout_s("grid_delay")
+    late |= ~grid.mask_active(np.where(row >= 0, grid.issue[row], -1), at)
+    state = np.select(
+        [
+            point < 0,
+            (row < 0) | (received <= tables.stops.last(time)[:, None]),
+            late,
+            np.isnan(grid.delay_m[row]),
+            grid.givei[row] == _NOT_MONITORED,
+        ],
+        [
+            IonosphereState.NO_GRID,
+            IonosphereState.NOT_MONITORED,
+            IonosphereState.TIMED_OUT,
+            IonosphereState.DO_NOT_USE,
+            IonosphereState.NOT_MONITORED,
+        ],
+        IonosphereState.OK,
+    )
+    return row, state.astype(np.int64)
+
+
+def _weights(
+    point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
+) -> tuple[Floats, Masks]:
+    """Weights of the corners (M, 4), and where they do (M,): four good ones, or three around the place.
+
+    That a corner which says do not use forbids the delay is judged apart.
+    """
+    good = state == IonosphereState.OK
+    weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
+    used = good.all(axis=1)
+    for missing in range(4):
+        at = np.flatnonzero((good.sum(axis=1) == 3) & ~good[:, missing] & ~polar)
+        if len(at):
+            three = triangle_weights(x[at], y[at], missing)
+            fits = (three >= 0.0).all(axis=1)
+            weights[at[fits]] = three[fits]
+            used[at[fits]] = True
+    return weights, used & (point >= 0).any(axis=1)
+
+
+def _values(
+    grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
+) -> tuple[Floats, Floats, Masks]:
+    """Vertical delay and variance of corners (M, 4), and where type 10 is in force (M,); t is the epoch of each."""
+    if not len(grid.time):
+        nothing = np.full(row.shape, np.nan)
+        return nothing, nothing, np.zeros(len(row), dtype=bool)
+    newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
+    of_ten, active = newest[t], in_force[t]
+    variance = _GIVE_VARIANCE[grid.givei[row]]
+    if not len(tables.degradation.time):
+        return grid.delay_m[row], variance, active
+    values = tables.degradation.values
+    age = seconds(time[t][:, None] - grid.time[row]) + limits.message_s
+    interval = np.maximum(values.iono_interval_s[of_ten], 1.0)[:, None]
+    grown = values.iono_step_m[of_ten][:, None] * np.floor(age / interval) + values.iono_rate_mps[of_ten][:, None] * age
+    squares = (values.rss_iono[of_ten] == 1)[:, None]
+    return grid.delay_m[row], np.where(squares, variance + grown**2, (np.sqrt(variance) + grown) ** 2), active

@@ -1,0 +1,155 @@
+"""What SBAS says about satellites and delays at epochs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import IntEnum
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers, Masks
+from railfix.gnss.observations import frozen
+
+
+class SatelliteState(IntEnum):
+    """Whether a satellite may be used, and why not; the first that holds of those listed."""
+
+    OK = 0
+    #: Type 0 was received within the last 60 s.
+    GEO_STOPPED = 1
+    #: There is no PRN mask, or it timed out.
+    NO_MASK = 2
+    NOT_IN_MASK = 3
+    NO_FAST = 4
+    #: UDREI 15.
+    DO_NOT_USE = 5
+    #: UDREI 14.
+    NOT_MONITORED = 6
+    TIMED_OUT = 7
+    #: UDREI above `SbasLimits.largest_udrei`.
+    UDREI_TOO_LARGE = 8
+    NO_LONG_TERM = 9
+    #: No navigation record has the issue of data of the long-term correction.
+    IODE_MISMATCH = 10
+    #: Degradation data (types 7, 10; 28 where it is sent) are missing.
+    NO_DEGRADATION = 11
+    #: Two fast corrections that give a rate are not there.
+    NO_RANGE_RATE = 12
+
+
+class IonosphereState(IntEnum):
+    """Whether the delay at a pierce point is known, and why not."""
+
+    OK = 0
+    GEO_STOPPED = 1
+    #: The mask has no cell of grid points around the pierce point.
+    NO_GRID = 2
+    #: A grid point that is needed says do not use.
+    DO_NOT_USE = 3
+    #: A grid point that is needed is not monitored, or was never sent.
+    NOT_MONITORED = 4
+    TIMED_OUT = 5
+    #: The delay is there; without type 10 it has no sigma.
+    NO_DEGRADATION = 6
+
+
+class _Frozen:
+    def __post_init__(self) -> None:
+        for item in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, frozen(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SatelliteCorrections(_Frozen):
+    """Corrections of T epochs by K satellites; NaN and -1 where `state` is not OK, but for `udrei` and `iode`.
+
+    The corrected code is ``code + fast_m``, with the satellite at ``broadcast + position_m`` and
+    its clock ``broadcast + clock_s``, both of the record with the issue of data `iode`.
+
+    Attributes
+    ----------
+    state : ndarray of int, shape (T, K)
+        `SatelliteState`.
+    fast_m : ndarray, shape (T, K) [m]
+        To be added to the code; the range-rate part is in it.
+    rate_mps : ndarray, shape (T, K) [m/s]
+        Range-rate correction.
+    position_m : ndarray, shape (T, K, 3) [m]
+    clock_s : ndarray, shape (T, K) [s]
+    iode : ndarray of int, shape (T, K)
+        Issue of data of the long-term correction taken, -1 without one.
+    record : ndarray of int, shape (T, K)
+        Row of `navigation.kepler` with that issue, -1 without navigation data.
+    udrei : ndarray of int, shape (T, K)
+        -1 where none was received.
+    sigma_udre_m : ndarray, shape (T, K) [m]
+    fast_growth_m, rate_growth_m, long_term_growth_m, en_route_m : ndarray, shape (T, K) [m]
+        Degradation terms (DO-229D, A.4.5.1); 0 where `inflated`.
+    inflated : ndarray of bool, shape (T, K)
+        Degradation data are missing: sigma is that of UDRE plus 8 m.
+    rss : ndarray of bool, shape (T, K)
+        The terms are summed as squares (RSS_UDRE of type 10).
+    covariance : ndarray of int, shape (T, K)
+        Row of the covariance (type 28) in force, -1 without.
+    """
+
+    state: Integers
+    fast_m: Floats
+    rate_mps: Floats
+    position_m: Floats
+    clock_s: Floats
+    iode: Integers
+    record: Integers
+    udrei: Integers
+    sigma_udre_m: Floats
+    fast_growth_m: Floats
+    rate_growth_m: Floats
+    long_term_growth_m: Floats
+    en_route_m: Floats
+    inflated: Masks
+    rss: Masks
+    covariance: Integers
+
+    def take_satellites(self, which: Integers) -> SatelliteCorrections:
+        """The corrections of some satellites, by index."""
+        return SatelliteCorrections(**{item.name: getattr(self, item.name)[:, which] for item in fields(self)})
+
+    def sigma_flt_m(self, delta_udre: Floats | float = 1.0) -> Floats:
+        """Standard deviation after fast and long-term correction, shape (T, K) [m] (DO-229D, A.4.5.1 and J.2.2).
+
+        Parameters
+        ----------
+        delta_udre : ndarray, shape (T, K), or float
+            Factor on sigma UDRE (`SbasCorrections.delta_udre`).
+        """
+        udre = self.sigma_udre_m * delta_udre
+        terms = np.stack([udre, self.fast_growth_m, self.rate_growth_m, self.long_term_growth_m, self.en_route_m])
+        squares = self.rss & ~self.inflated
+        return np.asarray(np.where(squares, np.sqrt((terms**2).sum(axis=0)), terms.sum(axis=0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class IonosphereDelays(_Frozen):
+    """Delays of T epochs by K satellites from the grid.
+
+    Attributes
+    ----------
+    state : ndarray of int, shape (T, K)
+        `IonosphereState`.
+    delay_m : ndarray, shape (T, K) [m]
+        Slant delay on L1, to be taken off the code; other carriers scale by (f1/f)^2.
+    sigma_uire_m : ndarray, shape (T, K) [m]
+    latitude_deg, longitude_deg : ndarray, shape (T, K) [deg]
+        Pierce point.
+    points : ndarray of int, shape (T, K)
+        Grid points it was interpolated from: 4, 3, or 0.
+    """
+
+    state: Integers
+    delay_m: Floats
+    sigma_uire_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    points: Integers

@@ -1,0 +1,157 @@
+"""From raw codes to ranges that can be fitted: signal choice, corrections, weights.
+
+``P = code + c dt_sv - c TGD - I - T`` (algorithm section of P1 2.2(2): the satellite clock, the
+ionosphere and the troposphere are predictable, the receiver clock is not), and the standard
+deviation that each P is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.core.constants import CLOCK_GROUP
+
+#: A pseudorange lies between these [m]: nearest satellite less a receiver clock 33 ms off, GEO plus the same.
+PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
+#: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
+_SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CodeNoise:
+    """Standard deviation of a corrected pseudorange from C/N0 and elevation.
+
+    ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
+
+    Attributes
+    ----------
+    model : {"cn0_elevation", "elevation"}
+        "elevation" leaves the C/N0 factor out.
+    zenith_sigma_m : float
+        At the zenith and the reference C/N0. Only ratios matter to the position: what it is on a
+        receiver is estimated from the residuals (`pipeline.AntennaState`).
+    floor_sigma_m : float
+        What neither C/N0 nor elevation sees: satellite clock and orbit, ionosphere, troposphere left over.
+    cn0_reference_dbhz, cn0_cap_dbhz : float
+        Above the cap a stronger signal is not a better one.
+    """
+
+    model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"
+    zenith_sigma_m: float = 1.0
+    floor_sigma_m: float = 1.0
+    cn0_reference_dbhz: float = 45.0
+    cn0_cap_dbhz: float = 50.0
+
+    def __post_init__(self) -> None:
+        if not self.zenith_sigma_m > 0.0:
+            raise ValueError(f"zenith_sigma_m must be positive, got {self.zenith_sigma_m}")
+        if not self.floor_sigma_m >= 0.0:
+            raise ValueError(f"floor_sigma_m must not be negative, got {self.floor_sigma_m}")
+
+
+def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
+    """Standard deviation of corrected pseudoranges, shape (T, M) [m].
+
+    Where C/N0 is NaN (a log without it) the reference C/N0 is taken. NaN at or below the horizon.
+    """
+    noise = noise or CodeNoise()
+    sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
+    sigma = noise.zenith_sigma_m / sine
+    if noise.model == "cn0_elevation":
+        cn0 = np.where(np.isnan(cn0_dbhz), noise.cn0_reference_dbhz, np.minimum(cn0_dbhz, noise.cn0_cap_dbhz))
+        sigma = sigma * 10.0 ** ((noise.cn0_reference_dbhz - cn0) / 20.0)
+    return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class NominalErrors:
+    """Standard deviations of what a local error model does not cover, where no SBAS tells them: assumptions.
+
+    ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
+    (A.4.4.10.4 and A.4.2.4).
+
+    Attributes
+    ----------
+    satellite_sigma_m : float
+        Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions
+        promise 2 m and 95 % of the time less.
+    ionosphere_sigma_m : float
+        Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
+    troposphere_sigma_m : float
+        Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4: 0.12 m).
+    """
+
+    satellite_sigma_m: float = 0.8
+    ionosphere_sigma_m: float = 1.0
+    troposphere_sigma_m: float = 0.12
+
+    def __post_init__(self) -> None:
+        for name in ("satellite_sigma_m", "ionosphere_sigma_m", "troposphere_sigma_m"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+
+    def sigma_m(self, elevation_deg: Floats) -> Floats:
+        """Standard deviation at elevations, any shape [m]; NaN below the horizon."""
+        sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
+        thin_shell = 1.0 / np.sqrt(1.0 - (_SHELL * np.sqrt(1.0 - sine**2)) ** 2)
+        wet = 1.001 / np.sqrt(0.002001 + sine**2)
+        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell) ** 2)
+        return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
+
+
+def channel_order(
+    satellite: Strings,
+    signal: Strings,
+    *,
+    systems: Sequence[str],
+    signals: Mapping[str, Sequence[str]],
+) -> Indices:
+    """Channels that may be used, those of one clock side by side, a satellite's best signal first.
+
+    Parameters
+    ----------
+    satellite, signal : ndarray of str, shape (M,)
+    systems : sequence of str
+        Constellations asked for.
+    signals : mapping of str to sequence of str
+        Signals of each constellation in order of preference.
+
+    Returns
+    -------
+    ndarray of int, shape (K,)
+        Indices into the channels.
+    """
+    keys = []
+    for i, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
+        letter = name[0]
+        preference = signals.get(letter, ())
+        if letter in systems and code in preference:
+            keys.append((CLOCK_GROUP[letter], name, preference.index(code), i))
+    return np.array([key[-1] for key in sorted(keys)], dtype=np.intp)
+
+
+def first_available(satellite: Strings, available: Masks) -> Masks:
+    """One channel a satellite and epoch: the first available one.
+
+    Parameters
+    ----------
+    satellite : ndarray of str, shape (K,)
+        Channels of one satellite side by side, best first (`channel_order`).
+    available : ndarray of bool, shape (T, K)
+
+    Returns
+    -------
+    ndarray of bool, shape (T, K)
+    """
+    starts = np.flatnonzero(np.r_[True, satellite[1:] != satellite[:-1]]) if len(satellite) else np.empty(0, int)
+    if len(starts) == len(satellite):
+        return available.copy()
+    count = np.cumsum(available, axis=1)
+    before = np.where(starts > 0, count[:, starts - 1], 0)
+    offset = np.repeat(before, np.diff(np.r_[starts, len(satellite)]), axis=1)
+    return np.asarray(available & (count - offset == 1))

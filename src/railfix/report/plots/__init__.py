@@ -1,0 +1,74 @@
+"""Pictures, of numbers in tables and arrays.
+
+Each picture comes twice: the function that makes a `Chart` (`error_over_time`), and the one that draws
+it with matplotlib at once (`plot_error_over_time`). `draw_chart` draws a chart into axes of your own.
+The report of `railfix.report` shows the same charts.
+
+matplotlib is imported when a picture is drawn, never with the package.
+"""
+
+from typing import Final
+
+from railfix.report.plots.chart import Chart, SkyEpochs
+from railfix.report.plots.draw import draw_chart, draw_figure, draw_sky, drawn
+from railfix.report.plots.errors import error_over_chainage, error_over_time, error_ranges
+from railfix.report.plots.levels import levels_over_chainage, levels_over_time, stanford
+from railfix.report.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
+from railfix.report.plots.run_screens import draw_run_screens, screens_of
+from railfix.report.plots.screens import draw_cn0_curve, draw_screen, screen_over_chainage, screen_over_time
+from railfix.report.plots.signals import cn0_over_elevation, sky_epochs
+from railfix.report.plots.timing import processing_time
+
+plot_plan: Final = drawn(plan)
+plot_error_over_time: Final = drawn(error_over_time)
+plot_error_over_chainage: Final = drawn(error_over_chainage)
+plot_error_ranges: Final = drawn(error_ranges)
+plot_stanford: Final = drawn(stanford)
+plot_levels_over_time: Final = drawn(levels_over_time)
+plot_levels_over_chainage: Final = drawn(levels_over_chainage)
+plot_interval_over_chainage: Final = drawn(interval_over_chainage)
+plot_interval_distribution: Final = drawn(interval_distribution)
+plot_satellites_over_time: Final = drawn(satellites_over_time)
+plot_processing_time: Final = drawn(processing_time)
+plot_screen_over_time: Final = drawn(screen_over_time)
+plot_screen_over_chainage: Final = drawn(screen_over_chainage)
+
+__all__ = [
+    "Chart",
+    "SkyEpochs",
+    "cn0_over_elevation",
+    "draw_chart",
+    "draw_cn0_curve",
+    "draw_figure",
+    "draw_run_screens",
+    "draw_screen",
+    "draw_sky",
+    "error_over_chainage",
+    "error_over_time",
+    "error_ranges",
+    "interval_distribution",
+    "interval_over_chainage",
+    "levels_over_chainage",
+    "levels_over_time",
+    "plan",
+    "plot_error_over_chainage",
+    "plot_error_over_time",
+    "plot_error_ranges",
+    "plot_interval_distribution",
+    "plot_interval_over_chainage",
+    "plot_levels_over_chainage",
+    "plot_levels_over_time",
+    "plot_plan",
+    "plot_processing_time",
+    "plot_satellites_over_time",
+    "plot_screen_over_chainage",
+    "plot_screen_over_time",
+    "plot_stanford",
+    "processing_time",
+    "satellites_over_time",
+    "screen_over_chainage",
+    "screen_over_time",
+    "screens_of",
+    "sky_epochs",
+    "stanford",
+]

@@ -1,0 +1,279 @@
+"""What a picture shows, apart from what draws it.
+
+A `Chart` is axes with layers of numbers. The functions of `railfix.report.plots` make charts from tables and
+arrays; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
+a page. So a notebook and the report show the same numbers.
+
+Long series are thinned where a chart is made (`railfix.report.plots.thinning`); its caption then says from how
+many points to how many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.core.arrays import Floats, Integers, Strings
+
+#: Colours that stay apart for the colour-blind (Okabe and Ito) and stand out on white by 3 to 1 or more.
+BLUE, RED, GREEN, PURPLE, BLACK, GREY = "#0072b2", "#d55e00", "#00805e", "#a3487e", "#000000", "#767676"
+#: Positions on the map, and the conventional ones, in every picture.
+CONSTRAINED: Final = BLUE
+CONVENTIONAL: Final = RED
+#: From small to large: dark blue to dark red, light between, for classes in order.
+ORDERED: Final = ("#0b559f", "#3d8ec4", "#8a8a8a", "#e0762f", "#b30000")
+#: For what has no order.
+CYCLE: Final = (BLUE, RED, GREEN, PURPLE, BLACK, "#8c6d00", "#56b4e9", GREY)
+
+Shape = Literal["dot", "square", "cross", "ring"]
+Scale = Literal["linear", "symlog", "log"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points:
+    """Points, P of them.
+
+    Attributes
+    ----------
+    label : str
+    colour : str
+    x, y : ndarray, shape (P,)
+        NaN is not drawn.
+    shape : {"dot", "square", "cross", "ring"}
+    size : float
+        Width in pixels of a page.
+    epoch_s : ndarray, shape (P,), or None [s]
+        When each was, from the start of the run; a click on it shows the sky then.
+    """
+
+    label: str
+    colour: str
+    x: Floats
+    y: Floats
+    shape: Shape = "dot"
+    size: float = 3.0
+    epoch_s: Floats | None = None
+
+    def __post_init__(self) -> None:
+        _same_length(self.label, self.x, self.y)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """A line through P points, broken where one is NaN."""
+
+    label: str
+    colour: str
+    x: Floats
+    y: Floats
+    width: float = 1.5
+    dash: Literal["solid", "dashed", "dotted"] = "solid"
+
+    def __post_init__(self) -> None:
+        _same_length(self.label, self.x, self.y)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """The area between two lines of P points, broken where one is NaN."""
+
+    label: str
+    colour: str
+    x: Floats
+    low: Floats
+    high: Floats
+
+    def __post_init__(self) -> None:
+        _same_length(self.label, self.x, self.low, self.high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bars:
+    """Upright bars from `left` to `right`, each B long."""
+
+    label: str
+    colour: str
+    left: Floats
+    right: Floats
+    height: Floats
+
+    def __post_init__(self) -> None:
+        _same_length(self.label, self.left, self.right, self.height)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """How many points fell into each cell of a grid, the more the darker.
+
+    Attributes
+    ----------
+    x_edges, y_edges : ndarray, shape (A + 1,), (B + 1,)
+    counts : ndarray of int, shape (A, B)
+    """
+
+    label: str
+    colour: str
+    x_edges: Floats
+    y_edges: Floats
+    counts: Integers
+
+    def __post_init__(self) -> None:
+        if self.counts.shape != (len(self.x_edges) - 1, len(self.y_edges) - 1):
+            raise ValueError(f"{self.label}: counts have shape {self.counts.shape}, not that of the cells")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranges:
+    """A bar from least to greatest with a mark at the mean, one a name, from the top down.
+
+    Attributes
+    ----------
+    names : tuple of str
+    low, mid, high : ndarray, shape (N,)
+        NaN is not drawn.
+    """
+
+    label: str
+    colour: str
+    names: tuple[str, ...]
+    low: Floats
+    mid: Floats
+    high: Floats
+
+    def __post_init__(self) -> None:
+        _same_length(self.label, np.array(self.names), self.low, self.mid, self.high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marks:
+    """Words at places.
+
+    Attributes
+    ----------
+    label : str
+        Blank: not in the legend.
+    colour : str
+    x, y : ndarray, shape (P,)
+    words : tuple of str
+        Lines apart by line feeds.
+    place : {"beside", "on"}
+        Beside a cross at the place; or the middle of the words on it, without a cross.
+    """
+
+    label: str
+    colour: str
+    x: Floats
+    y: Floats
+    words: tuple[str, ...]
+    place: Literal["beside", "on"] = "beside"
+
+    def __post_init__(self) -> None:
+        _same_length(self.label, self.x, self.y, np.array(self.words))
+
+
+Layer = Points | Line | Band | Bars | Cells | Ranges | Marks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """One picture.
+
+    Attributes
+    ----------
+    name : str
+        Short, for files and anchors: ``error-time``.
+    title, caption : str
+        What is shown; how to read it, and what was left out.
+    x_label, y_label : str
+    layers : tuple of Layer
+        Drawn in this order.
+    start : datetime64[ns] or None
+        `x` is seconds from this time.
+    y_scale, x_scale : {"linear", "symlog", "log"}
+    y_linear : float
+        A symlog axis is linear up to here.
+    x_range, y_range : (float, float) or None
+    equal : bool
+        One metre is as long across as up; a scale bar and north are drawn.
+    width : {"wide", "half"}
+    """
+
+    name: str
+    title: str
+    caption: str
+    x_label: str
+    y_label: str
+    layers: tuple[Layer, ...]
+    start: np.datetime64 | None = None
+    x_scale: Scale = "linear"
+    y_scale: Scale = "linear"
+    y_linear: float = 1.0
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    equal: bool = False
+    width: Literal["wide", "half"] = "wide"
+
+    @property
+    def empty(self) -> bool:
+        """Whether no layer has anything to draw."""
+        return not any(_drawn(layer) for layer in self.layers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkyEpochs:
+    """Satellites over an antenna, R rows over K epochs, for pictures of the sky.
+
+    Attributes
+    ----------
+    name, title, caption : str
+    start : datetime64[ns]
+    epoch_s : ndarray, shape (K,) [s]
+        Rising, from `start`.
+    first : ndarray of int, shape (K + 1,)
+        Rows of epoch k: first[k] to first[k + 1].
+    satellite, signal : ndarray of str, shape (R,)
+    azimuth_deg, elevation_deg, cn0_dbhz : ndarray, shape (R,)
+    reason : ndarray of str, shape (R,)
+        First reason that refused it; ``used``.
+    """
+
+    name: str
+    title: str
+    caption: str
+    start: np.datetime64
+    epoch_s: Floats
+    first: Integers
+    satellite: Strings
+    signal: Strings
+    azimuth_deg: Floats
+    elevation_deg: Floats
+    cn0_dbhz: Floats
+    reason: Strings = field(repr=False)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no satellite."""
+        return not len(self.satellite)
+
+
+def _drawn(layer: Layer) -> bool:
+    """Whether a layer has anything to draw; words alone are no picture."""
+    if isinstance(layer, Marks):
+        return False
+    if isinstance(layer, Cells):
+        return bool(layer.counts.any())
+    if isinstance(layer, Bars):
+        return bool((layer.height > 0).any())
+    if isinstance(layer, Band):
+        return bool(np.isfinite(layer.low).any())
+    if isinstance(layer, Ranges):
+        return bool(np.isfinite(layer.mid).any())
+    return bool((np.isfinite(layer.x) & np.isfinite(layer.y)).any())
+
+
+def _same_length(label: str, *arrays: NDArray[np.generic]) -> None:
+    if len({len(array) for array in arrays}) > 1:
+        raise ValueError(f"{label}: arrays of lengths {[len(array) for array in arrays]}, expected equal ones")

@@ -1,0 +1,229 @@
+"""Charts drawn with matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, Final, ParamSpec
+
+import numpy as np
+
+from railfix.core.timescale import timedelta
+from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+
+_MARKERS: Final = {"dot": "o", "square": "s", "cross": "x", "ring": "o"}
+_DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
+#: Colours of a sky picture: used, refused.
+_USED, _REFUSED = "#0072b2", "#d55e00"
+
+
+def drawn(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
+    """The function that draws what another one makes a chart of."""
+
+    @wraps(chart_of)
+    def draw(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        return draw_figure(chart_of(*args, **kwargs))
+
+    return draw
+
+
+def draw_figure(chart: Chart) -> Figure:
+    """Draw a chart as a figure of its own, with its caption.
+
+    Parameters
+    ----------
+    chart : Chart
+
+    Returns
+    -------
+    Figure
+        ``figure.savefig("error.png")`` writes it; a notebook shows it.
+    """
+    from matplotlib.figure import Figure
+
+    size = (10.0, 7.0) if chart.equal else (10.0 if chart.width == "wide" else 6.0, 4.2)
+    figure = Figure(figsize=size, layout="constrained")
+    draw_chart(chart, figure.subplots())
+    return figure
+
+
+def draw_chart(chart: Chart, axes: Axes) -> Axes:
+    """Draw a chart into axes of matplotlib.
+
+    Parameters
+    ----------
+    chart : Chart
+    axes : Axes
+
+    Returns
+    -------
+    Axes
+        `axes`.
+    """
+    for layer in chart.layers:
+        _draw(layer, axes, chart)
+    axes.set_title(chart.title, fontsize="medium")
+    axes.set_xlabel(chart.x_label)
+    axes.set_ylabel(chart.y_label)
+    _scales(chart, axes)
+    if not any(isinstance(layer, Ranges) for layer in chart.layers):
+        axes.grid(alpha=0.3)
+    if any(text for text in axes.get_legend_handles_labels()[1]):
+        axes.legend(fontsize="small", markerscale=2.5, loc="best")
+    return axes
+
+
+def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> Axes:
+    """Draw the satellites over an antenna at the epoch nearest to a time.
+
+    Parameters
+    ----------
+    sky : SkyEpochs
+    time : datetime64
+        GPS time.
+    axes : Axes, optional
+        Polar ones; made unless given.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ValueError
+        There is no epoch.
+    """
+    from matplotlib.figure import Figure
+
+    if sky.empty:
+        raise ValueError("there are no satellites to draw")
+    polar: Any = (
+        axes
+        if axes is not None
+        else Figure(figsize=(6, 6), layout="constrained").subplots(subplot_kw={"projection": "polar"})
+    )
+    k = int(np.argmin(np.abs(sky.start + timedelta(sky.epoch_s) - time)))
+    rows = slice(int(sky.first[k]), int(sky.first[k + 1]))
+    polar.set_theta_zero_location("N")
+    polar.set_theta_direction(-1)
+    polar.set_rlim(90.0, 0.0)
+    bearing, elevation = np.radians(sky.azimuth_deg[rows]), sky.elevation_deg[rows]
+    used = sky.reason[rows] == "used"
+    for mask, colour, marker, label in ((used, _USED, "o", "used"), (~used, _REFUSED, "x", "refused")):
+        polar.plot(bearing[mask], elevation[mask], marker, color=colour, label=label)
+    for where, high, name, cn0 in zip(bearing, elevation, sky.satellite[rows], sky.cn0_dbhz[rows], strict=True):
+        text = f"{name}\n{cn0:.0f}" if np.isfinite(cn0) else str(name)
+        polar.annotate(text, (where, high), textcoords="offset points", xytext=(5, 0), fontsize=8)
+    moment = np.datetime_as_string(sky.start + timedelta(sky.epoch_s[k]), unit="ms")
+    polar.set_title(f"{sky.title}, {moment}; C/N0 in dB-Hz", fontsize="medium")
+    polar.legend(loc="lower left", bbox_to_anchor=(-0.1, -0.1), fontsize="small")
+    drawn_axes: Axes = polar
+    return drawn_axes
+
+
+def _scales(chart: Chart, axes: Axes) -> None:
+    if chart.x_scale != "linear":
+        axes.set_xscale(chart.x_scale)
+    if chart.y_scale == "symlog":
+        axes.set_yscale("symlog", linthresh=chart.y_linear)
+    elif chart.y_scale == "log":
+        axes.set_yscale("log")
+    if chart.x_range is not None:
+        axes.set_xlim(*chart.x_range)
+    if chart.y_range is not None:
+        axes.set_ylim(*chart.y_range)
+    if chart.equal:
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.annotate(
+            "N",
+            xy=(0.97, 0.97),
+            xytext=(0.97, 0.87),
+            xycoords="axes fraction",
+            ha="center",
+            arrowprops={"arrowstyle": "-|>", "color": "black"},
+        )
+
+
+def _along(chart: Chart, x: Any) -> Any:
+    """Seconds as times where the chart is over time."""
+    return x if chart.start is None else chart.start + timedelta(x)
+
+
+def _draw(layer: Layer, axes: Axes, chart: Chart) -> None:
+    match layer:
+        case Points():
+            _points(layer, axes, chart)
+        case Line():
+            _line(layer, axes, chart)
+        case Band():
+            _band(layer, axes, chart)
+        case Bars():
+            _bars(layer, axes)
+        case Cells():
+            _cells(layer, axes)
+        case Ranges():
+            _ranges(layer, axes)
+        case Marks():
+            _marks(layer, axes)
+
+
+def _points(layer: Points, axes: Axes, chart: Chart) -> None:
+    axes.plot(
+        _along(chart, layer.x),
+        layer.y,
+        _MARKERS[layer.shape],
+        ms=layer.size * 0.8,
+        color=layer.colour,
+        mfc="none" if layer.shape == "ring" else layer.colour,
+        label=layer.label,
+        rasterized=len(layer.x) > 1000,
+    )
+
+
+def _line(layer: Line, axes: Axes, chart: Chart) -> None:
+    style = _DASHES[layer.dash]
+    axes.plot(_along(chart, layer.x), layer.y, style, lw=layer.width, color=layer.colour, label=layer.label)
+
+
+def _band(layer: Band, axes: Axes, chart: Chart) -> None:
+    axes.fill_between(
+        _along(chart, layer.x), layer.low, layer.high, color=layer.colour, alpha=0.25, lw=0, label=layer.label
+    )
+
+
+def _bars(layer: Bars, axes: Axes) -> None:
+    width = layer.right - layer.left
+    axes.bar(layer.left, layer.height, width, align="edge", color=layer.colour, alpha=0.6, label=layer.label)
+
+
+def _cells(layer: Cells, axes: Axes) -> None:
+    from matplotlib.colors import LogNorm
+
+    counts = np.ma.masked_equal(layer.counts, 0)
+    axes.pcolormesh(layer.x_edges, layer.y_edges, counts.T, cmap="Greys", norm=LogNorm(vmin=0.3), rasterized=True)
+
+
+def _ranges(layer: Ranges, axes: Axes) -> None:
+    at = np.arange(len(layer.names), dtype=np.float64)
+    axes.hlines(at, layer.low, layer.high, color=layer.colour, lw=6, alpha=0.4, label=layer.label)
+    axes.plot(layer.mid, at, "|", color=layer.colour, ms=14, mew=2.5)
+    axes.set_yticks(at, layer.names)
+    axes.set_ylim(len(layer.names) - 0.5, -0.5)
+    axes.grid(axis="x", alpha=0.3)
+
+
+def _marks(layer: Marks, axes: Axes) -> None:
+    if layer.place == "on":
+        ground = {"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.5}
+        for x, y, word in zip(layer.x, layer.y, layer.words, strict=True):
+            axes.text(x, y, word, ha="center", va="center", fontsize=8, color=layer.colour, bbox=ground)
+        return
+    axes.plot(layer.x, layer.y, "+", color=layer.colour, ms=7)
+    for x, y, word in zip(layer.x, layer.y, layer.words, strict=True):
+        axes.annotate(word, (x, y), textcoords="offset points", xytext=(4, 4), fontsize=8, color=layer.colour)

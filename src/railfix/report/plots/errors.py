@@ -1,0 +1,214 @@
+"""Charts of the error along the line (P1 figures 7, 8, 10, 11).
+
+The tables have one row an epoch of one antenna, as `railfix.evaluate.Evaluation.epochs` has them:
+``time_gpst``, ``chainage_m`` (where the antenna was), ``error_m`` and ``conventional_error_m`` (+ toward
+the end of the line), and, as far as there are any, ``along_sigma_m``, ``reference_good`` and columns of
+protection levels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Floats
+from railfix.report.plots.chart import (
+    BLACK,
+    CONSTRAINED,
+    CONVENTIONAL,
+    GREEN,
+    GREY,
+    PURPLE,
+    Band,
+    Chart,
+    Layer,
+    Line,
+    Points,
+    Ranges,
+)
+from railfix.report.plots.columns import floats, nice_step, since, start_of
+from railfix.report.plots.thinning import spread, told
+
+_ERROR_LABEL: Final = "error along the line [m]"
+_SIGN: Final = "+ is toward the end of the line."
+#: Pieces of the line over which the greatest sigma and level are drawn.
+_PIECES: Final = 600
+_SERIES: Final = (
+    ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
+    ("on the map", "error_m", CONSTRAINED, "dot"),
+)
+
+
+def error_over_time(errors: pl.DataFrame, *, title: str = "Error along the line over time") -> Chart:
+    """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
+
+    Parameters
+    ----------
+    errors : polars.DataFrame
+        Of one antenna, in order of time.
+    title : str
+
+    Returns
+    -------
+    Chart
+    """
+    start = start_of(errors)
+    x = since(errors, start)
+    return _errors(errors, x, name="error-time", title=title, x_label="GPS time", start=start)
+
+
+def error_over_chainage(errors: pl.DataFrame, *, title: str = "Error along the line over chainage") -> Chart:
+    """The same over the place where the antenna was (P1 figure 8).
+
+    Parameters
+    ----------
+    errors : polars.DataFrame
+        Of one antenna.
+    title : str
+
+    Returns
+    -------
+    Chart
+    """
+    x = floats(errors, "chainage_m")
+    return _errors(errors, x, name="error-chainage", title=title, x_label="chainage of the reference [m]", start=None)
+
+
+def _errors(
+    errors: pl.DataFrame, x: Floats, *, name: str, title: str, x_label: str, start: np.datetime64 | None
+) -> Chart:
+    layers: list[Layer] = []
+    caption = [_SIGN]
+    at, sigma = _greatest(x, floats(errors, "along_sigma_m"))
+    if len(at):
+        layers.append(Band(label="± sigma stated", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
+        caption.append("The band is the standard deviation that railfix states, the greatest of each short piece.")
+    levels = []
+    for column, colour in zip(level_columns(errors), (PURPLE, GREEN, BLACK, GREY), strict=False):
+        level = floats(errors, column)
+        at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
+        if len(at):
+            levels.append(most)
+            name_of = column.removesuffix("_m").replace("_", " ")
+            for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
+                layers.append(Line(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
+            caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
+    epoch = since(errors, start_of(errors))
+    shown = whole = 0
+    for label, column, colour, shape in _SERIES:
+        y = good_errors(errors, column)
+        rows = spread(x, y)
+        shown, whole = shown + len(rows), whole + int(np.isfinite(x + y).sum())
+        layers.append(
+            Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows], epoch_s=epoch[rows])  # type: ignore[arg-type]
+        )
+    every = np.concatenate([good_errors(errors, column) for _, column, _, _ in _SERIES])
+    scale = error_scale(every)
+    if scale["y_scale"] == "symlog":
+        caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
+    elif levels and np.isfinite(every).any():
+        # a few wide levels are not to press the errors flat
+        top = 1.25 * max(float(np.nanmax(np.abs(every))), *(float(np.nanmedian(most)) for most in levels))
+        scale["y_range"] = (-top, top)
+        if max(float(np.nanmax(most)) for most in levels) > top:
+            caption.append(f"Levels beyond ± {top:.1f} m are cut off.")
+    return Chart(
+        name=name,
+        title=title,
+        caption=" ".join(caption) + told(shown, whole),
+        x_label=x_label,
+        y_label=_ERROR_LABEL,
+        layers=tuple(layers),
+        start=start,
+        **scale,
+    )
+
+
+def good_errors(errors: pl.DataFrame, column: str) -> Floats:
+    """Errors of a column, NaN where the reference is worse than it must be."""
+    values = floats(errors, column)
+    if "reference_good" in errors.columns:
+        values[~errors["reference_good"].to_numpy()] = np.nan
+    return values
+
+
+def level_columns(table: pl.DataFrame) -> list[str]:
+    """Protection levels among the columns that tell any."""
+    named = [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
+    return [name for name in named if np.isfinite(floats(table, name)).any()]
+
+
+def error_scale(error_m: Floats) -> dict[str, Any]:
+    """Scale of an axis of errors: logarithmic outside where few are far larger than the rest."""
+    size = np.abs(error_m[np.isfinite(error_m)])
+    if not len(size):
+        return {"y_scale": "linear"}
+    usual, largest = float(np.percentile(size, 98)), float(size.max())
+    if largest <= 8.0 * max(usual, 0.5):
+        return {"y_scale": "linear"}
+    return {"y_scale": "symlog", "y_linear": nice_step(max(usual, 1.0))}
+
+
+def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """The greatest y of each piece of x, NaN between pieces far apart."""
+    rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    if not len(rows):
+        return np.empty(0), np.empty(0)
+    low, high = float(x[rows].min()), float(x[rows].max())
+    width = ((high - low) or 1.0) / _PIECES
+    piece = np.minimum(((x[rows] - low) / width).astype(np.intp), _PIECES - 1)
+    most = np.full(_PIECES, np.nan)
+    np.fmax.at(most, piece, y[rows])
+    here = np.isfinite(most)
+    # a few empty pieces are only the spacing of the epochs
+    inside = np.flatnonzero(here)
+    spacing = np.percentile(np.diff(inside), 98) if len(inside) > 1 else 1.0
+    gap = np.flatnonzero(np.diff(inside) > 3 * spacing)
+    middle = low + (inside + 0.5) * width
+    return np.insert(middle, gap + 1, np.nan), np.insert(most[inside], gap + 1, np.nan)
+
+
+def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the errors") -> Chart:
+    """Least, mean and greatest error of each run, on the map and conventional (P1 figure 11).
+
+    Parameters
+    ----------
+    runs : mapping of str to polars.DataFrame
+        Errors by the name of the run.
+    title : str
+
+    Returns
+    -------
+    Chart
+    """
+    names: list[str] = []
+    values: list[Floats] = []
+    for run, errors in runs.items():
+        for label, column, _, _ in reversed(_SERIES):
+            names.append(f"{run}, {label}")
+            error = good_errors(errors, column)
+            values.append(error[np.isfinite(error)])
+    layers = []
+    for label, _, colour, _ in reversed(_SERIES):
+        mine = [v if name.endswith(f", {label}") else np.empty(0) for name, v in zip(names, values, strict=True)]
+        layers.append(
+            Ranges(
+                label=label,
+                colour=colour,
+                names=tuple(names),
+                low=np.array([v.min() if len(v) else np.nan for v in mine]),
+                mid=np.array([v.mean() if len(v) else np.nan for v in mine]),
+                high=np.array([v.max() if len(v) else np.nan for v in mine]),
+            )
+        )
+    return Chart(
+        name="error-ranges",
+        title=title,
+        caption=f"From the least to the greatest signed error; the mark is the mean. {_SIGN}",
+        x_label=_ERROR_LABEL,
+        y_label="",
+        layers=tuple(layers),
+    )

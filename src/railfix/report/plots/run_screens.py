@@ -1,0 +1,272 @@
+"""Pictures of the screens of a run: each metric against its limit, from the files that the run wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+from polars.exceptions import PolarsError
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.errors import InputFileError, OutputError, SettingsError
+from railfix.core.reasons import Reason
+from railfix.pipeline.config import Config, parse_config
+from railfix.report.plots.screens import ScreenPicture, draw_screen
+
+_NEEDED: Final = ("run.json", "positions.parquet", "observations.parquet")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Grid:
+    """Observations of one antenna as arrays, T epochs by M channels, and its positions."""
+
+    time: Datetimes
+    chainage_m: Floats
+    positions: pl.DataFrame
+    rows: pl.DataFrame
+    at: tuple[Indices, Indices]
+    shape: tuple[int, int]
+
+    def channels(self, column: str) -> Floats:
+        """One column of the observations, NaN where not observed."""
+        whole = np.full(self.shape, np.nan)
+        whole[self.at] = _floats(self.rows, column)
+        return whole
+
+    def refused(self, reason: Reason) -> Masks:
+        """Observations that carry a reason."""
+        whole = np.zeros(self.shape, dtype=bool)
+        whole[self.at] = (self.rows["reason"].to_numpy() & int(reason)) != 0
+        return whole
+
+    def epochs(self, column: str) -> Floats:
+        """One column of the positions, shape (T, 1)."""
+        return _floats(self.positions, column)[:, None]
+
+
+def draw_run_screens(run: Path, out: Path) -> list[Path]:
+    """Draw every screen of a run that judged anything, a picture an antenna.
+
+    Parameters
+    ----------
+    run : Path
+        Folder that ``railfix run --observations`` wrote.
+    out : Path
+        Folder for the pictures; it is made.
+
+    Returns
+    -------
+    list of Path
+        ``front_doppler.png`` and the like.
+
+    Raises
+    ------
+    InputFileError
+        The folder is not that of a run, or the run wrote no observations.
+    OutputError
+        A picture cannot be written.
+    """
+    config, positions, observations = _read(run)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{out}: the folder cannot be made ({error.strerror})") from None
+    return [
+        draw_screen(out / f"{screen.antenna}_{screen.name}.png", screen.picture, screen.time, screen.chainage_m)
+        for screen in screens_of(config, positions, observations)
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunScreen:
+    """One screen of a run over one antenna.
+
+    Attributes
+    ----------
+    antenna, name : str
+        ``front``, ``doppler``.
+    picture : ScreenPicture
+    time : ndarray of datetime64[ns], shape (T,)
+    chainage_m : ndarray, shape (T,) [m]
+        Of the positions; NaN where there is none.
+    """
+
+    antenna: str
+    name: str
+    picture: ScreenPicture
+    time: Datetimes
+    chainage_m: Floats
+
+
+def screens_of(config: Config, positions: pl.DataFrame, observations: pl.DataFrame) -> Iterator[RunScreen]:
+    """Every screen of a run that judged anything, antenna by antenna.
+
+    Parameters
+    ----------
+    config : Config
+        Settings that were in force.
+    positions, observations : polars.DataFrame
+        Tables of the run, columns of `railfix.pipeline.tables`.
+
+    Yields
+    ------
+    RunScreen
+    """
+    for antenna in positions["antenna"].unique(maintain_order=True).to_list():
+        grid = _grid(positions.filter(pl.col("antenna") == antenna), observations.filter(pl.col("antenna") == antenna))
+        for name, picture in _pictures(antenna, grid, config):
+            if np.isfinite(picture.metric).any():
+                yield RunScreen(antenna=antenna, name=name, picture=picture, time=grid.time, chainage_m=grid.chainage_m)
+
+
+def _read(run: Path) -> tuple[Config, pl.DataFrame, pl.DataFrame]:
+    """Settings and tables of a run."""
+    for name in _NEEDED:
+        if not (run / name).is_file():
+            hint = "; run again with --observations" if name == "observations.parquet" else ""
+            raise InputFileError(run / name, f"there is no such file; expected the folder of a railfix run{hint}")
+    try:
+        record: dict[str, Any] = json.loads((run / "run.json").read_text(encoding="utf-8"))
+        config = parse_config(record["settings_used"], source=str(run / "run.json"))
+        positions, observations = (pl.read_parquet(run / name) for name in _NEEDED[1:])
+    except (ValueError, KeyError, TypeError, OSError, SettingsError, PolarsError) as error:
+        raise InputFileError(
+            run, f"is not what this railfix writes ({' '.join(str(error).split())}); run again"
+        ) from None
+    lacking = {"raim_statistic", "metric_antenna_spacing_m"} - set(positions.columns)
+    lacking |= {"metric_doppler_m", "limit_doppler_m", "metric_antenna_pair_m"} - set(observations.columns)
+    if lacking:
+        raise InputFileError(run, f"the tables lack {', '.join(sorted(lacking))}; run again with this railfix")
+    return config, positions, observations
+
+
+def _grid(positions: pl.DataFrame, observations: pl.DataFrame) -> _Grid:
+    time = positions["time_gpst"].to_numpy()
+    names = (observations["satellite"] + " " + observations["signal"]).to_numpy().astype(np.str_)
+    channels, column = np.unique(names, return_inverse=True)
+    row = np.searchsorted(time, observations["time_gpst"].to_numpy())
+    return _Grid(
+        time=time,
+        chainage_m=_floats(positions, "chainage_m"),
+        positions=positions,
+        rows=observations,
+        at=(row.astype(np.intp), column.astype(np.intp)),
+        shape=(len(time), len(channels)),
+    )
+
+
+def _pictures(antenna: str, grid: _Grid, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
+    """The screens that were on, with the name of the file."""
+    on = config.screens
+    if "elevation" in on:
+        yield (
+            "elevation",
+            ScreenPicture(
+                title=f"{antenna}: elevation mask",
+                label="elevation [deg]",
+                metric=grid.channels("elevation_deg"),
+                reject=grid.refused(Reason.ELEVATION_MASK),
+                limit=config.elevation.mask_deg,
+                sides="below",
+            ),
+        )
+    if "cn0" in on and config.cn0.floor_dbhz is not None:
+        yield (
+            "cn0_floor",
+            ScreenPicture(
+                title=f"{antenna}: signal strength, floor",
+                label="C/N0 [dB-Hz]",
+                metric=grid.channels("cn0_dbhz"),
+                reject=grid.refused(Reason.CN0_FLOOR),
+                limit=config.cn0.floor_dbhz,
+                sides="below",
+            ),
+        )
+    if "cn0" in on and config.cn0.deficit_dbhz is not None:
+        yield (
+            "cn0_curve",
+            ScreenPicture(
+                title=f"{antenna}: signal strength against an open sky",
+                label="mean at the elevation less C/N0 [dB]",
+                metric=grid.channels("metric_cn0_deficit_dbhz"),
+                reject=grid.refused(Reason.CN0_CURVE),
+                limit=config.cn0.deficit_dbhz,
+                sides="above",
+            ),
+        )
+    if "doppler" in on:
+        yield (
+            "doppler",
+            ScreenPicture(
+                title=f"{antenna}: pseudorange against Doppler",
+                label="change of the pseudorange less Doppler [m]",
+                metric=grid.channels("metric_doppler_m"),
+                reject=grid.refused(Reason.DOPPLER),
+                limit=grid.channels("limit_doppler_m"),
+            ),
+        )
+    if "antenna_pair" in on:
+        yield (
+            "antenna_pair",
+            ScreenPicture(
+                title=f"{antenna}: pseudoranges of two antennas",
+                label="rear less front less spacing [m]",
+                metric=grid.channels("metric_antenna_pair_m"),
+                reject=grid.refused(Reason.ANTENNA_PAIR),
+                limit=config.antenna_pair.limit_m,
+            ),
+        )
+    yield from _pictures_of_positions(antenna, grid, config)
+
+
+def _pictures_of_positions(antenna: str, grid: _Grid, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
+    """Screens that judge an epoch: RAIM, its protection level, the antennas' spacing."""
+    if "raim" in config.screens:
+        statistic, threshold = grid.epochs("raim_statistic"), grid.epochs("raim_threshold")
+        unit = "m^2" if config.raim.mode == "fixed" else "noise variances"
+        yield (
+            "raim",
+            ScreenPicture(
+                title=f"{antenna}: RAIM, before any exclusion",
+                label=f"sum of squared residuals [{unit}]",
+                metric=np.where(np.isfinite(threshold), statistic, np.nan),
+                reject=statistic >= threshold,
+                limit=threshold,
+                sides="above",
+            ),
+        )
+    if config.protection == "on":
+        level = grid.epochs("protection_level_m")
+        level[~np.isfinite(level)] = np.nan
+        yield (
+            "protection_level",
+            ScreenPicture(
+                title=f"{antenna}: protection level along the line against the alarm limit (finite ones)",
+                label="protection level [m]",
+                metric=level,
+                reject=level > config.alarm_limit_m,
+                limit=config.alarm_limit_m,
+                sides="above",
+            ),
+        )
+    if "antenna_spacing" in config.screens:
+        spacing = grid.epochs("metric_antenna_spacing_m")
+        yield (
+            "antenna_spacing",
+            ScreenPicture(
+                title=f"{antenna}: positions of two antennas",
+                label="distance less spacing [m]",
+                metric=spacing,
+                reject=np.abs(spacing) > config.antenna_spacing.limit_m,
+                limit=config.antenna_spacing.limit_m,
+            ),
+        )
+
+
+def _floats(table: pl.DataFrame, column: str) -> Floats:
+    return np.array(table[column].cast(pl.Float64).fill_null(float("nan")).to_numpy())

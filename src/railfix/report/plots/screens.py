@@ -1,0 +1,230 @@
+"""Pictures of the screens: the C/N0 curve as P1's figure 3, and each metric against its limit."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.errors import OutputError
+from railfix.core.timescale import seconds
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
+from railfix.report.plots.chart import Chart, Layer, Line, Points
+from railfix.report.plots.columns import nice_step
+from railfix.report.plots.draw import draw_chart
+from railfix.report.plots.thinning import extremes, spread, told
+from railfix.screens import Cn0Limits
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+#: Colours that stay apart for the colour-blind (Okabe and Ito).
+_MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#2f86b8"
+_COLUMNS: Final = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenPicture:
+    """What is drawn of one screen, T epochs by M channels (M = 1 for a screen of positions).
+
+    Attributes
+    ----------
+    title : str
+    label : str
+        What the metric is, with its unit.
+    metric : ndarray, shape (T, M)
+    reject : ndarray of bool, shape (T, M)
+    limit : ndarray or float
+        Broadcasts to (T, M).
+    sides : {"both", "above", "below"}
+        Where the screen refuses: beyond the limit to both sides, above it, or below it.
+    """
+
+    title: str
+    label: str
+    metric: Floats
+    reject: Masks
+    limit: Floats | float
+    sides: str = "both"
+
+    def __post_init__(self) -> None:
+        if self.sides not in ("both", "above", "below"):
+            raise ValueError(f"sides must be 'both', 'above' or 'below', got {self.sides!r}")
+
+
+def draw_screen(
+    path: str | PathLike[str], picture: ScreenPicture, time: Datetimes, chainage_m: Floats | None = None
+) -> Path:
+    """Draw a metric against its limit over time, and over chainage where it is known.
+
+    Parameters
+    ----------
+    path : path
+        PNG file; it appears whole or not at all.
+    picture : ScreenPicture
+    time : ndarray of datetime64[ns], shape (T,)
+    chainage_m : ndarray, shape (T,) [m], optional
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    charts = [screen_over_time(picture, time)]
+    if chainage_m is not None:
+        charts.append(screen_over_chainage(picture, chainage_m))
+    figure = Figure(figsize=(12, 4.2 * len(charts)), layout="constrained")
+    for axes, chart in zip(np.ravel(figure.subplots(len(charts), 1)), charts, strict=True):
+        draw_chart(chart, axes)
+    return _save(figure, path)
+
+
+def screen_over_time(picture: ScreenPicture, time: Datetimes) -> Chart:
+    """Chart of a metric against its limit over time.
+
+    Parameters
+    ----------
+    picture : ScreenPicture
+    time : ndarray of datetime64[ns], shape (T,)
+
+    Returns
+    -------
+    Chart
+    """
+    start = time.min() if len(time) else np.datetime64(0, "ns")
+    return _screen(picture, seconds(time - start), name="time", x_label="GPS time", start=start)
+
+
+def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats) -> Chart:
+    """Chart of a metric against its limit over the place.
+
+    Parameters
+    ----------
+    picture : ScreenPicture
+    chainage_m : ndarray, shape (T,) [m]
+
+    Returns
+    -------
+    Chart
+    """
+    return _screen(picture, chainage_m, name="chainage", x_label="chainage [m]", start=None)
+
+
+def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start: np.datetime64 | None) -> Chart:
+    judged = int(np.count_nonzero(np.isfinite(picture.metric)))
+    refused = int(np.count_nonzero(picture.reject))
+    share = f"{100 * refused / judged:.2f} %" if judged else "none"
+    where = np.broadcast_to(x[:, None], picture.metric.shape)
+    layers: list[Layer] = []
+    shown = whole = 0
+    for mask, colour, label in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "refused")):
+        along, metric = where[mask], picture.metric[mask]
+        rows = spread(along, metric)
+        shown, whole = shown + len(rows), whole + int(np.count_nonzero(np.isfinite(along + metric)))
+        layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
+    limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
+    finite = np.isfinite(limit).any(axis=1)
+    # one line for all channels: the tightest limit of each epoch, where channels differ
+    least = np.full(len(limit), np.nan)
+    least[finite] = np.nanmin(limit[finite], axis=1)
+    same = bool((~finite).all() or np.nanmax(limit) == np.nanmin(limit))
+    rows = extremes(x, least)
+    rows = rows[np.argsort(x[rows], kind="stable")]
+    for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
+        label = "limit" if sign > 0 else ""
+        layers.append(Line(label=label, colour=_FLOOR, x=x[rows], y=sign * least[rows], width=1.0))
+    scale: dict[str, Any] = {}
+    values = np.abs(picture.metric[np.isfinite(picture.metric)])
+    if finite.any() and picture.sides != "below" and len(values):
+        top = 6.0 * float(np.nanmedian(least))
+        if top > 0.0 and values.max() > top:
+            scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
+    return Chart(
+        name=name,
+        title=f"{picture.title}: {judged:,} judged, {refused:,} refused ({share})",
+        caption=(("" if same else "The line is the tightest limit of each epoch.") + told(shown, whole)).strip(),
+        x_label=x_label,
+        y_label=picture.label,
+        layers=tuple(layers),
+        start=start,
+        width="half",
+        **scale,
+    )
+
+
+def draw_cn0_curve(
+    path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples, *, limits: Cn0Limits | None = None
+) -> Path:
+    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3).
+
+    Parameters
+    ----------
+    path : path
+        PNG file; it appears whole or not at all.
+    curve : Cn0Curve
+    samples : Cn0Samples
+        What the curve was fitted on.
+    limits : Cn0Limits, optional
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    limits = limits or Cn0Limits()
+    rows = -(-len(curve.means) // _COLUMNS)
+    figure = Figure(figsize=(4.0 * min(_COLUMNS, len(curve.means)), 3.0 * rows), layout="constrained")
+    source = curve.source
+    figure.suptitle(f"{source.antenna or 'antenna not named'}, {source.receiver or 'receiver not named'}")
+    panels = np.ravel(figure.subplots(rows, min(_COLUMNS, len(curve.means)), sharex=True, sharey=True))
+    for axes, mean in zip(panels, curve.means, strict=False):
+        _draw_mean(axes, mean, samples, limits)
+    for axes in panels[len(curve.means) :]:
+        axes.set_visible(False)
+    panels[0].legend(fontsize="x-small", loc="lower right")
+    return _save(figure, path)
+
+
+def _draw_mean(axes: Axes, mean: Cn0Mean, samples: Cn0Samples, limits: Cn0Limits) -> None:
+    from matplotlib.colors import LogNorm
+
+    elevation, cn0 = samples.of(mean.kind, mean.signal)
+    axes.hist2d(elevation, cn0, bins=[np.arange(0, 91, 1.0), np.arange(10, 61, 0.5)], cmap="Greys", norm=LogNorm())
+    at = np.linspace(0.0, 90.0, 361)
+    level = mean.at(at)
+    axes.plot(at, level, "-", color=_MEAN, label="mean")
+    axes.plot(mean.elevation_deg, mean.mean_dbhz, ".", color=_MEAN, ms=4)
+    if limits.deficit_dbhz is not None:
+        axes.plot(at, level - limits.deficit_dbhz, "--", color=_LIMIT, label=f"mean - {limits.deficit_dbhz:g} dB-Hz")
+    if limits.floor_dbhz is not None:
+        axes.axhline(limits.floor_dbhz, color=_FLOOR, lw=0.8, ls=":", label=f"floor {limits.floor_dbhz:g} dB-Hz")
+    axes.set_title(f"{KINDS.get(mean.kind, mean.kind)}, {mean.signal}", fontsize="small")
+    axes.set_xlim(0, 90)
+    axes.set_ylim(10, 60)
+    axes.set_xlabel("elevation [deg]", fontsize="small")
+    axes.set_ylabel("C/N0 [dB-Hz]", fontsize="small")
+    axes.label_outer()
+    axes.grid(alpha=0.3)
+
+
+def _save(figure: Figure, path: str | PathLike[str]) -> Path:
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        figure.savefig(temporary, format="png", dpi=110)
+        temporary.replace(target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OutputError(f"{path}: the picture cannot be written ({error.strerror})") from None
+    return target

@@ -1,0 +1,194 @@
+"""Charts of the signals: C/N0 over elevation (P1 figure 3), the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Datetimes
+from railfix.core.reasons import Reason, first_reason
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve
+from railfix.ranges.cn0_curve.curve import satellite_kind
+from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Layer, Line, Points, SkyEpochs
+from railfix.report.plots.columns import floats, since, start_of, words
+from railfix.screens import Cn0Limits
+
+#: Cells of C/N0 over elevation.
+_ELEVATION_EDGES: Final = np.arange(0.0, 91.0, 1.0)
+_CN0_EDGES: Final = np.arange(10.0, 60.5, 0.5)
+#: Fewest samples of a piece of elevation to draw a mean of.
+_LEAST: Final = 10
+#: Epochs of the pictures of the sky.
+SKY_EPOCHS: Final = 2000
+
+
+def cn0_over_elevation(
+    observations: pl.DataFrame,
+    *,
+    limits: Cn0Limits | None = None,
+    curve: Cn0Curve | None = None,
+    mask_deg: float | None = None,
+    title: str = "C/N0 over elevation",
+) -> list[Chart]:
+    """C/N0 over elevation with mean and thresholds, a chart a constellation and signal (P1 figure 3).
+
+    Parameters
+    ----------
+    observations : polars.DataFrame
+        Of one antenna, columns of `railfix.pipeline.tables.OBSERVATION_COLUMNS`.
+    limits : Cn0Limits, optional
+        Thresholds that were in force; none are drawn without.
+    curve : Cn0Curve, optional
+        Curve of the open sky. Without it, the mean of these observations themselves is drawn.
+    mask_deg : float, optional [deg]
+        Elevation mask.
+    title : str
+
+    Returns
+    -------
+    list of Chart
+        Of every signal that was taken, the most observed first.
+    """
+    taken = observations.filter(pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0)
+    taken = taken.filter(pl.col("cn0_dbhz").is_not_null(), pl.col("elevation_deg") >= 0.0)
+    names = taken["satellite"].unique().to_list()
+    kinds = pl.DataFrame({"satellite": names, "kind": [satellite_kind(name) for name in names]}, schema_overrides={
+        "satellite": pl.String, "kind": pl.String,
+    })  # fmt: skip
+    taken = taken.join(kinds, on="satellite", how="left")
+    groups = taken.partition_by("kind", "signal", as_dict=True)
+    charts = []
+    for (kind, signal), rows in sorted(groups.items(), key=lambda item: -len(item[1])):
+        lines = tuple(_lines(rows, str(kind), str(signal), limits, curve, mask_deg))
+        counts, _, _ = np.histogram2d(
+            floats(rows, "elevation_deg"), floats(rows, "cn0_dbhz"), bins=(_ELEVATION_EDGES, _CN0_EDGES)
+        )
+        cells = Cells(
+            label="observations",
+            colour=BLACK,
+            x_edges=_ELEVATION_EDGES,
+            y_edges=_CN0_EDGES,
+            counts=counts.astype(np.int64),
+        )
+        charts.append(
+            Chart(
+                name=f"cn0-{kind}-{signal}".lower(),
+                title=f"{title}: {KINDS.get(str(kind), str(kind))}, {signal}",
+                caption=f"{len(rows):,} observations, the more the darker.",
+                x_label="elevation [deg]",
+                y_label="C/N0 [dB-Hz]",
+                layers=(cells, *lines),
+                x_range=(0.0, 90.0),
+                y_range=(10.0, 60.0),
+                width="half",
+            )
+        )
+    return charts
+
+
+def _lines(
+    rows: pl.DataFrame,
+    kind: str,
+    signal: str,
+    limits: Cn0Limits | None,
+    curve: Cn0Curve | None,
+    mask_deg: float | None,
+) -> Iterator[Layer]:
+    whole = np.array([0.0, 90.0])
+    mean = next((m for m in curve.means if (m.kind, m.signal) == (kind, signal)), None) if curve else None
+    if mean is not None:
+        at = np.linspace(0.0, 90.0, 181)
+        level = mean.at(at)
+        yield Line(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
+        if limits is not None and limits.deficit_dbhz is not None:
+            label = f"{limits.deficit_dbhz:g} dB below"
+            yield Line(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
+    else:
+        yield from _mean_of(rows)
+    if limits is not None and limits.floor_dbhz is not None:
+        floor = np.full(2, limits.floor_dbhz)
+        yield Line(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
+    if mask_deg is not None:
+        edge = np.full(2, mask_deg)
+        yield Line(label=f"mask {mask_deg:g} deg", colour=GREY, x=edge, y=np.array([10.0, 60.0]), dash="dotted")
+
+
+def _mean_of(rows: pl.DataFrame) -> Iterator[Layer]:
+    elevation, cn0 = floats(rows, "elevation_deg"), floats(rows, "cn0_dbhz")
+    piece = np.minimum((elevation / 5.0).astype(np.intp), 17)
+    count = np.bincount(piece, minlength=18)
+    total = np.bincount(piece, weights=cn0, minlength=18)
+    mean = np.where(count >= _LEAST, total / np.maximum(count, 1), np.nan)
+    middle = np.arange(2.5, 90.0, 5.0)
+    yield Line(label="mean of this run", colour=BLUE, x=middle, y=mean, width=2.0)
+    yield Points(label="mean of this run", colour=BLUE, x=middle, y=mean, size=6.0)
+
+
+def sky_epochs(
+    observations: pl.DataFrame,
+    *,
+    wanted: Datetimes | None = None,
+    epochs: int = SKY_EPOCHS,
+    start: np.datetime64 | None = None,
+    title: str = "Sky",
+) -> SkyEpochs:
+    """Satellites of some epochs, for pictures of the sky.
+
+    Parameters
+    ----------
+    observations : polars.DataFrame
+        Of one antenna, columns of `railfix.pipeline.tables.OBSERVATION_COLUMNS`.
+    wanted : ndarray of datetime64[ns], optional
+        Epochs that must be among them, as far as there are no more than half of `epochs`.
+    epochs : int
+        How many at most; they lie evenly in the run.
+    start : datetime64[ns], optional
+        From which times count; the first epoch unless given.
+    title : str
+
+    Returns
+    -------
+    SkyEpochs
+        Each satellite once, by the signal that was taken.
+    """
+    known = observations.filter(pl.col("elevation_deg").is_not_null(), pl.col("azimuth_deg").is_not_null())
+    known = known.filter(pl.col("elevation_deg") >= 0.0)
+    times = known["time_gpst"].unique().sort()
+    if len(times) > epochs:
+        extra = pl.Series([] if wanted is None else wanted[: epochs // 2], dtype=times.dtype).unique()
+        extra = extra.filter(extra.is_in(times.implode()))
+        even = times.gather(np.unique(np.linspace(0, len(times) - 1, epochs - len(extra)).astype(np.int64)))
+        kept = pl.concat([even, extra]).unique().sort()
+        known = known.filter(pl.col("time_gpst").is_in(kept.implode()))
+    else:
+        kept = times
+    other = (pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN)) != 0
+    known = (
+        known.with_columns(aside=other)
+        .sort("time_gpst", "satellite", "aside", maintain_order=True)
+        .unique(["time_gpst", "satellite"], keep="first", maintain_order=True)
+    )
+    start = (start_of(known) if len(known) else np.datetime64(0, "ns")) if start is None else start
+    seconds = since(known, start)
+    epoch, first = np.unique(seconds, return_index=True)
+    names = {int(bit): str(bit.name).lower() for bit in Reason if bit.name} | {0: "used"}
+    reason = first_reason(known["reason"].to_numpy())
+    return SkyEpochs(
+        name="sky",
+        title=title,
+        caption=f"{len(kept):,} of {len(times):,} epochs are in this page."
+        if len(kept) < len(times)
+        else f"All {len(times):,} epochs are in this page.",
+        start=start,
+        epoch_s=epoch,
+        first=np.append(first, len(known)).astype(np.int64),
+        satellite=words(known, "satellite"),
+        signal=words(known, "signal"),
+        azimuth_deg=floats(known, "azimuth_deg"),
+        elevation_deg=floats(known, "elevation_deg"),
+        cn0_dbhz=floats(known, "cn0_dbhz"),
+        reason=np.array([names[int(r)] for r in reason], dtype=np.str_),
+    )

@@ -1,6 +1,0 @@
-"""Readers of RINEX files, and what they are stored in."""
-
-from railfix.rinex.navigation import read_navigation
-from railfix.rinex.observations import read_observations, scan_observations
-
-__all__ = ["read_navigation", "read_observations", "scan_observations"]

@@ -1,0 +1,211 @@
+"""Track maps as CSV with named columns."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import write_whole
+from railfix.io.named_columns import NamedColumns, misspelt, read_named_columns
+from railfix.track.heights import check_height_datum, ellipsoidal_heights
+from railfix.track.segment import Segment
+from railfix.track.track import Track
+
+#: Column of the file, attribute of the track, factor, and what an empty cell means.
+OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
+    "kilometrage_m": ("kilometrage_m", 1.0, np.nan),
+    "cant_mm": ("cant_m", 1e-3, np.nan),
+    "radius_m": ("radius_m", 1.0, np.inf),
+    "gradient_permille": ("gradient_permille", 1.0, np.nan),
+}
+KNOWN_COLUMNS: Final = ("latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS)
+#: ``# key: value`` lines above the header that mean something; others are kept without effect.
+KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
+
+
+def straight_radius(radius_m: Floats) -> Floats:
+    """Radii with 0, a common way to write straight track, as infinite."""
+    return np.where(radius_m == 0.0, np.inf, radius_m)
+
+
+def read_csv_segment(
+    path: str | PathLike[str],
+    *,
+    crs: str | None = None,
+    height_datum: str | None = None,
+    geoid: str | None = None,
+    duplicates: str = "refuse",
+) -> Segment:
+    """One track map of a CSV file, as a piece of a route.
+
+    Parameters
+    ----------
+    path : path
+    crs : str, optional
+        Geographic CRS of the columns where it is not WGS 84 (``EPSG:6668``).
+    height_datum : str, optional
+        Only to confirm what the column's name says.
+    geoid : str, optional
+        See `railfix.track.heights.geoid_heights`.
+    duplicates : {"refuse", "keep"}
+        Whether two equal points in a row are an error (the quality report keeps them to show them).
+    """
+    check_height_datum(height_datum)
+    table = read_named_columns(path)
+    notes = _check_columns(table)
+    if "note" in table.metadata:
+        notes += tuple(table.metadata["note"].split("; "))
+    latitude, longitude = table.numbers("latitude_deg"), table.numbers("longitude_deg")
+    check_degrees(table, latitude, longitude)
+    datum = _datum(table, height_datum)
+    heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
+    if len(table) < 2:
+        raise InputFileError(path, f"{len(table)} point(s); a track needs at least two")
+    if duplicates == "refuse":
+        _refuse_duplicates(table, latitude, longitude, heights)
+    crs = crs if crs is not None else table.metadata.get("crs")
+    latitude, longitude = _to_wgs84(crs, latitude, longitude, path=table.path)
+    if geoid is None and datum == "orthometric" and "geoid_m" not in table:
+        geoid = table.metadata.get("geoid")
+    height, model = ellipsoidal_heights(
+        heights,
+        latitude,
+        longitude,
+        datum=datum,
+        geoid=geoid,
+        geoid_m=table.numbers("geoid_m") if "geoid_m" in table and datum == "orthometric" else None,
+        path=table.path,
+    )
+    attributes = {name: np.full(len(table), np.nan) for name, _, _ in OPTIONAL_COLUMNS.values()}
+    for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
+        if column in table:
+            attributes[name] = table.numbers(column, blank=blank) * factor
+    attributes["radius_m"] = straight_radius(attributes["radius_m"])
+    return Segment(
+        source=table.path,
+        file=table.path,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        crs=crs or "EPSG:4979",
+        height_datum=datum,
+        geoid=model,
+        metadata={key: value for key, value in table.metadata.items() if key in KNOWN_METADATA},
+        notes=notes,
+        **attributes,
+    )
+
+
+def _check_columns(table: NamedColumns) -> tuple[str, ...]:
+    """Refuse a header without coordinates or with a misspelt column; name the columns not used."""
+    close = misspelt(table.cells, KNOWN_COLUMNS)
+    for wrong, right in close.items():
+        if right not in table:
+            message = f"column {wrong!r} is unknown; is {right!r} meant?"
+            raise InputFileError(table.path, message, line=table.header_line)
+    for name in ("latitude_deg", "longitude_deg"):
+        if name not in table:
+            message = f"there is no column {name!r}; the columns are {', '.join(table.cells)}"
+            raise InputFileError(table.path, message, line=table.header_line)
+    if ("height_m" in table) == ("elevation_m" in table):
+        what = "both 'height_m' and 'elevation_m'" if "height_m" in table else "neither 'height_m' nor 'elevation_m'"
+        message = f"{what}; one is needed: height_m is ellipsoidal, elevation_m is orthometric (levelling)"
+        raise InputFileError(table.path, message, line=table.header_line)
+    extra = [name for name in table.cells if name not in KNOWN_COLUMNS]
+    return (f"{table.path}: columns not used: {', '.join(extra)}",) if extra else ()
+
+
+def _datum(table: NamedColumns, asked: str | None) -> str:
+    datum = "ellipsoidal" if "height_m" in table else "orthometric"
+    for source, said in (("height_datum", asked), ("the line '# height_datum'", table.metadata.get("height_datum"))):
+        if said is not None and said != datum:
+            column = "height_m" if datum == "ellipsoidal" else "elevation_m"
+            message = (
+                f"{source} says {said!r}, but the column {column} is {datum}; rename the column or drop the setting"
+            )
+            raise InputFileError(table.path, message, line=table.header_line)
+    return datum
+
+
+def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floats) -> None:
+    """Refuse coordinates that cannot be degrees of latitude and longitude."""
+    outside = np.abs(latitude_deg) > 90.0
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise table.error(row, f"latitude_deg {latitude_deg[row]:g} is over 90; are latitude and longitude swapped?")
+    outside = np.abs(longitude_deg) > 360.0
+    if outside.any():
+        row = int(np.argmax(outside))
+        raise table.error(row, f"longitude_deg {longitude_deg[row]:g} is over 360; degrees were expected")
+    if len(table) and (np.abs(latitude_deg) <= np.pi / 2).all() and (np.abs(longitude_deg) <= np.pi).all():
+        raise table.error(0, "all coordinates lie within a few degrees of 0, 0: radians were given, degrees expected")
+
+
+def _refuse_duplicates(table: NamedColumns, latitude: Floats, longitude: Floats, height: Floats) -> None:
+    same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(height) == 0)
+    if same.any():
+        row = int(np.argmax(same)) + 1
+        raise table.error(
+            row,
+            f"the same point as line {table.line[row - 1]} ({int(same.sum())} such in the file); remove it, "
+            "'railfix map check' lists them all",
+        )
+
+
+def _to_wgs84(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats]:
+    """Degrees of another geographic system as WGS 84."""
+    if crs is None:
+        return latitude, longitude
+    try:
+        system = CRS.from_user_input(crs)
+    except CRSError:
+        raise SettingsError(f"{path}: the CRS {crs!r} is unknown; give for example EPSG:4326 or EPSG:6668") from None
+    if not system.is_geographic:
+        raise SettingsError(
+            f"{path}: {crs} is {system.name}, but the columns are latitude and longitude; "
+            "projected coordinates are read from GeoJSON"
+        )
+    transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
+    lon, lat = transformer.transform(longitude, latitude)
+    return np.asarray(lat, np.float64), np.asarray(lon, np.float64)
+
+
+def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
+    """Write a track as CSV with ellipsoidal heights; the file appears whole or not at all.
+
+    Attributes that the track has nowhere are left out. What is read back equals the track to
+    1e-10 degrees and 0.1 mm.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    columns = {
+        "latitude_deg": [f"{v:.10f}" for v in track.latitude_deg],
+        "longitude_deg": [f"{v:.10f}" for v in track.longitude_deg],
+        "height_m": [f"{v:.4f}" for v in track.height_m],
+    }
+    for column, (name, factor, _) in OPTIONAL_COLUMNS.items():
+        values = getattr(track, name) / factor
+        if np.isfinite(values).any() or np.isinf(values).any():
+            columns[column] = ["" if np.isnan(v) else f"{v:.10g}" for v in values]
+            if column == "radius_m" and np.isnan(values).any():
+                columns[column] = ["nan" if np.isnan(v) else f"{v:.10g}" for v in values]
+    lines = [
+        f"# name: {track.name}",
+        "# crs: EPSG:4979",
+        "# height_datum: ellipsoidal",
+        f"# sigma_plan_m: {track.sigma_plan_m:g}",
+        f"# sigma_height_m: {track.sigma_height_m:g}",
+        *(f"# note: {note}" for note in track.provenance.notes),
+        ",".join(columns),
+        *(",".join(row) for row in zip(*columns.values(), strict=True)),
+    ]
+    write_whole(path, "\n".join(lines) + "\n")

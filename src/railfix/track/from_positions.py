@@ -1,0 +1,346 @@
+"""A track map made from good positions where no map exists (P1 4.2(1))."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.errors import InputFileError
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.timescale import seconds
+from railfix.io.position_log import PositionLog
+from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
+
+#: Said by every map of this kind.
+ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThinningLimits:
+    """How positions become points of a map.
+
+    Attributes
+    ----------
+    spacing_m : float [m]
+        A point is kept when it is at least this far from the last one kept.
+    standing_mps : float [m/s]
+        Slower than this over `standing_window_s`, in the horizontal, the antenna stands: the position
+        is noise or drift. Needs times; 0 keeps all.
+    standing_window_s : float [s]
+        Half of the window in which the displacement is looked at.
+    chord_m : float [m]
+        Where the positions between two points leave their chord by more, the furthest becomes a point
+        too (P1 4.1(3) keeps a map's chords within 0.30 m of the curve). Needs times, which tell noise
+        while standing from a bend.
+    jump_m : float [m]
+        Neighbouring points further apart are reported, for a straight line bridges them.
+    """
+
+    spacing_m: float = 5.0
+    chord_m: float = 0.30
+    standing_mps: float = 0.2
+    standing_window_s: float = 3.0
+    jump_m: float = 50.0
+
+    def __post_init__(self) -> None:
+        if not min(self.spacing_m, self.chord_m, self.jump_m, self.standing_window_s) > 0 or self.standing_mps < 0:
+            raise ValueError("limits of thinning must be positive (standing_mps may be 0)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thinned:
+    """What became of each position.
+
+    Attributes
+    ----------
+    kept : ndarray of int, shape (V,)
+        Rows that became points of the map, in order.
+    dropped : dict of int
+        Number of rows by reason.
+    jumps : ndarray of int, shape (j,)
+        Points after which the next is further than `ThinningLimits.jump_m`.
+    jump_m : ndarray, shape (j,) [m]
+        How far.
+    turns : ndarray of int, shape (t,)
+        Points at which the path turns back by more than 120 degrees: the vehicle reversed, or a position
+        is wrong.
+    """
+
+    kept: Indices
+    dropped: dict[str, int]
+    jumps: Indices
+    jump_m: Floats
+    turns: Indices
+
+
+def standing(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
+    """Rows at which the antenna stands: it moves less than speed times window, horizontally.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (n,)
+        Rising; rows without a time never stand.
+    ecef_m : ndarray, shape (n, 3) [m]
+    speed_mps : float [m/s]
+    window_s : float [s]
+        Looked at before and after each row; shorter at the ends and at gaps.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+    """
+    if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
+        return np.zeros(len(time), dtype=np.bool_)
+    t = seconds(time - time[0])
+    first = np.searchsorted(t, t - window_s - 1e-6, side="left")
+    last = np.searchsorted(t, t + window_s + 1e-6, side="right") - 1
+    latitude, longitude, _ = geodetic_from_ecef(ecef_m)
+    moved = np.einsum("tij,tj->ti", enu_axes(latitude, longitude), ecef_m[last] - ecef_m[first])
+    distance = np.hypot(moved[:, 0], moved[:, 1])
+    # half a window is needed to tell
+    known = t[last] - t[first] >= window_s
+    return np.asarray(known & (distance < speed_mps * (t[last] - t[first])))
+
+
+def thin(
+    time: Datetimes,
+    ecef_m: Floats,
+    *,
+    usable: Masks | None = None,
+    limits: ThinningLimits | None = None,
+) -> Thinned:
+    """Choose the positions that become points of a map.
+
+    Jitter and drift of a standing antenna cannot draw loops: a point is kept only at full spacing
+    from the last, and rows at which the antenna stands are dropped first. The last good position is
+    kept where it goes on by at least a fifth of the spacing.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (n,)
+    ecef_m : ndarray, shape (n, 3) [m]
+        Rows with NaN are dropped.
+    usable : ndarray of bool, shape (n,), optional
+        False drops a row for its quality.
+    limits : ThinningLimits, optional
+    """
+    limits = limits or ThinningLimits()
+    finite = np.isfinite(ecef_m).all(axis=1)
+    good = finite if usable is None else finite & usable
+    rows = np.flatnonzero(good)
+    stands = standing(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=limits.standing_window_s)
+    stands = _with_shuffles(ecef_m[rows], stands, limits.spacing_m)
+    moving = rows[~stands]
+    chosen = _at_spacing(ecef_m[moving], limits.spacing_m)
+    back = chosen[_turning_back(ecef_m[moving[chosen]])]
+    if not np.isnat(time[moving]).any():
+        chosen = _with_bends(ecef_m[moving], chosen, limits.chord_m)
+    kept = moving[chosen]
+    length = np.linalg.norm(np.diff(ecef_m[kept], axis=0), axis=1)
+    jumps = np.flatnonzero(length > limits.jump_m)
+    return Thinned(
+        kept=kept,
+        dropped={
+            "without a position": int((~finite).sum()),
+            "of insufficient quality": int((finite & ~good).sum()),
+            "standing still": int(stands.sum()),
+            "nearer than the spacing": len(moving) - len(kept),
+        },
+        jumps=jumps,
+        jump_m=length[jumps],
+        turns=np.searchsorted(chosen, back),
+    )
+
+
+def _turning_back(points: Floats) -> Indices:
+    """Points at which the path turns by more than 120 degrees."""
+    steps = np.diff(points, axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    cosine = np.einsum("vi,vi->v", steps[1:], steps[:-1]) / (length[1:] * length[:-1])
+    return np.flatnonzero(cosine < -0.5) + 1
+
+
+def _with_shuffles(points: Floats, stands: Masks, spacing_m: float) -> Masks:
+    """Rows at which the antenna stands, with the moves between two stands that stay within the spacing.
+
+    Such a move ends where the next begins, so the line loses nothing; a start-up transient of the
+    reference or a wrong fix while standing does not bend it.
+    """
+    if not stands.any():
+        return stands
+    edges = np.flatnonzero(np.diff(stands)) + 1
+    result = stands.copy()
+    for first, end in pairwise([0, *edges.tolist(), len(stands)]):
+        extent = np.linalg.norm(points[first:end] - points[first], axis=1).max()
+        result[first:end] |= extent < spacing_m
+    return result
+
+
+def _at_spacing(points: Floats, spacing_m: float) -> Indices:
+    """Indices of points each at least the spacing from the one before; the last goes on where it can."""
+    if not len(points):
+        return np.zeros(0, dtype=np.intp)
+    kept = [0]
+    block = 64
+    start = 1
+    while start < len(points):
+        offset = np.linalg.norm(points[start : start + block] - points[kept[-1]], axis=1)
+        far = offset >= spacing_m - 1e-6
+        if far.any():
+            kept.append(start + int(np.argmax(far)))
+            start = kept[-1] + 1
+        else:
+            start += block
+    if kept[-1] != len(points) - 1 and len(kept) > 1:
+        onward, before = points[-1] - points[kept[-1]], points[kept[-1]] - points[kept[-2]]
+        if np.linalg.norm(onward) >= 0.2 * spacing_m and float(onward @ before) > 0:
+            kept.append(len(points) - 1)
+    return np.array(kept, dtype=np.intp)
+
+
+def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
+    """The chosen points, and between two of them the one furthest from their chord, if over the limit."""
+    if len(chosen) < 2:
+        return chosen
+    piece = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
+    inside = np.flatnonzero((piece >= 0) & (piece < len(chosen) - 1) & ~np.isin(np.arange(len(points)), chosen))
+    piece = piece[inside]
+    start, step = points[chosen[piece]], points[chosen[piece + 1]] - points[chosen[piece]]
+    share = np.einsum("ni,ni->n", points[inside] - start, step) / np.einsum("ni,ni->n", step, step)
+    off = np.linalg.norm(points[inside] - start - share[:, None] * step, axis=1)
+    # near an end of the chord it would make a kink, not a curve
+    off = np.where((share > 0.2) & (share < 0.8), off, 0.0)
+    worst = np.zeros(len(chosen) - 1)
+    np.maximum.at(worst, piece, off)
+    bends = np.flatnonzero((off > chord_m) & (off == worst[piece]))
+    _, once = np.unique(piece[bends], return_index=True)
+    return np.sort(np.concatenate([chosen, inside[bends[once]]]))
+
+
+def from_positions(
+    time: Datetimes,
+    ecef_m: Floats,
+    *,
+    spacing_m: float = 5.0,
+    usable: Masks | None = None,
+    limits: ThinningLimits | None = None,
+    name: str = "positions",
+    sigma_plan_m: float = SIGMA_PLAN_M,
+    sigma_height_m: float = SIGMA_HEIGHT_M,
+) -> Track:
+    """A track of good positions, thinned, without standing still.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (n,)
+        In the order in which the vehicle went; NaT where unknown.
+    ecef_m : ndarray, shape (n, 3) [m]
+    spacing_m : float [m]
+        Not used where `limits` is given.
+    usable : ndarray of bool, shape (n,), optional
+        False drops a row.
+    limits : ThinningLimits, optional
+
+    Returns
+    -------
+    Track
+        Its notes say that it is the antenna's path, and where it jumps or turns back.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two points are left.
+    """
+    thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
+    return track_of(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
+
+
+def track_of(
+    ecef_m: Floats,
+    thinned: Thinned,
+    *,
+    name: str = "positions",
+    files: tuple[str, ...] = (),
+    sigma_plan_m: float = SIGMA_PLAN_M,
+    sigma_height_m: float = SIGMA_HEIGHT_M,
+) -> Track:
+    """The track of positions that `thin` chose."""
+    if len(thinned.kept) < 2:
+        dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
+        raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions left, a track needs two ({dropped})")
+    notes = [ANTENNA_PATH]
+    if len(thinned.jumps):
+        notes.append(
+            f"{len(thinned.jumps)} gap(s) between positions are bridged by a straight line, "
+            f"the longest {thinned.jump_m.max():.0f} m"
+        )
+    if len(thinned.turns):
+        notes.append(f"the path turns back at {len(thinned.turns)} point(s)")
+    return Track.from_ecef(
+        ecef_m[thinned.kept],
+        name=name,
+        sigma_plan_m=sigma_plan_m,
+        sigma_height_m=sigma_height_m,
+        provenance=Provenance(files=files, notes=tuple(notes)),
+    )
+
+
+def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
+    """Rows of a log that are good enough.
+
+    Parameters
+    ----------
+    log : PositionLog
+    quality : sequence of int, optional
+        Accepted quality numbers; by default 1 (fix) where the log tells quality, else all rows.
+    max_sigma_m : float, optional [m]
+        Largest standard deviation in north, east and up; rows without one are refused then.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+
+    Raises
+    ------
+    InputFileError
+        A filter was asked for that the log has no column for.
+    """
+    usable = np.ones(len(log), dtype=np.bool_)
+    if quality is not None and not log.has_quality:
+        raise InputFileError(log.path, "a quality was asked for, but the log has no column 'quality'")
+    if log.has_quality:
+        usable &= np.isin(log.quality, (1,) if quality is None else tuple(quality))
+    if max_sigma_m is not None:
+        if not np.isfinite(log.sigma_m).any():
+            raise InputFileError(log.path, "a largest sigma was asked for, but the log has no standard deviations")
+        usable &= log.sigma_m.max(axis=1) <= max_sigma_m
+    return usable
+
+
+def from_position_log(
+    log: PositionLog,
+    *,
+    spacing_m: float = 5.0,
+    quality: Sequence[int] | None = None,
+    max_sigma_m: float | None = None,
+    limits: ThinningLimits | None = None,
+    name: str | None = None,
+) -> tuple[Track, Thinned]:
+    """A track of the good positions of a log, and what became of each row.
+
+    Raises
+    ------
+    InputFileError
+        Fewer than two points are left, or the log lacks what a filter needs.
+    """
+    limits = limits or ThinningLimits(spacing_m=spacing_m)
+    usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)
+    thinned = thin(log.time, log.ecef_m, usable=usable, limits=limits)
+    try:
+        return track_of(log.ecef_m, thinned, name=name or "positions", files=(log.path,)), thinned
+    except ValueError as error:
+        raise InputFileError(log.path, str(error)) from None

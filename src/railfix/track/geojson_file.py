@@ -1,0 +1,232 @@
+"""Track maps as GeoJSON: 3-D LineString, MultiLineString, or features of them (RFC 7946)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.io.named_columns import misspelt, read_text
+from railfix.track.csv_file import OPTIONAL_COLUMNS, straight_radius
+from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
+from railfix.track.segment import Segment
+
+#: RFC 7946, section 4: longitude and latitude on WGS 84 where the file says nothing.
+RFC_CRS: Final = "OGC:CRS84"
+_DATUM_HELP: Final = (
+    "give height_datum 'ellipsoidal' or 'orthometric', as an option (--height-datum) or as a member of the file"
+)
+_MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
+
+
+def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_Line]:
+    """Every LineString below a GeoJSON object, with the members that apply to it."""
+    kind = node.get("type")
+    own = {key: node[key] for key in _MEMBERS if key in node}
+    if kind == "FeatureCollection":
+        features = node.get("features")
+        if not isinstance(features, list) or not features:
+            raise InputFileError(path, "the FeatureCollection has no features")
+        for number, feature in enumerate(features, start=1):
+            if not isinstance(feature, dict):
+                raise InputFileError(path, f"feature {number} is not an object")
+            yield from _lines(path, feature, f"feature {number}", inherited | own)
+    elif kind == "Feature":
+        properties = node.get("properties") or {}
+        geometry = node.get("geometry")
+        if not isinstance(properties, dict) or not isinstance(geometry, dict):
+            raise InputFileError(path, f"{label or 'the feature'} has no geometry")
+        yield from _lines(path, geometry, label, inherited | own | properties)
+    elif kind == "LineString":
+        yield _Line(path, label, node.get("coordinates"), inherited | own, -1)
+    elif kind == "MultiLineString":
+        parts = node.get("coordinates")
+        if not isinstance(parts, list) or not parts:
+            raise InputFileError(path, f"{label or 'the geometry'} has no coordinates")
+        for number, part in enumerate(parts):
+            where = f"{label}, part {number + 1}" if label else f"part {number + 1}"
+            yield _Line(path, where, part, inherited | own, number)
+    else:
+        where = f"{label}: " if label else ""
+        raise InputFileError(
+            path, f"{where}type {kind!r}; LineString or MultiLineString (or features of them) expected"
+        )
+
+
+class _Line:
+    """Coordinates of one LineString and the properties that apply to it."""
+
+    def __init__(self, path: str, label: str, coordinates: Any, properties: dict[str, Any], part: int) -> None:
+        self.path = path
+        self.source = f"{path} ({label})" if label else path
+        self.properties = properties
+        self.part = part
+        self.coordinates = self._coordinates(coordinates)
+
+    def error(self, message: str) -> InputFileError:
+        return InputFileError(self.source, message)
+
+    def _coordinates(self, coordinates: Any) -> Floats:
+        if not isinstance(coordinates, list) or len(coordinates) < 2:
+            raise self.error("a track needs at least two points")
+        sizes = {len(point) if isinstance(point, list) else 0 for point in coordinates}
+        if sizes == {2}:
+            raise self.error(
+                "the coordinates have no height; a 3-D track map needs [longitude, latitude, height] at every point"
+            )
+        if not sizes <= {3, 4}:
+            raise self.error("every point must be [longitude, latitude, height]")
+        try:
+            values = np.array([point[:3] for point in coordinates], dtype=np.float64)
+        except (TypeError, ValueError):
+            raise self.error("a coordinate is not a number") from None
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            raise self.error(f"point {int(np.argmax(bad)) + 1} has a coordinate that is not finite")
+        return values
+
+    def text(self, key: str) -> str | None:
+        value = self.properties.get(key)
+        if value is None or isinstance(value, str):
+            return value
+        raise self.error(f"{key} is {value!r}; a text was expected")
+
+    def array(self, key: str, *, blank: float) -> Floats | None:
+        """A property with one value a point; null is `blank`."""
+        value = self.properties.get(key)
+        if value is None:
+            return None
+        if self.part >= 0 and isinstance(value, list) and self.part < len(value) and isinstance(value[self.part], list):
+            value = value[self.part]
+        if not isinstance(value, list) or len(value) != len(self.coordinates):
+            size = len(value) if isinstance(value, list) else "a single value"
+            raise self.error(f"property {key}: {size} for {len(self.coordinates)} points; give an array, one a point")
+        try:
+            return np.array([blank if item is None else item for item in value], dtype=np.float64)
+        except (TypeError, ValueError):
+            raise self.error(f"property {key} holds something that is not a number") from None
+
+
+def _crs_member(path: str, document: dict[str, Any]) -> str | None:
+    """CRS of the old ``crs`` member (GeoJSON 2008, section 3), still written by many programs."""
+    member = document.get("crs")
+    if member is None:
+        return None
+    try:
+        return str(member["properties"]["name"])
+    except (TypeError, KeyError):
+        raise InputFileError(path, "the 'crs' member has no properties.name; give --crs") from None
+
+
+def _crs(path: str, crs: str) -> CRS:
+    try:
+        return CRS.from_user_input(crs)
+    except CRSError:
+        raise SettingsError(f"{path}: the CRS {crs!r} is unknown; give for example EPSG:4326 or EPSG:6677") from None
+
+
+def _to_wgs84(path: str, crs: str, values: Floats) -> tuple[Floats, Floats]:
+    """Latitude and longitude of coordinates in easting-northing or longitude-latitude order."""
+    system = _crs(path, crs)
+    if system.is_geographic:
+        over = np.abs(values[:, 1]) > 90.0
+        if over.any() or (np.abs(values[:, 0]) > 360.0).any():
+            point = values[int(np.argmax(over))]
+            raise InputFileError(
+                path,
+                f"{crs}: [{point[0]:g}, {point[1]:g}] is no [longitude, latitude]; are they swapped, or is the CRS a "
+                "projected one (give --crs)?",
+            )
+    transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
+    lon, lat = (np.asarray(v, np.float64) for v in transformer.transform(values[:, 0], values[:, 1]))
+    if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
+        raise InputFileError(path, f"some coordinates lie outside the CRS {crs}; is it the right one?")
+    return lat, lon
+
+
+def read_geojson_segments(
+    path: str | PathLike[str],
+    *,
+    crs: str | None = None,
+    height_datum: str | None = None,
+    geoid: str | None = None,
+    duplicates: str = "refuse",
+) -> list[Segment]:
+    """Every line of a GeoJSON file, in the file's order, as pieces of a route.
+
+    Parameters
+    ----------
+    path : path
+    crs : str, optional
+        Overrides nothing: it is an error where the file names another one.
+    height_datum, geoid : str, optional
+        Where the file has no such member or property.
+    duplicates : {"refuse", "keep"}
+    """
+    text = read_text(path)
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputFileError(path, f"this is not JSON ({error.msg})", line=error.lineno) from None
+    if not isinstance(document, dict):
+        raise InputFileError(path, "this is JSON, but not a GeoJSON object")
+    named = _crs_member(str(path), document)
+    if crs is not None and named is not None and _crs(str(path), crs) != _crs(str(path), named):
+        raise SettingsError(f"{path}: --crs {crs} contradicts the file's own CRS {named}")
+    used = crs or named or RFC_CRS
+    return [_segment(line, used, height_datum, geoid, duplicates) for line in _lines(str(path), document, "", {})]
+
+
+def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None, duplicates: str) -> Segment:
+    told = line.text("height_datum")
+    if told is not None and told not in HEIGHT_DATUMS:
+        raise line.error(f"height_datum is {told!r}; expected 'ellipsoidal' or 'orthometric'")
+    if height_datum is not None and told is not None and height_datum != told:
+        raise SettingsError(f"{line.source}: height_datum {height_datum!r} contradicts the file's own {told!r}")
+    datum = height_datum or told
+    if datum is None:
+        raise line.error(f"the height datum is not said; {_DATUM_HELP}")
+    for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
+        if right not in line.properties:
+            raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
+    same = (np.diff(line.coordinates, axis=0) == 0).all(axis=1)
+    if duplicates == "refuse" and same.any():
+        raise line.error(
+            f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
+            "'railfix map check' lists them all"
+        )
+    latitude, longitude = _to_wgs84(line.source, crs, line.coordinates)
+    geoid_m = line.array("geoid_m", blank=np.nan) if datum == "orthometric" else None
+    if geoid is None and datum == "orthometric" and geoid_m is None:
+        geoid = line.text("geoid")
+    height, model = ellipsoidal_heights(
+        line.coordinates[:, 2], latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source
+    )
+    attributes: dict[str, Floats] = {name: np.full(len(latitude), np.nan) for name, _, _ in OPTIONAL_COLUMNS.values()}
+    for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
+        values = line.array(column, blank=blank)
+        if values is not None:
+            attributes[name] = values * factor
+    attributes["radius_m"] = straight_radius(attributes["radius_m"])
+    return Segment(
+        source=line.source,
+        file=line.path,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        crs=crs,
+        height_datum=datum,
+        geoid=model,
+        kilometrage_m=attributes["kilometrage_m"],
+        cant_m=attributes["cant_m"],
+        radius_m=attributes["radius_m"],
+        gradient_permille=attributes["gradient_permille"],
+        metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties},
+    )

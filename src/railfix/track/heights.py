@@ -1,0 +1,154 @@
+"""Ellipsoidal heights from orthometric ones: the geoid, always named, never silently zero.
+
+Maps carry heights from levelling; satellites see the ellipsoid (P1 3.1(1)).
+``ellipsoidal = orthometric + geoid``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import japan_geoid
+import numpy as np
+from pyproj import CRS, Transformer
+from pyproj.exceptions import CRSError, ProjError
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, SettingsError
+
+#: Geoid models of the Geospatial Information Authority of Japan that japan-geoid ships. Heights levelled
+#: before April 2025 belong to GSIGEO2011, those of the later national height system to JPGEO2024.
+JAPAN_MODELS: Final = {
+    "japan": "JPGEO2024",
+    "jpgeo2024": "JPGEO2024",
+    "jpgeo2024+hrefconv2024": "JPGEO2024+Hrefconv2024",
+    "gsigeo2011": "GSIGEO2011",
+}
+_LOADERS: Final = {
+    "JPGEO2024": japan_geoid.load_embedded_jpgeo2024,
+    "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
+    "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
+}
+#: How to mend a file of orthometric heights that names no geoid.
+GEOID_HELP: Final = (
+    "give geoid='japan' (JPGEO2024), 'gsigeo2011', a pyproj grid file or vertical CRS such as 'EPSG:5773', "
+    "or a column geoid_m"
+)
+HEIGHT_DATUMS: Final = ("ellipsoidal", "orthometric")
+
+
+def check_height_datum(height_datum: str | None) -> None:
+    """Refuse a height datum that is neither ellipsoidal nor orthometric."""
+    if height_datum is not None and height_datum not in HEIGHT_DATUMS:
+        raise SettingsError(f"height_datum {height_datum!r} is unknown; expected 'ellipsoidal' or 'orthometric'")
+
+
+def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> tuple[Floats, str]:
+    """Height of a geoid above the WGS 84 ellipsoid.
+
+    Parameters
+    ----------
+    geoid : str
+        A key of `JAPAN_MODELS`; a file or name of a pyproj grid (``.tif``, ``.gtx``); or a vertical or
+        compound CRS (``EPSG:5773``).
+    latitude_deg, longitude_deg : ndarray, shape (n,) [deg]
+    path : str
+        The map, for messages.
+
+    Returns
+    -------
+    geoid_m : ndarray, shape (n,) [m]
+    name : str
+        The model used.
+
+    Raises
+    ------
+    SettingsError
+        The model is unknown or its grid is not installed.
+    InputFileError
+        The map leaves the model's area.
+    """
+    key = geoid.strip().lower()
+    if key in JAPAN_MODELS:
+        name = JAPAN_MODELS[key]
+        heights = np.asarray(_LOADERS[name]().get_heights(np.array(longitude_deg), np.array(latitude_deg)), np.float64)
+    else:
+        name, transformer = _proj_transformer(geoid)
+        zeros = np.zeros_like(latitude_deg)
+        heights = np.asarray(transformer.transform(longitude_deg, latitude_deg, zeros)[2], np.float64)
+    outside = ~np.isfinite(heights)
+    if outside.any():
+        i = int(np.argmax(outside))
+        raise InputFileError(
+            path,
+            f"{int(outside.sum())} of {len(heights)} points lie outside the geoid {name}, the first at latitude "
+            f"{latitude_deg[i]:.6f}, longitude {longitude_deg[i]:.6f}; are latitude and longitude swapped, or is it "
+            "another country's geoid?",
+        )
+    return heights, name
+
+
+def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
+    """A pyproj transformation from heights over a geoid to the ellipsoid; no ballpark, no missing grid."""
+    grid = geoid.lower().endswith((".tif", ".tiff", ".gtx")) or Path(geoid).is_file()
+    try:
+        if grid:
+            steps = f"+proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=vgridshift +grids={geoid} +multiplier=1"
+            back = "+step +proj=unitconvert +xy_in=rad +xy_out=deg"
+            return geoid, Transformer.from_pipeline(f"+proj=pipeline +step {steps} {back}")
+        crs = CRS.from_user_input(geoid)
+        if not (crs.is_vertical or crs.is_compound):
+            raise SettingsError(f"geoid {geoid!r} is {crs.name}, which has no height datum; {GEOID_HELP}")
+        source = CRS.from_user_input(f"EPSG:4326+{geoid.split(':')[-1]}") if crs.is_vertical else crs
+        transformer = Transformer.from_crs(source, "EPSG:4979", always_xy=True, allow_ballpark=False, only_best=True)
+        return crs.name, transformer
+    except CRSError:
+        raise SettingsError(f"geoid {geoid!r} is unknown; {GEOID_HELP}") from None
+    except ProjError:
+        raise SettingsError(
+            f"geoid {geoid!r}: pyproj has not got the grid; install it (projsync --file NAME) or give its path"
+        ) from None
+
+
+def ellipsoidal_heights(
+    heights_m: Floats,
+    latitude_deg: Floats,
+    longitude_deg: Floats,
+    *,
+    datum: str,
+    geoid: str | None,
+    geoid_m: Floats | None,
+    path: str,
+) -> tuple[Floats, str]:
+    """Ellipsoidal heights, and the geoid that was used.
+
+    Parameters
+    ----------
+    heights_m, latitude_deg, longitude_deg : ndarray, shape (n,)
+    datum : str
+        ``"ellipsoidal"`` or ``"orthometric"``.
+    geoid : str or None
+        Model, where one was asked for.
+    geoid_m : ndarray, shape (n,) or None
+        Geoid heights that the map itself carries.
+    path : str
+        The map, for messages.
+
+    Raises
+    ------
+    InputFileError, SettingsError
+        Orthometric heights without a geoid, or with two; ellipsoidal heights with one.
+    """
+    if datum == "ellipsoidal":
+        if geoid is not None:
+            raise SettingsError(f"{path}: geoid {geoid!r} was given, but the heights are ellipsoidal already")
+        return heights_m, ""
+    if geoid_m is not None:
+        if geoid is not None:
+            raise SettingsError(f"{path}: geoid {geoid!r} was given, but the map carries geoid_m itself; use one")
+        return heights_m + geoid_m, "geoid_m of the map"
+    if geoid is None:
+        raise InputFileError(path, f"the heights are orthometric, which needs a geoid; {GEOID_HELP}")
+    model_m, name = geoid_heights(geoid, latitude_deg, longitude_deg, path=path)
+    return heights_m + model_m, name

@@ -1,0 +1,90 @@
+"""Nearest point of a polyline, exactly, for many positions at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from railfix.core.arrays import Floats, Indices, Masks
+
+#: Samples looked at in the first round; doubled for the positions whose answer is not yet proven.
+_FIRST_CANDIDATES = 6
+#: Positions times candidates in one piece of work.
+_CHUNK = 2_000_000
+
+
+def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
+    """Nearest point of segments: its share of the segment in [0, 1], and the distance.
+
+    Parameters
+    ----------
+    points_m, start_m, step_m : ndarray, shapes that broadcast to (..., 3) [m]
+        Position, first point of the segment, and first to last point.
+    """
+    offset = points_m - start_m
+    squared = np.einsum("...i,...i->...", step_m, step_m)
+    share = np.clip(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0, 1.0)
+    rest = offset - share[..., None] * step_m
+    return share, np.sqrt(np.einsum("...i,...i->...", rest, rest))
+
+
+class NearestOnPolyline:
+    """A polyline prepared for nearest-point questions.
+
+    Samples are laid on the polyline so that each point of it lies within `reach_m` of a sample of
+    its own segment. The nearest point then belongs to a sample no further than the best distance
+    found plus `reach_m`, which proves an answer or asks for more candidates.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (V, 3) [m]
+    """
+
+    def __init__(self, points_m: Floats) -> None:
+        self._start = points_m[:-1]
+        self._step = np.diff(points_m, axis=0)
+        self._length = np.linalg.norm(self._step, axis=1)
+        spacing = max(float(np.median(self._length)), float(self._length.sum()) / (4 * len(points_m)), 1e-3)
+        pieces = np.maximum(np.ceil(self._length / spacing).astype(np.int64), 1)
+        first = np.cumsum(pieces) - pieces
+        self._segment = np.repeat(np.arange(len(pieces)), pieces)
+        share = (np.arange(pieces.sum()) - first[self._segment] + 0.5) / pieces[self._segment]
+        #: Half the spacing of the samples, which lie in the middle of their pieces [m].
+        self.reach_m = float((self._length / pieces).max()) / 2.0 * (1.0 + 1e-9)
+        self._tree = cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
+
+    def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
+        """Segment, distance along it and distance from it, shapes (n,); -1 and NaN for NaN."""
+        points = np.asarray(ecef_m, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"ecef_m has shape {points.shape}, expected (n, 3)")
+        index = np.full(len(points), -1, dtype=np.intp)
+        along = np.full(len(points), np.nan)
+        offset = np.full(len(points), np.nan)
+        open_ = np.flatnonzero(np.isfinite(points).all(axis=1))
+        candidates = min(_FIRST_CANDIDATES, len(self._segment))
+        while open_.size:
+            unproven = []
+            rows = max(1, _CHUNK // candidates)
+            for part in (open_[i : i + rows] for i in range(0, open_.size, rows)):
+                index[part], along[part], offset[part], proven = self._among(points[part], candidates)
+                unproven.append(part[~proven])
+            open_ = np.concatenate(unproven)
+            candidates = min(candidates * 4, len(self._segment))
+        return index, along, offset
+
+    def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
+        """Best of the nearest samples' segments, and whether no other can be better."""
+        found = self._tree.query(points, k=np.arange(1, candidates + 1))
+        distance, sample = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.intp)
+        segment = self._segment[sample]
+        share, offset = project_on_segments(points[:, None], self._start[segment], self._step[segment])
+        best = offset.min(axis=1)
+        # of equally near points the one earlier on the line, whatever order the tree gave them in
+        place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
+        column = np.argmin(place, axis=1)[:, None]
+        chosen = np.take_along_axis(segment, column, axis=1)[:, 0]
+        along = np.take_along_axis(share, column, axis=1)[:, 0] * self._length[chosen]
+        proven = (distance[:, -1] > best + self.reach_m) | (candidates == len(self._segment))
+        return chosen, along, best, proven

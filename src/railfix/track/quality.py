@@ -1,0 +1,323 @@
+"""What is wrong with a track map: spacing, chords against arcs, kinks, duplicates, marking, gradient, cant.
+
+A map error is common to all satellites, so no screen of the receiver's data can find it: it must be
+found here (P1 2.2(1), 4.1(3)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks
+from railfix.track.geometry import Geometry, geometry_of, windowed_gradients
+from railfix.track.track import Track, kilometrage_breaks
+
+Severity = Literal["error", "warning"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapLimits:
+    """Limits of a track map; a value on the limit passes.
+
+    Attributes
+    ----------
+    mid_chord_m : float [m]
+        Chord from arc at the middle of a segment (P1 4.1(3): 0.30 m).
+    spacing_m : float [m]
+        Longest segment (P1 2.2(1): some tens of metres on straight track).
+    near_duplicate_m : float [m]
+        Two points nearer than this are one point measured twice.
+    kink_deg : float [deg]
+        A turn at a point over this that is also sharper than `least_radius_m` is a kink.
+    sharp_kink_deg : float [deg]
+        A kink over this is an error, below a warning.
+    least_radius_m : float [m]
+        Sharper curves no railway vehicle passes.
+    gradient_permille : float
+        Steepest segment.
+    height_spike_m : float [m]
+        Height of a point against the line through its neighbours.
+    gradient_difference_permille : float
+        Gradient attribute against the heights, over `gradient_window_m`.
+    gradient_window_m : float [m]
+    cant_m : float [m]
+        Largest cant either way.
+    """
+
+    mid_chord_m: float = 0.30
+    spacing_m: float = 50.0
+    near_duplicate_m: float = 0.10
+    kink_deg: float = 3.0
+    sharp_kink_deg: float = 15.0
+    least_radius_m: float = 60.0
+    gradient_permille: float = 60.0
+    height_spike_m: float = 0.50
+    gradient_difference_permille: float = 5.0
+    gradient_window_m: float = 100.0
+    cant_m: float = 0.20
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            if not getattr(self, item.name) > 0:
+                raise ValueError(f"{item.name} must be positive")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One fault of the map, at a run of neighbouring points or segments.
+
+    Attributes
+    ----------
+    severity : {"error", "warning"}
+    kind : str
+    first, last : int
+        Points of the map between which it lies.
+    chainage_m, kilometrage_m : float [m]
+        Of the first point; the marking may be NaN.
+    value, limit : float
+        The worst value, and what it is held against; NaN where a fault has no number.
+    sentence : str
+    """
+
+    severity: Severity
+    kind: str
+    first: int
+    last: int
+    chainage_m: float
+    kilometrage_m: float
+    value: float
+    limit: float
+    sentence: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackQuality:
+    """Quality report of a track map.
+
+    Attributes
+    ----------
+    track : Track
+    limits : MapLimits
+    geometry : Geometry
+        Spacing, turns, mid-chord deviations and gradients that were judged.
+    findings : tuple of Finding
+        In order of chainage, errors first.
+    """
+
+    track: Track
+    limits: MapLimits
+    geometry: Geometry
+    findings: tuple[Finding, ...]
+
+    @property
+    def errors(self) -> tuple[Finding, ...]:
+        """Findings that make the map unfit."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+    @property
+    def warnings(self) -> tuple[Finding, ...]:
+        """Findings that a person should look at."""
+        return tuple(finding for finding in self.findings if finding.severity == "warning")
+
+
+def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
+    """Judge a track map.
+
+    Parameters
+    ----------
+    track : Track
+        Read with ``duplicates="keep"`` so that duplicates are shown instead of refused.
+    limits : MapLimits, optional
+
+    Returns
+    -------
+    TrackQuality
+    """
+    limits = limits or MapLimits()
+    geometry = geometry_of(track)
+    report = _Report(track)
+    findings = [
+        *_spacing(report, geometry, limits),
+        *_shape(report, geometry, limits),
+        *_kilometrage(report, track),
+        *_heights(report, track, geometry, limits),
+        *_attributes(report, track, geometry, limits),
+    ]
+    findings.sort(key=lambda finding: (finding.severity != "error", finding.chainage_m))
+    return TrackQuality(track=track, limits=limits, geometry=geometry, findings=tuple(findings))
+
+
+class _Report:
+    """Turns masks over points or segments into findings, one for each run of neighbours."""
+
+    def __init__(self, track: Track) -> None:
+        self.track = track
+
+    def runs(
+        self,
+        mask: Masks,
+        severity: Severity,
+        kind: str,
+        text: str,
+        *,
+        values: Floats | None = None,
+        limit: float = np.nan,
+    ) -> Iterator[Finding]:
+        """Findings for a mask over V points or V - 1 segments; ``{value}`` and ``{limit}`` stand in `text`."""
+        track = self.track
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
+        over = 1 if len(mask) == len(track) - 1 else 0
+        for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            worst = np.nan
+            if values is not None:
+                part = values[first:end]
+                worst = float(part[np.nanargmax(np.abs(part))])
+            last = end - 1 + over
+            where = f"at {track.chainage_m[first]:.1f} m" + (
+                f" to {track.chainage_m[last]:.1f} m" if track.chainage_m[last] > track.chainage_m[first] else ""
+            )
+            yield Finding(
+                severity=severity,
+                kind=kind,
+                first=first,
+                last=last,
+                chainage_m=float(track.chainage_m[first]),
+                kilometrage_m=float(track.kilometrage_m[first]),
+                value=worst,
+                limit=limit,
+                sentence=f"{where}: {text.format(value=worst, limit=limit)}",
+            )
+
+
+def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+    spacing = geometry.spacing_m
+    yield from report.runs(spacing == 0.0, "error", "duplicate", "the same point twice or more; remove the repetition")
+    yield from report.runs(
+        (spacing > 0.0) & (spacing < limits.near_duplicate_m),
+        "warning",
+        "near duplicate",
+        "points only {value:.3f} m apart (limit {limit:g} m)",
+        values=spacing,
+        limit=limits.near_duplicate_m,
+    )
+    yield from report.runs(
+        spacing > limits.spacing_m,
+        "warning",
+        "spacing",
+        "points {value:.1f} m apart (limit {limit:g} m); a curve in between would not be seen",
+        values=spacing,
+        limit=limits.spacing_m,
+    )
+
+
+def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+    with np.errstate(invalid="ignore"):
+        deviation = np.abs(geometry.mid_chord_m)
+        yield from report.runs(
+            deviation > limits.mid_chord_m,
+            "error",
+            "mid-chord",
+            "the chord leaves the arc by {value:.3f} m (limit {limit:g} m); add points",
+            values=deviation,
+            limit=limits.mid_chord_m,
+        )
+        turn = np.abs(geometry.turn_deg)
+        sharp = np.radians(turn) > geometry.reach_m / limits.least_radius_m
+        kink = sharp & (turn > limits.kink_deg)
+    for severity, mask, limit in (
+        ("error", kink & (turn > limits.sharp_kink_deg), limits.sharp_kink_deg),
+        ("warning", kink & ~(turn > limits.sharp_kink_deg), limits.kink_deg),
+    ):
+        yield from report.runs(
+            mask,
+            "error" if severity == "error" else "warning",
+            "kink",
+            "the direction turns by {value:.1f} degrees at one point (limit {limit:g})",
+            values=turn,
+            limit=limit,
+        )
+
+
+def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
+    marking = track.kilometrage_m
+    if np.isnan(marking).all():
+        return
+    broken = kilometrage_breaks(track.chainage_m, marking)
+    change = np.diff(marking)
+    yield from report.runs(
+        broken,
+        "warning",
+        "kilometrage break",
+        "the kilometrage changes by {value:.1f} m, which is not the distance",
+        values=change,
+    )
+    direction = np.where(broken | (change == 0.0), np.nan, np.sign(change))
+    known = np.flatnonzero(np.isfinite(direction))
+    turned = np.zeros(len(track), dtype=np.bool_)
+    turned[known[1:][np.diff(direction[known]) != 0.0]] = True
+    yield from report.runs(turned, "warning", "kilometrage reversal", "the kilometrage begins to run the other way")
+    yield from report.runs(np.isnan(marking), "warning", "kilometrage absent", "the map has no kilometrage here")
+
+
+def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+    with np.errstate(invalid="ignore"):
+        steep = np.abs(geometry.gradient_permille) > limits.gradient_permille
+        yield from report.runs(
+            steep,
+            "warning",
+            "gradient",
+            "the heights climb {value:.1f} per mille (limit {limit:g})",
+            values=geometry.gradient_permille,
+            limit=limits.gradient_permille,
+        )
+        yield from report.runs(
+            np.abs(geometry.height_spike_m) > limits.height_spike_m,
+            "error",
+            "height spike",
+            "the height leaves the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
+            values=geometry.height_spike_m,
+            limit=limits.height_spike_m,
+        )
+        told, seen = windowed_gradients(track, window_m=limits.gradient_window_m)
+        difference = told - seen
+        yield from report.runs(
+            np.abs(difference) > limits.gradient_difference_permille,
+            "warning",
+            "gradient attribute",
+            "gradient_permille differs from the heights by {value:.1f} per mille (limit {limit:g}); rising is positive",
+            values=difference,
+            limit=limits.gradient_difference_permille,
+        )
+
+
+def _attributes(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
+    with np.errstate(invalid="ignore"):
+        yield from report.runs(
+            np.abs(track.cant_m) > limits.cant_m,
+            "error",
+            "cant",
+            "cant of {value:.3f} m (limit {limit:g} m); the column is in millimetres",
+            values=track.cant_m,
+            limit=limits.cant_m,
+        )
+        sharp = np.abs(track.radius_m) < limits.least_radius_m
+        yield from report.runs(
+            sharp,
+            "error",
+            "radius",
+            "radius of {value:.1f} m (limit {limit:g} m)",
+            values=np.where(np.isfinite(track.radius_m), track.radius_m, 0.0),
+            limit=limits.least_radius_m,
+        )
+        opposite = geometry.told_curvature * geometry.bend_curvature < 0.0
+        opposite &= (np.abs(geometry.told_curvature) > 1 / 3000) & (np.abs(geometry.bend_curvature) > 1 / 3000)
+    yield from report.runs(
+        opposite,
+        "error",
+        "radius side",
+        "radius_m bends the other way than the points; in the direction of the file, right is positive",
+    )

@@ -1,0 +1,65 @@
+"""One piece of a route as read from a file, before the pieces are joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from railfix.core.arrays import Floats
+
+#: Curve attributes that a map may carry at each point.
+ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segment:
+    """Points of one file or feature, in WGS 84 with ellipsoidal heights.
+
+    Attributes
+    ----------
+    source : str
+        The file, or the file and the feature in it.
+    file : str
+        The file alone.
+    latitude_deg, longitude_deg, height_m : ndarray, shape (n,)
+    kilometrage_m, cant_m, radius_m, gradient_permille : ndarray, shape (n,)
+        NaN where not given.
+    crs, height_datum, geoid : str
+        What the file was in, and the geoid that was used.
+    metadata : dict of str
+        Name and accuracy, where the file tells them.
+    notes : tuple of str
+    """
+
+    source: str
+    file: str
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    kilometrage_m: Floats
+    cant_m: Floats
+    radius_m: Floats
+    gradient_permille: Floats
+    crs: str
+    height_datum: str
+    geoid: str
+    metadata: dict[str, str]
+    notes: tuple[str, ...] = ()
+
+    def reversed(self) -> Segment:
+        """The same piece run the other way: right curves become left ones, climbs become falls."""
+        return Segment(
+            source=self.source,
+            file=self.file,
+            latitude_deg=self.latitude_deg[::-1],
+            longitude_deg=self.longitude_deg[::-1],
+            height_m=self.height_m[::-1],
+            kilometrage_m=self.kilometrage_m[::-1],
+            cant_m=self.cant_m[::-1],
+            radius_m=-self.radius_m[::-1],
+            gradient_permille=-self.gradient_permille[::-1],
+            crs=self.crs,
+            height_datum=self.height_datum,
+            geoid=self.geoid,
+            metadata=self.metadata,
+            notes=(*self.notes, f"{self.source} is run against the order of its points"),
+        )

@@ -1,0 +1,277 @@
+"""The centreline of a line in three dimensions, with its curve attributes (P1 2.2(1), 4.1(3)).
+
+Right is positive: seen in the direction of rising chainage, a curve to the right has a positive
+radius. Cant is the height of the outer rail above the inner one, so it is positive in every
+ordinarily canted curve, left or right, and negative where the outer rail lies lower (the
+diverging track of a turnout on a curve). The height of a point is that of the rail tops' middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+
+#: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
+SIGMA_PLAN_M = 0.30
+#: Standard deviation of its height [m]: about twice the plan's (P1 4.1(3)).
+SIGMA_HEIGHT_M = 0.60
+#: Kilometrage that disagrees with the length of a segment by more than this, plus a twentieth of
+#: the length, is a break in the marking [m]: files carry it rounded to the metre.
+KILOMETRAGE_BREAK_M = 1.0
+
+
+def frozen(values: ArrayLike) -> Floats:
+    """A read-only float copy of an array."""
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a track map came from, as carried to every output.
+
+    Attributes
+    ----------
+    files : tuple of str
+    crs : str
+        Coordinate reference system of the files.
+    height_datum_asked, height_datum_used : str
+        ``"ellipsoidal"`` or ``"orthometric"``; empty where nothing was asked for.
+    geoid : str
+        Geoid model that turned orthometric into ellipsoidal heights; empty where none was needed.
+    notes : tuple of str
+        Sentences that every result drawn from this map must carry.
+    """
+
+    files: tuple[str, ...] = ()
+    crs: str = "EPSG:4979"
+    height_datum_asked: str = ""
+    height_datum_used: str = "ellipsoidal"
+    geoid: str = ""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Track:
+    """Centreline of a route, V points in the order of the route.
+
+    Attributes
+    ----------
+    name : str
+    latitude_deg, longitude_deg : ndarray, shape (V,) [deg]
+        WGS 84.
+    height_m : ndarray, shape (V,) [m]
+        Ellipsoidal height of the middle between the rail tops.
+    kilometrage_m : ndarray, shape (V,) [m]
+        The line's own marking; may jump or run backwards; NaN where the map has none.
+    cant_m : ndarray, shape (V,) [m]
+        Outer rail above inner rail; NaN where the map has none.
+    radius_m : ndarray, shape (V,) [m]
+        Positive in a curve to the right in the direction of rising chainage, infinite on straight
+        track, NaN where the map says nothing.
+    gradient_permille : ndarray, shape (V,)
+        Positive where the line rises with chainage; NaN where the map has none.
+    section : ndarray of int, shape (V,)
+        Which of `sections` a point belongs to.
+    sections : tuple of str
+        The files or features that were joined to the route, in order.
+    sigma_plan_m, sigma_height_m : float [m]
+        Standard deviations of the map across the line and in height.
+    provenance : Provenance
+    """
+
+    name: str
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    kilometrage_m: Floats
+    cant_m: Floats
+    radius_m: Floats
+    gradient_permille: Floats
+    section: Integers
+    sections: tuple[str, ...] = ("track",)
+    sigma_plan_m: float = SIGMA_PLAN_M
+    sigma_height_m: float = SIGMA_HEIGHT_M
+    provenance: Provenance = field(default_factory=Provenance)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.latitude_deg),)
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray) and value.shape != shape:
+                raise ValueError(f"{item.name} has shape {value.shape}, expected {shape}")
+        if shape[0] < 2:
+            raise ValueError(f"a track needs at least two points, got {shape[0]}")
+        place = np.stack([self.latitude_deg, self.longitude_deg, self.height_m])
+        if not np.isfinite(place).all():
+            raise ValueError("latitude_deg, longitude_deg and height_m must be finite")
+        if not (self.sigma_plan_m > 0 and self.sigma_height_m > 0):
+            raise ValueError("sigma_plan_m and sigma_height_m must be positive")
+
+    @classmethod
+    def from_geodetic(
+        cls,
+        latitude_deg: ArrayLike,
+        longitude_deg: ArrayLike,
+        height_m: ArrayLike,
+        *,
+        name: str = "track",
+        kilometrage_m: ArrayLike | None = None,
+        cant_m: ArrayLike | None = None,
+        radius_m: ArrayLike | None = None,
+        gradient_permille: ArrayLike | None = None,
+        section: ArrayLike | None = None,
+        sections: tuple[str, ...] = ("track",),
+        sigma_plan_m: float = SIGMA_PLAN_M,
+        sigma_height_m: float = SIGMA_HEIGHT_M,
+        provenance: Provenance | None = None,
+    ) -> Track:
+        """Track of geodetic coordinates; attributes that are left out are NaN.
+
+        Parameters
+        ----------
+        latitude_deg, longitude_deg, height_m : array_like, shape (V,)
+            WGS 84, ellipsoidal height.
+
+        Returns
+        -------
+        Track
+        """
+        latitude = frozen(latitude_deg)
+        absent = np.full(latitude.shape, np.nan)
+        return cls(
+            name=name,
+            latitude_deg=latitude,
+            longitude_deg=frozen(longitude_deg),
+            height_m=frozen(height_m),
+            kilometrage_m=frozen(absent if kilometrage_m is None else kilometrage_m),
+            cant_m=frozen(absent if cant_m is None else cant_m),
+            radius_m=frozen(absent if radius_m is None else radius_m),
+            gradient_permille=frozen(absent if gradient_permille is None else gradient_permille),
+            section=np.array(np.zeros(latitude.shape) if section is None else section, dtype=np.int64),
+            sections=sections,
+            sigma_plan_m=sigma_plan_m,
+            sigma_height_m=sigma_height_m,
+            provenance=provenance or Provenance(),
+        )
+
+    @classmethod
+    def from_ecef(
+        cls,
+        ecef_m: ArrayLike,
+        *,
+        name: str = "track",
+        kilometrage_m: ArrayLike | None = None,
+        cant_m: ArrayLike | None = None,
+        radius_m: ArrayLike | None = None,
+        sigma_plan_m: float = SIGMA_PLAN_M,
+        sigma_height_m: float = SIGMA_HEIGHT_M,
+        provenance: Provenance | None = None,
+    ) -> Track:
+        """Track of ECEF points, shape (V, 3) [m]; attributes that are left out are NaN."""
+        latitude, longitude, height = geodetic_from_ecef(ecef_m)
+        return cls.from_geodetic(
+            latitude,
+            longitude,
+            height,
+            name=name,
+            kilometrage_m=kilometrage_m,
+            cant_m=cant_m,
+            radius_m=radius_m,
+            sigma_plan_m=sigma_plan_m,
+            sigma_height_m=sigma_height_m,
+            provenance=provenance,
+        )
+
+    def __len__(self) -> int:
+        return len(self.latitude_deg)
+
+    @cached_property
+    def ecef_m(self) -> Floats:
+        """Points of the centreline, shape (V, 3) [m]."""
+        return frozen(ecef_from_geodetic(self.latitude_deg, self.longitude_deg, self.height_m))
+
+    @cached_property
+    def chainage_m(self) -> Floats:
+        """Length of the polyline from its first point, shape (V,) [m]; not rising only at duplicate points."""
+        steps = np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1)
+        return frozen(np.concatenate([[0.0], np.cumsum(steps)]))
+
+    def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
+        """The line's own marking at chainages; see `interpolate_kilometrage`."""
+        return interpolate_kilometrage(chainage_m, self.chainage_m, self.kilometrage_m)
+
+
+def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
+    """Segments in which the marking jumps.
+
+    Parameters
+    ----------
+    chainage_m, kilometrage_m : ndarray, shape (V,) [m]
+
+    Returns
+    -------
+    ndarray of bool, shape (V - 1,)
+        True where the marking's change, either way, is not the segment's length within
+        `KILOMETRAGE_BREAK_M` and a twentieth; False where a marking is NaN.
+    """
+    length = np.diff(chainage_m)
+    change = np.abs(np.diff(kilometrage_m))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.abs(change - length) > KILOMETRAGE_BREAK_M + 0.05 * length)
+
+
+def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
+    """The line's own marking at chainages.
+
+    Linear between two points. Inside a segment where the marking jumps, the marking of the nearer
+    point is carried on in the direction it runs on that side, never interpolated over the jump.
+
+    Parameters
+    ----------
+    chainage_m : array_like, any shape [m]
+    known_chainage_m, known_kilometrage_m : ndarray, shape (V,) [m]
+        Rising chainage, and the marking there.
+
+    Returns
+    -------
+    ndarray, same shape as `chainage_m` [m]
+        NaN where there is no marking on the side asked for, and for NaN.
+    """
+    at = np.asarray(chainage_m, dtype=np.float64)
+    index = np.clip(np.searchsorted(known_chainage_m, at, side="right") - 1, 0, len(known_chainage_m) - 2)
+    start, end = known_chainage_m[index], known_chainage_m[index + 1]
+    before, after = known_kilometrage_m[index], known_kilometrage_m[index + 1]
+    length = np.where(end > start, end - start, 1.0)
+    linear = before + (at - start) / length * (after - before)
+    broken = kilometrage_breaks(known_chainage_m, known_kilometrage_m)
+    if not broken.any():
+        return linear
+    left, right = _running_direction(known_kilometrage_m, broken)
+    carried = np.where(
+        at - start < end - at,
+        before + left[index] * (at - start),
+        after - right[index + 1] * (end - at),
+    )
+    return np.where(broken[index], carried, linear)
+
+
+def _running_direction(kilometrage_m: Floats, broken: Masks) -> tuple[Floats, Floats]:
+    """Direction (+1 or -1) in which the marking runs up to each point, and on from each point."""
+    sign = np.sign(np.diff(kilometrage_m))
+    usable = ~broken & np.isfinite(sign) & (sign != 0)
+    if not usable.any():
+        ones = np.ones(len(kilometrage_m))
+        return ones, ones
+    places = np.flatnonzero(usable)
+    points = np.arange(len(kilometrage_m))
+    upto = places[np.clip(np.searchsorted(places, points, side="left") - 1, 0, len(places) - 1)]
+    onward = places[np.clip(np.searchsorted(places, points, side="left"), 0, len(places) - 1)]
+    return sign[upto], sign[onward]

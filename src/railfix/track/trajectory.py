@@ -1,0 +1,248 @@
+"""The path of an antenna: what the solver constrains the position to.
+
+A `Trajectory` is a polyline in ECEF with its own arc length, tied point by point to the line's
+chainage. `Trajectory.from_track` takes the track itself as the antenna's path; with a vehicle,
+`railfix.track.vehicle.antenna_trajectory` computes it from the bogies on the track (P1 3.1(1)).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from railfix.core.arrays import Floats, Indices
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.track.polyline import NearestOnPolyline
+from railfix.track.track import (
+    SIGMA_HEIGHT_M,
+    SIGMA_PLAN_M,
+    Track,
+    frozen,
+    interpolate_kilometrage,
+)
+
+#: Said in every output of a run without a vehicle file.
+TRACK_AS_PATH = "no vehicle file: the track is taken as the antenna's own path"
+#: Rounding allowed beyond the ends of a trajectory [m].
+_END_TOLERANCE_M = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """Path of one antenna, V points.
+
+    Right is positive across the path, seen in the direction of rising chainage.
+
+    Attributes
+    ----------
+    name : str
+        The antenna, or the track taken as its path.
+    ecef_m : ndarray, shape (V, 3) [m]
+    chainage_m : ndarray, shape (V,) [m]
+        Chainage of the track at the reference point, strictly rising.
+    kilometrage_m : ndarray, shape (V,) [m]
+        The line's own marking there; NaN where the map has none.
+    cant_m : ndarray, shape (V,) [m]
+        Cant of the track there; NaN where the map has none.
+    roll_deg : ndarray, shape (V,) [deg]
+        Lean of the body, positive to the right; 0 where the track is taken as the path.
+    reference : str
+        The point of the vehicle whose chainage is given.
+    body_chainage_m : ndarray, shape (V,), or None [m]
+        Chainage of the middle between the bogies when the antenna is at the point, strictly rising: where
+        one antenna is, it tells where the other one of the same vehicle is. None without a vehicle.
+    facing : {"rising", "falling"}
+        Which way along the line the vehicle's front points; "rising" is taken where no vehicle tells.
+    sigma_plan_m, sigma_height_m : float [m]
+        Standard deviations of the map, carried into the solution.
+    notes : tuple of str
+        Sentences that every result must carry.
+    """
+
+    name: str
+    ecef_m: Floats
+    chainage_m: Floats
+    kilometrage_m: Floats
+    cant_m: Floats
+    roll_deg: Floats
+    reference: str = "antenna"
+    body_chainage_m: Floats | None = None
+    facing: Literal["rising", "falling"] = "rising"
+    sigma_plan_m: float = SIGMA_PLAN_M
+    sigma_height_m: float = SIGMA_HEIGHT_M
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        points = len(self.ecef_m)
+        if points < 2 or self.ecef_m.shape != (points, 3):
+            raise ValueError(f"ecef_m has shape {self.ecef_m.shape}, expected (V, 3) with V of at least 2")
+        for name in ("chainage_m", "kilometrage_m", "cant_m", "roll_deg"):
+            if getattr(self, name).shape != (points,):
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected ({points},)")
+        if not np.isfinite(self.ecef_m).all():
+            raise ValueError("ecef_m must be finite")
+        if not (np.diff(self.chainage_m) > 0).all():
+            i = int(np.argmin(np.diff(self.chainage_m)))
+            raise ValueError(
+                f"chainage_m must rise strictly; point {i + 1} at {self.chainage_m[i]:.3f} m repeats or runs back"
+            )
+        if not (self.length_m > 0).all():
+            raise ValueError(f"points {int(np.argmin(self.length_m))} and the next are equal")
+
+    @classmethod
+    def from_track(cls, track: Track) -> Trajectory:
+        """The track taken as the antenna's own path, as `notes` then says."""
+        return cls(
+            name=track.name,
+            ecef_m=track.ecef_m,
+            chainage_m=track.chainage_m,
+            kilometrage_m=track.kilometrage_m,
+            cant_m=track.cant_m,
+            roll_deg=frozen(np.zeros(len(track))),
+            sigma_plan_m=track.sigma_plan_m,
+            sigma_height_m=track.sigma_height_m,
+            notes=(TRACK_AS_PATH, *track.provenance.notes),
+        )
+
+    def __len__(self) -> int:
+        return len(self.ecef_m)
+
+    @cached_property
+    def length_m(self) -> Floats:
+        """Length of each segment, shape (V - 1,) [m]."""
+        return frozen(np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1))
+
+    @cached_property
+    def arc_m(self) -> Floats:
+        """Arc length of each point from the first, shape (V,) [m]."""
+        return frozen(np.concatenate([[0.0], np.cumsum(self.length_m)]))
+
+    @cached_property
+    def tangent(self) -> Floats:
+        """Unit vector along each segment, shape (V - 1, 3)."""
+        return frozen(np.diff(self.ecef_m, axis=0) / self.length_m[:, None])
+
+    @cached_property
+    def _axes(self) -> Floats:
+        """East, north, up at the middle of each segment, shape (V - 1, 3, 3)."""
+        latitude, longitude, _ = geodetic_from_ecef((self.ecef_m[1:] + self.ecef_m[:-1]) / 2.0)
+        return enu_axes(latitude, longitude)
+
+    @cached_property
+    def up(self) -> Floats:
+        """Normal of the ellipsoid at each segment, unit vectors, shape (V - 1, 3)."""
+        return frozen(self._axes[:, 2])
+
+    @cached_property
+    def across(self) -> Floats:
+        """Horizontal unit vector to the right of each segment, shape (V - 1, 3)."""
+        right = np.cross(self.tangent, self.up)
+        return frozen(right / np.linalg.norm(right, axis=1, keepdims=True))
+
+    @cached_property
+    def heading_deg(self) -> Floats:
+        """Azimuth of each segment in rising chainage, clockwise from north, shape (V - 1,) [deg]."""
+        enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
+        return frozen(np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360.0)
+
+    @cached_property
+    def gradient_permille(self) -> Floats:
+        """Climb of each segment in rising chainage, shape (V - 1,)."""
+        enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
+        return frozen(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
+
+    def body_azimuth_deg(self, arc_m: ArrayLike) -> Floats:
+        """Azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""
+        heading = self.heading_deg[self.segment_at(arc_m)[0]] + (0.0 if self.facing == "rising" else 180.0)
+        return np.where(np.isfinite(np.asarray(arc_m, dtype=np.float64)), heading % 360.0, np.nan)
+
+    @cached_property
+    def _nearest(self) -> NearestOnPolyline:
+        return NearestOnPolyline(self.ecef_m)
+
+    def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
+        """Segment that an arc length falls on, and the distance along it.
+
+        Parameters
+        ----------
+        arc_m : array_like, any shape [m]
+
+        Returns
+        -------
+        index : ndarray of int
+            A point that two segments share belongs to the later one; before the start, 0; beyond the
+            end and for NaN, the last.
+        along_m : ndarray [m]
+            From the segment's first point; negative before the start; NaN for NaN.
+        """
+        arc = np.asarray(arc_m, dtype=np.float64)
+        index = np.clip(np.searchsorted(self.arc_m, arc, side="right") - 1, 0, len(self) - 2)
+        return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
+
+    def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
+        index, along = self.segment_at(arc_m)
+        share = along / self.length_m[index]
+        beyond = _END_TOLERANCE_M / self.length_m[index]
+        share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)
+        shape = share.shape + (1,) * (values.ndim - 1)
+        # exact at both ends of a segment
+        return np.asarray((1.0 - share.reshape(shape)) * values[index] + share.reshape(shape) * values[index + 1])
+
+    def at_arc(self, arc_m: ArrayLike) -> Floats:
+        """Point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
+        return self._interpolate(arc_m, self.ecef_m)
+
+    def chainage_at(self, arc_m: ArrayLike) -> Floats:
+        """Chainage of the reference point at an arc length [m]; NaN beyond the ends and for NaN."""
+        return self._interpolate(arc_m, self.chainage_m)
+
+    def body_at(self, arc_m: ArrayLike) -> Floats:
+        """Chainage of the vehicle's middle when the antenna is at arcs [m]; NaN without a vehicle or off the path."""
+        if self.body_chainage_m is None:
+            return np.full(np.shape(arc_m), np.nan)
+        return self._interpolate(arc_m, self.body_chainage_m)
+
+    def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
+        """Where the antenna is when the vehicle's middle is at chainages [m]; NaN without a vehicle or off the path."""
+        if self.body_chainage_m is None:
+            return np.full(np.shape(body_chainage_m), np.nan)
+        return np.interp(
+            np.asarray(body_chainage_m, dtype=np.float64), self.body_chainage_m, self.arc_m, left=np.nan, right=np.nan
+        )
+
+    def arc_at_chainage(self, chainage_m: ArrayLike) -> Floats:
+        """Arc length at a chainage of the reference point [m]; NaN beyond the ends and for NaN."""
+        chainage = np.asarray(chainage_m, dtype=np.float64)
+        inside = np.isfinite(chainage)
+        inside &= (chainage >= self.chainage_m[0] - _END_TOLERANCE_M) & (
+            chainage <= self.chainage_m[-1] + _END_TOLERANCE_M
+        )
+        return np.where(inside, np.interp(chainage, self.chainage_m, self.arc_m), np.nan)
+
+    def kilometrage_at(self, arc_m: ArrayLike) -> Floats:
+        """The line's own marking at an arc length [m]; never interpolated over a jump of the marking."""
+        return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
+
+    def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
+        """Nearest point of the trajectory to each position.
+
+        Exact, over all segments: a tree finds the candidates and a bound proves that none is missed.
+
+        Parameters
+        ----------
+        ecef_m : array_like, shape (n, 3) [m]
+
+        Returns
+        -------
+        arc_m, offset_m : ndarray, shape (n,) [m]
+            Arc length of the nearest point and its distance; NaN where the position is NaN. Of two
+            equally near points the one of smaller arc length.
+        """
+        index, along, offset = self._nearest(ecef_m)
+        found = index >= 0
+        arc = np.where(found, self.arc_m[np.maximum(index, 0)] + along, np.nan)
+        return arc, offset

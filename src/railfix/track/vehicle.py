@@ -1,0 +1,396 @@
+"""The vehicle: two bogies on the track, a roof antenna, and the path that the antenna takes (P1 3.1(1)).
+
+Axes of the vehicle: origin midway between the bogie centres at the height of the rail tops;
+``along_m`` toward the vehicle's front, ``across_m`` to the right seen toward the front, ``up_m``
+above the rail tops, square to the body's floor.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from os import PathLike
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.io.named_columns import misspelt, read_text
+from railfix.track.from_positions import ANTENNA_PATH
+from railfix.track.track import Track
+from railfix.track.trajectory import Trajectory
+
+Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
+
+#: Distance between the wheels' contact points beyond the gauge [m]: about the width of a rail head.
+RAIL_HEAD_M: Final = 0.070
+#: The antenna's path is subdivided until it is this straight between two points [m].
+PATH_TOLERANCE_M: Final = 0.02
+#: Segments of the path are not made shorter than this [m].
+_SHORTEST_M: Final = 1.0
+_MAX_ITERATIONS: Final = 200
+_SETTLED_M: Final = 1e-7
+
+
+class AntennaOffset(BaseModel):
+    """Phase centre of one antenna in the axes of the vehicle [m]."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    along_m: float = Field(ge=-30.0, le=30.0)
+    across_m: float = Field(default=0.0, ge=-2.5, le=2.5)
+    up_m: float = Field(ge=0.0, le=8.0)
+
+
+class Vehicle(BaseModel):
+    """A vehicle as its TOML file gives it.
+
+    Attributes
+    ----------
+    bogie_distance_m : float
+        Between the two bogie centres, as a chord.
+    gauge_m : float
+        Track gauge; cant is measured over the gauge and `RAIL_HEAD_M`.
+    facing : {"rising", "falling"}
+        Which way along the chainage the vehicle's front points.
+    antennas : dict
+        Offsets by name: ``front``, ``rear``.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    name: str = "vehicle"
+    bogie_distance_m: float = Field(gt=0.5, le=30.0)
+    gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
+    facing: Literal["rising", "falling"] = "rising"
+    antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)
+
+    @property
+    def contact_spacing_m(self) -> float:
+        """Distance between the contact points of the two wheels of an axle [m]."""
+        return self.gauge_m + RAIL_HEAD_M
+
+
+def read_vehicle(path: str | PathLike[str]) -> Vehicle:
+    """Read a vehicle file (TOML).
+
+    Raises
+    ------
+    InputFileError
+        No such file, or not TOML.
+    SettingsError
+        A key is unknown, missing or out of range.
+    """
+    try:
+        values = tomllib.loads(read_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise InputFileError(path, f"this is not TOML ({error})") from None
+    try:
+        return Vehicle.model_validate(values)
+    except ValidationError as error:
+        raise SettingsError(f"{path}: {_first_fault(error)}") from None
+
+
+def _first_fault(error: ValidationError) -> str:
+    """One sentence about the first fault, unknown names before missing ones."""
+    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+    fault = faults[0]
+    key = ".".join(str(part) for part in fault["loc"] if part != "[key]")
+    last = str(fault["loc"][-1]) if fault["loc"] else ""
+    if fault["type"] == "extra_forbidden":
+        known = (*Vehicle.model_fields, *AntennaOffset.model_fields)
+        near = misspelt([last], known).get(last)
+        return f"{key} is unknown" + (f"; is {near!r} meant?" if near else f"; known are {', '.join(known)}")
+    if fault["type"] == "missing":
+        return f"{key} is missing"
+    if fault["type"] == "literal_error" and fault["loc"] and fault["loc"][0] == "antennas":
+        return f"{key} is unknown; antennas are named 'front' and 'rear'"
+    return f"{key}: {fault['msg']}, got {fault['input']!r}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Body:
+    """Pose of the car body at n places, seen in the direction of rising chainage.
+
+    Attributes
+    ----------
+    lower_m, upper_m : ndarray, shape (n,) [m]
+        Chainage of the bogie centres, the lower first.
+    origin : ndarray, shape (n, 3) [m]
+        Midway between the bogie centres, ECEF.
+    forward, right, up : ndarray, shape (n, 3)
+        Unit vectors of the body.
+    roll_rad : ndarray, shape (n,)
+        Lean to the right.
+    """
+
+    lower_m: Floats
+    upper_m: Floats
+    origin: Floats
+    forward: Floats
+    right: Floats
+    up: Floats
+    roll_rad: Floats
+
+
+class _Line:
+    """The centreline as a function of chainage, with the lean that its cant gives a bogie."""
+
+    def __init__(self, track: Track, contact_spacing_m: float) -> None:
+        self.chainage = track.chainage_m
+        self.points = track.ecef_m
+        step = np.diff(self.chainage)
+        if not (step > 0).all():
+            i = int(np.argmin(step))
+            raise ValueError(f"points {i} and {i + 1} of the track are equal")
+        self.tangent = np.diff(self.points, axis=0) / step[:, None]
+        cant, self.notes = _signed_cant(track)
+        if (np.abs(cant) >= contact_spacing_m).any():
+            raise MismatchError(
+                f"{track.name}: a cant of {np.abs(cant).max():g} m is more than the track is wide; is it in mm?"
+            )
+        self.roll = np.arcsin(cant / contact_spacing_m)
+
+    def at(self, chainage: Floats) -> Floats:
+        """Points, shape (n, 3); beyond the ends the first and last segments go on straight."""
+        index = np.clip(np.searchsorted(self.chainage, chainage, side="right") - 1, 0, len(self.tangent) - 1)
+        return np.asarray(self.points[index] + (chainage - self.chainage[index])[:, None] * self.tangent[index])
+
+    def roll_at(self, chainage: Floats) -> Floats:
+        return np.interp(chainage, self.chainage, self.roll)
+
+
+def _signed_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
+    """Cant, positive where the body leans to the right, and what had to be assumed.
+
+    The side is that of the curve the point is on by its radius; at a canted point that the map calls
+    straight (the foot of a ramp) that of the nearest curve; without radii that of the curve itself.
+    """
+    cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
+    canted = cant != 0.0
+    notes: list[str] = []
+    if np.isnan(track.cant_m).all():
+        notes.append("the track map has no cant: the body is taken as upright in curves")
+    elif np.isnan(track.cant_m).any():
+        notes.append(f"cant is taken as 0 at {int(np.isnan(track.cant_m).sum())} points where the map has none")
+    if not canted.any():
+        return cant, tuple(notes)
+    with np.errstate(divide="ignore"):
+        side = np.where(np.isfinite(track.radius_m), np.sign(track.radius_m), 0.0)
+    if (canted & np.isnan(track.radius_m)).any():
+        side = np.where(np.isnan(track.radius_m), _turning_side(track), side)
+        notes.append("the side of the cant is taken from the bend of the centreline where the map has no radius")
+    curved = np.flatnonzero(side)
+    if not curved.size:
+        raise MismatchError(f"{track.name}: the track has cant but no curve, so its side is unknown; give radius_m")
+    place = np.interp(track.chainage_m, track.chainage_m[curved], np.arange(curved.size))
+    side = np.where(side == 0.0, side[curved[np.rint(place).astype(np.intp)]], side)
+    return cant * side, tuple(notes)
+
+
+def _turning_side(track: Track) -> Floats:
+    """+1 where the centreline bends to the right, -1 to the left, 0 where straight, shape (V,)."""
+    steps = np.diff(track.ecef_m, axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    up = enu_axes(track.latitude_deg, track.longitude_deg)[1:-1, 2]
+    turn = np.einsum("vi,vi->v", np.cross(steps[1:], steps[:-1]), up)
+    return np.concatenate([[0.0], np.where(np.abs(turn) > 1e-5, np.sign(turn), 0.0), [0.0]])
+
+
+def _bogies(line: _Line, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
+    """Chainage of the bogies, equally far from `middle`, at the bogie distance as a chord."""
+    half = np.full(len(middle), distance_m / 2.0)
+    todo = np.arange(len(middle))
+    for _ in range(_MAX_ITERATIONS):
+        chord = np.linalg.norm(line.at(middle[todo] + half[todo]) - line.at(middle[todo] - half[todo]), axis=1)
+        missing = distance_m - chord
+        half[todo] += missing / 2.0
+        todo = todo[np.abs(missing) > _SETTLED_M]
+        if not todo.size:
+            return middle - half, middle + half
+    raise MismatchError(
+        f"{track.name}: the line turns back on itself near chainage {middle[todo[0]]:.1f} m, "
+        f"where no bogie distance of {distance_m:g} m fits"
+    )
+
+
+def body_pose(track: Track, vehicle: Vehicle, middle_m: Floats) -> Body:
+    """Pose of the body with its bogies equally far along the track from given chainages.
+
+    Parameters
+    ----------
+    track : Track
+    vehicle : Vehicle
+    middle_m : ndarray, shape (n,) [m]
+
+    Returns
+    -------
+    Body
+    """
+    return _pose(_Line(track, vehicle.contact_spacing_m), track, vehicle, np.asarray(middle_m, dtype=np.float64))
+
+
+def _pose(line: _Line, track: Track, vehicle: Vehicle, middle: Floats) -> Body:
+    lower, upper = _bogies(line, middle, vehicle.bogie_distance_m, track)
+    first, second = line.at(lower), line.at(upper)
+    origin = (first + second) / 2.0
+    forward = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True)
+    latitude, longitude, _ = geodetic_from_ecef(origin)
+    gravity_up = enu_axes(latitude, longitude)[:, 2]
+    level_right = np.cross(forward, gravity_up)
+    level_right /= np.linalg.norm(level_right, axis=1, keepdims=True)
+    level_up = np.cross(level_right, forward)
+    roll = (line.roll_at(lower) + line.roll_at(upper)) / 2.0
+    cos, sin = np.cos(roll)[:, None], np.sin(roll)[:, None]
+    return Body(
+        lower_m=lower,
+        upper_m=upper,
+        origin=origin,
+        forward=forward,
+        right=cos * level_right - sin * level_up,
+        up=cos * level_up + sin * level_right,
+        roll_rad=roll,
+    )
+
+
+def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
+    """The antenna, ECEF, shape (n, 3) [m]."""
+    sign = 1.0 if vehicle.facing == "rising" else -1.0
+    return np.asarray(
+        body.origin + sign * offset.along_m * body.forward + sign * offset.across_m * body.right + offset.up_m * body.up
+    )
+
+
+def _abeam(line: _Line, body: Body, antenna: Floats, along_m: float) -> Floats:
+    """Chainage of the centreline point abeam the antenna: in the plane through it square to the body."""
+    chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
+    for _ in range(_MAX_ITERATIONS):
+        ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
+        chainage -= ahead
+        if np.abs(ahead).max() < _SETTLED_M:
+            return chainage
+    raise MismatchError("the line turns so sharply that no point of it is abeam the antenna")
+
+
+def _refined(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
+    """Places of the body's middle: the points of the track, and more where the path bends between them."""
+    half = _end_halves(line, track, vehicle)
+    first, last = half[0], line.chainage[-1] - half[1]
+    if not last - first > 0.0:
+        raise MismatchError(
+            f"{track.name}: the track is {line.chainage[-1]:.1f} m long, too short for a vehicle with "
+            f"{vehicle.bogie_distance_m:g} m between its bogies"
+        )
+    inner = line.chainage[(line.chainage > first + 0.1) & (line.chainage < last - 0.1)]
+    middle = np.concatenate([[first], inner, [last]])
+    fine = np.zeros(len(middle) - 1, dtype=np.bool_)
+    while True:
+        places = _place(_pose(line, track, vehicle, middle), vehicle, offset)
+        long = ~fine & (np.diff(middle) > 2.0 * _SHORTEST_M)
+        at = np.flatnonzero(long)
+        if not at.size:
+            return middle
+        centre = (middle[at] + middle[at + 1]) / 2.0
+        true = _place(_pose(line, track, vehicle, centre), vehicle, offset)
+        chord = places[at + 1] - places[at]
+        chord /= np.linalg.norm(chord, axis=1, keepdims=True)
+        off = true - places[at]
+        off -= np.einsum("vi,vi->v", off, chord)[:, None] * chord
+        bent = np.linalg.norm(off, axis=1) > PATH_TOLERANCE_M
+        fine[at[~bent]] = True
+        fine = np.insert(fine, at[bent], False)
+        middle = np.insert(middle, at[bent] + 1, centre[bent])
+
+
+def _end_halves(line: _Line, track: Track, vehicle: Vehicle) -> tuple[float, float]:
+    """How far the body's middle stays from either end with both bogies on the track."""
+    first, last = 0.0, line.chainage[-1]
+    half = np.full(2, vehicle.bogie_distance_m / 2.0)
+    for _ in range(_MAX_ITERATIONS):
+        middle = np.array([first + half[0], last - half[1]])
+        lower, upper = _bogies(line, middle, vehicle.bogie_distance_m, track)
+        short = np.array([first - lower[0], upper[1] - last])
+        half += short
+        if np.abs(short).max() < _SETTLED_M:
+            break
+    return float(half[0]), float(half[1])
+
+
+def antenna_trajectory(
+    track: Track,
+    vehicle: Vehicle,
+    antenna: Literal["front", "rear"] = "front",
+    *,
+    reference: Reference = "antenna",
+) -> Trajectory:
+    """Path of a roof antenna of a vehicle that runs over the track.
+
+    Both bogie centres lie on the centreline at the bogie distance (a chord). At each bogie the
+    track leans by ``asin(cant / contact spacing)`` toward the inside of the curve; the body leans
+    by the mean of the two (P1 3.1(1)). The body's forward axis joins the bogie centres, its up axis
+    is gravity's up leant about it. The path starts and ends where a bogie reaches the end of the
+    track: nothing is invented beyond.
+
+    Parameters
+    ----------
+    track : Track
+    vehicle : Vehicle
+    antenna : {"front", "rear"}
+    reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
+        The point of the vehicle whose chainage is given: the centreline point abeam the antenna
+        (beyond the outer bogies the centreline goes on straight), the middle between the bogies, or a
+        bogie centre; front and rear are those of the vehicle.
+
+    Returns
+    -------
+    Trajectory
+        With a point where the body's middle passes each point of the track, and more where the path
+        bends by over `PATH_TOLERANCE_M` in between.
+
+    Raises
+    ------
+    SettingsError
+        The vehicle has no such antenna.
+    MismatchError
+        Track and vehicle do not fit: the track is shorter than the vehicle, turns too sharply, has cant
+        whose side is unknown, or is an antenna's path itself.
+    """
+    if ANTENNA_PATH in track.provenance.notes:
+        raise MismatchError(f"{track.name}: {ANTENNA_PATH}; use it without a vehicle file")
+    if antenna not in vehicle.antennas:
+        raise SettingsError(
+            f"vehicle {vehicle.name!r} has no antenna {antenna!r}; it has {', '.join(vehicle.antennas)}"
+        )
+    offset = vehicle.antennas[antenna]
+    line = _Line(track, vehicle.contact_spacing_m)
+    middle = _refined(line, track, vehicle, offset)
+    body = _pose(line, track, vehicle, middle)
+    places = _place(body, vehicle, offset)
+    rising = vehicle.facing == "rising"
+    chainage = {
+        "antenna": lambda: _abeam(line, body, places, offset.along_m if rising else -offset.along_m),
+        "centre": lambda: middle,
+        "front_bogie": lambda: body.upper_m if rising else body.lower_m,
+        "rear_bogie": lambda: body.lower_m if rising else body.upper_m,
+    }[reference]()
+    if not (np.diff(chainage) > 0).all():
+        i = int(np.argmin(np.diff(chainage)))
+        raise MismatchError(
+            f"{track.name}: the line turns so sharply near chainage {chainage[i]:.1f} m that the antenna runs back"
+        )
+    cant = np.interp(chainage, track.chainage_m, np.where(np.isnan(track.cant_m), 0.0, track.cant_m))
+    return Trajectory(
+        name=f"{vehicle.name} {antenna}",
+        ecef_m=places,
+        chainage_m=chainage,
+        kilometrage_m=track.kilometrage_at(chainage),
+        cant_m=np.full_like(cant, np.nan) if np.isnan(track.cant_m).all() else cant,
+        roll_deg=np.degrees(body.roll_rad),
+        reference=reference,
+        body_chainage_m=middle,
+        facing=vehicle.facing,
+        sigma_plan_m=track.sigma_plan_m,
+        sigma_height_m=track.sigma_height_m,
+        notes=(*line.notes, *track.provenance.notes),
+    )
