@@ -126,15 +126,14 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
     InputFileError
         The file cannot be read.
     """
-    import tomllib
-
-    from railfix.pipeline.config import load_config, parse_config
+    from railfix.core.settings import read_toml
+    from railfix.pipeline.config import parse_config
 
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:
-        load_config(choices.config)
-        values = tomllib.loads(choices.config.read_text(encoding="utf-8"))
+        values = read_toml(choices.config, what="a configuration file")
+        parse_config(values, source=str(choices.config))
     if choices.preset is not None:
         values["preset"] = _preset(choices.preset)
     for text in choices.setting:

@@ -18,25 +18,20 @@ A preset names a set of settings; single ones stand over it.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
-from dataclasses import fields
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from pydantic import (
-    BaseModel,
-    ConfigDict,
     Field,
     TypeAdapter,
-    ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
 )
 
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.settings import Settings, load_settings, validated
 from railfix.integrity.protection import RiskBudget
 from railfix.integrity.raim import RaimLimits
 from railfix.positioning.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
@@ -105,7 +100,7 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 
 
-class Config(BaseModel):
+class Config(Settings):
     """Settings of the positioning, each with its default and where that comes from.
 
     Attributes
@@ -182,8 +177,6 @@ class Config(BaseModel):
         Limits of the rooms of the carrier phase.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=False)
-
     preset: Literal["default", "strict", "p1"] = "default"
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
@@ -256,7 +249,7 @@ class Config(BaseModel):
         """Refuse misspelt settings of a room; those left out keep this model's defaults, not the room's."""
         if isinstance(value, dict) and info.field_name:
             default = cls.model_fields[info.field_name].get_default(call_default_factory=True)
-            known = {item.name for item in fields(default)}
+            known = set(type(default).model_fields if isinstance(default, Settings) else default.__dataclass_fields__)
             unknown = sorted(set(value) - known)
             if unknown:
                 raise ValueError(f"unknown setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
@@ -279,7 +272,7 @@ def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any
     return both
 
 
-def parse_config(values: dict[str, Any], *, source: str = "settings") -> Config:
+def parse_config(values: Mapping[str, Any], *, source: str = "settings") -> Config:
     """A configuration from plain values.
 
     Raises
@@ -287,16 +280,7 @@ def parse_config(values: dict[str, Any], *, source: str = "settings") -> Config:
     SettingsError
         Names the source, the setting, and what was expected.
     """
-    try:
-        return Config.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        known = sorted(Config.model_fields)
-        if first["type"] == "extra_forbidden":
-            raise SettingsError(f"{source}: unknown setting {where}; known are {', '.join(known)}") from None
-        message = first["msg"].removeprefix("Value error, ")
-        raise SettingsError(f"{source}: setting {where}: {message}, got {first['input']!r}") from None
+    return validated(Config, values, source=source)
 
 
 def load_config(path: str | PathLike[str]) -> Config:
@@ -309,14 +293,4 @@ def load_config(path: str | PathLike[str]) -> Config:
     SettingsError
         A setting is misspelt or out of range.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read as a configuration file ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputFileError(path, "is no text file; a configuration is TOML") from None
-    try:
-        values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputFileError(path, f"is no valid TOML: {error}") from None
-    return parse_config(values, source=str(path))
+    return load_settings(Config, path, what="a configuration file")

@@ -1,0 +1,126 @@
+"""Settings and limits: frozen pydantic models, read from TOML, misspelt keys rejected.
+
+Every set of limits is a `Settings` model beside the function it belongs to. `Config`
+(`railfix.pipeline.config`) puts them side by side; TOML files and ``--set`` are read here alone.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import FilePath, write_whole
+
+
+class Settings(BaseModel):
+    """Base of all settings: frozen, unknown names rejected, validated when made."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def replaced(self, **changes: Any) -> Self:
+        """Return a validated copy with some settings changed.
+
+        Raises
+        ------
+        ValidationError
+            A value is out of range or a name unknown.
+        """
+        values = {name: getattr(self, name) for name in type(self).model_fields}
+        return type(self)(**{**values, **changes})
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
+    """Settings from plain values.
+
+    Parameters
+    ----------
+    model : type of Settings
+    values : mapping
+    source : str
+        Where the values come from, for the message: a path, or "--set".
+
+    Raises
+    ------
+    SettingsError
+        Names the source, the setting, what was expected and what was given.
+    """
+    try:
+        return model.model_validate(dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(sorted(_fields_at(model, first["loc"][:-1])))
+            raise SettingsError(f"{source}: unknown setting {where}; known are {known}") from None
+        message = first["msg"].removeprefix("Value error, ")
+        raise SettingsError(f"{source}: setting {where}: {message}, got {first['input']!r}") from None
+
+
+def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
+    """Names of the settings of the group at a location of a nested model."""
+    for part in location:
+        field = model.model_fields.get(str(part))
+        if field is None or not isinstance(field.annotation, type) or not issubclass(field.annotation, BaseModel):
+            return set()
+        model = field.annotation
+    return set(model.model_fields)
+
+
+def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
+    """Values of a TOML file.
+
+    Parameters
+    ----------
+    path : path
+    what : str
+        What the file should be, with its article ("a vehicle file").
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, not UTF-8, or not TOML.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read as {what} ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputFileError(path, f"is not a text file; {what} is TOML in UTF-8") from None
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputFileError(path, f"is not valid TOML: {error}") from None
+
+
+def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
+    """Settings from a TOML file.
+
+    Raises
+    ------
+    InputFileError
+        As `read_toml`.
+    SettingsError
+        As `validated`.
+    """
+    return validated(model, read_toml(path, what=what), source=str(path))
+
+
+def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file", comment: str = "") -> None:
+    """Write values as TOML, whole or not at all, below an optional comment.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
+    write_whole(path, head + tomli_w.dumps(dict(values)), what=what)
