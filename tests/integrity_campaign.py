@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.reasons import Status
+from railfix.core.settings import write_toml
 from railfix.evaluate.range_errors import range_errors
 from railfix.evaluate.range_errors.gather import joined
 from railfix.integrity.protection import Cause
@@ -40,7 +41,7 @@ from railfix.ranges.error_model import (
     write_error_model,
 )
 from railfix.simulate import Scenario, Simulation
-from railfix.simulate.run import vehicle_toml
+from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -79,7 +80,7 @@ class Played:
         simulation = Simulation(scenario)
         with TemporaryDirectory() as folder:
             path = Path(folder) / "vehicle.toml"
-            path.write_text(vehicle_toml(scenario.vehicle))
+            write_toml(path, vehicle_table(scenario.vehicle))
             vehicle = read_vehicle(path)
         track = simulation.line.track()
         return cls(simulation, {name: antenna_trajectory(track, vehicle, name) for name in ANTENNAS})

@@ -286,7 +286,7 @@ def commercial(folder: Path, runs: Sequence[int] = (0, 1, 2, 3), seed: int | Non
     campaigns = []
     for number in runs:
         other = {} if seed is None else {"seed": seed, "place_seed": seed, "line": {"generated": {"seed": seed}}}
-        scenario = replace(recipe.scenario(number, changes=other), sensors=None)
+        scenario = recipe.scenario(number, changes=other).replaced(sensors=None)
         name = recipe.names[number] if seed is None else f"seed-{seed}"
         campaigns.append(ridden(Bench(scenario, name, WAYS, SYSTEMS, curve)))
     return together(campaigns)
@@ -294,7 +294,7 @@ def commercial(folder: Path, runs: Sequence[int] = (0, 1, 2, 3), seed: int | Non
 
 def short_scenario() -> Scenario:
     """The first minutes of the first run: a station, tall buildings, town."""
-    return replace(load_recipe("p1-commercial").scenario(0), sensors=None, duration_s=SHORT_S)
+    return load_recipe("p1-commercial").scenario(0).replaced(sensors=None, duration_s=SHORT_S)
 
 
 def short_report(folder: Path) -> Iterator[str]:

@@ -13,11 +13,12 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.reasons import CHECK_FAILED, Status
+from railfix.core.settings import write_toml
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.simulate import Scenario, Simulation
-from railfix.simulate.run import vehicle_toml
+from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario import ANTENNAS, RunSettings
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.signals import Piece
@@ -55,8 +56,7 @@ class Way:
 def cn0_curve(folder: Path) -> Path:
     """P1 2.3(1): mean C/N0 over elevation, of a day of open sky standing, with the receivers of the commercial run."""
     base = load_recipe("commercial-run").scenario()
-    day = replace(
-        Scenario(),
+    day = Scenario().replaced(
         seed=230,
         start=base.start,
         duration_s=86_400.0,
@@ -146,7 +146,7 @@ class Bench:
         self.sampled, self.mapped = line.sampled_chainage_m(), track.chainage_m
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "vehicle.toml"
-            path.write_text(vehicle_toml(scenario.vehicle))
+            write_toml(path, vehicle_table(scenario.vehicle))
             vehicle = read_vehicle(path)
         self.trajectories = {a: antenna_trajectory(track, vehicle, a) for a in ANTENNAS}
         self.ways, self.systems = ways, systems

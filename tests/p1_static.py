@@ -7,7 +7,7 @@ each triple of the satellites above the mask is taken as all there is.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,13 +17,14 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
 from railfix.core.reasons import Status
+from railfix.core.settings import write_toml
 from railfix.gnss.observations import Observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.line_settings import Element, LineSettings
-from railfix.simulate.run import vehicle_toml
+from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario import RunSettings, Station
 from railfix.simulate.scenario_file import load_recipe, whole_run_s
 from railfix.track.trajectory import Trajectory
@@ -85,16 +86,16 @@ def standing(start: np.datetime64, seed: int, place: Place, places: Sequence[flo
     around = base.environment if place == "houses" else EnvironmentSettings()
     if place == "open field, a line without curves":
         straight = Element(kind="straight", length_m=756.0)
-        base = replace(base, line=LineSettings(kind="elements", elements=(straight,)))
-    scenario = replace(base, start=start, seed=seed, rate_hz=1.0, run=run, sensors=None, environment=around)
-    return replace(scenario, duration_s=whole_run_s(scenario))
+        base = base.replaced(line=LineSettings(kind="elements", elements=(straight,)))
+    scenario = base.replaced(start=start, seed=seed, rate_hz=1.0, run=run, sensors=None, environment=around)
+    return scenario.replaced(duration_s=whole_run_s(scenario))
 
 
 def trajectory_of(simulation: Simulation) -> Trajectory:
     """Of the front antenna."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "vehicle.toml"
-        path.write_text(vehicle_toml(simulation.scenario.vehicle))
+        write_toml(path, vehicle_table(simulation.scenario.vehicle))
         return antenna_trajectory(simulation.line.track(), read_vehicle(path), "front")
 
 

@@ -6,7 +6,6 @@ The part ``test-line`` of `p1_experiment`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -27,15 +26,15 @@ DAYS: Final = tuple(np.datetime64(f"2011-12-{start}:30:15", "ns") for start in (
 
 def figure_7_scenario() -> Scenario:
     """Table 2: 2010/8/19, 12 min 34 s at 5 Hz, two round trips."""
-    return replace(load_recipe("p1-test-line").scenario(), sensors=None)
+    return load_recipe("p1-test-line").scenario().replaced(sensors=None)
 
 
 def table_4_scenario(day: int) -> Scenario:
     """Table 3: two receivers at 10 Hz, antennas 18.14 m apart; one QZSS satellite, as there was then."""
     base = figure_7_scenario()
-    vehicle = replace(base.vehicle, front=(9.07, 0.25, 3.95), rear=(-9.07, 0.25, 3.95))
-    sky = replace(base.sky, unhealthy=(*base.sky.unhealthy, "J02", "J03", "J04"))
-    return replace(base, start=DAYS[day], seed=400 + day, rate_hz=10.0, vehicle=vehicle, sky=sky)
+    vehicle = base.vehicle.replaced(front=(9.07, 0.25, 3.95), rear=(-9.07, 0.25, 3.95))
+    sky = base.sky.replaced(unhealthy=(*base.sky.unhealthy, "J02", "J03", "J04"))
+    return base.replaced(start=DAYS[day], seed=400 + day, rate_hz=10.0, vehicle=vehicle, sky=sky)
 
 
 def figure_7() -> Campaign:

@@ -10,7 +10,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -128,11 +127,11 @@ def speed() -> None:
             write_run(run, folder)
 
     print(f"{2 * scenario.epochs} antenna-epochs, {len(Simulation(scenario).channels)} channels; seconds of CPU")
-    everything = replace(scenario, errors=full())
+    everything = scenario.replaced(errors=full())
     timed("observations, no errors", lambda: observe(scenario))
     timed("observations, all errors", lambda: observe(everything))
     timed("observations and packed files, all errors", lambda: write(everything))
-    sensing = replace(scenario, sensors=SensorSettings())
+    sensing = scenario.replaced(sensors=SensorSettings())
     timed("sensors (inertial at 100 Hz)", lambda: sensor_tables(Simulation(sensing)))
 
 

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.core.settings import write_toml
 from railfix.simulate import (
     Element,
     GeneratedLine,
@@ -28,7 +30,7 @@ from railfix.simulate import (
     shuttle,
 )
 from railfix.simulate.motion import Sway
-from railfix.simulate.run import vehicle_toml
+from railfix.simulate.run import vehicle_table
 from railfix.track import read_track, write_track_csv
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
@@ -117,7 +119,7 @@ def test_the_antenna_is_where_the_map_says(tmp_path: Path, antenna: str) -> None
     folder = tmp_path
     vehicle = VehicleSettings()
     write_track_csv(LINE.track(), folder / "track.csv")
-    (folder / "vehicle.toml").write_text(vehicle_toml(vehicle))
+    write_toml(folder / "vehicle.toml", vehicle_table(vehicle))
     path = antenna_trajectory(read_track(folder / "track.csv"), read_vehicle(folder / "vehicle.toml"), antenna)  # type: ignore[arg-type]
     offset = getattr(vehicle, antenna)
     # Bodies whose antenna stands abeam the chainages of the path's own points.
@@ -184,7 +186,7 @@ def test_the_train_runs_as_it_was_told() -> None:
     ],
 )
 def test_settings_that_make_no_run_are_refused(settings: object) -> None:
-    with pytest.raises(SettingsError):
+    with pytest.raises(ValidationError):
         settings()  # type: ignore[operator]
 
 
@@ -245,7 +247,7 @@ def test_a_line_of_elements_is_what_they_say() -> None:
     ],
 )  # fmt: skip
 def test_lines_that_cannot_be_are_refused(settings: object, told: str) -> None:
-    with pytest.raises(SettingsError, match=told):
+    with pytest.raises((ValidationError, SettingsError), match=told):
         settings()  # type: ignore[operator]
 
 

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from pydantic import BaseModel, ValidationError
 
 from conftest import ROOT
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.settings import validated, write_toml
 from railfix.gnss.observations import concatenate
 from railfix.io.rinex import read_navigation, write
 from railfix.simulate import (
@@ -32,14 +34,13 @@ from railfix.simulate import (
     load_recipe,
     load_scenario,
     made_navigation,
-    scenario_toml,
+    scenario_table,
     shipped_scenarios,
     write_run,
 )
 from railfix.simulate.environment.settings import ElectrificationSettings, EnvironmentSettings, SectionSettings
 from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 from railfix.simulate.sensors.settings import SensorSettings, SlipInterval, TachometerSettings
-from railfix.simulate.settings_tables import from_table
 from test_simulate_signals import corrected, whole
 
 pytestmark = pytest.mark.requirement("D4")
@@ -83,10 +84,11 @@ def write_text(folder: Path, text: str, name: str = "scenario.toml") -> Path:
 
 @pytest.mark.parametrize("scenario", [Scenario(), FULL], ids=["default", "everything"])
 def test_a_scenario_is_the_same_after_its_file(tmp_path: Path, scenario: Scenario) -> None:
-    assert load_scenario(write_text(tmp_path, scenario_toml(scenario))) == scenario
+    write_toml(tmp_path / "scenario.toml", scenario_table(scenario))
+    assert load_scenario(tmp_path / "scenario.toml") == scenario
     names = scenario.describe()
     assert {"seed", "line.length_m", "run.cruise_mps", "environment.antenna_height_m"} <= set(names)
-    assert not any(hasattr(value, "__dataclass_fields__") for value in names.values())
+    assert not any(isinstance(value, BaseModel) for value in names.values())
 
 
 def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
@@ -96,27 +98,26 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("sede = 1", "unknown setting sede; did you mean seed"),
-        ("[line]\nlenght_m = 9.0", "unknown setting line.lenght_m; did you mean length_m"),
-        ("seed = 1.5", "seed: Input should be a valid integer, got 1.5"),
-        ("seed = true", "seed: .*integer"),
+        ("sede = 1", "unknown setting sede; known are .*, seed,"),
+        ("[line]\nlenght_m = 9.0", "unknown setting line.lenght_m; known are .*, length_m,"),
+        ("seed = 1.5", "seed: Input should be a valid integer, .* got 1.5"),
         ('duration_s = "long"', "duration_s: .*number"),
         ("rate_hz = 3", "whole 100 ns"),
         ("start = 2024-03-05T03:10:00Z", "GPS time without a zone"),
-        ('start = "yesterday"', "start must be a time"),
-        ("start = 5", "start must be a time"),
-        ("run = 3", "run must be a table"),
-        ("[run]\nstations = 3", "run.stations must be a list"),
-        ("[run]\nstations = [{at_m = 30}, {dwell_s = 3}]", "run.stations 2 lacks the setting at_m"),
+        ('start = "yesterday"', "start: must be a time"),
+        ("start = 5", "start: must be a time"),
+        ("run = 3", "run: .*valid dictionary"),
+        ("[run]\nstations = 3", "run.stations: .*valid tuple"),
+        ("[run]\nstations = [{at_m = 30}, {dwell_s = 3}]", "run.stations.1.at_m: Field required"),
         ("[run]\nstations = [{at_m = 30}, {at_m = 990}]", "990.0 m lies within"),
-        ('[line]\nkind = "wiggly"', "line.kind: Input should be 'pattern', 'elements', 'generated' or 'file'"),
-        ("[vehicle]\nfront = [1, 2]", "vehicle.front 3: Field required"),
-        ('[sky]\nunhealthy = ["G01", 2]', "sky.unhealthy 2: .*string"),
+        ('[line]\nkind = "wiggly"', "setting line.kind: Input should be 'pattern', 'elements', 'generated' or 'file'"),
+        ("[vehicle]\nfront = [1, 2]", "vehicle.front.2: Field required"),
+        ('[sky]\nunhealthy = ["G01", 2]', "sky.unhealthy.1: .*string"),
         ("[errors.satellites.G]\nclock = 1", "unknown setting errors.satellites.G.clock"),
-        ("[errors]\nsatellites = {G = 1}", "errors.satellites.G must be a table"),
-        ('[environment]\nsections = [{from_m = 0, to_m = 9, kind = "moon"}]', "environment.sections 1.kind"),
-        ("[sensors.tachometer]\npulses_per_turn = 0", "sensors.tachometer: TachometerSettings.pulses_per_turn"),
-        ('sensors = "all"', "sensors must be a table"),
+        ("[errors]\nsatellites = {G = 1}", "errors.satellites.G: .*valid dictionary"),
+        ('[environment]\nsections = [{from_m = 0, to_m = 9, kind = "moon"}]', "environment.sections.0.kind"),
+        ("[sensors.tachometer]\npulses_per_turn = 0", "sensors.tachometer.pulses_per_turn: .*greater than 0"),
+        ('sensors = "all"', "sensors: .*valid dictionary"),
     ],
 )
 def test_wrong_settings_are_refused_by_file_and_key(tmp_path: Path, text: str, told: str) -> None:
@@ -172,7 +173,7 @@ def test_recipes_that_are_none_are_refused(tmp_path: Path, text: str, told: str)
 
 
 def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
-    with pytest.raises(InputFileError, match="no valid TOML"):
+    with pytest.raises(InputFileError, match="not valid TOML"):
         load_scenario(write_text(tmp_path, "seed = "))
     with pytest.raises(InputFileError, match=r"shipped are .*demo"):
         load_scenario("nothing")
@@ -190,9 +191,9 @@ def test_every_shipped_run_can_be_set_up(name: str) -> None:
     recipe = load_recipe(name)
     for number in {0, len(recipe.names) - 1}:
         scenario = recipe.scenario(number)
-        simulation = Simulation(replace(scenario, duration_s=1.0))
+        simulation = Simulation(scenario.replaced(duration_s=1.0))
         assert len(simulation.channels) >= 6
-        assert Scenario.__dataclass_fields__.keys() == scenario.__dataclass_fields__.keys()
+        assert simulation.scenario.replaced(duration_s=scenario.duration_s) == scenario
 
 
 def test_the_test_line_is_that_of_the_paper() -> None:
@@ -241,8 +242,8 @@ def test_the_campaign_is_2000_km_long() -> None:
 
 def test_everything_switched_on_is_cut_anyhow() -> None:
     """The same numbers by any cutting: errors, environment, carried noise and tracking included."""
-    scenario = replace(load_recipe("commercial-run").scenario(changes={"duration_s": 12.0}), rate_hz=5.0)
-    scenario = replace(scenario, run=replace(scenario.run, first_stand_s=0.0))
+    scenario = load_recipe("commercial-run").scenario(changes={"duration_s": 12.0}).replaced(rate_hz=5.0)
+    scenario = scenario.replaced(run=scenario.run.replaced(first_stand_s=0.0))
     simulation = Simulation(scenario)
     expected = whole(scenario).observations
     joined = concatenate([p.observations for p in simulation.pieces("front", chunk_epochs=7)])
@@ -292,7 +293,7 @@ def test_the_truth_tells_acceleration_and_what_stands_along_the_line(tmp_path: P
 def test_a_made_sky_read_back_from_its_file_is_the_same_sky(tmp_path: Path) -> None:
     scenario = Scenario(duration_s=5.0, rate_hz=1.0, sky=SkySettings(systems="GJEC", unhealthy=()))
     write.write_navigation(made_navigation(scenario), tmp_path / "sky.rnx")
-    filed = replace(scenario, sky=replace(scenario.sky, nav=str(tmp_path / "sky.rnx")))
+    filed = scenario.replaced(sky=scenario.sky.replaced(nav=str(tmp_path / "sky.rnx")))
     made, read = whole(scenario).observations, whole(filed).observations
     assert made.satellite.tolist() == read.satellite.tolist()
     np.testing.assert_allclose(made.code_m, read.code_m, rtol=0.0, atol=1e-6)
@@ -308,7 +309,7 @@ def test_a_real_sky_is_corrected_by_the_product(recordings: Path, systems: str) 
         rate_hz=0.2,
         line=LineSettings(latitude_deg=55.5, longitude_deg=8.5),
         sky=SkySettings(nav=str(nav), systems=systems, unhealthy=()),
-        receiver=replace(QUIET, signals_per_satellite=2),
+        receiver=QUIET.replaced(signals_per_satellite=2),
     )
     simulation = Simulation(scenario)
     residual = corrected(whole(scenario), simulation)
@@ -331,8 +332,8 @@ def test_a_time_outside_of_the_file_is_refused(tmp_path: Path) -> None:
     navigation = replace(read_navigation(tmp_path / "sky.rnx"), klobuchar={})
     write.write_navigation(navigation, tmp_path / "bare.rnx")
     with pytest.raises(MismatchError, match="Klobuchar"):
-        made_navigation(Scenario(sky=replace(sky, nav=str(tmp_path / "bare.rnx"))))
-    with pytest.raises(SettingsError, match="unhealthy"):
+        made_navigation(Scenario(sky=sky.replaced(nav=str(tmp_path / "bare.rnx"))))
+    with pytest.raises(ValidationError, match="unhealthy"):
         SkySettings(nav="x")
 
 
@@ -360,7 +361,7 @@ def test_rtklib_stands_where_the_antenna_is_on_any_line(tmp_path: Path, kind: st
         rate_hz=1.0,
         line=lines(tmp_path)[kind],
         run=RunSettings(first_stand_s=3.0, cant_deficiency_m=0.05, direction="falling"),
-        vehicle=replace(Scenario().vehicle, sway_sigma_deg=1.0),
+        vehicle=Scenario().vehicle.replaced(sway_sigma_deg=1.0),
         sky=SkySettings(systems="GJEC", unhealthy=()),
         receiver=QUIET,
     )
@@ -399,7 +400,7 @@ def test_georinex_reads_the_files(tmp_path: Path) -> None:
 
 def test_tables_of_settings_tell_what_is_known() -> None:
     with pytest.raises(SettingsError, match=r"known are .*bogie_distance_m"):
-        from_table(Scenario, tomllib.loads("[vehicle]\nbogie = 3"), where="", source="here")
+        validated(Scenario, tomllib.loads("[vehicle]\nbogie = 3"), source="here")
 
 
 def test_the_files_of_the_document_are_scenarios(tmp_path: Path) -> None:

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from railfix.core.errors import SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate import RunSettings, Scenario, Simulation
 from railfix.simulate.sensors import (
@@ -351,5 +350,5 @@ def test_settings_are_read_from_plain_tables() -> None:
     ],
 )
 def test_settings_out_of_range_are_refused(settings: Any, names: str) -> None:
-    with pytest.raises(SettingsError, match=names):
+    with pytest.raises(ValidationError, match=names):
         settings()

@@ -62,7 +62,8 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
             known = ", ".join(sorted(_fields_at(model, first["loc"][:-1])))
             raise SettingsError(f"{source}: unknown setting {where}; known are {known}") from None
         message = first["msg"].removeprefix("Value error, ")
-        raise SettingsError(f"{source}: setting {where}: {message}, got {first['input']!r}") from None
+        given = "" if isinstance(first["input"], (Mapping, BaseModel)) else f", got {first['input']!r}"
+        raise SettingsError(f"{source}: setting {where}: {message}{given}") from None
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:

@@ -35,7 +35,7 @@ from railfix.simulate.scenario import (
     Station,
     VehicleSettings,
 )
-from railfix.simulate.scenario_file import Recipe, load_recipe, load_scenario, scenario_toml, shipped_scenarios
+from railfix.simulate.scenario_file import Recipe, load_recipe, load_scenario, scenario_table, shipped_scenarios
 from railfix.simulate.sensors import SensorSettings
 from railfix.simulate.sensors.tables import sensor_tables
 from railfix.simulate.signals import Piece, Simulation
@@ -77,7 +77,7 @@ __all__ = [
     "made_motion",
     "made_navigation",
     "run_curve",
-    "scenario_toml",
+    "scenario_table",
     "section_table",
     "sensor_tables",
     "shipped_scenarios",

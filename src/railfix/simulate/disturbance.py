@@ -1,16 +1,16 @@
-"""What is added to clean signals: the place where multipath and shadowing come in."""
+"""Disturbances of clean signals, such as multipath and shadowing, and the geometry that they depend on."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from railfix.core.arrays import Datetimes, Floats, Strings
 
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Where one antenna and its satellites are at T epochs, M channels.
+    """Positions of one antenna and directions to its satellites at T epochs, M channels.
 
     Attributes
     ----------
@@ -42,16 +42,16 @@ class Geometry:
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """What is added to the observations, shapes (T, M).
+    """Terms added to the observations, shapes (T, M).
 
     Attributes
     ----------
     code_m : ndarray [m]
-        NaN where the signal is lost: the channel is then absent altogether.
+        NaN where the signal is lost; all observables are then absent.
     phase_m : ndarray [m]
     doppler_hz : ndarray [Hz]
     cn0_db : ndarray [dB]
-        Negative where the signal is weakened.
+        Negative where the signal is attenuated.
     """
 
     code_m: Floats
@@ -60,9 +60,5 @@ class Disturbance:
     cn0_db: Floats
 
 
-class Disturbances(Protocol):
-    """A source of disturbances; a function of the geometry alone, so that pieces of a run equal the whole."""
-
-    def __call__(self, geometry: Geometry) -> Disturbance:
-        """Disturbance of every channel and epoch."""
-        ...
+#: A source of disturbances: a function of the geometry alone, so that results do not depend on the chunks.
+Disturbances = Callable[[Geometry], Disturbance]

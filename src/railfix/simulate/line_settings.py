@@ -1,29 +1,22 @@
-"""What line is simulated: the settings of its four kinds and of the map's error."""
+"""Settings of the simulated line: its four kinds and the error of its map."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Final, Literal
 
-from railfix.core.errors import SettingsError
-from railfix.simulate.setting_checks import require_not_negative, require_one_of, require_positive
+from pydantic import Field, field_validator, model_validator
+
+from railfix.simulate.setting_types import Between, Finite, NotNegative, Positive, ScenarioSettings, Seed
 
 #: Length of the pattern of P1's test line [m], and of a generated line, where none is given.
 PATTERN_LENGTH_M: Final = 756.0
 GENERATED_LENGTH_M: Final = 36_000.0
 
 
-def _range(table: Any, name: str) -> None:
-    value = getattr(table, name)
-    if not 0.0 < value[0] <= value[1] < math.inf:
-        raise SettingsError(f"{type(table).__name__}.{name} must be two positive rising numbers, got {value!r}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Element:
-    """A piece of the line in plan.
+class Element(ScenarioSettings):
+    """Horizontal alignment element.
 
     Attributes
     ----------
@@ -37,29 +30,25 @@ class Element:
     """
 
     kind: Literal["straight", "transition", "curve"]
-    length_m: float
+    length_m: Positive
     radius_m: float = math.inf
-    cant_m: float = 0.0
+    cant_m: float = Field(default=0.0, ge=0.0, le=0.3)
 
-    def __post_init__(self) -> None:
-        require_one_of(self, "kind", ("straight", "transition", "curve"))
-        require_positive(self, "length_m")
-        require_not_negative(self, "cant_m")
+    @model_validator(mode="after")
+    def _curves_alone_bend(self) -> Element:
         curved = self.kind == "curve"
         if curved != math.isfinite(self.radius_m) or (curved and abs(self.radius_m) < 30.0):
-            raise SettingsError(
-                f"Element.radius_m of a {self.kind} is {self.radius_m}; a curve has one of at least 30 m "
-                "(negative to the left), the others none"
+            raise ValueError(
+                f"radius_m of a {self.kind} is {self.radius_m}; a curve has a radius of at least 30 m "
+                "(negative to the left), other elements have none"
             )
         if self.cant_m > 0.0 and not curved:
-            raise SettingsError(f"Element.cant_m of a {self.kind} is {self.cant_m}; give it to the curve")
-        if self.cant_m > 0.3:
-            raise SettingsError(f"Element.cant_m is {self.cant_m} m, expected at most 0.3")
+            raise ValueError(f"cant_m of a {self.kind} is {self.cant_m}; give it to the curve")
+        return self
 
 
-@dataclass(frozen=True, kw_only=True)
-class Gradient:
-    """The gradient from a place on.
+class Gradient(ScenarioSettings):
+    """Gradient from a chainage on.
 
     Attributes
     ----------
@@ -68,87 +57,76 @@ class Gradient:
     permille : float
         Positive where the line rises with chainage.
     vertical_radius_m : float
-        Of the vertical curve that joins it to the gradient before.
+        Radius of the vertical curve that joins it to the gradient before.
     """
 
-    from_m: float
-    permille: float
-    vertical_radius_m: float = 4000.0
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "from_m")
-        require_positive(self, "vertical_radius_m")
-        if not abs(self.permille) <= 100.0:
-            raise SettingsError(f"Gradient.permille must lie within 100, got {self.permille}")
+    from_m: NotNegative
+    permille: float = Field(ge=-100.0, le=100.0)
+    vertical_radius_m: Positive = 4000.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Terrain:
-    """What a generated line is made of from a place on; lengths and radii are drawn evenly from ranges.
+class Terrain(ScenarioSettings):
+    """Limits of the elements of a generated line from a chainage on; lengths and radii are uniform in their ranges.
 
     Attributes
     ----------
     from_m : float
     straight_m, curve_m, radius_m : tuple of float
-        Least and most of the straights' and curves' lengths, transitions not counted, and of the radii.
+        Range of the lengths of straights and curves, transitions not counted, and of the radii.
     permille : float
         Steepest gradient.
     gradient_m : tuple of float
-        Least and most of the distance between two changes of the gradient.
+        Range of the distance between two changes of gradient.
     """
 
-    from_m: float = 0.0
-    straight_m: tuple[float, float] = (200.0, 1500.0)
-    curve_m: tuple[float, float] = (100.0, 500.0)
-    radius_m: tuple[float, float] = (400.0, 1600.0)
-    permille: float = 10.0
-    gradient_m: tuple[float, float] = (400.0, 1500.0)
+    from_m: NotNegative = 0.0
+    straight_m: Between = (200.0, 1500.0)
+    curve_m: Between = (100.0, 500.0)
+    radius_m: Between = (400.0, 1600.0)
+    permille: float = Field(default=10.0, ge=0.0, le=35.0)
+    gradient_m: Between = (400.0, 1500.0)
 
-    def __post_init__(self) -> None:
-        require_not_negative(self, "from_m", "permille")
-        for name in ("straight_m", "curve_m", "radius_m", "gradient_m"):
-            _range(self, name)
-        if self.radius_m[0] < 100.0:
-            raise SettingsError(f"Terrain.radius_m begins at {self.radius_m[0]} m, expected at least 100")
-        if self.gradient_m[0] < 200.0:
-            raise SettingsError(f"Terrain.gradient_m begins at {self.gradient_m[0]} m, expected at least 200")
-        if self.permille > 35.0:
-            raise SettingsError(f"Terrain.permille must be at most 35, got {self.permille}")
+    @field_validator("straight_m", "curve_m", "radius_m", "gradient_m")
+    @classmethod
+    def _long_enough(cls, pair: tuple[float, float], info: Any) -> tuple[float, float]:
+        least = {"radius_m": 100.0, "gradient_m": 200.0}.get(info.field_name, 1.0)
+        if pair[0] < least:
+            raise ValueError(f"must begin at {least:g} m or more")
+        return pair
 
 
-@dataclass(frozen=True, kw_only=True)
-class GeneratedLine:
-    """How a commercial line is made up.
+class GeneratedLine(ScenarioSettings):
+    """Commercial line generated from a seed.
 
     Attributes
     ----------
     seed : int
-        Of the line alone, so that many runs share it.
+        Of the line alone, so that several runs share it.
     speed_mps : float
-        The cant is the equilibrium cant of this speed, up to `largest_cant_m`, in steps of 5 mm.
+        The cant is the equilibrium cant at this speed, up to `largest_cant_m`, in steps of 5 mm.
     largest_cant_m : float
     vertical_radius_m : float
     terrain : tuple of Terrain
         By rising `from_m`, the first from 0.
     """
 
-    seed: int = 1
-    speed_mps: float = 110.0 / 3.6
-    largest_cant_m: float = 0.105
-    vertical_radius_m: float = 4000.0
+    seed: Seed = 1
+    speed_mps: Positive = 110.0 / 3.6
+    largest_cant_m: NotNegative = 0.105
+    vertical_radius_m: Positive = 4000.0
     terrain: tuple[Terrain, ...] = (Terrain(),)
 
-    def __post_init__(self) -> None:
-        require_positive(self, "speed_mps", "vertical_radius_m")
-        require_not_negative(self, "seed", "largest_cant_m")
-        starts = [part.from_m for part in self.terrain]
+    @field_validator("terrain")
+    @classmethod
+    def _from_the_start(cls, terrain: tuple[Terrain, ...]) -> tuple[Terrain, ...]:
+        starts = [part.from_m for part in terrain]
         if not starts or starts[0] != 0.0 or any(a >= b for a, b in pairwise(starts)):
-            raise SettingsError(f"GeneratedLine.terrain must begin at 0 and rise, got from_m of {starts}")
+            raise ValueError(f"must begin at 0 and rise; its from_m are {starts}")
+        return terrain
 
 
-@dataclass(frozen=True, kw_only=True)
-class LineFile:
-    """A track file as the line.
+class LineFile(ScenarioSettings):
+    """Track file used as the line.
 
     Attributes
     ----------
@@ -157,69 +135,72 @@ class LineFile:
     from_m, to_m : float
         Part of the file's chainage that is used.
     crs, height_datum, geoid : str
-        As the options of `read_track`; empty where the file says it itself.
+        As the options of `read_track`; empty where the file states them itself.
     """
 
     path: str
-    from_m: float = 0.0
+    from_m: NotNegative = 0.0
     to_m: float = math.inf
     crs: str = ""
     height_datum: str = ""
     geoid: str = ""
 
-    def __post_init__(self) -> None:
-        require_not_negative(self, "from_m")
-        if not self.to_m > self.from_m:
-            raise SettingsError(f"LineFile.to_m must lie beyond from_m of {self.from_m}, got {self.to_m}")
+    @field_validator("to_m")
+    @classmethod
+    def _beyond(cls, to_m: float, info: Any) -> float:
+        if not to_m > info.data.get("from_m", -math.inf):
+            raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
+        return to_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapError:
-    """How far the map lies from the true line: smooth along it, Gaussian.
+class MapError(ScenarioSettings):
+    """Offset of the map from the true line: a smooth Gaussian function of chainage.
 
     Attributes
     ----------
     plan_sigma_m : float
-        Standard deviation to the east and to the north, each.
+        Standard deviation of each of the east and north offsets.
     height_sigma_m : float
     correlation_m : float
         Distance along the line over which the correlation falls to exp(-1/2).
     seed : int
     """
 
-    plan_sigma_m: float = 0.0
-    height_sigma_m: float = 0.0
-    correlation_m: float = 500.0
-    seed: int = 1
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "plan_sigma_m", "height_sigma_m", "seed")
-        require_positive(self, "correlation_m")
+    plan_sigma_m: NotNegative = 0.0
+    height_sigma_m: NotNegative = 0.0
+    correlation_m: Positive = 500.0
+    seed: Seed = 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class LineSettings:
-    """The line and how its map is sampled.
+def _length_m(given: dict[str, Any]) -> float:
+    """Length of a line whose settings do not give it."""
+    total = math.fsum(item.length_m for item in given.get("elements", ()))
+    by_kind = {"pattern": PATTERN_LENGTH_M, "generated": GENERATED_LENGTH_M, "elements": total}
+    return by_kind.get(given.get("kind", "file"), math.nan)
+
+
+class LineSettings(ScenarioSettings):
+    """The line and the spacing of its map.
 
     Attributes
     ----------
     name : str
     kind : {"pattern", "elements", "generated", "file"}
         The pattern of P1's test line; `elements` and `gradients`; `generated`; or `file`.
-    length_m : float
-        The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated
-        line ends here. Elements have their own sum, and a file its own length (NaN here).
     latitude_deg, longitude_deg, height_m : float
-        First point; ellipsoidal height. An invented place. Not used for a file.
+        First point; ellipsoidal height. Not used for a file.
     azimuth_deg : float
         Direction of the line at its first point. Not used for a file.
     kilometrage_start_m : float
-        The line's own marking at its first point; it rises with the length. A file brings its own.
+        Kilometrage of the first point; it rises with chainage. A file brings its own.
     straight_spacing_m, curve_spacing_m : float
         Largest spacing of the map's points; curves include their transitions. A file brings its points.
     elements : tuple of Element
     gradients : tuple of Gradient
         Level where there is none.
+    length_m : float
+        The pattern, 756 m long, is repeated (every second time mirrored) and cut off here; a generated
+        line ends here. Elements have their own sum, and a file its own length (NaN here).
     generated : GeneratedLine
     file : LineFile or None
     map_error : MapError
@@ -227,45 +208,34 @@ class LineSettings:
 
     name: str = "made test line"
     kind: Literal["pattern", "elements", "generated", "file"] = "pattern"
-    length_m: float = math.nan
-    latitude_deg: float = 35.05
-    longitude_deg: float = 135.45
-    height_m: float = 162.0
-    azimuth_deg: float = 63.0
-    kilometrage_start_m: float = 12_340.0
-    straight_spacing_m: float = 20.0
-    curve_spacing_m: float = 2.32
+    latitude_deg: float = Field(default=35.05, gt=-80.0, lt=80.0)
+    longitude_deg: Finite = 135.45
+    height_m: Finite = 162.0
+    azimuth_deg: Finite = 63.0
+    kilometrage_start_m: Finite = 12_340.0
+    straight_spacing_m: Positive = 20.0
+    curve_spacing_m: Positive = 2.32
     elements: tuple[Element, ...] = ()
     gradients: tuple[Gradient, ...] = ()
-    generated: GeneratedLine = field(default_factory=GeneratedLine)
+    length_m: float = Field(default_factory=_length_m)
+    generated: GeneratedLine = GeneratedLine()
     file: LineFile | None = None
-    map_error: MapError = field(default_factory=MapError)
+    map_error: MapError = MapError()
 
-    def __post_init__(self) -> None:
-        require_one_of(self, "kind", ("pattern", "elements", "generated", "file"))
-        self._of_one_kind()
-        if math.isnan(self.length_m) and self.kind != "file":
-            by_kind = {"pattern": PATTERN_LENGTH_M, "generated": GENERATED_LENGTH_M, "elements": self._sum_m}
-            object.__setattr__(self, "length_m", by_kind[self.kind])
-        require_positive(self, "straight_spacing_m", "curve_spacing_m")
-        if self.kind != "file" and not self.length_m >= 100.0:
-            raise SettingsError(f"LineSettings.length_m must be at least 100 m for a train to run, got {self.length_m}")
-        if not abs(self.latitude_deg) < 80.0:
-            raise SettingsError(f"LineSettings.latitude_deg must lie within 80 degrees, got {self.latitude_deg}")
-
-    @property
-    def _sum_m(self) -> float:
-        return math.fsum(item.length_m for item in self.elements)
-
-    def _of_one_kind(self) -> None:
-        """Settings of another kind than the line's are contradictions, not ignored."""
+    @model_validator(mode="after")
+    def _of_one_kind(self) -> LineSettings:
+        """Reject settings of another kind of line."""
+        total = math.fsum(item.length_m for item in self.elements)
         if (self.kind == "elements") != bool(self.elements) or (self.gradients and not self.elements):
-            raise SettingsError(f"LineSettings.elements (and gradients) go with kind 'elements', got {self.kind!r}")
+            raise ValueError(f"elements (and gradients) go with kind 'elements', got {self.kind!r}")
         if (self.kind == "file") != (self.file is not None):
-            raise SettingsError(f"LineSettings.file goes with kind 'file', got kind {self.kind!r}")
+            raise ValueError(f"file goes with kind 'file', got kind {self.kind!r}")
         if self.kind != "generated" and self.generated != GeneratedLine():
-            raise SettingsError(f"LineSettings.generated goes with kind 'generated', got {self.kind!r}")
+            raise ValueError(f"generated goes with kind 'generated', got {self.kind!r}")
         if self.kind == "file" and not math.isnan(self.length_m):
-            raise SettingsError("LineSettings.length_m is the file's own; use from_m and to_m of the file for a part")
-        if self.kind == "elements" and abs(self.length_m - self._sum_m) > 1e-6:
-            raise SettingsError(f"LineSettings.length_m is {self.length_m}, but the elements are {self._sum_m} m long")
+            raise ValueError("length_m is the file's own; use from_m and to_m of the file for a part")
+        if self.kind == "elements" and abs(self.length_m - total) > 1e-6:
+            raise ValueError(f"length_m is {self.length_m}, but the elements are {total} m long")
+        if self.kind != "file" and not self.length_m >= 100.0:
+            raise ValueError(f"length_m must be at least 100 m for a train to run, got {self.length_m}")
+        return self

@@ -9,19 +9,20 @@ import tempfile
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import polars as pl
 
 from railfix.core.errors import OutputError
+from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.io.rinex.write import write_navigation, write_observations
 from railfix.simulate.run_readme import run_readme
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
+from railfix.simulate.scenario_file import scenario_table
 from railfix.simulate.sensors.tables import sensor_tables
-from railfix.simulate.settings_tables import to_toml
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
@@ -173,13 +174,13 @@ def _write_files(
         write_observations(watched(), files[antenna], comments=_COMMENTS)
     write_navigation(simulation.navigation, files["nav"], comments=_COMMENTS)
     write_track_csv(simulation.line.track(), files["track"])
-    _write(files["vehicle"], vehicle_toml(scenario.vehicle).encode())
+    write_toml(files["vehicle"], vehicle_table(scenario.vehicle))
     content = _csv(truth_table(simulation), TRUTH_DECIMALS)
     _write(files["truth"], gzip.compress(content, compresslevel=6, mtime=0) if packed else content)
     _write(files["sections"], _csv(section_table(simulation), TRUTH_DECIMALS))
     for name, table in tables.items():
         _write(files[name], _parquet(table) if packed else _csv(table, None))
-    _write(files["scenario"], to_toml(scenario).encode())
+    write_toml(files["scenario"], scenario_table(scenario))
     _write(files["readme"], run_readme(simulation, files, command).encode())
     return files
 
@@ -203,18 +204,13 @@ def _in_place(path: Path, out: Path) -> Path:
         raise OutputError(f"{out / path.name}: the file cannot be written ({error.strerror or error})") from error
 
 
-def vehicle_toml(vehicle: VehicleSettings) -> str:
-    """The vehicle as `railfix.track.vehicle.read_vehicle` reads it."""
-    lines = [
-        f'name = "{vehicle.name}"',
-        f"bogie_distance_m = {vehicle.bogie_distance_m}",
-        f"gauge_m = {vehicle.gauge_m}",
-        'facing = "rising"',
-    ]
-    for antenna in ANTENNAS:
-        along, across, up = getattr(vehicle, antenna)
-        lines += ["", f"[antennas.{antenna}]", f"along_m = {along}", f"across_m = {across}", f"up_m = {up}"]
-    return "\n".join(lines) + "\n"
+def vehicle_table(vehicle: VehicleSettings) -> dict[str, Any]:
+    """The vehicle as the vehicle file holds it, see `railfix.track.vehicle.read_vehicle`."""
+    antennas = {
+        name: dict(zip(("along_m", "across_m", "up_m"), getattr(vehicle, name), strict=True)) for name in ANTENNAS
+    }
+    known = {name: getattr(vehicle, name) for name in ("name", "bogie_distance_m", "gauge_m")}
+    return {**known, "facing": "rising", "antennas": antennas}
 
 
 def _write(path: Path, content: bytes) -> None:

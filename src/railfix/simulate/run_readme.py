@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +84,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
 def _switched_on(scenario: Scenario) -> str:
     """One sentence a group of errors: on, or none."""
     usual = Scenario().errors
-    names = [item.name for item in fields(usual)]
+    names = list(type(usual).model_fields)
     errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]
     parts = [
         f"Errors of satellites, atmosphere and receivers: {', '.join(errors)}."

@@ -1,17 +1,18 @@
-"""What is simulated: every choice with its default, in frozen dataclasses.
+"""Settings of a simulated run.
 
-The defaults are the shipped demonstration run: a made test line about like P1's (table 1: 756 m,
-189 points, 2 to 3 m apart in curves and at most about 20 m on straights), a train of P1's
-dimensions (antennas 18.2 m apart) and a made sky. Nothing in it exists.
+The defaults resemble P1's experiment: a line about like its test line (table 1: 756 m, 189 points, 2 to
+3 m apart in curves and at most about 20 m on straights), a train of its dimensions (antennas 18.2 m
+apart) and simulated satellites.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import SettingsError
 from railfix.simulate.disturbance import Disturbances
@@ -19,16 +20,22 @@ from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.errors.settings import ErrorSettings
 from railfix.simulate.line_settings import LineSettings
 from railfix.simulate.sensors.settings import SensorSettings
-from railfix.simulate.setting_checks import require_not_negative, require_one_of, require_positive
+from railfix.simulate.setting_types import (
+    SYSTEMS,
+    Finite,
+    GpsTime,
+    NotNegative,
+    Positive,
+    ScenarioSettings,
+    Seed,
+    Three,
+)
 
 #: Antennas of the vehicle, in the order in which they are written.
 ANTENNAS: Final = ("front", "rear")
-#: Constellations that can be made.
-SYSTEMS: Final = "GJEC"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Station:
+class Station(ScenarioSettings):
     """Where the train stops.
 
     Attributes
@@ -39,16 +46,12 @@ class Station:
     name : str
     """
 
-    at_m: float
-    dwell_s: float = 30.0
+    at_m: NotNegative
+    dwell_s: NotNegative = 30.0
     name: str = ""
 
-    def __post_init__(self) -> None:
-        require_not_negative(self, "at_m", "dwell_s")
 
-
-@dataclass(frozen=True, kw_only=True)
-class SpeedLimit:
+class SpeedLimit(ScenarioSettings):
     """Highest speed of the vehicle's middle on a part of the line.
 
     Attributes
@@ -56,26 +59,27 @@ class SpeedLimit:
     from_m, to_m, limit_mps : float
     """
 
-    from_m: float
-    to_m: float
-    limit_mps: float
+    from_m: Finite
+    to_m: Finite
+    limit_mps: Positive
 
-    def __post_init__(self) -> None:
-        require_positive(self, "limit_mps")
-        if not self.to_m > self.from_m:
-            raise SettingsError(f"SpeedLimit.to_m must lie beyond from_m of {self.from_m}, got {self.to_m}")
+    @field_validator("to_m")
+    @classmethod
+    def _beyond(cls, to_m: float, info: Any) -> float:
+        if to_m <= info.data.get("from_m", -np.inf):
+            raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
+        return to_m
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunSettings:
-    """How the train runs: it stands, runs from stop to stop, and comes back, until the time is up.
+class RunSettings(ScenarioSettings):
+    """Motion of the train: it stands, runs from stop to stop and back, until the end of the run.
 
     Attributes
     ----------
     cruise_mps, acceleration_mps2, deceleration_mps2 : float
-        Accelerating and braking are even. Where a leg is too short the cruising speed is not reached.
+        Accelerations are constant. Where a leg is too short the cruising speed is not reached.
     first_stand_s, stand_s : float
-        Standing at the start of the run, and at each end where no station says otherwise.
+        Standing times at the start of the run, and at each end without a station.
     end_margin_m : float
         Distance from the vehicle's middle to the ends of the line where the train turns.
     stations : tuple of Station
@@ -84,37 +88,33 @@ class RunSettings:
     cant_deficiency_m : float or None
         Curves are run at the speed whose equilibrium cant is the curve's cant and this; None: curves do not limit.
     direction : {"rising", "falling"}
-        Of the first way. The vehicle's front points to rising chainage either way.
+        Of the first leg. The vehicle's front points to rising chainage either way.
     at_end : {"return", "stand"}
-        What the train does after its last stop.
+        After the last stop.
     """
 
-    cruise_mps: float = 40.0 / 3.6
-    acceleration_mps2: float = 0.7
-    deceleration_mps2: float = 0.8
-    first_stand_s: float = 15.0
-    stand_s: float = 10.0
-    end_margin_m: float = 20.0
+    cruise_mps: Positive = 40.0 / 3.6
+    acceleration_mps2: Positive = 0.7
+    deceleration_mps2: Positive = 0.8
+    first_stand_s: NotNegative = 15.0
+    stand_s: NotNegative = 10.0
+    end_margin_m: NotNegative = 20.0
     stations: tuple[Station, ...] = ()
     limits: tuple[SpeedLimit, ...] = ()
-    cant_deficiency_m: float | None = None
+    cant_deficiency_m: Positive | None = None
     direction: Literal["rising", "falling"] = "rising"
     at_end: Literal["return", "stand"] = "return"
 
-    def __post_init__(self) -> None:
-        require_positive(self, "cruise_mps", "acceleration_mps2", "deceleration_mps2")
-        require_not_negative(self, "first_stand_s", "stand_s", "end_margin_m")
-        require_one_of(self, "direction", ("rising", "falling"))
-        require_one_of(self, "at_end", ("return", "stand"))
-        if self.cant_deficiency_m is not None:
-            require_positive(self, "cant_deficiency_m")
-        places = [station.at_m for station in self.stations]
+    @field_validator("stations")
+    @classmethod
+    def _apart(cls, stations: tuple[Station, ...]) -> tuple[Station, ...]:
+        places = [station.at_m for station in stations]
         if len(places) == 1 or any(b - a < 10.0 for a, b in pairwise(places)):
-            raise SettingsError(f"RunSettings.stations must be two or more, rising by 10 m or more, got {places}")
+            raise ValueError(f"must be two or more, rising by 10 m or more; they are at {places}")
+        return stations
 
 
-@dataclass(frozen=True, kw_only=True)
-class VehicleSettings:
+class VehicleSettings(ScenarioSettings):
     """The vehicle, in metres; antennas as (along, across to the right, above the rail tops).
 
     The origin lies midway between the bogie centres at the height of the rail tops; the front points
@@ -127,25 +127,20 @@ class VehicleSettings:
     bogie_distance_m, gauge_m : float
     front, rear : tuple of float
     sway_sigma_deg, sway_period_s : float
-        Swaying of the body about its forward axis at 20 m/s and more, in proportion to the speed below that;
-        one for both antennas. Not in the vehicle's file: nobody knows it.
+        Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that.
+        Not in the vehicle's file, as it is unknown in practice.
     """
 
     name: str = "made test car"
-    bogie_distance_m: float = 13.8
-    gauge_m: float = 1.067
-    front: tuple[float, float, float] = (9.1, 0.25, 3.95)
-    rear: tuple[float, float, float] = (-9.1, 0.25, 3.95)
-    sway_sigma_deg: float = 0.0
-    sway_period_s: float = 1.5
-
-    def __post_init__(self) -> None:
-        require_positive(self, "bogie_distance_m", "gauge_m", "sway_period_s")
-        require_not_negative(self, "sway_sigma_deg")
+    bogie_distance_m: Positive = 13.8
+    gauge_m: Positive = 1.067
+    front: Three = (9.1, 0.25, 3.95)
+    rear: Three = (-9.1, 0.25, 3.95)
+    sway_sigma_deg: NotNegative = 0.0
+    sway_period_s: Positive = 1.5
 
 
-@dataclass(frozen=True, kw_only=True)
-class SkySettings:
+class SkySettings(ScenarioSettings):
     """Satellites and atmosphere.
 
     Attributes
@@ -154,9 +149,9 @@ class SkySettings:
         Letters out of G (30 satellites in 6 planes), J (3 inclined, 1 over the equator), E (24 in 3
         planes), C (24 in 3 planes and 3 inclined geosynchronous; no GEO); or those of the file.
     nav : str or None
-        A RINEX navigation file in place of the made satellites; in a scenario file relative to that file.
+        A RINEX navigation file in place of the simulated satellites; in a scenario file relative to that file.
     cutoff_deg : float
-        Below this elevation nothing is tracked.
+        Elevation below which no signal is tracked.
     unhealthy : tuple of str
         Satellites whose newer records say unhealthy, while the record before the run says healthy.
     satellites_at_most : int or None
@@ -167,30 +162,27 @@ class SkySettings:
 
     systems: str = "GJE"
     nav: str | None = None
-    cutoff_deg: float = 5.0
+    cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)
     unhealthy: tuple[str, ...] = ("G02",)
-    satellites_at_most: int | None = None
-    ionosphere_scale: float = 1.0
-    troposphere_scale: float = 1.0
+    satellites_at_most: Annotated[int, Field(ge=1)] | None = None
+    ionosphere_scale: NotNegative = 1.0
+    troposphere_scale: NotNegative = 1.0
 
-    def __post_init__(self) -> None:
-        if not self.systems or set(self.systems) - set(SYSTEMS) or len(set(self.systems)) < len(self.systems):
-            raise SettingsError(
-                f"SkySettings.systems must be letters out of {SYSTEMS!r}, each once, got {self.systems!r}"
-            )
-        if not 0.0 <= self.cutoff_deg < 90.0:
-            raise SettingsError(f"SkySettings.cutoff_deg must lie in [0, 90), got {self.cutoff_deg}")
-        if self.satellites_at_most is not None and self.satellites_at_most < 1:
-            raise SettingsError(f"SkySettings.satellites_at_most must be at least 1, got {self.satellites_at_most}")
+    @field_validator("systems")
+    @classmethod
+    def _letters(cls, systems: str) -> str:
+        if not systems or set(systems) - set(SYSTEMS) or len(set(systems)) < len(systems):
+            raise ValueError(f"must be letters out of {SYSTEMS!r}, each once")
+        return systems
+
+    @model_validator(mode="after")
+    def _healthy_file(self) -> SkySettings:
         if self.nav is not None and self.unhealthy:
-            raise SettingsError(
-                "SkySettings.unhealthy is for the made satellites; with a navigation file give an empty list"
-            )
-        require_not_negative(self, "ionosphere_scale", "troposphere_scale")
+            raise ValueError("unhealthy is for simulated satellites; with a navigation file give an empty list")
+        return self
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReceiverSettings:
+class ReceiverSettings(ScenarioSettings):
     """Receivers: clocks, and noise that is white in time and independent between channels.
 
     The standard deviation of a code is ``code_sigma_m * 10^(-(min(C/N0, 50) - 45) / 20) /
@@ -212,26 +204,17 @@ class ReceiverSettings:
     """
 
     signals_per_satellite: Literal[1, 2] = 1
-    code_sigma_m: float = 0.5
-    phase_sigma_m: float = 0.002
-    doppler_sigma_hz: float = 0.05
-    cn0_sigma_dbhz: float = 0.7
+    code_sigma_m: NotNegative = 0.5
+    phase_sigma_m: NotNegative = 0.002
+    doppler_sigma_hz: NotNegative = 0.05
+    cn0_sigma_dbhz: NotNegative = 0.7
     clocks: Literal["separate", "common"] = "separate"
-    clock_bias_s: float = 1.2e-4
-    clock_drift: float = 2.0e-7
+    clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
+    clock_drift: Finite = 2.0e-7
     clock_steps: Literal["none", "millisecond"] = "none"
 
-    def __post_init__(self) -> None:
-        require_not_negative(self, "code_sigma_m", "phase_sigma_m", "doppler_sigma_hz", "cn0_sigma_dbhz")
-        require_one_of(self, "signals_per_satellite", (1, 2))
-        require_one_of(self, "clocks", ("separate", "common"))
-        require_one_of(self, "clock_steps", ("none", "millisecond"))
-        if not abs(self.clock_bias_s) < 0.01:
-            raise SettingsError(f"ReceiverSettings.clock_bias_s must lie within 10 ms, got {self.clock_bias_s}")
 
-
-@dataclass(frozen=True, kw_only=True)
-class Scenario:
+class Scenario(ScenarioSettings):
     """One run.
 
     Attributes
@@ -241,69 +224,73 @@ class Scenario:
     start : datetime64
         First time tag, GPS time.
     duration_s, rate_hz : float
-        Number of epochs is their product; the interval must be a whole number of 100 ns.
+        The number of epochs is their product; the interval must be a multiple of 100 ns.
     line, run, vehicle, sky, receiver
         Settings of the parts.
     errors : ErrorSettings
-        What satellites, atmosphere and receivers are off by beyond the noise of `receiver`; nothing by default.
+        Errors of satellites, atmosphere and receivers beyond the noise of `receiver`; none by default.
     sensors : SensorSettings or None
         Sensors on board besides the receivers.
     environment : EnvironmentSettings
-        What stands along the line; nothing by default.
+        Structures along the line; none by default.
     place_seed : int
-        Of what is drawn along the line, so that runs of other seeds pass the same place.
+        Seed of the structures along the line, so that runs of other seeds pass the same structures.
     multipath : tuple of Disturbances
-        More that is added to the clean signals, from Python only; not in `describe` nor in scenario files.
+        Further disturbances of the signals, from Python only; not in `describe` nor in scenario files.
     """
 
-    seed: int = 20_240_305
-    start: np.datetime64 = field(default_factory=lambda: np.datetime64("2024-03-05T03:10:00", "ns"))
-    duration_s: float = 200.0
-    rate_hz: float = 10.0
-    line: LineSettings = field(default_factory=LineSettings)
-    run: RunSettings = field(default_factory=RunSettings)
-    vehicle: VehicleSettings = field(default_factory=VehicleSettings)
-    sky: SkySettings = field(default_factory=SkySettings)
-    receiver: ReceiverSettings = field(default_factory=ReceiverSettings)
-    errors: ErrorSettings = field(default_factory=ErrorSettings)
-    environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
-    place_seed: int = 1
+    seed: Seed = 20_240_305
+    start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")
+    duration_s: Positive = 200.0
+    rate_hz: Positive = 10.0
+    line: LineSettings = LineSettings()
+    run: RunSettings = RunSettings()
+    vehicle: VehicleSettings = VehicleSettings()
+    sky: SkySettings = SkySettings()
+    receiver: ReceiverSettings = ReceiverSettings()
+    errors: ErrorSettings = ErrorSettings()
+    environment: EnvironmentSettings = EnvironmentSettings()
+    place_seed: Seed = 1
     sensors: SensorSettings | None = None
-    multipath: tuple[Disturbances, ...] = ()
+    multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
 
-    def __post_init__(self) -> None:
-        require_not_negative(self, "seed", "place_seed")
-        require_positive(self, "duration_s", "rate_hz")
+    @model_validator(mode="after")
+    def _whole_epochs(self) -> Scenario:
         if abs(1e7 / self.rate_hz - round(1e7 / self.rate_hz)) > 1e-6:
-            raise SettingsError(f"Scenario.rate_hz must give an interval of whole 100 ns, got {self.rate_hz}")
+            raise ValueError(f"rate_hz must give an interval of whole 100 ns, got {self.rate_hz}")
         if self.epochs < 1:
-            raise SettingsError("Scenario.duration_s times rate_hz is less than one epoch")
-        if np.isnat(self.start):
-            raise SettingsError("Scenario.start must be a time, got NaT")
-        if not np.isnan(self.line.length_m):
-            self.check_room(self.line.length_m)
+            raise ValueError("duration_s times rate_hz is less than one epoch")
+        if not np.isnan(self.line.length_m) and (problem := self._room_problem(self.line.length_m)):
+            raise ValueError(problem)
+        return self
 
     def check_room(self, length_m: float) -> None:
-        """Whether the train runs within a line of this length.
+        """Check that the train stays within a line of this length.
 
         Raises
         ------
         SettingsError
             The vehicle or a station would stand beyond an end.
         """
+        if problem := self._room_problem(length_m):
+            raise SettingsError(problem)
+
+    def _room_problem(self, length_m: float) -> str:
+        """Sentence on why the train does not stay within a line of this length; empty where it does."""
         margin, stations = self.run.end_margin_m, self.run.stations
         reach = max(abs(v) for v in (self.vehicle.front[0], self.vehicle.rear[0], self.vehicle.bogie_distance_m / 2.0))
         if length_m <= 2.0 * margin or margin < reach + 1.0:
-            raise SettingsError(
-                f"RunSettings.end_margin_m of {margin} m does not keep the vehicle "
+            return (
+                f"run.end_margin_m of {margin} m does not keep the vehicle "
                 f"({reach} m either way) on a line of {length_m:g} m"
             )
         outside = [item.at_m for item in stations if not margin <= item.at_m <= length_m - margin]
         if outside:
-            raise SettingsError(
-                f"RunSettings.stations: {outside[0]} m lies within {margin} m of an end of the line or beyond, "
+            return (
+                f"run.stations: {outside[0]} m lies within {margin} m of an end of the line or beyond, "
                 f"which is {length_m:g} m long"
             )
+        return ""
 
     @property
     def epochs(self) -> int:
@@ -317,22 +304,13 @@ class Scenario:
 
     def describe(self) -> dict[str, Any]:
         """All settings as plain values, by their dotted names; those of a list by their number, from 1."""
-        flat: dict[str, Any] = {}
-        for item in fields(self):
-            if item.name != "multipath":
-                _flatten(item.name, getattr(self, item.name), flat)
-        return flat
+        return _flattened("", self.model_dump() | {"start": str(self.start)})
 
 
-def _flatten(name: str, value: Any, flat: dict[str, Any]) -> None:
-    if is_dataclass(value):
-        for item in fields(value):
-            _flatten(f"{name}.{item.name}", getattr(value, item.name), flat)
-    elif isinstance(value, dict) and value:
-        for key, inner in value.items():
-            _flatten(f"{name}.{key}", inner, flat)
-    elif isinstance(value, tuple) and any(is_dataclass(inner) for inner in value):
-        for k, inner in enumerate(value, 1):
-            _flatten(f"{name}.{k}", inner, flat)
-    else:
-        flat[name] = str(value) if isinstance(value, np.datetime64) else value
+def _flattened(name: str, value: Any) -> dict[str, Any]:
+    if isinstance(value, tuple) and any(isinstance(part, Mapping) for part in value):
+        value = {str(k): part for k, part in enumerate(value, 1)}
+    if not isinstance(value, Mapping) or not value:
+        return {name: value}
+    inner = [_flattened(f"{name}.{key}" if name else key, part) for key, part in value.items()]
+    return {key: part for table in inner for key, part in table.items()}

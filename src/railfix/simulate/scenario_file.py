@@ -1,4 +1,4 @@
-"""Scenario files: TOML of one run, or a recipe that lists many.
+"""Scenario files: TOML of one run, or a recipe that lists several.
 
 One run holds the settings of `Scenario` by their names::
 
@@ -32,27 +32,26 @@ file beside it or a shipped one, and for each run what differs::
     [parts.back]
     run.direction = "falling"
 
-Parts are settings that several runs share; a run's own stand over those of its parts, later parts
-over earlier ones, and all over the base. Paths in a file (``sky.nav``, ``line.file.path``) are relative to it.
+Parts are settings that several runs share; a run's own settings override those of its parts, later parts
+override earlier ones, and all override the base. Paths in a file (``sky.nav``, ``line.file.path``) are relative to it.
 """
 
 from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.settings import read_toml, validated
 from railfix.simulate.alignment import made_alignment
 from railfix.simulate.motion import made_motion
 from railfix.simulate.scenario import Scenario
-from railfix.simulate.settings_tables import from_table, to_toml
 
 #: Word for a duration that the run curve gives.
 WHOLE_RUN: Final = "run"
@@ -61,7 +60,7 @@ _FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What a scenario file asks for.
+    """Contents of a scenario file: the settings of one run or of several.
 
     Attributes
     ----------
@@ -85,7 +84,7 @@ class Recipe:
         ----------
         number : int
         changes : mapping, optional
-            Settings that stand over those of the file, in tables as the file has them.
+            Settings that override those of the file, in tables as the file has them.
 
         Raises
         ------
@@ -95,22 +94,22 @@ class Recipe:
             The track file of a line whose run gives the duration cannot be read.
         """
         table = _over(self.tables[number], changes or {})
-        whole = table.get("duration_s") == WHOLE_RUN
-        if whole:
+        to_the_end = table.get("duration_s") == WHOLE_RUN
+        if to_the_end:
             del table["duration_s"]
         name = self.names[number]
         source = f"{self.path}, run {name}" if name else str(self.path)
-        scenario: Scenario = from_table(Scenario, table, where="", source=source)
-        if not whole:
+        scenario = validated(Scenario, table, source=source)
+        if not to_the_end:
             return scenario
         try:
-            return replace(scenario, duration_s=whole_run_s(scenario))
+            return scenario.replaced(duration_s=whole_run_s(scenario))
         except SettingsError as error:
             raise SettingsError(f"{source}: {error}") from None
 
 
 def whole_run_s(scenario: Scenario) -> float:
-    """Time until the train has stood at its last stop of the first way, in whole seconds."""
+    """Time to the end of the stop at the end of the first leg, in whole seconds."""
     motion = made_motion(made_alignment(scenario.line), scenario, duration_s=0.0)
     run = scenario.run
     last = run.stations[-1 if run.direction == "rising" else 0].dwell_s if run.stations else run.stand_s
@@ -139,7 +138,7 @@ def find_scenario(name: str | PathLike[str]) -> Path:
 
 
 def load_recipe(name: str | PathLike[str]) -> Recipe:
-    """What a scenario file asks for: one run or many.
+    """Contents of a scenario file, one run or several.
 
     Parameters
     ----------
@@ -154,7 +153,7 @@ def load_recipe(name: str | PathLike[str]) -> Recipe:
         A recipe is not one: names twice, other keys. Settings of a run are checked by `Recipe.scenario`.
     """
     path = find_scenario(name)
-    table = _read(path)
+    table = read_toml(path, what="a scenario file")
     description = str(table.pop("description", ""))
     if "runs" not in table and "base" not in table:
         return Recipe(path=path, description=description, names=("",), tables=(_absolute(table, path),))
@@ -214,24 +213,24 @@ def load_scenario(name: str | PathLike[str]) -> Scenario:
     return recipe.scenario()
 
 
-def scenario_toml(scenario: Scenario) -> str:
-    """A scenario as the TOML that `load_scenario` reads; `multipath` is not in it."""
-    return to_toml(scenario)
+def scenario_table(scenario: Scenario) -> dict[str, Any]:
+    """All settings of a scenario as a scenario file holds them, for `railfix.core.settings.write_toml`.
+
+    None is the word "none"; `multipath` is not in it.
+    """
+    return dict(_without_none(scenario.model_dump()))
 
 
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read as a scenario file ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputFileError(path, "is no text file; a scenario is TOML") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputFileError(path, f"is no valid TOML: {error}") from None
+def _without_none(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _without_none(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return [_without_none(part) for part in value]
+    return "none" if value is None else value
 
 
 def _absolute(table: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The same settings with the paths in them relative to the file made absolute."""
+    """The same settings with absolute paths."""
     sky, line = table.get("sky"), table.get("line")
     if isinstance(sky, dict) and isinstance(sky.get("nav"), str) and sky["nav"] != "none":
         sky["nav"] = str(path.resolve().parent / sky["nav"])
@@ -241,7 +240,7 @@ def _absolute(table: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings over those of a base, table by table."""
+    """Settings of a base overridden by others, table by table."""
     both = {**base, **values}
     for name in set(base) & set(values):
         if isinstance(base[name], Mapping) and isinstance(values[name], Mapping):

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from railfix.simulate.environment.settings import Between, Kind, RoofSettings, RowSettings, SectionSettings
+from railfix.simulate.environment.settings import Kind, RoofSettings, RowSettings, SectionSettings
+from railfix.simulate.setting_types import Between
 
 #: A road over the tracks.
 _BRIDGE: Final = RoofSettings(

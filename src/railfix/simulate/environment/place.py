@@ -10,7 +10,8 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings
 from railfix.simulate.environment.kinds import ROOFS, ROWS, TUNNEL_CROWN
-from railfix.simulate.environment.settings import Between, RoofSettings, RowSettings, SectionSettings
+from railfix.simulate.environment.settings import RoofSettings, RowSettings, SectionSettings
+from railfix.simulate.setting_types import Between
 
 #: The first and the last section go on so far beyond the line [m].
 BEYOND_M: Final = 500.0

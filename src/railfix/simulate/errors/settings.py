@@ -1,61 +1,47 @@
-"""Which errors are put into the signals; nothing by default, so that a receiver's corrections leave nothing.
+"""Settings of the errors in the signals; none by default, so that a receiver's corrections are exact.
 
-Plain values in frozen dataclasses, so that a TOML table reads into them. A Gauss-Markov process has a
-standard deviation and a correlation time: its autocorrelation is ``sigma^2 exp(-|lag| / time)``.
+A Gauss-Markov process has a standard deviation and a correlation time: its autocorrelation is
+``sigma^2 exp(-|lag| / time)``.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
-from railfix.core.errors import SettingsError
-from railfix.simulate.noise import NoiseSettings, TrackingSettings
-from railfix.simulate.setting_checks import (
-    require_finite,
-    require_interval,
-    require_not_negative,
-    require_positive,
-)
+from pydantic import Field
 
-#: Constellations that errors can be given for.
-_LETTERS = "GJEC"
+from railfix.simulate.setting_types import SYSTEMS, Finite, Interval, NotNegative, Positive, ScenarioSettings, Share
+
+#: Letter of a constellation.
+System = Annotated[str, Field(pattern=f"^[{SYSTEMS}]$")]
 
 
-@dataclass(frozen=True, kw_only=True)
-class SatelliteErrorSettings:
-    """Errors of the broadcast message, each satellite of a constellation its own.
+class SatelliteErrorSettings(ScenarioSettings):
+    """Errors of the broadcast message, independent for each satellite of a constellation.
 
     Attributes
     ----------
     clock_sigma_m, clock_time_s : float
         Gauss-Markov error of the clock, in metres of range.
     radial_sigma_m, along_sigma_m, cross_sigma_m : float
-        Gauss-Markov errors of the place, true minus broadcast.
+        Gauss-Markov errors of the position, true minus broadcast.
     orbit_time_s : float
         Their correlation time.
     group_delay_sigma_m : float
         Constant of each satellite and signal, in the code alone.
     """
 
-    clock_sigma_m: float = 0.0
-    clock_time_s: float = 3600.0
-    radial_sigma_m: float = 0.0
-    along_sigma_m: float = 0.0
-    cross_sigma_m: float = 0.0
-    orbit_time_s: float = 7200.0
-    group_delay_sigma_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_not_negative(
-            self, "clock_sigma_m", "radial_sigma_m", "along_sigma_m", "cross_sigma_m", "group_delay_sigma_m"
-        )
-        require_positive(self, "clock_time_s", "orbit_time_s")
+    clock_sigma_m: NotNegative = 0.0
+    clock_time_s: Positive = 3600.0
+    radial_sigma_m: NotNegative = 0.0
+    along_sigma_m: NotNegative = 0.0
+    cross_sigma_m: NotNegative = 0.0
+    orbit_time_s: Positive = 7200.0
+    group_delay_sigma_m: NotNegative = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class IonosphereErrorSettings:
-    """What the ionosphere is more than the model (times `SkySettings.ionosphere_scale`), on L1.
+class IonosphereErrorSettings(ScenarioSettings):
+    """Ionospheric delay on L1 beyond the model (times `SkySettings.ionosphere_scale`).
 
     Attributes
     ----------
@@ -67,20 +53,14 @@ class IonosphereErrorSettings:
         Direction in which it grows.
     """
 
-    vertical_sigma_m: float = 0.0
-    vertical_time_s: float = 1800.0
-    gradient_mm_per_km: float = 0.0
-    gradient_azimuth_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "vertical_sigma_m", "gradient_mm_per_km")
-        require_positive(self, "vertical_time_s")
-        require_finite(self, "gradient_azimuth_deg")
+    vertical_sigma_m: NotNegative = 0.0
+    vertical_time_s: Positive = 1800.0
+    gradient_mm_per_km: NotNegative = 0.0
+    gradient_azimuth_deg: Finite = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class TroposphereErrorSettings:
-    """What the troposphere is more than the model (times `SkySettings.troposphere_scale`).
+class TroposphereErrorSettings(ScenarioSettings):
+    """Tropospheric delay beyond the model (times `SkySettings.troposphere_scale`).
 
     Attributes
     ----------
@@ -88,46 +68,30 @@ class TroposphereErrorSettings:
         Gauss-Markov zenith delay.
     """
 
-    zenith_sigma_m: float = 0.0
-    zenith_time_s: float = 7200.0
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "zenith_sigma_m")
-        require_positive(self, "zenith_time_s")
+    zenith_sigma_m: NotNegative = 0.0
+    zenith_time_s: Positive = 7200.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SatelliteFault:
-    """A satellite whose ranges go wrong for a while, without a word in its message.
+class SatelliteFault(Interval):
+    """Satellite whose ranges are wrong for a time, without a warning in its message.
 
     Attributes
     ----------
     satellite : str
         "G07".
-    start_s, end_s : float
-        Seconds after the start of the run; an end of None is the end of the run.
     step_m : float
         Added to code and phase from the start on.
     ramp_mps : float
         Growth of the error from the start on.
     """
 
-    satellite: str
-    start_s: float
-    end_s: float | None = None
-    step_m: float = 0.0
-    ramp_mps: float = 0.0
-
-    def __post_init__(self) -> None:
-        if re.fullmatch(f"[{_LETTERS}][0-9]{{2}}", self.satellite) is None:
-            raise SettingsError(f"SatelliteFault.satellite must be a name like 'G07', got {self.satellite!r}")
-        require_interval(self)
-        require_finite(self, "step_m", "ramp_mps")
+    satellite: str = Field(pattern=f"^[{SYSTEMS}][0-9]{{2}}$")
+    step_m: Finite = 0.0
+    ramp_mps: Finite = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClockWalkSettings:
-    """Wander of a receiver's clock about its even drift, as metres of range.
+class ClockWalkSettings(ScenarioSettings):
+    """Random walks of a receiver's clock about its constant drift, in metres of range.
 
     Attributes
     ----------
@@ -137,16 +101,12 @@ class ClockWalkSettings:
         Random walk of the drift: standard deviation after one second.
     """
 
-    walk_m_per_sqrt_s: float = 0.0
-    frequency_walk_mps_per_sqrt_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_not_negative(self, "walk_m_per_sqrt_s", "frequency_walk_mps_per_sqrt_s")
+    walk_m_per_sqrt_s: NotNegative = 0.0
+    frequency_walk_mps_per_sqrt_s: NotNegative = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class InterSystemSettings:
-    """What a receiver measures a whole constellation too long, in code, phase and Doppler.
+class InterSystemSettings(ScenarioSettings):
+    """Inter-system bias of the receivers for one constellation, in code, phase and Doppler.
 
     Attributes
     ----------
@@ -154,19 +114,57 @@ class InterSystemSettings:
         At the start of the run.
     drift_mps : float
     rear_difference_m : float
-        The rear receiver has so much more, whether its clock is common or not.
+        Bias of the rear receiver less that of the front receiver, whether their clock is common or not.
     """
 
-    offset_m: float = 0.0
-    drift_mps: float = 0.0
-    rear_difference_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_finite(self, "offset_m", "drift_mps", "rear_difference_m")
+    offset_m: Finite = 0.0
+    drift_mps: Finite = 0.0
+    rear_difference_m: Finite = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class ErrorSettings:
+class NoiseSettings(ScenarioSettings):
+    """Time-correlated receiver noise; the sigmas are those of `ReceiverSettings`.
+
+    Attributes
+    ----------
+    code_correlated_share : float
+        Share of the code noise's variance, in [0, 1], that is correlated in time.
+    code_correlation_time_s : float
+        Its correlation time: a code loop of noise bandwidth B has 1 / (4 B), 1 s at 0.25 Hz.
+    cn0_wander_sigma_db, cn0_wander_time_s : float
+        Gauss-Markov variation of C/N0, independent for each channel.
+    weak_signals : {"code", "all"}
+        Observables whose noise grows as C/N0 falls: the code alone, or phase and Doppler by the same law
+        (10 times as noisy for 20 dB less; their sigmas are those at 45 dB-Hz).
+    """
+
+    code_correlated_share: Share = 0.0
+    code_correlation_time_s: Positive = 1.0
+    cn0_wander_sigma_db: NotNegative = 0.0
+    cn0_wander_time_s: Positive = 10.0
+    weak_signals: Literal["code", "all"] = "code"
+
+
+class TrackingSettings(ScenarioSettings):
+    """Loss of lock and re-acquisition.
+
+    Attributes
+    ----------
+    threshold_dbhz : float or None
+        A signal weaker than this is lost; None: no signal is too weak.
+    reacquisition_s : float
+        A lost signal is absent for this time after it could be tracked again.
+    slips : {"none", "after_loss"}
+        "after_loss": the phase returns with another number of whole cycles, and its first epoch
+        has bit 0 of the loss-of-lock indicator set.
+    """
+
+    threshold_dbhz: NotNegative | None = None
+    reacquisition_s: NotNegative = 0.0
+    slips: Literal["none", "after_loss"] = "none"
+
+
+class ErrorSettings(ScenarioSettings):
     """All errors of satellites, atmosphere and receivers; none by default.
 
     Attributes
@@ -177,25 +175,18 @@ class ErrorSettings:
     troposphere : TroposphereErrorSettings
     faults : tuple of SatelliteFault
     clock : ClockWalkSettings
-        Both receivers alike; one walk where `ReceiverSettings.clocks` is "common".
+        Of both receivers; one walk where `ReceiverSettings.clocks` is "common".
     intersystem : dict of str to InterSystemSettings
         By the letter of the constellation.
     noise : NoiseSettings
-        What the receivers' noise is beyond the white one of `ReceiverSettings`.
     tracking : TrackingSettings
     """
 
-    satellites: dict[str, SatelliteErrorSettings] = field(default_factory=dict)
-    ionosphere: IonosphereErrorSettings = field(default_factory=IonosphereErrorSettings)
-    troposphere: TroposphereErrorSettings = field(default_factory=TroposphereErrorSettings)
+    satellites: dict[System, SatelliteErrorSettings] = Field(default_factory=dict)
+    ionosphere: IonosphereErrorSettings = IonosphereErrorSettings()
+    troposphere: TroposphereErrorSettings = TroposphereErrorSettings()
     faults: tuple[SatelliteFault, ...] = ()
-    clock: ClockWalkSettings = field(default_factory=ClockWalkSettings)
-    intersystem: dict[str, InterSystemSettings] = field(default_factory=dict)
-    noise: NoiseSettings = field(default_factory=NoiseSettings)
-    tracking: TrackingSettings = field(default_factory=TrackingSettings)
-
-    def __post_init__(self) -> None:
-        for name in ("satellites", "intersystem"):
-            strange = sorted(set(getattr(self, name)) - set(_LETTERS))
-            if strange:
-                raise SettingsError(f"ErrorSettings.{name} goes by letters out of {_LETTERS!r}, got {strange[0]!r}")
+    clock: ClockWalkSettings = ClockWalkSettings()
+    intersystem: dict[System, InterSystemSettings] = Field(default_factory=dict)
+    noise: NoiseSettings = NoiseSettings()
+    tracking: TrackingSettings = TrackingSettings()
