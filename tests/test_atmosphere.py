@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orbits_made import TOE
+from railfix.core.arrays import read_only
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.gnss.observations import frozen
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 
 REFERENCES = json.loads((Path(__file__).parent / "references" / "orbits.json").read_text())
@@ -100,14 +100,14 @@ def test_other_carriers_scale_by_the_square_of_the_frequency() -> None:
 
 
 def test_absent_inputs_and_the_horizon_give_nan_and_nothing_else_changes() -> None:
-    elevation = frozen(np.array([[40.0, np.nan, 0.0, -5.0, 30.0], [40.0, 41.0, 42.0, 43.0, 44.0]]))
-    azimuth = frozen(np.array([[10.0, 10.0, 10.0, 10.0, np.nan], [10.0] * 5]))
-    time = frozen(np.array([TOE, TOE]))
-    latitude, longitude = frozen(np.array([35.0, np.nan])), frozen(np.array([139.0, 139.0]))
-    frequency = frozen(np.full(5, FREQUENCY_L1))
-    ion = klobuchar_delay_m(time, latitude, longitude, elevation, azimuth, frozen(COEFFICIENTS), frequency)
+    elevation = read_only(np.array([[40.0, np.nan, 0.0, -5.0, 30.0], [40.0, 41.0, 42.0, 43.0, 44.0]]))
+    azimuth = read_only(np.array([[10.0, 10.0, 10.0, 10.0, np.nan], [10.0] * 5]))
+    time = read_only(np.array([TOE, TOE]))
+    latitude, longitude = read_only(np.array([35.0, np.nan])), read_only(np.array([139.0, 139.0]))
+    frequency = read_only(np.full(5, FREQUENCY_L1))
+    ion = klobuchar_delay_m(time, latitude, longitude, elevation, azimuth, read_only(COEFFICIENTS), frequency)
     assert np.isnan(ion).tolist() == [[False, True, True, True, True], [True] * 5]
-    trop = saastamoinen_delay_m(latitude, frozen(np.array([50.0, 50.0])), elevation)
+    trop = saastamoinen_delay_m(latitude, read_only(np.array([50.0, 50.0])), elevation)
     assert np.isnan(trop).tolist() == [[False, True, True, True, False], [True] * 5]
     assert np.isnan(saastamoinen_delay_m(np.array([35.0]), np.array([np.nan]), np.array([[40.0]]))).all()
     no_frequency = np.array([np.nan] * 5)

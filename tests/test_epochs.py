@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from railfix.core import errors
+from railfix.core.arrays import read_only
 from railfix.core.reasons import POSITIONED, Reason, Status, first_reason, reason_text, reason_texts
 from railfix.gnss.observations import (
     MAX_PROBLEMS,
@@ -15,7 +16,6 @@ from railfix.gnss.observations import (
     Observations,
     capped_problems,
     concatenate,
-    frozen,
 )
 
 START = np.datetime64("2024-03-13T08:00:00", "ns")
@@ -47,7 +47,7 @@ def test_arrays_are_read_only_and_the_callers_stay_writable() -> None:
     with pytest.raises(ValueError, match="read-only"):
         log.code_m[0, 0] = 1.0
     mine[0, 0] = 1.0
-    assert frozen(mine).base is mine
+    assert read_only(mine).base is mine
     with pytest.raises(AttributeError):
         log.code_m = mine  # type: ignore[misc]
 

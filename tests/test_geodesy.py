@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod, Transformer
 
+from railfix.core.arrays import read_only
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import (
     ecef_from_geodetic,
@@ -16,7 +17,6 @@ from railfix.core.geodesy import (
     geodetic_from_ecef,
     range_with_rotation,
 )
-from railfix.gnss.observations import frozen
 
 A, F = 6_378_137.0, 1 / 298.257_223_563
 latitudes, longitudes = st.floats(-90.0, 90.0), st.floats(-180.0, 180.0)
@@ -46,11 +46,11 @@ def test_there_and_back(latitude: float, longitude: float, height: float) -> Non
 
 
 def test_shapes_and_absent_points() -> None:
-    grid = frozen(ecef_from_geodetic(np.full((2, 3), 35.0), np.full((2, 3), 139.0), np.zeros((2, 3))))
+    grid = read_only(ecef_from_geodetic(np.full((2, 3), 35.0), np.full((2, 3), 139.0), np.zeros((2, 3))))
     assert grid.shape == (2, 3, 3)
     with_gap = grid.copy()
     with_gap[1, 2, 0] = np.nan
-    latitude, longitude, height = geodetic_from_ecef(frozen(with_gap))
+    latitude, longitude, height = geodetic_from_ecef(read_only(with_gap))
     assert np.isnan(latitude).sum() == np.isnan(longitude).sum() == np.isnan(height).sum() == 1
     assert np.isnan(latitude[1, 2])
     assert latitude[0, 0] == pytest.approx(35.0)
@@ -92,7 +92,7 @@ def test_elevation_and_azimuth_of_known_directions(
     receiver = ecef_from_geodetic(*place.T)
     direction = np.array([east, north, up]) @ enu_axes(place[:, 0], place[:, 1])
     satellite = receiver + 2.2e7 * direction
-    found_elevation, found_azimuth = elevation_azimuth(frozen(satellite[:, None, :]), frozen(receiver))
+    found_elevation, found_azimuth = elevation_azimuth(read_only(satellite[:, None, :]), read_only(receiver))
     np.testing.assert_allclose(found_elevation[:, 0], elevation, atol=1e-7)
     if azimuth is not None:
         assert ((found_azimuth >= 0.0) & (found_azimuth < 360.0)).all()
@@ -138,7 +138,7 @@ def test_range_is_that_of_the_satellite_turned_by_the_flight() -> None:
             axis=-1,
         )
         distance = np.linalg.norm(turned - receiver, axis=1)
-    found, sight = range_with_rotation(frozen(satellite), frozen(receiver))
+    found, sight = range_with_rotation(read_only(satellite), read_only(receiver))
     assert np.abs(distance - np.linalg.norm(satellite - receiver, axis=1)).max() > 20.0
     np.testing.assert_allclose(found, distance, atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(sight, axis=1), 1.0, atol=1e-15)

@@ -144,5 +144,5 @@ def test_damage_anywhere_is_an_error_or_a_table(tmp_path: Path, data: st.DataObj
     assert isinstance(navigation, Navigation)
     assert np.isfinite(navigation.kepler.sqrt_a).all()
     assert np.isfinite(navigation.glonass.position_ecef_m).all()
-    lenient = read_navigation(path, on_error="lenient")
+    lenient = read_navigation(path, broken_lines="count")
     assert len(lenient.kepler) == len(navigation.kepler)

@@ -320,7 +320,7 @@ def test_packed_files(tmp_path: Path) -> None:
 def test_lenient_reading_passes_over_and_names_what_is_broken(tmp_path: Path) -> None:
     broken = record("G02", {"sqrt_a": None}) + record("X03") + record("G04", time="2020 13 26 08 00 00")
     text = header() + record("G01") + broken + record("G05")
-    navigation = read(tmp_path, text, on_error="lenient")
+    navigation = read(tmp_path, text, broken_lines="count")
     assert navigation.kepler.satellite.tolist() == ["G01", "G05"]
     assert navigation.passed_over == {"broken": 3}
     assert [note.split(":")[1].split(",")[1] for note in navigation.notes] == [" line 13", " line 19", " line 27"]

@@ -16,6 +16,7 @@ from scipy.integrate import solve_ivp
 
 import orbits_made
 from orbits_made import HOUR, KINDS, TOE, glonass, kepler, navigation
+from railfix.core.arrays import read_only
 from railfix.core.constants import (
     EARTH_ROTATION_RATE,
     EARTH_ROTATION_RATE_BEIDOU,
@@ -28,7 +29,6 @@ from railfix.core.constants import (
     SPEED_OF_LIGHT,
 )
 from railfix.gnss.navigation import KeplerRecords, Navigation
-from railfix.gnss.observations import frozen
 from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.gnss.orbits.kepler import Orbits, eccentric_anomaly, kepler_state
 
@@ -45,8 +45,8 @@ def states(
     nav: Navigation, after_toe_s: Any, satellite: str = "G05", signal: str = "1C", code_m: float = CODE, **more: Any
 ) -> SatelliteStates:
     time = at(after_toe_s)
-    code = frozen(np.full((len(time), 1), code_m))
-    return satellite_states(frozen(time), frozen(np.array([satellite])), np.array([signal]), code, nav, **more)
+    code = read_only(np.full((len(time), 1), code_m))
+    return satellite_states(read_only(time), read_only(np.array([satellite])), np.array([signal]), code, nav, **more)
 
 
 def textbook(record: KeplerRecords, t: float) -> tuple[np.ndarray, float]:
@@ -237,14 +237,14 @@ def test_any_cutting_into_chunks_gives_the_same_bits(lengths: list[int], seed: i
     nav, satellite, signal = mixed()
     rng = np.random.default_rng(seed)
     total = sum(lengths)
-    time = frozen(at(np.sort(rng.uniform(-7000, 7000, total))))
+    time = read_only(at(np.sort(rng.uniform(-7000, 7000, total))))
     code = rng.uniform(2e7, 4e7, (total, len(satellite)))
     code[rng.random(code.shape) < 0.2] = np.nan
-    whole = satellite_states(time, satellite, signal, frozen(code), nav)
+    whole = satellite_states(time, satellite, signal, read_only(code), nav)
     begin = 0
     for length in lengths:
         part = slice(begin, begin + length)
-        piece = satellite_states(time[part], satellite, signal, frozen(code[part]), nav)
+        piece = satellite_states(time[part], satellite, signal, read_only(code[part]), nav)
         begin += length
         for item in fields(whole):
             np.testing.assert_array_equal(getattr(piece, item.name), getattr(whole, item.name)[part], item.name)

@@ -100,7 +100,7 @@ def test_broken_logs_are_refused(lines: list[str], said: str, tmp_path: Path) ->
 
 def test_a_lenient_reader_names_what_it_left_out(tmp_path: Path) -> None:
     found = read_nmea(
-        log(tmp_path / "a.nmea", *GOOD, gga("010001.00")[:-2] + "00", gga("010002.00")), on_error="lenient"
+        log(tmp_path / "a.nmea", *GOOD, gga("010001.00")[:-2] + "00", gga("010002.00")), broken_lines="count"
     )
     assert len(found) == 2
     assert "line 3: the checksum is 00" in found.notes[1]

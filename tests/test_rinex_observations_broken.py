@@ -125,7 +125,7 @@ def test_broken_line(tmp_path: Path, name: str) -> None:
         read_observations(path)
     assert caught.value.line == number
     assert str(caught.value).startswith(f"{path}, line {number}: ")
-    lenient = read_observations(path, on_error="lenient")
+    lenient = read_observations(path, broken_lines="count")
     assert len(lenient) == epochs
     five = (lenient.satellite == "G05") & (lenient.signal == "1C")
     assert np.isfinite(lenient.code_m[:, five]).sum() == left
@@ -150,7 +150,7 @@ def test_many_problems_are_told_of_in_few_sentences(tmp_path: Path) -> None:
     for k in range(90):
         lines += epoch_3(f"02 {k // 60:02d} {k % 60:02d}.0000000", {"G05": [field("x")], "G12": [field(2e7)]})
     path = write(tmp_path / "log", lines)
-    whole = read_observations(path, on_error="lenient")
+    whole = read_observations(path, broken_lines="count")
     assert (len(whole), whole.problem_count, len(whole.problems)) == (90, 90, 51)
     assert whole.problems[-1] == "and 40 more problems"
     assert whole.passed_over == {"broken satellite lines": 90}
@@ -251,7 +251,7 @@ def test_zeros_left_by_a_failing_recorder(tmp_path: Path, old: str, words: str) 
         read_observations(path)
     assert caught.value.line == 107
     assert str(caught.value).isprintable()
-    assert np.isfinite(read_observations(path, on_error="lenient").code_m).sum() == 59
+    assert np.isfinite(read_observations(path, broken_lines="count").code_m).sum() == 59
 
 
 @pytest.mark.parametrize("pack", ["gzip", "hatanaka"])
@@ -265,7 +265,7 @@ def test_lenient_reads_what_comes_before_damage(tmp_path: Path, pack: str) -> No
     path.write_bytes(packed[: len(packed) * 2 // 3])
     with pytest.raises(InputFileError, match=r"end early|cut short"):
         read_observations(path)
-    lenient = read_observations(path, on_error="lenient")
+    lenient = read_observations(path, broken_lines="count")
     assert len(lenient) > 1000 or pack == "gzip"
     assert "what came before was read" in lenient.problems[0]
 
@@ -283,7 +283,7 @@ def test_nothing_in_the_span_asked_for(tmp_path: Path) -> None:
         read_observations(path, start="2022-01-01")
 
 
-@pytest.mark.parametrize("options", [{"on_error": "ignore"}, {"systems": "GX"}, {"systems": ""}])
+@pytest.mark.parametrize("options", [{"broken_lines": "ignore"}, {"systems": "GX"}, {"systems": ""}])
 def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=r"was expected|were expected"):
         read_observations(write(tmp_path / "log", good_3()), **options)
@@ -315,7 +315,7 @@ def test_whatever_is_broken_ends_in_one_sentence(
     else:
         assert not strict.problems
     try:
-        lenient = read_observations(path, on_error="lenient")
+        lenient = read_observations(path, broken_lines="count")
     except InputFileError:
         return
     assert len(lenient) > 0

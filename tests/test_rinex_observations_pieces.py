@@ -85,8 +85,8 @@ def busy_log_2(epochs: int = 90, *, seed: int = 6) -> list[str]:
 @pytest.mark.parametrize("epochs", [1, 7, 1000])
 def test_pieces_are_the_whole(tmp_path: Path, log: type, epochs: int) -> None:
     path = write(tmp_path / "log", log())
-    whole = read_observations(path, on_error="lenient")
-    pieces = list(scan_observations(path, epochs=epochs, on_error="lenient"))
+    whole = read_observations(path, broken_lines="count")
+    pieces = list(scan_observations(path, epochs=epochs, broken_lines="count"))
     assert {len(piece) for piece in pieces[:-1]} <= {epochs}
     assert 0 < len(pieces[-1]) <= epochs
     assert whole.problem_count > 3
@@ -102,11 +102,11 @@ def test_pieces_are_the_whole(tmp_path: Path, log: type, epochs: int) -> None:
 @pytest.mark.parametrize("block_bytes", [700, 3000, 20000])
 def test_where_blocks_of_text_end_does_not_matter(tmp_path: Path, log: type, block_bytes: int) -> None:
     path = write(tmp_path / "log", log(), strip=block_bytes != 3000, end="\r\n" if block_bytes == 700 else "\n")
-    wanted = observations_blocks.Wanted(on_error="lenient")
+    wanted = observations_blocks.Wanted(broken_lines="count")
     runs = list(observations_blocks.BlockReader(path, wanted, block_bytes=block_bytes).blocks())
     assert len(runs) > 2
     joined = concatenate([run for run in runs if len(run)])
-    whole = read_observations(path, on_error="lenient")
+    whole = read_observations(path, broken_lines="count")
     for name in (*ARRAYS, "break_before"):
         assert getattr(joined, name).tobytes() == getattr(whole, name).tobytes(), name
     assert sum(run.problem_count for run in runs) == whole.problem_count
@@ -184,7 +184,7 @@ def test_files_that_overlap(tmp_path: Path) -> None:
     parts = [_file(tmp_path, "a", range(12)), _file(tmp_path, "b", range(8, 20))]
     with pytest.raises(InputFileError, match=r"b, line 8: .* does not come after .*of the file before"):
         read_observations(parts)
-    joined = read_observations(parts, on_error="lenient")
+    joined = read_observations(parts, broken_lines="count")
     assert (joined.time - joined.time[0]).astype("m8[s]").astype(int).tolist() == list(range(20))
     assert joined.passed_over == {"epochs out of order": 4}
     with pytest.raises(InputFileError, match="does not come after"):
@@ -195,7 +195,7 @@ def test_a_file_without_epochs_among_several(tmp_path: Path) -> None:
     parts = [_file(tmp_path, "a", range(5)), _file(tmp_path, "empty", range(0))]
     with pytest.raises(InputFileError, match=r"empty: has a header but no epochs"):
         read_observations(parts)
-    assert len(read_observations(parts, on_error="lenient")) == 5
+    assert len(read_observations(parts, broken_lines="count")) == 5
 
 
 #: What F14.3 can hold.

@@ -152,7 +152,7 @@ def test_a_broken_record_of_rinex_takes_no_other_with_it(tmp_path: Path) -> None
     lines[3] = lines[3].replace("  1 ", " XY ", 1)
     path = tmp_path / "broken.b"
     path.write_text("\n".join([*lines[:8], "what is this", *lines[8:]]))
-    read = read_sbas(path, on_error="lenient")
+    read = read_sbas(path, broken_lines="count")
     assert read.refused["line"] == 2
     assert read.type.tolist() == [2, 63, 62, 10]
 
@@ -233,7 +233,7 @@ def test_a_broken_line_is_named(tmp_path: Path, fault: str) -> None:
     with pytest.raises(InputFileError, match=words) as caught:
         read_sbas(path)
     assert caught.value.line == 6
-    log = read_sbas(path, on_error="lenient")
+    log = read_sbas(path, broken_lines="count")
     assert len(log) == 5
     assert log.refused["line"] == 1
     assert words in " ".join(log.notes)

@@ -1,8 +1,34 @@
 """railfix: satellite train positioning on a 3-D track map.
 
 A train runs on a known line, so its antenna lies on a known 3-D curve and its position is one
-number along it. railfix turns raw receiver logs (RINEX) and a track map into positions along the
-line, with the reason for everything it refused.
+coordinate along it. railfix turns raw receiver logs (RINEX) and a track map into positions along
+the line, with the reason for every rejected observation.
+
+Where to begin
+--------------
+>>> import railfix
+>>> files = railfix.demo_files()
+>>> log = railfix.read_observations(files["front"])
+>>> navigation = railfix.read_navigation(files["nav"])
+>>> track = railfix.read_track(files["track"])
+>>> trajectory = railfix.Trajectory.from_track(track)
+>>> result, state = railfix.EpochProcessor(railfix.Config(), navigation, {"front": trajectory}).process({"front": log})
+>>> positions = railfix.positions_table(result)
+
+============================ =========================================================================
+read                         `read_observations`, `read_navigation`, `read_track`, `read_vehicle`,
+                             `read_sbas`, `read_sp3`, `read_positions`, `read_reference`
+position in Python           `EpochProcessor` with a `Config` and `Trajectory` objects
+                             (`antenna_trajectory`); the answer is a `Result`
+position files               `run_files` with `RunInputs`
+tables                       `positions_table`, `observations_table` (polars), `to_xarray`
+evaluate and report          `evaluate_runs`, `write_report`
+from and to georinex         `observations_from_xarray`, `observations_to_xarray`,
+                             `navigation_from_xarray`, `navigation_to_xarray`
+============================ =========================================================================
+
+docs/example.md goes from a log to positions with these names; ``railfix --help`` lists the same
+as commands. Every name is imported at its first use, so ``import railfix`` costs next to nothing.
 
 Vocabulary
 ----------
@@ -22,5 +48,9 @@ GPS time
 Names carry the unit at public edges: ``_m``, ``_deg``, ``_s``, ``_hz``, ``_dbhz``, ``_ecef_m``.
 Absent is NaN (NaT for times); 0 is a value. A rejected observation is True in a mask everywhere.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"

@@ -62,7 +62,7 @@ def cn0_curve(
         if path is not None and not path.parent.is_dir():
             raise OutputError(f"{path}: the folder {path.parent} does not exist")
     made = cn0_curve_from_log(
-        observations, nav, position_ecef_m=place, fit=fit, on_error="lenient" if lenient else "strict"
+        observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"
     )
     if plot is not None:
         from railfix.report.plots.screens import draw_cn0_curve

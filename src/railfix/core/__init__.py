@@ -1,1 +1,5 @@
-"""Foundations: constants, errors, time scales, geodesy, reasons, array types, files."""
+"""Foundations: constants, errors, time scales, geodesy, reasons, array types, settings, files."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,8 @@
-"""Types of the arrays that functions take and return, by what their elements are."""
+"""Types of the arrays that functions take and return, by what their elements are; read-only views."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,3 +27,10 @@ Datetimes = NDArray[np.datetime64]
 Bytes = NDArray[np.uint8]
 #: Names, for example of satellites.
 Strings = NDArray[np.str_]
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only view of an array; the caller's own array stays writable."""
+    view = array.view()
+    view.flags.writeable = False
+    return view

@@ -15,6 +15,7 @@ Hatanaka (CRX)  piped through the compiled ``crx2rnx`` of the `hatanaka` package
 from __future__ import annotations
 
 import gzip
+import hashlib
 import importlib.resources
 import io
 import json
@@ -28,13 +29,15 @@ import zlib
 from contextlib import ExitStack, closing
 from os import PathLike
 from pathlib import Path
-from typing import IO, Final, cast
+from typing import IO, Any, Final, Literal, cast
 
 import ncompress
 
 from railfix.core.errors import InputFileError, OutputError
 
 FilePath = str | PathLike[str]
+#: What a reader does with a broken line: stop with an error, or leave it out and count it.
+BrokenLines = Literal["stop", "count"]
 
 _GZIP: Final = b"\x1f\x8b"
 _COMPRESS: Final = b"\x1f\x9d"
@@ -176,6 +179,33 @@ def read_bytes(path: FilePath) -> bytes:
     """
     with open_stream(path) as stream:
         return stream.read()
+
+
+def file_sha256(path: FilePath) -> str:
+    """SHA-256 of a file as it is on disk, as hexadecimal digits.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read ({error.strerror}); check the name") from error
+
+
+def fingerprint(kind: str, path: FilePath) -> dict[str, Any]:
+    """What a file is, its path, size [bytes] and SHA-256, as plain values for JSON.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read.
+    """
+    digest = file_sha256(path)
+    return {"input": kind, "path": str(path), "bytes": Path(path).stat().st_size, "sha256": digest}
 
 
 def toml_string(text: str) -> str:

@@ -24,7 +24,7 @@ from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
 from railfix.run.driver import Progress, RunOptions, notes_of, open_inputs
-from railfix.run.inputs import RunInputs, collected
+from railfix.run.inputs import RunInputs
 from railfix.run.output import OutputFolder
 from railfix.run.record import run_record
 from railfix.run.tally import Tally
@@ -203,7 +203,7 @@ def ablate_files(
         notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs))
         wall = clock.perf_counter() - began
         record = run_record(
-            files=collected(fingerprints),
+            files=[entry.result() for entry in fingerprints],
             command=sys.argv,
             asked=asked or {},
             used=config.model_copy(update={"screens": screens}).as_dict(),

@@ -11,6 +11,7 @@ from typing import Any, Final
 import polars as pl
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import fingerprint
 from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, protection_columns
 from railfix.evaluate.figures import ALL, KEYS, WORDS, classed, figures_by
 from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
@@ -18,7 +19,7 @@ from railfix.evaluate.intervals import interval_table
 from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import TrackFiles
-from railfix.evaluate.run_folder import UNKNOWN_KIND, RunFolder, fingerprint, read_run
+from railfix.evaluate.run_folder import UNKNOWN_KIND, RunFolder, read_run
 from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, read_reference
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -226,16 +225,6 @@ def _record(file: Path) -> Mapping[str, Any]:
     if not isinstance(record, dict):
         raise InputFileError(file, "is not the record of a run; expected an object")
     return record
-
-
-def fingerprint(kind: str, path: Path) -> dict[str, Any]:
-    """What a file is, its size and SHA-256, as plain values."""
-    try:
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-        return {"input": kind, "path": str(path), "bytes": path.stat().st_size, "sha256": digest}
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror}); check the name") from error
 
 
 def floats(table: pl.DataFrame, name: str) -> np.ndarray[Any, np.dtype[np.float64]]:

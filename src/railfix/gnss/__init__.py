@@ -1,1 +1,16 @@
 """Observations, navigation records, signals and satellite orbits."""
+
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation, PreciseEphemeris
+from railfix.gnss.observations import ObservationHeader, Observations, concatenate
+from railfix.gnss.signals import carrier_frequency_hz
+
+__all__ = [
+    "GlonassRecords",
+    "KeplerRecords",
+    "Navigation",
+    "ObservationHeader",
+    "Observations",
+    "PreciseEphemeris",
+    "carrier_frequency_hz",
+    "concatenate",
+]

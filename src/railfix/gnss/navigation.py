@@ -13,8 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Strings
-from railfix.gnss.observations import frozen
+from railfix.core.arrays import Datetimes, Floats, Integers, Strings, read_only
+from railfix.core.display import NotebookTable, plural, time_span_text
+
+
+def _records_text(satellite: Strings, toe: Datetimes) -> str:
+    """Records, satellites, constellations and span of time, for `repr`."""
+    satellites = np.unique(satellite)
+    systems = "".join(np.unique(satellites.astype("<U1")).tolist())
+    text = f"{plural(satellite, 'record')} of {plural(satellites, 'satellite')}"
+    return f"{text} ({systems}), {time_span_text(np.sort(toe))}" if satellites.size else text
 
 
 def _freeze(table: Any, length: int) -> None:
@@ -23,11 +31,11 @@ def _freeze(table: Any, length: int) -> None:
         if isinstance(value, np.ndarray):
             if len(value) != length:
                 raise ValueError(f"{item.name} has {len(value)} records, satellite has {length}")
-            object.__setattr__(table, item.name, frozen(value))
+            object.__setattr__(table, item.name, read_only(value))
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeplerRecords:
+class KeplerRecords(NotebookTable):
     """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows.
 
     Attributes
@@ -100,9 +108,12 @@ class KeplerRecords:
     def __len__(self) -> int:
         return len(self.satellite)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {_records_text(self.satellite, self.toe)}>"
+
 
 @dataclass(frozen=True, kw_only=True)
-class GlonassRecords:
+class GlonassRecords(NotebookTable):
     """State-vector records of GLONASS, n rows.
 
     Attributes
@@ -142,9 +153,12 @@ class GlonassRecords:
     def __len__(self) -> int:
         return len(self.satellite)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {_records_text(self.satellite, self.toe)}>"
+
 
 @dataclass(frozen=True, kw_only=True)
-class PreciseEphemeris:
+class PreciseEphemeris(NotebookTable):
     """Positions and clocks from SP3, E epochs by N satellites.
 
     Attributes
@@ -174,11 +188,15 @@ class PreciseEphemeris:
                 f"do not match (epochs, satellites) = {expected}"
             )
         for name in ("time", "satellite", "position_ecef_m", "clock_s"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __repr__(self) -> str:
+        span = time_span_text(self.time)
+        return f"<PreciseEphemeris: {plural(self.time, 'epoch')} of {plural(self.satellite, 'satellite')}, {span}>"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Navigation:
+class Navigation(NotebookTable):
     """All that navigation files say. Compared and hashed by identity, so that what is prepared from it can be kept.
 
     Attributes
@@ -208,6 +226,13 @@ class Navigation:
     notes: tuple[str, ...] = ()
     precise: PreciseEphemeris | None = None
     sources: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        satellite = np.concatenate([self.kepler.satellite, self.glonass.satellite])
+        toe = np.concatenate([self.kepler.toe, self.glonass.toe])
+        klobuchar = f"Klobuchar {''.join(sorted(self.klobuchar)) or 'none'}"
+        precise = ", precise ephemeris" if self.precise is not None else ""
+        return f"<Navigation: {_records_text(satellite, toe)}, {klobuchar}{precise}>"
 
 
 @lru_cache(maxsize=8)

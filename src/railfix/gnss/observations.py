@@ -10,22 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain, islice
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings, read_only
+from railfix.core.display import NotebookTable, plural, time_span_text
 
 #: Sentences about single faults that are kept; the rest is only counted.
 MAX_PROBLEMS: Final = 50
-
-
-def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """The same array, read-only (a view, so that the caller's own array stays writable)."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +61,7 @@ class ObservationHeader:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Observations:
+class Observations(NotebookTable):
     """Raw observations of one receiver, T epochs by M channels.
 
     Attributes
@@ -130,10 +123,17 @@ class Observations:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, frozen(value))
+                object.__setattr__(self, item.name, read_only(value))
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        satellites = np.unique(self.satellite)
+        systems = "".join(np.unique(self.system).tolist())
+        text = f"{plural(self, 'epoch')} {time_span_text(self.time)}, {plural(self.satellite, 'channel')}"
+        marker = f' "{self.header.marker}"' if self.header.marker else ""
+        return f"<Observations{marker}: {text} of {plural(satellites, 'satellite')} ({systems})>"
 
     @property
     def system(self) -> Strings:

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_text_lines
+from railfix.core.files import BrokenLines, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import utc_to_gpst
 from railfix.gnss.observations import capped_problems
@@ -50,7 +50,7 @@ class _Date:
 def read_nmea(
     path: str | PathLike[str],
     *,
-    on_error: Literal["strict", "lenient"] = "strict",
+    broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> PositionLog:
     """Read the GGA sentences of an NMEA log.
@@ -59,7 +59,7 @@ def read_nmea(
     ----------
     path : path
         Text, .gz too; sentences of other kinds are read over.
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
         What to do with a sentence whose checksum or fields are wrong: an error, or a note.
     date : datetime64, optional
         UTC date of the first GGA, for logs without RMC and ZDA.
@@ -87,7 +87,7 @@ def read_nmea(
         except (ValueError, IndexError) as error:
             reason = str(error) if str(error).startswith("height") else f"a field of {kind} is not what it should be"
             problems.append(InputFileError(path, reason, line=number))
-    if problems and on_error == "strict":
+    if problems and broken_lines == "stop":
         raise problems[0]
     if not places:
         raise InputFileError(path, "there is no GGA sentence; an NMEA log with GGA was expected")
@@ -195,7 +195,7 @@ def _times(places: list[_Place], dates: list[_Date], *, chained: bool) -> Dateti
 def read_any_positions(
     path: str | PathLike[str],
     *,
-    on_error: Literal["strict", "lenient"] = "strict",
+    broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> PositionLog:
     """A log of positions of any kind: NMEA by its ending (``.nmea``, ``.nma``, ``.gga``), else `read_positions`.
@@ -203,11 +203,11 @@ def read_any_positions(
     Parameters
     ----------
     path : path
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
     date : datetime64, optional
         For NMEA; see `read_nmea`.
     """
     name = Path(path).name.lower().removesuffix(".gz")
     if name.endswith((".nmea", ".nma", ".gga")):
-        return read_nmea(path, on_error=on_error, date=date)
+        return read_nmea(path, broken_lines=broken_lines, date=date)
     return read_positions(path)

@@ -28,10 +28,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.errors import InputFileError
 from railfix.core.files import read_bytes, write_whole
-from railfix.gnss.observations import frozen
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog, positions_of_table
@@ -85,7 +84,7 @@ class AntennaReference:
             value = getattr(self, item.name)
             if len(value) != instants:
                 raise ValueError(f"{item.name} has {len(value)} instants, time has {instants}")
-            object.__setattr__(self, item.name, frozen(value))
+            object.__setattr__(self, item.name, read_only(value))
         if np.isnat(self.time).any() or not (np.diff(self.time) > np.timedelta64(0, "ns")).all():
             raise ValueError("time must rise strictly")
         strange = sorted(set(self.source.tolist()) - set(SOURCES))

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.arrays import Floats, Indices, Integers, Strings, read_only
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.observations import Observations, frozen
+from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.pipeline.config import Config
 from railfix.positioning.normal_equations import clock_groups
@@ -95,12 +95,12 @@ class ChannelBook:
         names, which = np.unique(obs.satellite, return_inverse=True)
         frequency = carrier_frequency_hz(satellite, signal, {**self._glonass, **obs.header.glonass_channel})
         return Channels(
-            columns=frozen(columns),
-            satellite=frozen(satellite),
-            signal=frozen(signal),
+            columns=read_only(columns),
+            satellite=read_only(satellite),
+            signal=read_only(signal),
             groups=groups,
             clocks=tuple(CLOCK_GROUP[str(satellite[group.start])[0]] for group in groups),
-            frequency_hz=frozen(frequency),
-            left_out=frozen(left_out.astype(np.int64)),
-            member=frozen((which[:, None] == np.arange(len(names))).astype(np.int64)),
+            frequency_hz=read_only(frequency),
+            left_out=read_only(left_out.astype(np.int64)),
+            member=read_only((which[:, None] == np.arange(len(names))).astype(np.int64)),
         )

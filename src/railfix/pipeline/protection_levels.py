@@ -21,7 +21,7 @@ from railfix.track.trajectory import Trajectory
 
 #: What a level rests on: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
-KINDS: Final = ("sbas", "separation")
+KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
 def kind_of(config: Config) -> str:

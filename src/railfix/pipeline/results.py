@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from railfix.core.arrays import Bits, Codes, Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.core.display import NotebookTable, plural, time_span_text
+from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.pipeline.carrier_phase import CarrierState
@@ -102,7 +104,7 @@ class State:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AntennaResult:
+class AntennaResult(NotebookTable):
     """All that was found for one antenna, T epochs by M channels (those of the observations given).
 
     Attributes
@@ -202,9 +204,16 @@ class AntennaResult:
     def __len__(self) -> int:
         return len(self.time)
 
+    def __repr__(self) -> str:
+        return f"<AntennaResult: {self.status_text()}, {time_span_text(self.time)}>"
+
+    def status_text(self) -> str:
+        """How many epochs have the status OK: ``1,827 of 2,000 epochs ok``."""
+        return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
+
 
 @dataclass(frozen=True, kw_only=True)
-class Result:
+class Result(NotebookTable):
     """Results of one chunk.
 
     Attributes
@@ -216,6 +225,10 @@ class Result:
 
     antennas: Mapping[str, AntennaResult]
     notes: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        parts = (f"{name} {result.status_text()}" for name, result in self.antennas.items())
+        return f"<Result: {'; '.join(parts)}>"
 
 
 def patched(whole: Rows, epochs: Indices, part: Rows) -> Rows:

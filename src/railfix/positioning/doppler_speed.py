@@ -20,11 +20,11 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.gnss.navigation import Navigation, glonass_channels
-from railfix.gnss.observations import Observations, frozen
+from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.ranges.atmosphere import saastamoinen_delay_m
@@ -104,7 +104,7 @@ class Dopplers:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            object.__setattr__(self, item.name, frozen(getattr(self, item.name)))
+            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
 
     def __len__(self) -> int:
         return len(self.time)

@@ -8,7 +8,7 @@ import time as clock
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
@@ -124,9 +124,8 @@ def reference_files(
 
 def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
     """All files but those of the line."""
-    strictness: Literal["strict", "lenient"] = "strict" if options.broken_lines == "stop" else "lenient"
     logs: dict[str, PositionLog] = {
-        name: read_any_positions(path, on_error=strictness, date=options.date)
+        name: read_any_positions(path, broken_lines=options.broken_lines, date=options.date)
         for name, path in inputs.positions.items()
     }
     notes = [note for log in logs.values() for note in log.notes]
@@ -135,7 +134,7 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
     ]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
-        navigation = read_navigation(inputs.nav, on_error=strictness)
+        navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
         for name, paths in inputs.logs.items():
             log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines)
             dopplers[name] = _dopplers(log, navigation)

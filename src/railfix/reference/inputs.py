@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import fingerprint
 from railfix.run.inputs import Antenna
 from railfix.run.sources import TrackReading
 
@@ -84,12 +84,7 @@ class ReferenceInputs:
 
     def fingerprints(self) -> list[dict[str, Any]]:
         """Name, path, size and hash of every file, as plain values."""
-        found = []
-        for name, path in self.named():
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            found.append({"input": name, "path": str(path), "bytes": path.stat().st_size, "sha256": digest})
-        return found
+        return [fingerprint(name, path) for name, path in self.named()]
 
 
 @dataclass(frozen=True, kw_only=True)

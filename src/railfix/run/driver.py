@@ -28,7 +28,7 @@ from railfix.run.checks import (
     check_sbas_time,
 )
 from railfix.run.chunks import aligned
-from railfix.run.inputs import Antenna, RunInputs, collected
+from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.output import OutputFolder
 from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
 from railfix.run.sources import Line, Log, TrackReading, open_line
@@ -153,7 +153,7 @@ def run_files(
         notes = (*notes_of(line, navigation, tally, logs), *_notes_of_levels(config, tally, found_levels))
         wall = clock.perf_counter() - began
         record = run_record(
-            files=collected(fingerprints),
+            files=[entry.result() for entry in fingerprints],
             command=sys.argv,
             asked=asked or {},
             used=config.as_dict(),
@@ -192,7 +192,7 @@ def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Lin
     InputFileError, SettingsError, MismatchError
         A file is not what it should be, or track and vehicle do not fit.
     """
-    navigation = read_navigation(inputs.nav, on_error="strict" if options.broken_lines == "stop" else "lenient")
+    navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
     if inputs.sp3:
         navigation = replace(navigation, precise=read_sp3(inputs.sp3))
     line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)

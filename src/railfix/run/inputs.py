@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, fields, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from railfix.core.errors import InputFileError
+from railfix.core.files import fingerprint
 from railfix.pipeline.config import Config
 
 Antenna = Literal["front", "rear"]
@@ -85,17 +85,9 @@ class RunInputs:
                     )
                 seen[whole] = (name, path)
 
-    def fingerprints(self, pool: Executor) -> list[tuple[str, Path, Future[str]]]:
-        """SHA-256 of every file, worked out beside the run."""
-        return [(name, path, pool.submit(file_sha256, path)) for name, path in self.named()]
-
-
-def collected(fingerprints: list[tuple[str, Path, Future[str]]]) -> list[dict[str, Any]]:
-    """Name, path, size and hash of every file, as plain values."""
-    return [
-        {"input": name, "path": str(path), "bytes": path.stat().st_size, "sha256": digest.result()}
-        for name, path, digest in fingerprints
-    ]
+    def fingerprints(self, pool: Executor) -> list[Future[dict[str, Any]]]:
+        """Name, path, size and SHA-256 of every file, computed while the run goes on."""
+        return [pool.submit(fingerprint, name, path) for name, path in self.named()]
 
 
 def _check_file(name: str, path: Path) -> None:
@@ -109,12 +101,3 @@ def _check_file(name: str, path: Path) -> None:
             file.read(1)
     except OSError as error:
         raise InputFileError(path, f"cannot be read ({error.strerror}); check what --{name} names") from error
-
-
-def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, as hexadecimal digits."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror})") from error

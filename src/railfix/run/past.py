@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.files import file_sha256
 from railfix.pipeline.config import Config, parse_config
 from railfix.run.driver import RunOptions
-from railfix.run.inputs import RunInputs, file_sha256
+from railfix.run.inputs import RunInputs
 from railfix.run.sources import TrackReading
 
 

@@ -146,7 +146,7 @@ class Log:
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,
-            on_error="strict" if self.broken_lines == "stop" else "lenient",
+            broken_lines=self.broken_lines,
             start=None if self.start is None else np.datetime64(self.start, "ns"),
             end=None if self.end is None else np.datetime64(self.end, "ns"),
             progress=self._read_to,

@@ -19,10 +19,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
-from railfix.gnss.observations import frozen
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
 from railfix.screens.medians import clock_columns, enough_satellites, row_median
 from railfix.screens.result import Screened
@@ -86,7 +85,7 @@ class DopplerState:
         for item in fields(self):
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, frozen(value))
+                object.__setattr__(self, item.name, read_only(value))
 
 
 def doppler_screen(

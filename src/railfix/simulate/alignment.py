@@ -17,14 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, read_only
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.simulate.line_elements import Knots, generated_knots, knots_of_elements
 from railfix.simulate.line_file import FileLine, line_of_file
 from railfix.simulate.line_settings import PATTERN_LENGTH_M, LineSettings
 from railfix.simulate.waves import Waves
 from railfix.track import Track, interpolate_kilometrage
-from railfix.track.track import frozen
 
 _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
@@ -152,7 +151,7 @@ class Alignment:
             ecef = ecef + np.einsum("ni,nij->nj", self.map_error_m(chainage), enu_axes(there[0], there[1]))
         place = geodetic_from_ecef(ecef)
         if self.file is not None:
-            latitude, longitude, height = (frozen(part) for part in place)
+            latitude, longitude, height = (read_only(part) for part in place)
             return replace(self.file.track, latitude_deg=latitude, longitude_deg=longitude, height_m=height)
         curvature = self.curvature_at(chainage)
         with np.errstate(divide="ignore"):

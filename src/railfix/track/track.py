@@ -14,7 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.arrays import Floats, Integers, Masks, read_only
+from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 
 #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
@@ -24,13 +25,6 @@ SIGMA_HEIGHT_M = 0.60
 #: Kilometrage that disagrees with the length of a segment by more than this, plus a twentieth of
 #: the length, is a break in the marking [m]: files carry it rounded to the metre.
 KILOMETRAGE_BREAK_M = 1.0
-
-
-def frozen(values: ArrayLike) -> Floats:
-    """A read-only float copy of an array."""
-    array = np.array(values, dtype=np.float64)
-    array.flags.writeable = False
-    return array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +53,7 @@ class Provenance:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Track:
+class Track(NotebookTable):
     """Centreline of a route, V points in the order of the route.
 
     Attributes
@@ -105,8 +99,10 @@ class Track:
         shape = (len(self.latitude_deg),)
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, np.ndarray) and value.shape != shape:
-                raise ValueError(f"{item.name} has shape {value.shape}, expected {shape}")
+            if isinstance(value, np.ndarray):
+                if value.shape != shape:
+                    raise ValueError(f"{item.name} has shape {value.shape}, expected {shape}")
+                object.__setattr__(self, item.name, read_only(value))
         if shape[0] < 2:
             raise ValueError(f"a track needs at least two points, got {shape[0]}")
         place = np.stack([self.latitude_deg, self.longitude_deg, self.height_m])
@@ -144,17 +140,20 @@ class Track:
         -------
         Track
         """
-        latitude = frozen(latitude_deg)
-        absent = np.full(latitude.shape, np.nan)
+        latitude = np.array(latitude_deg, dtype=np.float64)
+
+        def floats(values: ArrayLike | None) -> Floats:
+            return np.full(latitude.shape, np.nan) if values is None else np.array(values, dtype=np.float64)
+
         return cls(
             name=name,
             latitude_deg=latitude,
-            longitude_deg=frozen(longitude_deg),
-            height_m=frozen(height_m),
-            kilometrage_m=frozen(absent if kilometrage_m is None else kilometrage_m),
-            cant_m=frozen(absent if cant_m is None else cant_m),
-            radius_m=frozen(absent if radius_m is None else radius_m),
-            gradient_permille=frozen(absent if gradient_permille is None else gradient_permille),
+            longitude_deg=floats(longitude_deg),
+            height_m=floats(height_m),
+            kilometrage_m=floats(kilometrage_m),
+            cant_m=floats(cant_m),
+            radius_m=floats(radius_m),
+            gradient_permille=floats(gradient_permille),
             section=np.array(np.zeros(latitude.shape) if section is None else section, dtype=np.int64),
             sections=sections,
             sigma_plan_m=sigma_plan_m,
@@ -193,16 +192,21 @@ class Track:
     def __len__(self) -> int:
         return len(self.latitude_deg)
 
+    def __repr__(self) -> str:
+        marking = self.kilometrage_m[np.isfinite(self.kilometrage_m)] / 1e3
+        kilometrage = f", kilometrage {marking[0]:.3f} to {marking[-1]:.3f} km" if marking.size else ""
+        return f'<Track "{self.name}": {plural(self, "point")}, {self.chainage_m[-1]:,.0f} m{kilometrage}>'
+
     @cached_property
     def ecef_m(self) -> Floats:
         """Points of the centreline, shape (V, 3) [m]."""
-        return frozen(ecef_from_geodetic(self.latitude_deg, self.longitude_deg, self.height_m))
+        return read_only(ecef_from_geodetic(self.latitude_deg, self.longitude_deg, self.height_m))
 
     @cached_property
     def chainage_m(self) -> Floats:
         """Length of the polyline from its first point, shape (V,) [m]; not rising only at duplicate points."""
         steps = np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1)
-        return frozen(np.concatenate([[0.0], np.cumsum(steps)]))
+        return read_only(np.concatenate([[0.0], np.cumsum(steps)]))
 
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
         """The line's own marking at chainages; see `interpolate_kilometrage`."""

@@ -7,21 +7,21 @@ chainage. `Trajectory.from_track` takes the track itself as the antenna's path; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, read_only
+from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.track.polyline import NearestOnPolyline
 from railfix.track.track import (
     SIGMA_HEIGHT_M,
     SIGMA_PLAN_M,
     Track,
-    frozen,
     interpolate_kilometrage,
 )
 
@@ -32,7 +32,7 @@ _END_TOLERANCE_M = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trajectory:
+class Trajectory(NotebookTable):
     """Path of one antenna, V points.
 
     Right is positive across the path, seen in the direction of rising chainage.
@@ -85,6 +85,10 @@ class Trajectory:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected ({points},)")
         if not np.isfinite(self.ecef_m).all():
             raise ValueError("ecef_m must be finite")
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, read_only(value))
         if not (np.diff(self.chainage_m) > 0).all():
             i = int(np.argmin(np.diff(self.chainage_m)))
             raise ValueError(
@@ -102,7 +106,7 @@ class Trajectory:
             chainage_m=track.chainage_m,
             kilometrage_m=track.kilometrage_m,
             cant_m=track.cant_m,
-            roll_deg=frozen(np.zeros(len(track))),
+            roll_deg=read_only(np.zeros(len(track))),
             sigma_plan_m=track.sigma_plan_m,
             sigma_height_m=track.sigma_height_m,
             notes=(TRACK_AS_PATH, *track.provenance.notes),
@@ -111,20 +115,24 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.ecef_m)
 
+    def __repr__(self) -> str:
+        span = f"chainage {self.chainage_m[0]:,.1f} to {self.chainage_m[-1]:,.1f} m"
+        return f'<Trajectory "{self.name}": {plural(self, "point")}, {span} of the {self.reference}>'
+
     @cached_property
     def length_m(self) -> Floats:
         """Length of each segment, shape (V - 1,) [m]."""
-        return frozen(np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1))
+        return read_only(np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1))
 
     @cached_property
     def arc_m(self) -> Floats:
         """Arc length of each point from the first, shape (V,) [m]."""
-        return frozen(np.concatenate([[0.0], np.cumsum(self.length_m)]))
+        return read_only(np.concatenate([[0.0], np.cumsum(self.length_m)]))
 
     @cached_property
     def tangent(self) -> Floats:
         """Unit vector along each segment, shape (V - 1, 3)."""
-        return frozen(np.diff(self.ecef_m, axis=0) / self.length_m[:, None])
+        return read_only(np.diff(self.ecef_m, axis=0) / self.length_m[:, None])
 
     @cached_property
     def _axes(self) -> Floats:
@@ -135,25 +143,25 @@ class Trajectory:
     @cached_property
     def up(self) -> Floats:
         """Normal of the ellipsoid at each segment, unit vectors, shape (V - 1, 3)."""
-        return frozen(self._axes[:, 2])
+        return read_only(self._axes[:, 2])
 
     @cached_property
     def across(self) -> Floats:
         """Horizontal unit vector to the right of each segment, shape (V - 1, 3)."""
         right = np.cross(self.tangent, self.up)
-        return frozen(right / np.linalg.norm(right, axis=1, keepdims=True))
+        return read_only(right / np.linalg.norm(right, axis=1, keepdims=True))
 
     @cached_property
     def heading_deg(self) -> Floats:
         """Azimuth of each segment in rising chainage, clockwise from north, shape (V - 1,) [deg]."""
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
-        return frozen(np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360.0)
+        return read_only(np.degrees(np.arctan2(enu[:, 0], enu[:, 1])) % 360.0)
 
     @cached_property
     def gradient_permille(self) -> Floats:
         """Climb of each segment in rising chainage, shape (V - 1,)."""
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
-        return frozen(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
+        return read_only(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
 
     def body_azimuth_deg(self, arc_m: ArrayLike) -> Floats:
         """Azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""

@@ -11,6 +11,7 @@ import numpy as np
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
+from railfix.core.files import file_sha256
 from railfix.evaluate.range_errors.base_station import BaseStation, base_station_from_files
 from railfix.evaluate.range_errors.gather import GatherLimits, joined, range_errors
 from railfix.io.reference_log import read_reference
@@ -18,7 +19,6 @@ from railfix.pipeline.processor import EpochProcessor, State, conditions_of
 from railfix.ranges.error_model import ErrorModel, ErrorModelFit, ErrorModelSource, ErrorSamples, fit_bins
 from railfix.run.chunks import aligned
 from railfix.run.driver import open_inputs
-from railfix.run.inputs import file_sha256
 from railfix.run.past import past_run
 
 #: Told after each chunk: name of the run and epochs done in it.

@@ -9,11 +9,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.observations import frozen
 from railfix.gnss.orbits.kepler import kepler_state
 from railfix.gnss.orbits.precise import precise_clock_s, precise_state
 from railfix.gnss.orbits.table import Plan, Table, table_of
@@ -74,7 +73,7 @@ class SatelliteStates:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            object.__setattr__(self, item.name, frozen(getattr(self, item.name)))
+            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
 
 
 def satellite_states(

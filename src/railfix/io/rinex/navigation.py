@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from os import PathLike
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_text_lines
+from railfix.core.files import BrokenLines, read_text_lines
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.navigation_header import Gathered, read_header
 from railfix.io.rinex.navigation_records import (
@@ -43,16 +43,14 @@ _WIDTH: Final = 19
 _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z][ \d]\d) *(\S*)")
 
 
-def read_navigation(
-    paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict", "lenient"] = "strict"
-) -> Navigation:
+def read_navigation(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> Navigation:
     """All records of one or several navigation files.
 
     Parameters
     ----------
     paths : path or sequence of paths
         Plain, gzip, compress.
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
         A broken record stops the reading, or is counted in `passed_over` and named in `notes`.
 
     Returns
@@ -69,7 +67,7 @@ def read_navigation(
     files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
     if not files:
         raise ValueError("at least one navigation file is needed")
-    gathered = Gathered(lenient=on_error == "lenient")
+    gathered = Gathered(lenient=broken_lines == "count")
     for path in files:
         _read_file(path, gathered)
     if not gathered.records:

@@ -31,10 +31,9 @@ from typing import Final, get_args
 import numpy as np
 
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import FilePath
+from railfix.core.files import BrokenLines, FilePath
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io.rinex.observations_blocks import BlockReader, Wanted
-from railfix.io.rinex.observations_log import OnError
 from railfix.io.rinex.observations_signals import SYSTEMS
 
 #: Epochs of a piece unless asked otherwise.
@@ -49,7 +48,7 @@ Paths = FilePath | Sequence[FilePath]
 def read_observations(
     path: Paths,
     *,
-    on_error: OnError = "strict",
+    broken_lines: BrokenLines = "stop",
     systems: Iterable[str] | None = None,
     start: np.datetime64 | str | None = None,
     end: np.datetime64 | str | None = None,
@@ -61,7 +60,7 @@ def read_observations(
     path : path-like or sequence of path-like
         RINEX 2.10 to 2.12, 3.00 to 3.05, 4.00 to 4.02; plain, ``.gz``, ``.Z``, Hatanaka (CRX) plain
         or in one of these, told by content. Several files are put in order of time and joined.
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
         What to do about what is broken, see above.
     systems : iterable of str, optional
         Constellation letters wanted ("GEJ"); all by default.
@@ -84,7 +83,7 @@ def read_observations(
     -----
     Use `scan_observations` for logs that do not fit into memory.
     """
-    wanted = _wanted(on_error=on_error, systems=systems, start=start, end=end)
+    wanted = _wanted(broken_lines=broken_lines, systems=systems, start=start, end=end)
     return concatenate(list(_runs(_as_list(path), wanted)))
 
 
@@ -92,7 +91,7 @@ def scan_observations(
     path: Paths,
     *,
     epochs: int = DEFAULT_EPOCHS,
-    on_error: OnError = "strict",
+    broken_lines: BrokenLines = "stop",
     systems: Iterable[str] | None = None,
     start: np.datetime64 | str | None = None,
     end: np.datetime64 | str | None = None,
@@ -102,7 +101,7 @@ def scan_observations(
 
     Parameters
     ----------
-    path, on_error, systems, start, end
+    path, broken_lines, systems, start, end
         As `read_observations`, of which this is the other form: the pieces concatenated are the whole.
     epochs : int
         Epochs of a piece; the last may have fewer.
@@ -121,7 +120,7 @@ def scan_observations(
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
-    wanted = _wanted(on_error=on_error, systems=systems, start=start, end=end)
+    wanted = _wanted(broken_lines=broken_lines, systems=systems, start=start, end=end)
     return _pieces(_runs(_as_list(path), wanted, progress), epochs)
 
 
@@ -134,13 +133,13 @@ def _as_list(path: Paths) -> list[str]:
 
 def _wanted(
     *,
-    on_error: OnError,
+    broken_lines: BrokenLines,
     systems: Iterable[str] | None,
     start: np.datetime64 | str | None,
     end: np.datetime64 | str | None,
 ) -> Wanted:
-    if on_error not in get_args(OnError):
-        raise ValueError(f"on_error is '{on_error}', 'strict' or 'lenient' was expected")
+    if broken_lines not in get_args(BrokenLines):
+        raise ValueError(f"broken_lines is '{broken_lines}', 'stop' or 'count' was expected")
     letters = None if systems is None else frozenset(systems)
     if letters is not None and (not letters or not letters <= set(SYSTEMS)):
         raise ValueError(f"systems is {sorted(letters)}, letters out of {SYSTEMS} were expected")
@@ -148,7 +147,7 @@ def _wanted(
     for name, time in (("start_ns", start), ("end_ns", end)):
         if time is not None:
             limits[name] = int(np.asarray(time, dtype="datetime64[ns]").astype(np.int64))
-    return Wanted(on_error=on_error, systems=letters, **limits)
+    return Wanted(broken_lines=broken_lines, systems=letters, **limits)
 
 
 def _runs(paths: list[str], wanted: Wanted, progress: Callable[[float], None] | None = None) -> Iterator[Observations]:
@@ -169,16 +168,16 @@ def _runs(paths: list[str], wanted: Wanted, progress: Callable[[float], None] | 
             if progress is not None:
                 progress((k + reader.share) / len(paths))
             yield run
-        if not reader.epochs and wanted.on_error == "strict":
+        if not reader.epochs and wanted.broken_lines == "stop":
             raise InputFileError(path, "has a header but no epochs; the recording is empty or cut short")
     if reader is not None and not found:
         if not reader.epochs:
-            raise InputFileError(reader.path, "has no epoch that can be used; see it with on_error='strict'")
+            raise InputFileError(reader.path, "has no epoch that can be used; see it with broken_lines='stop'")
         raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
 
 
 def _in_order_of_time(paths: list[str], wanted: Wanted) -> list[str]:
-    peek = replace(wanted, on_error="lenient", systems=None, start_ns=Wanted.start_ns, end_ns=Wanted.end_ns)
+    peek = replace(wanted, broken_lines="count", systems=None, start_ns=Wanted.start_ns, end_ns=Wanted.end_ns)
     firsts = []
     for path in paths:
         with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:

@@ -10,14 +10,14 @@ import numpy as np
 
 from railfix.core.arrays import Integers, Masks
 from railfix.core.errors import InputFileError
-from railfix.core.files import ByteStream, FilePath, open_stream
+from railfix.core.files import BrokenLines, ByteStream, FilePath, open_stream
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.observations import Observations
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import decode, lines_per_satellite
 from railfix.io.rinex.observations_epochs import Epochs, find_epochs
 from railfix.io.rinex.observations_lines import Lines, split_lines
-from railfix.io.rinex.observations_log import CYCLE_SLIPS, DUPLICATES, EXTERNAL_EVENTS, FaultLog, OnError
+from railfix.io.rinex.observations_log import CYCLE_SLIPS, DUPLICATES, EXTERNAL_EVENTS, FaultLog
 
 #: Bytes of text read at a time: enough that arrays pay off, few enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
@@ -32,14 +32,14 @@ class Wanted:
 
     Attributes
     ----------
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
     systems : frozenset of str or None
         Constellation letters; None for all.
     start_ns, end_ns : int
         Time tags from `start_ns` up to, not including, `end_ns`, since 1970 in GPS time.
     """
 
-    on_error: OnError = "strict"
+    broken_lines: BrokenLines = "stop"
     systems: frozenset[str] | None = None
     start_ns: int = _BEFORE_ALL
     end_ns: int = int(np.iinfo(np.int64).max)
@@ -76,7 +76,7 @@ class BlockReader:
         self._after_ns = after_ns
         self._wanted = wanted
         self._block_bytes = block_bytes
-        self._log = FaultLog(self.path, on_error=wanted.on_error)
+        self._log = FaultLog(self.path, broken_lines=wanted.broken_lines)
         self._break = False
 
     def blocks(self) -> Generator[Observations]:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
 
 from railfix.core.arrays import Integers
 from railfix.core.errors import InputFileError
+from railfix.core.files import BrokenLines
 from railfix.gnss.observations import MAX_PROBLEMS, capped_problems
-
-OnError = Literal["strict", "lenient"]
 
 EPOCHS = "broken epochs"
 SATELLITES = "broken satellite lines"
@@ -31,9 +29,9 @@ _WHAT_BECAME_OF_IT = {
 class FaultLog:
     """Collects faults of one file; `settle` raises the first of them when reading is strict."""
 
-    def __init__(self, path: str, *, on_error: OnError) -> None:
+    def __init__(self, path: str, *, broken_lines: BrokenLines) -> None:
         self.path = path
-        self.strict = on_error == "strict"
+        self.strict = broken_lines == "stop"
         self.counts: dict[str, int] = {}
         self._sentences: list[str] = []
         self._problems = 0
@@ -73,7 +71,7 @@ class FaultLog:
 
     def fresh(self) -> FaultLog:
         """An empty log of the same file, for a trial that may be thrown away."""
-        return FaultLog(self.path, on_error="strict" if self.strict else "lenient")
+        return FaultLog(self.path, broken_lines="stop" if self.strict else "count")
 
     def absorb(self, other: FaultLog) -> None:
         """Add what another log of the same file has."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from typing import Final
 
@@ -109,9 +109,29 @@ def _calendar_text(time: Datetimes) -> Strings:
     return np.char.add(" ", text)
 
 
+def kepler_numbers(records: KeplerRecords) -> Iterator[tuple[str, np.datetime64, list[float]]]:
+    """Satellite, clock time in the constellation's own time, and numbers in file order of each record."""
+    toc, fields = _kepler_fields(records)
+    for satellite, time, numbers in zip(records.satellite.tolist(), toc, np.stack(fields, axis=1), strict=True):
+        yield satellite, time, numbers.tolist()
+
+
+def glonass_numbers(records: GlonassRecords) -> Iterator[tuple[str, np.datetime64, list[float]]]:
+    """Satellite, time in UTC, and numbers in file order (kilometres) of each record."""
+    toe, fields = _glonass_fields(records)
+    for satellite, time, numbers in zip(records.satellite.tolist(), toe, np.stack(fields, axis=1), strict=True):
+        yield satellite, time, numbers.tolist()
+
+
 def _kepler_text(records: KeplerRecords) -> Strings:
     if len(records) == 0:
         return np.empty(0, dtype="<U1")
+    toc, fields = _kepler_fields(records)
+    return _records(records.satellite, toc, fields)
+
+
+def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
+    """Clock time in the constellation's own time, and one array for each number of the file."""
     letter = records.satellite.astype("<U1")
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
     if unknown.size:
@@ -140,7 +160,7 @@ def _kepler_text(records: KeplerRecords) -> Strings:
         records.accuracy_m, records.health, first, np.where(navstar, records.iodc, second),
         sent, np.where(navstar, fit, np.where(beidou, records.iodc, none)),
     )  # fmt: skip
-    return _records(records.satellite, toc, [np.asarray(f, dtype=np.float64) for f in fields])
+    return toc, [np.asarray(f, dtype=np.float64) for f in fields]
 
 
 def _week_and_transmission(
@@ -159,6 +179,11 @@ def _week_and_transmission(
 def _glonass_text(records: GlonassRecords) -> Strings:
     if len(records) == 0:
         return np.empty(0, dtype="<U1")
+    return _records(records.satellite, *_glonass_fields(records))
+
+
+def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
+    """Time in UTC, and one array for each number of the file."""
     toe, sent = _utc(records.toe), _utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     place, speed, push = (
@@ -172,7 +197,7 @@ def _glonass_text(records: GlonassRecords) -> Strings:
     last = (records.health, records.frequency_channel, records.age_days)
     for axis, extra in enumerate(last):
         fields += [place[:, axis], speed[:, axis], push[:, axis], extra.astype(np.float64)]
-    return _records(records.satellite, toe, fields)
+    return toe, fields
 
 
 def _utc(time: Datetimes) -> Datetimes:

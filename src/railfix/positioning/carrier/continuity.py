@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
-from railfix.gnss.observations import frozen
 from railfix.track.trajectory import Trajectory
 
 
@@ -167,8 +166,8 @@ def track_jumps(
         after = ContinuityState(
             time=time[-1],
             channels=channels,
-            phase_m=frozen(phase_m[-1].copy()),
-            sat_ecef_m=frozen(sat_ecef_m[-1].copy()),
+            phase_m=read_only(phase_m[-1].copy()),
+            sat_ecef_m=read_only(sat_ecef_m[-1].copy()),
             arc_m=float(arc_m[-1]),
         )
     found = TrackJumps(

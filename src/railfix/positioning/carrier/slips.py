@@ -19,10 +19,10 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.arrays import Floats, Integers, Masks, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
-from railfix.gnss.observations import Observations, frozen
+from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
@@ -257,10 +257,10 @@ def find_slips(
         after = SlipState(
             time=observations.time[-1],
             channels=channels,
-            code_m=frozen(observations.code_m[-1].copy()),
-            phase_m=frozen(phase[-1].copy()),
-            doppler_mps=frozen(doppler[-1].copy()),
-            half_cycle=frozen(half[-1].copy()),
+            code_m=read_only(observations.code_m[-1].copy()),
+            phase_m=read_only(phase[-1].copy()),
+            doppler_mps=read_only(doppler[-1].copy()),
+            half_cycle=read_only(half[-1].copy()),
             step_ms=int(total_ms[-1]),
         )
     slips = Slips(

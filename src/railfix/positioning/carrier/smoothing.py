@@ -13,9 +13,8 @@ from typing import Literal
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.timescale import seconds
-from railfix.gnss.observations import frozen
 from railfix.positioning.carrier.recursion import linear_recursion
 
 
@@ -197,11 +196,11 @@ def smooth_codes(
     after = SmoothingState(
         time=time[-1],
         channels=channels,
-        base_m=frozen(np.where(runs[-1], base[-1], np.nan)),
-        offset_m=frozen(np.where(runs[-1], offset[-1], 0.0)),
-        variance=frozen(np.where(runs[-1], variance[-1], 0.0)),
-        count=frozen(np.where(runs[-1], count[-1], 0.0).astype(np.int64)),
-        last_m=frozen(last),
+        base_m=read_only(np.where(runs[-1], base[-1], np.nan)),
+        offset_m=read_only(np.where(runs[-1], offset[-1], 0.0)),
+        variance=read_only(np.where(runs[-1], variance[-1], 0.0)),
+        count=read_only(np.where(runs[-1], count[-1], 0.0).astype(np.int64)),
+        last_m=read_only(last),
         clock_m=float(apart[-1]),
     )
     return Smoothed(code_m=smoothed, sigma_factor=factor), after

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PchipInterpolator
 
-from railfix.core.arrays import Floats, Integers, Masks, Strings
-from railfix.gnss.observations import ObservationHeader, frozen
+from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
+from railfix.gnss.observations import ObservationHeader
 
 #: Standard deviation of a normal variable against its median absolute deviation.
 _NORMAL_MAD: Final = 1.482_602_218_505_602
@@ -115,7 +115,7 @@ class Cn0Mean:
             values = getattr(self, name)
             if values.shape != self.elevation_deg.shape or values.ndim != 1 or not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite, one number a bin")
-            object.__setattr__(self, name, frozen(values))
+            object.__setattr__(self, name, read_only(values))
         if len(self.elevation_deg) < 2 or not (np.diff(self.elevation_deg) > 0.0).all():
             raise ValueError("elevation_deg must rise, over at least two bins")
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import BrokenLines, file_sha256
 from railfix.core.geodesy import elevation_azimuth
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
@@ -74,7 +74,7 @@ def cn0_curve_from_log(
     *,
     position_ecef_m: Floats | None = None,
     fit: CurveFit | None = None,
-    on_error: Literal["strict", "lenient"] = "strict",
+    broken_lines: BrokenLines = "stop",
     progress: Callable[[float], None] | None = None,
 ) -> Cn0Calibration:
     """Fit a curve on the log of a receiver whose antenna stood under open sky.
@@ -87,7 +87,7 @@ def cn0_curve_from_log(
     position_ecef_m : ndarray, shape (3,) [m], optional
         Where the antenna stood, to some kilometres; by default what the header says.
     fit : CurveFit, optional
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
         What to do about broken lines of the log.
     progress : callable, optional
         Called with the part that has been read, 0 to 1.
@@ -106,11 +106,11 @@ def cn0_curve_from_log(
         Satellites were tracked that stand below the horizon of the position, or the navigation
         files have none of them, or too few samples for any curve.
     """
-    records = read_navigation(list(navigation), on_error=on_error)
+    records = read_navigation(list(navigation), broken_lines=broken_lines)
     samples, low = Cn0Samples(), _Horizon()
     header: ObservationHeader | None = None
     start, end, epochs = np.datetime64("NaT", "ns"), np.datetime64("NaT", "ns"), 0
-    for part in scan_observations(list(observations), on_error=on_error, progress=progress):
+    for part in scan_observations(list(observations), broken_lines=broken_lines, progress=progress):
         if header is None:
             header, start = part.header, part.time[0]
             place = _position(header, position_ecef_m, observations[0])
@@ -127,7 +127,7 @@ def cn0_curve_from_log(
         antenna=header.antenna,
         receiver=header.receiver,
         marker=header.marker,
-        files=tuple((path.name, _sha256(path)) for path in (*observations, *navigation)),
+        files=tuple((path.name, file_sha256(path)) for path in (*observations, *navigation)),
         start=str(start),
         end=str(end),
         epochs=epochs,
@@ -189,11 +189,3 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
                 f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; its satellites differ, or the sky is not open"
             )
     return tuple(notes)
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror})") from error

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Integers, Masks
-from railfix.gnss.observations import frozen
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, read_only
 from railfix.ranges.sbas.names import DECODED, system_name, type_name
 
 
@@ -58,7 +57,7 @@ class SbasLog:
             if isinstance(value, np.ndarray):
                 if len(value) != len(self.time):
                     raise ValueError(f"{item.name} has {len(value)} messages, time has {len(self.time)}")
-                object.__setattr__(self, item.name, frozen(value))
+                object.__setattr__(self, item.name, read_only(value))
 
     def __len__(self) -> int:
         return len(self.time)

@@ -6,14 +6,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix.core.arrays import Bytes, Integers, Masks
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_text_lines
+from railfix.core.files import BrokenLines, read_text_lines
 from railfix.core.timescale import GPS_EPOCH
 from railfix.ranges.sbas.lines import RawMessage, kind_of_file, parse
 from railfix.ranges.sbas.log import SbasLog
@@ -35,7 +35,7 @@ class _Gathered:
     notes: list[str] = field(default_factory=list)
 
 
-def read_sbas(paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict", "lenient"] = "strict") -> SbasLog:
+def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> SbasLog:
     """SBAS messages of one or several files.
 
     Parameters
@@ -43,7 +43,7 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict
     paths : path or sequence of paths
         RTKLIB (.sbs), EGNOS message server (.ems) or RINEX broadcast data (type B), told by their
         content; plain, gzip or compress.
-    on_error : {"strict", "lenient"}
+    broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `refused` and
         named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
         left out and counted in either case.
@@ -64,7 +64,7 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict
         raise ValueError("at least one SBAS file is needed")
     gathered = _Gathered()
     for number, path in enumerate(files):
-        _read_file(str(path), number, on_error, gathered)
+        _read_file(str(path), number, broken_lines, gathered)
     sources = tuple(str(path) for path in files)
     if not gathered.raw:
         raise InputFileError(", ".join(sources), "holds no SBAS message that can be read")
@@ -75,14 +75,14 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, on_error: Literal["strict
     return log
 
 
-def _read_file(path: str, number: int, on_error: str, gathered: _Gathered) -> None:
+def _read_file(path: str, number: int, broken_lines: str, gathered: _Gathered) -> None:
     lines = read_text_lines(path)
     broken = 0
     for item in parse(path, kind_of_file(path, lines), lines):
         if isinstance(item, RawMessage):
             gathered.raw.append(item)
             gathered.source.append(number)
-        elif on_error == "strict":
+        elif broken_lines == "stop":
             raise item
         else:
             broken += 1

@@ -7,8 +7,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers, Masks
-from railfix.gnss.observations import frozen
+from railfix.core.arrays import Floats, Integers, Masks, read_only
 
 
 class SatelliteState(IntEnum):
@@ -58,7 +57,7 @@ class _Frozen:
         for item in fields(self):  # type: ignore[arg-type]
             value = getattr(self, item.name)
             if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, frozen(value))
+                object.__setattr__(self, item.name, read_only(value))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,35 @@
+# The names of `railfix.core`, imported at their first use (lazy-loader): the command line needs only the errors.
+
+from .errors import (
+    InputFileError,
+    MapQualityError,
+    MismatchError,
+    NoPositionError,
+    OutputError,
+    RailfixError,
+    SettingsError,
+)
+from .files import FilePath, file_sha256, write_whole
+from .reasons import Reason, Status, reason_text, reason_texts
+from .settings import Settings, load_settings, read_toml, write_toml
+
+__all__ = [
+    "FilePath",
+    "InputFileError",
+    "MapQualityError",
+    "MismatchError",
+    "NoPositionError",
+    "OutputError",
+    "RailfixError",
+    "Reason",
+    "Settings",
+    "SettingsError",
+    "Status",
+    "file_sha256",
+    "load_settings",
+    "read_toml",
+    "reason_text",
+    "reason_texts",
+    "write_toml",
+    "write_whole",
+]

@@ -1,0 +1,318 @@
+"""Observations and navigation records in the xarray layout of georinex, both ways.
+
+georinex (``georinex.load``) holds a log as a dataset over ``time`` and ``sv`` with one variable for
+each RINEX observation type ("C1C", "L1C", "D1C", "S1C", "L1Clli"), and navigation records as a dataset
+over ``time`` (clock reference time in the constellation's own time) and ``sv`` with the names of the
+RINEX tables. A second record of a satellite at the same time (Galileo I/NAV beside F/NAV) is named
+"E01_1".
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Strings
+from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import ObservationHeader, Observations
+from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
+from railfix.io.rinex.observations_signals import KINDS, signal_of
+from railfix.io.rinex.write_navigation import glonass_numbers, kepler_numbers
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_ARRAYS: Final = dict(zip(KINDS, ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz"), strict=True))
+_DIMENSIONS: Final = ("time", "sv")
+_TYPE: Final = re.compile(r"[CPLDS][1-9ABCD][A-Z]?")
+#: Names that georinex gives the numbers of a record, in the order of the file (RINEX 3.04, tables A6 to A14).
+_KEPLER: Final = (
+    "SVclockBias SVclockDrift SVclockDriftRate IODE Crs DeltaN M0 Cuc Eccentricity Cus sqrtA Toe Cic Omega0 Cis Io Crc "
+    "omega OmegaDot IDOT CodesL2 GPSWeek L2Pflag SVacc health TGD IODC TransTime FitIntvl"
+)
+_GLONASS: Final = (
+    "SVclockBias SVrelFreqBias MessageFrameTime X dX dX2 health Y dY dY2 FreqNum Z dZ dZ2 AgeOpInfo".split()
+)
+_OTHER_NAMES: Final = {
+    "G": {},
+    "J": {},
+    "E": {
+        "IODE": "IODnav", "CodesL2": "DataSrc", "GPSWeek": "GALWeek", "L2Pflag": "spare0", "SVacc": "SISA",
+        "TGD": "BGDe5a", "IODC": "BGDe5b", "FitIntvl": "spare1",
+    },
+    "C": {
+        "IODE": "AODE", "CodesL2": "spare0", "GPSWeek": "BDTWeek", "L2Pflag": "spare1", "health": "SatH1",
+        "TGD": "TGD1", "IODC": "TGD2", "FitIntvl": "AODC",
+    },
+}  # fmt: skip
+_NAMES: Final = {
+    **{letter: [other.get(name, name) for name in _KEPLER.split()] for letter, other in _OTHER_NAMES.items()},
+    "R": _GLONASS,
+}
+#: Numbers that RINEX writes in kilometres and georinex holds in metres.
+_KILOMETRES: Final = frozenset("X dX dX2 Y dY dY2 Z dZ dZ2".split())
+_KLOBUCHAR: Final = {"G": "ionospheric_corr_GPS", "C": "ionospheric_corr_BDS", "J": "ionospheric_corr_QZS"}
+#: RINEX writes 0.9999E9 for a number that is not known.
+_UNKNOWN: Final = 0.99e9
+
+
+def observations_to_xarray(observations: Observations) -> xr.Dataset:
+    """Observations as a dataset in the layout of georinex.
+
+    Parameters
+    ----------
+    observations : Observations
+
+    Returns
+    -------
+    xarray.Dataset
+        One variable over ``time`` and ``sv`` for each observation type; absent is NaN. Beyond georinex's
+        own: ``break_before`` over ``time``, ``glonass_channel`` over ``sv``. Attributes as georinex's.
+    """
+    import xarray as xr
+
+    satellites, row = np.unique(observations.satellite, return_inverse=True)
+    shape = (len(observations), len(satellites))
+    variables: dict[str, Any] = {}
+    for kind, name in _ARRAYS.items():
+        values = getattr(observations, name)
+        for column in np.flatnonzero(np.isfinite(values).any(axis=0)):
+            variable = kind + str(observations.signal[column])
+            grid = variables.setdefault(variable, (_DIMENSIONS, np.full(shape, np.nan)))[1]
+            grid[:, row[column]] = values[:, column]
+    for column in np.flatnonzero(observations.loss_of_lock.any(axis=0)):
+        variable = f"L{observations.signal[column]}lli"
+        grid = variables.setdefault(variable, (_DIMENSIONS, np.full(shape, np.nan)))[1]
+        grid[:, row[column]] = observations.loss_of_lock[:, column]
+    header = observations.header
+    channels = [header.glonass_channel.get(name, np.nan) for name in satellites.tolist()]
+    return xr.Dataset(
+        variables
+        | {"break_before": ("time", observations.break_before), "glonass_channel": ("sv", np.array(channels, float))},
+        coords={"time": observations.time, "sv": satellites},
+        attrs={
+            "version": header.version,
+            "interval": header.interval_s,
+            "rinextype": "obs",
+            "time_system": "GPS",
+            "position": header.approximate_ecef_m.tolist(),
+            "antenna_delta_hen_m": header.antenna_delta_hen_m.tolist(),
+            "marker": header.marker,
+            "receiver": header.receiver,
+            "antenna": header.antenna,
+            "receiver_clock_offset_applied": int(header.receiver_clock_applied),
+        },
+    )
+
+
+def observations_from_xarray(data: xr.Dataset) -> Observations:
+    """Observations of a dataset in the layout of georinex.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        As ``georinex.load`` gives it, best with ``useindicators=True``: without indicators no loss of
+        lock is known.
+
+    Returns
+    -------
+    Observations
+        Channels with at least one observation, sorted by satellite, then signal; RINEX 2 types are
+        mapped to signals as `read_observations` maps them. Time is GPS time; georinex cuts it to 1 us.
+
+    Raises
+    ------
+    ValueError
+        The dataset has no observation types over ``time`` and ``sv``, an unknown time system, or times
+        that do not rise.
+    """
+    types = [str(name) for name in data.data_vars if _TYPE.fullmatch(str(name))]
+    if not types:
+        raise ValueError("the dataset has no observation types such as C1C; georinex.load of an observation file has")
+    time = _gps_time(data)
+    satellites = np.array([str(name) for name in data["sv"].values], dtype="<U3")
+    version = float(data.attrs.get("version", 3.0 if any(len(name) == 3 for name in types) else 2.0))
+    columns: dict[tuple[str, str], dict[str, Floats]] = {}
+    for name in types:
+        values = np.asarray(data[name].transpose(*_DIMENSIONS).values, dtype=np.float64)
+        flags = data.get(f"{name}lli")
+        lock = None if flags is None else np.asarray(flags.transpose(*_DIMENSIONS).values, dtype=np.float64)
+        for k in np.flatnonzero(np.isfinite(values).any(axis=0)):
+            satellite = str(satellites[k])
+            signal = signal_of(name, system=satellite[0], version=version, announced=types)
+            if signal is None:
+                continue
+            channel = columns.setdefault((satellite, signal), {})
+            channel.setdefault("C" if name[0] == "P" else name[0], values[:, k])
+            if lock is not None:
+                channel.setdefault("lock", lock[:, k])
+    keys = sorted(columns)
+    absent = np.full(len(time), np.nan)
+
+    def grid(kind: str) -> Floats:
+        values = np.stack([columns[key].get(kind, absent) for key in keys], axis=1)
+        return np.where(values == 0.0, np.nan, values)
+
+    breaks = data.get("break_before")
+    return Observations(
+        time=time,
+        satellite=np.array([key[0] for key in keys], dtype="<U3"),
+        signal=np.array([key[1] for key in keys], dtype="<U2"),
+        code_m=grid("C"),
+        phase_cycles=grid("L"),
+        doppler_hz=grid("D"),
+        cn0_dbhz=grid("S"),
+        loss_of_lock=np.nan_to_num(grid("lock")).astype(np.uint8),
+        break_before=np.zeros(len(time), dtype=np.bool_) if breaks is None else np.array(breaks.values, dtype=np.bool_),
+        header=_observation_header(data, keys, version),
+    )
+
+
+def _gps_time(data: xr.Dataset) -> Datetimes:
+    """Times of an observation dataset in GPS time."""
+    time: Datetimes = np.asarray(data["time"].values, dtype="datetime64[ns]")
+    system = str(data.attrs.get("time_system", "GPS"))
+    if system in ("GLO", "UTC"):
+        time = utc_to_gpst(time)
+    elif system == "BDT":
+        time = bdt_to_gpst(time)
+    elif system not in ("GPS", "GAL", "QZS"):
+        raise ValueError(f"time_system is {system!r}; GPS, GAL, QZS, BDT, GLO or UTC was expected")
+    if (np.diff(time) <= np.timedelta64(0)).any():
+        raise ValueError("time must rise strictly; sort the dataset by time and drop repeated epochs")
+    return time
+
+
+def _observation_header(data: xr.Dataset, keys: list[tuple[str, str]], version: float) -> ObservationHeader:
+    attributes = data.attrs
+    signals: dict[str, set[str]] = {}
+    for satellite, signal in keys:
+        signals.setdefault(satellite[0], set()).add(signal)
+    channels = data.get("glonass_channel")
+    position = np.array(attributes.get("position", np.full(3, np.nan)), dtype=np.float64)
+    return ObservationHeader(
+        version=version,
+        marker=str(attributes.get("marker", "")),
+        receiver=str(attributes.get("receiver", "")),
+        antenna=str(attributes.get("antenna", "")),
+        approximate_ecef_m=np.where(np.any(position != 0.0), position, np.nan),
+        antenna_delta_hen_m=np.array(attributes.get("antenna_delta_hen_m", np.zeros(3)), dtype=np.float64),
+        interval_s=float(attributes.get("interval", np.nan)),
+        glonass_channel={}
+        if channels is None
+        else {str(sv): int(k) for sv, k in zip(data["sv"].values, channels.values, strict=True) if np.isfinite(k)},
+        signals={system: tuple(sorted(names)) for system, names in signals.items()},
+        receiver_clock_applied=bool(attributes.get("receiver_clock_offset_applied", 0)),
+    )
+
+
+def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
+    """Navigation records as a dataset in the layout of georinex.
+
+    Parameters
+    ----------
+    navigation : Navigation
+        `precise` is left out.
+
+    Returns
+    -------
+    xarray.Dataset
+        Variables over ``time`` and ``sv`` by the names of georinex; NaN where a satellite has no record
+        at a time. Klobuchar coefficients are attributes.
+    """
+    import xarray as xr
+
+    records = [*kepler_numbers(navigation.kepler), *glonass_numbers(navigation.glonass)]
+    copies: Counter[tuple[str, np.datetime64]] = Counter()
+    rows = []
+    for satellite, time, numbers in records:
+        copy = copies[satellite, time]
+        copies[satellite, time] += 1
+        rows.append((f"{satellite}_{copy}" if copy else satellite, time, numbers))
+    names = sorted({name for name, _, _ in rows})
+    times = np.unique(np.array([time for _, time, _ in rows], dtype="datetime64[ns]"))
+    column, row = {name: i for i, name in enumerate(names)}, {time: i for i, time in enumerate(times)}
+    variables: dict[str, Any] = {}
+    for name, time, numbers in rows:
+        for variable, number in zip(_NAMES[name[0]], numbers, strict=True):
+            grid = variables.setdefault(variable, (_DIMENSIONS, np.full((len(times), len(names)), np.nan)))[1]
+            grid[row[time], column[name]] = number * (1e3 if variable in _KILOMETRES else 1.0)
+    attributes = {_KLOBUCHAR[letter]: values.tolist() for letter, values in navigation.klobuchar.items()}
+    if navigation.leap_seconds is not None:
+        attributes["leap_seconds"] = navigation.leap_seconds
+    return xr.Dataset(
+        variables,
+        coords={"time": times, "sv": names},
+        attrs={
+            **attributes,
+            "version": 3.04,
+            "svtype": sorted({name[0] for name in names}),
+            "rinextype": "nav",
+            "filename": " ".join(navigation.sources),
+        },
+    )
+
+
+def navigation_from_xarray(data: xr.Dataset) -> Navigation:
+    """Navigation records of a dataset in the layout of georinex.
+
+    Parameters
+    ----------
+    data : xarray.Dataset
+        As ``georinex.load`` gives it for a RINEX 3 navigation file.
+
+    Returns
+    -------
+    Navigation
+        Records in order of satellite, then time. Records of constellations that railfix does not use are
+        counted in `passed_over`.
+
+    Raises
+    ------
+    ValueError
+        The dataset has no navigation records, or a number of a record is not possible.
+    """
+    if "SVclockBias" not in data:
+        raise ValueError("the dataset has no SVclockBias; georinex.load of a RINEX 3 navigation file has")
+    values = {
+        str(name): np.asarray(data[name].transpose(*_DIMENSIONS).values, dtype=np.float64) for name in data.data_vars
+    }
+    times = np.asarray(data["time"].values, dtype="datetime64[ns]")
+    satellites: Strings = np.array([str(name) for name in data["sv"].values], dtype=np.str_)
+    raw: list[RawRecord] = []
+    passed_over: Counter[str] = Counter()
+    for k, i in zip(*np.nonzero(np.isfinite(values["SVclockBias"]).T), strict=True):
+        name = str(satellites[k])[:3]
+        if name[0] not in _NAMES:
+            passed_over[name[0]] += 1
+            continue
+        numbers = [_number(values, variable, i, k) for variable in _NAMES[name[0]]]
+        record = RawRecord(name[0], name, "", times[i], numbers, float(data.attrs.get("version", 3.0)))
+        fault = first_fault(record)
+        if fault is not None:
+            raise ValueError(f"record of {name} at {times[i]}: {fault[1]}")
+        raw.append(record)
+    leap = data.attrs.get("leap_seconds")
+    return Navigation(
+        kepler=kepler_records([record for record in raw if record.system != "R"]),
+        glonass=glonass_records([record for record in raw if record.system == "R"]),
+        klobuchar={
+            letter: np.array(data.attrs[name], dtype=np.float64)
+            for letter, name in _KLOBUCHAR.items()
+            if np.any(data.attrs.get(name, 0.0))
+        },
+        leap_seconds=None if leap is None else int(leap),
+        passed_over=dict(passed_over),
+        sources=(str(data.attrs.get("filename", "")),),
+    )
+
+
+def _number(values: dict[str, Floats], name: str, row: int, column: int) -> float:
+    """One number of a record in the unit of the file; NaN where absent or written as unknown."""
+    value = float(values[name][row, column]) if name in values else np.nan
+    value = np.nan if _UNKNOWN < abs(value) < 1.01e9 else value
+    return value / 1e3 if name in _KILOMETRES else value

@@ -1,0 +1,196 @@
+"""The package as a notebook meets it: lazy names, short reprs, the xarray layout of georinex."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import railfix
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.simulate.demo_data import demo_files
+
+georinex = pytest.importorskip("georinex")
+#: georinex merges datasets by a default of xarray that will change.
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
+
+
+@pytest.mark.parametrize("package", [railfix, railfix.core])
+def test_every_name_of_the_package_can_be_imported(package: object) -> None:
+    names = package.__all__  # type: ignore[attr-defined]
+    assert len(names) > 15
+    assert all(getattr(package, name) is not None for name in names)
+
+
+def test_the_import_is_quick_and_loads_no_array_library() -> None:
+    program = (
+        "import time, sys; began = time.perf_counter(); import railfix; "
+        "print(time.perf_counter() - began, 'numpy' in sys.modules, 'EpochProcessor' in dir(railfix))"
+    )
+    runs = [subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True) for _ in "123"]
+    shown = [run.stdout.split() for run in runs]
+    assert min(float(seconds) for seconds, _, _ in shown) < 0.05
+    assert {(loaded, listed) for _, loaded, listed in shown} == {("False", "True")}
+
+
+@pytest.fixture(scope="module")
+def demo() -> dict[str, object]:
+    files = demo_files()
+    track = railfix.read_track(files["track"])
+    vehicle = railfix.read_vehicle(files["vehicle"])
+    front = railfix.read_observations(files["front"])[:20]
+    navigation = railfix.read_navigation(files["nav"])
+    trajectory = railfix.antenna_trajectory(track, vehicle, "front")
+    result, _ = railfix.EpochProcessor(railfix.Config(), navigation, {"front": trajectory}).process({"front": front})
+    return {
+        "Track": track,
+        "Trajectory": trajectory,
+        "Observations": front,
+        "Navigation": navigation,
+        "KeplerRecords": navigation.kepler,
+        "GlonassRecords": navigation.glonass,
+        "Result": result,
+        "AntennaResult": result.antennas["front"],
+    }
+
+
+NAMES = "Track Trajectory Observations Navigation KeplerRecords GlonassRecords Result AntennaResult".split()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_objects_show_themselves_in_one_line_and_as_a_table(demo: dict[str, object], name: str) -> None:
+    shown = repr(demo[name])
+    assert shown.startswith(f"<{name}")
+    assert "\n" not in shown
+    assert len(shown) < 200
+    html = demo[name]._repr_html_()  # type: ignore[attr-defined]
+    assert html.startswith("<table>")
+    assert html.count("<tr>") >= 2
+    assert len(html) < 20_000
+
+
+def same_observations(first: Observations, second: Observations) -> None:
+    assert np.array_equal(first.satellite, second.satellite)
+    assert np.array_equal(first.signal, second.signal)
+    assert np.array_equal(first.time, second.time)
+    for name in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock", "break_before"):
+        assert np.array_equal(getattr(first, name), getattr(second, name), equal_nan=name.endswith(("_m", "s", "z")))
+    assert first.header.glonass_channel == second.header.glonass_channel
+    assert first.header.approximate_ecef_m == pytest.approx(second.header.approximate_ecef_m, nan_ok=True)
+    assert first.header.receiver_clock_applied == second.header.receiver_clock_applied
+
+
+def same_navigation(first: Navigation, second: Navigation) -> None:
+    for kind in ("kepler", "glonass"):
+        ours, theirs = getattr(first, kind), getattr(second, kind)
+        assert len(ours) == len(theirs)
+        orders = [
+            np.lexsort((getattr(t, "message", t.satellite), t.toe, t.satellite)) if len(t) else np.arange(0)
+            for t in (ours, theirs)
+        ]
+        for name in type(ours).__dataclass_fields__:
+            one, other = getattr(ours, name)[orders[0]], getattr(theirs, name)[orders[1]]
+            if one.dtype.kind == "f":
+                np.testing.assert_allclose(one, other, rtol=1e-15, atol=0, err_msg=name)
+            else:
+                np.testing.assert_array_equal(one, other, err_msg=name)
+    assert {k: v.tolist() for k, v in first.klobuchar.items()} == {k: v.tolist() for k, v in second.klobuchar.items()}
+
+
+def cut(source: Path, target: Path, lines: int) -> Path:
+    """The file up to the last epoch that begins before a number of lines."""
+    text = railfix.core.files.read_text_lines(source)
+    end = max(k for k in range(lines) if not text[k].startswith(" ") and text[k][:1] == ">")
+    target.write_text("\n".join(text[:end]) + "\n", encoding="latin-1")
+    return target
+
+
+def test_observations_survive_the_layout_of_georinex(demo: dict[str, object]) -> None:
+    log = demo["Observations"]
+    assert isinstance(log, Observations)
+    same_observations(railfix.observations_from_xarray(railfix.observations_to_xarray(log)), log)
+
+
+def test_navigation_survives_the_layout_of_georinex(demo: dict[str, object]) -> None:
+    navigation = demo["Navigation"]
+    assert isinstance(navigation, Navigation)
+    same_navigation(railfix.navigation_from_xarray(railfix.navigation_to_xarray(navigation)), navigation)
+
+
+def test_georinex_loads_the_same_observations(tmp_path: Path) -> None:
+    """The shipped log as georinex loads it, and as railfix reads it, are the same both ways."""
+    path = tmp_path / "front.rnx"
+    railfix.write_observations(railfix.read_observations(demo_files()["front"])[:12], path)
+    log = railfix.read_observations(path)
+    theirs = georinex.load(path, useindicators=True)
+    same_observations(railfix.observations_from_xarray(theirs), log)
+    ours = railfix.observations_to_xarray(log)
+    assert ours.sv.values.tolist() == sorted(theirs.sv.values.tolist())
+    for name in ours.data_vars:
+        if name[0] in "CLDS" and not name.endswith("lli"):
+            np.testing.assert_array_equal(ours[name].values, theirs[name].sel(sv=ours.sv).values, err_msg=name)
+
+
+def test_georinex_loads_the_same_recorded_observations(recordings: Path, tmp_path: Path) -> None:
+    path = cut(recordings / "static/ESBC_2020177/ESBC00DNK_R_20201770000_01D_30S_MO.crx.gz", tmp_path / "a.rnx", 400)
+    log = railfix.read_observations(path, broken_lines="count")
+    theirs = georinex.load(path, useindicators=True)
+    found = railfix.observations_from_xarray(theirs)[: len(log)]
+    assert len(log) > 5
+    for name in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz"):
+        for k, key in enumerate(zip(log.satellite.tolist(), log.signal.tolist(), strict=True)):
+            column = np.flatnonzero((found.satellite == key[0]) & (found.signal == key[1]))
+            assert column.size == 1, key
+            np.testing.assert_array_equal(getattr(found, name)[:, column[0]], getattr(log, name)[:, k])
+
+
+def _keys(navigation: Navigation) -> list[tuple[str, str, str]]:
+    records = navigation.kepler
+    return [(str(s), str(t), str(m)) for s, t, m in zip(records.satellite, records.toc, records.message, strict=True)]
+
+
+@pytest.mark.parametrize("name", ["demo", "kinematic/urbannav_tst/hksc137c.nav"])
+def test_georinex_loads_the_same_navigation(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    if name == "demo":
+        path = tmp_path / "nav.rnx"
+        railfix.write_navigation(railfix.read_navigation(demo_files()["nav"]), path)
+    else:
+        path = request.getfixturevalue("recordings") / name
+    ours = railfix.read_navigation(path, broken_lines="count")
+    theirs = railfix.navigation_from_xarray(georinex.load(path))
+    assert len(theirs.kepler) > 20
+    keys = [set(_keys(navigation)) for navigation in (ours, theirs)]
+    assert keys[1] <= keys[0]
+    assert len(keys[1]) >= 0.9 * len(keys[0])
+    first = {key: k for k, key in reversed(list(enumerate(_keys(ours))))}
+    rows = np.array([first[key] for key in _keys(theirs)])
+    for field in "toe transmitted sqrt_a m0 omega0 toe_sow_s health iode iodc group_delay_1_s group_delay_2_s".split():
+        np.testing.assert_array_equal(getattr(theirs.kepler, field), getattr(ours.kepler, field)[rows], err_msg=field)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.assign_attrs(time_system="IRN"), "time_system is 'IRN'"),
+        (lambda d: d.isel(time=slice(None, None, -1)), "time must rise"),
+        (lambda d: d[["break_before"]], "no observation types"),
+    ],
+)
+def test_another_dataset_is_named(demo: dict[str, object], change: object, message: str) -> None:
+    data = railfix.observations_to_xarray(demo["Observations"])  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=message):
+        railfix.observations_from_xarray(change(data))  # type: ignore[operator]
+    with pytest.raises(ValueError, match="SVclockBias"):
+        railfix.navigation_from_xarray(data)
+
+
+def test_the_help_leads_on() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", "import railfix; help(railfix)"], capture_output=True, text=True, check=True
+    )
+    assert "read_observations" in run.stdout
+    assert "docs/example.md" in run.stdout
