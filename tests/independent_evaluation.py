@@ -57,13 +57,16 @@ def reference_at(truth, times, time):
         return None
     share = (time - times[i - 1]) / (times[i] - times[i - 1])
     a, b = truth[i - 1], truth[i]
-    return (*(x + share * (y - x) for x, y in zip(a[:3], b[:3], strict=True)), a[3] if share <= 0.5 else b[3])
+    return (*(x + share * (y - x) for x, y in zip(a[:6], b[:6], strict=True)), a[6] if share <= 0.5 else b[6])
 
 
 def epochs_of(positions, truth):
     """Every epoch of one antenna, those put in included, as dictionaries."""
     known = [
-        (number(r["chainage_m"]), number(r["speed_mps"]), number(r.get("sigma_m")), r.get("environment") or "unknown")
+        (
+            *(number(r.get(name)) for name in ("chainage_m", "speed_mps", "sigma_m", "x_m", "y_m", "z_m")),
+            r.get("environment") or "unknown",
+        )
         for r in truth
     ]
     clock = [nanoseconds(r["time_gpst"]) for r in truth]
@@ -81,7 +84,8 @@ def epochs_of(positions, truth):
         at, row = reference_at(known, clock, time), logged.get(time, {})
         one = {"time": time, "in": at is not None, "status": row.get("status", "not_logged")}
         one["observed"] = one["status"] not in ("not_logged", "no_observation")
-        one["chainage"], one["speed"], one["sigma"], one["environment"] = at or (NAN, NAN, NAN, "unknown")
+        one["chainage"], one["speed"], one["sigma"], *place, one["environment"] = at or (*[NAN] * 6, "unknown")
+        one["away"] = math.dist([number(row.get(name)) for name in ("x_m", "y_m", "z_m")], place)
         one["speed"] = abs(one["speed"])
         one["good"] = one["in"] and not one["sigma"] > SIGMA_M
         one["n"] = number(row.get("n_used"))
@@ -128,29 +132,34 @@ def has(one, position, epochs_of_both):
 
 
 def limits(epochs, position):
-    """Blocks drawn with replacement: limits of mean, rate and 95th percentile."""
+    """Blocks drawn with replacement: limits of mean, rate, 95th percentile, and error over sigma."""
     names = sorted({one["block"] for one in epochs})
     if len(names) < 5:
-        return len(names), [NAN] * 6
+        return len(names), [NAN] * 10
     errors = {name: [] for name in names}
     observed, positioned = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
     for one in epochs:
         observed[one["block"]] += one["observed"]
         positioned[one["block"]] += has(one, position, "own")
         if has(one, position, "own") and one["good"]:
-            errors[one["block"]].append(one["3d" if position == "conventional" else "map"])
-    means, rates, tails = [], [], []
+            error = one["3d" if position == "conventional" else "map"]
+            errors[one["block"]].append((error, NAN if position == "conventional" else abs(error) / one["along"]))
+    means, rates, tails, middle, wide = [], [], [], [], []
     for draw in np.random.default_rng(SEED).integers(0, len(names), (DRAWS, len(names))):
         drawn = [names[i] for i in draw]
         seen = sum(observed[name] for name in drawn)
         if seen:
             rates.append(sum(positioned[name] for name in drawn) / seen)
-        values = [e for name in drawn for e in errors[name]]
+        values = [e for name in drawn for e, _ in errors[name]]
+        ratios = sorted(r for name in drawn for _, r in errors[name] if not math.isnan(r))
+        if ratios:
+            middle.append(ratios[math.ceil(0.68 * len(ratios) - 1e-9) - 1])
+            wide.append(ratios[math.ceil(0.95 * len(ratios) - 1e-9) - 1])
         if values:
             means.append(statistics.fmean(values))
             tails.append(sorted(abs(e) for e in values)[math.ceil(0.95 * len(values) - 1e-9) - 1])
     out = []
-    for values in (means, rates, tails):
+    for values in (means, rates, tails, middle, wide):
         for share in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2):
             out.append(percentile(values, share) if values else NAN)
     return len(names), out
@@ -177,7 +186,8 @@ def figures(epochs, position, both, *, with_limits):
     if with_limits:
         blocks, told = limits(inside, position)
         out["blocks"] = blocks
-        names = ("mean_low_m", "mean_high_m", "rate_low", "rate_high", "p95_low_m", "p95_high_m")
+        names = ["mean_low_m", "mean_high_m", "rate_low", "rate_high", "p95_low_m", "p95_high_m"]
+        names += [f"normalised_p{q}_{end}" for q in (68, 95) for end in ("low", "high")]
         out |= dict(zip(names, told, strict=True))
     if not errors:
         return out
@@ -201,7 +211,10 @@ def figures(epochs, position, both, *, with_limits):
             "along_sigma_p50_m": statistics.median([one["along"] for one in judged]),
             "normalised_mean": statistics.fmean(ratio),
             "normalised_rms": math.sqrt(statistics.fmean([r * r for r in ratio])),
+            "distance_max_m": max(one["away"] for one in judged),
         }
+        out |= {f"normalised_p{q}": percentile([abs(r) for r in ratio], q / 100) for q in (68, 95)}
+        out |= {f"distance_p{q}_m": percentile([one["away"] for one in judged], q / 100) for q in (50, 95)}
         out |= {f"over_{n}_sigma": sum(abs(r) > n for r in ratio) / len(ratio) for n in (1, 2, 3)}
     return out
 
@@ -320,7 +333,7 @@ def bound(one, levels_of):
     """What the error is held against; None without a position."""
     if not one["has map"]:
         return None
-    if levels_of == "vouched" and (one["status"] != "ok" or one["verdict"] == "alarm"):
+    if levels_of == "usable" and (one["status"] != "ok" or one["verdict"] == "alarm"):
         return math.inf
     return math.inf if math.isnan(one["level"]) else one["level"]
 
@@ -370,7 +383,7 @@ def stanford_counts(by_antenna):
         for one in groups["all", "all"]:
             groups.setdefault(("environment", one["environment"]), []).append(one)
         for (grouping, group), inside in groups.items():
-            for levels_of in ("vouched", "all"):
+            for levels_of in ("usable", "all"):
                 for limit in ALARM_LIMITS:
                     fit = [available(one, levels_of, limit) for one in inside]
                     where = [region(one, levels_of, limit) for one in inside]
@@ -408,9 +421,9 @@ def stanford_counts(by_antenna):
 
 
 def beyond(by_antenna):
-    """(antenna, time) of the epochs whose error is over a finite level to error, level, and whether it was vouched."""
+    """(antenna, time) of the epochs whose error is over a finite level to error, level, and whether it was usable."""
     return {
-        (antenna, one["time"]): (one["map"], one["level"], bound(one, "vouched") < math.inf)
+        (antenna, one["time"]): (one["map"], one["level"], bound(one, "usable") < math.inf)
         for antenna, epochs in by_antenna.items()
         for one in epochs
         if one["in"] and one["has map"] and one["good"] and abs(one["map"]) > one["level"]

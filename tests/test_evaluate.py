@@ -7,7 +7,7 @@ import pytest
 
 import synthetic
 from railfix.core.timescale import timedelta
-from railfix.evaluate import along_track_error, interpolate_reference, score
+from railfix.evaluate import along_track_error, interpolate_reference, score, straight_distance
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -41,6 +41,9 @@ def test_other_branch_of_a_hairpin_is_the_same_place_within_its_width():
     reference = hairpin.at_arc(np.array([100.0]))
     beside = hairpin.arc_m[-1] - 100.0
     assert along_track_error(np.array([beside + 4.0]), reference, hairpin) == pytest.approx([4.0], abs=1e-3)
+    # the straight distance needs no choice of a pass: 12 m across and 4 m along
+    straight = straight_distance(np.array([beside + 4.0, np.nan]), np.repeat(reference, 2, axis=0), hairpin)
+    assert straight == pytest.approx([np.hypot(12.0, 4.0), np.nan], abs=1e-3, nan_ok=True)
     strict = along_track_error(np.array([beside + 4.0]), reference, hairpin, same_place_m=5.0)
     assert strict == pytest.approx([np.hypot(12.0, 4.0)], abs=1e-3)  # straight across, not round the bend
 

@@ -16,6 +16,7 @@ import synthetic
 from conftest import ROOT
 from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.settings import validated
 from railfix.core.timescale import timedelta
 from railfix.evaluate import (
     BEYOND_COLUMNS,
@@ -32,6 +33,7 @@ from railfix.evaluate import (
 )
 from railfix.evaluate.blocks import block_limits
 from railfix.evaluate.epochs import travelled, with_missing
+from railfix.evaluate.run_folder import tables_of
 from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, write_reference
 from railfix.run import run_files
@@ -144,6 +146,60 @@ def test_errors_and_rates_by_hand(tmp_path: Path):
     assert statuses.filter(group="too_few_satellites")["mean_m"].item() is None
 
 
+def test_another_table_of_the_same_run_stands_beside_the_positions(tmp_path: Path):
+    """The filter has a position in the tunnel, where no satellite is observed, and a sigma of its own."""
+    time, place = np.arange(10.0), 100.0 + 10.0 * np.arange(10.0)
+    tunnel = (time >= 4) & (time < 7)
+    answer = np.where(tunnel, np.nan, place + 3.0)
+    status = np.where(tunnel, "no_observation", "ok").tolist()
+    run = write_run(tmp_path / "run", time, answer, status=status, conventional=np.where(tunnel, np.nan, place + 8.0))
+    train = pl.read_parquet(run / "positions.parquet").select("time_gpst", "antenna")
+    places = at(place + 1.0)
+    train = train.with_columns(
+        status=pl.Series(np.where(tunnel, "coasting", "tracking")),
+        chainage_m=pl.Series(place + 1.0),
+        along_sigma_m=pl.Series(np.full(10, 0.5)),
+        protection_level_m=pl.Series(np.full(10, 6.0)),
+        **{f"{axis}_m": pl.Series(places[:, i]) for i, axis in enumerate("xyz")},
+    )
+    train.write_csv(run / "train.csv")
+    assert tables_of(run) == ["positions", "train"]
+    truth = reference(time, place)
+    both = [RunAndReference(run=run, reference=truth, table=name) for name in ("positions", "train")]
+    found = evaluate_runs(both)
+    single, tracked = {"run": "run"}, {"run": "run (train)"}
+    assert (found.figure("positions", **single), found.figure("positions", **tracked)) == (7, 10)
+    assert (found.figure("rate", **single), found.figure("rate", **tracked)) == (1.0, 1.0)
+    assert (found.figure("rate_of_run", **single), found.figure("rate_of_run", **tracked)) == (0.7, 1.0)
+    assert found.figure("max_m", **single) == pytest.approx(3.0, abs=1e-6)
+    assert found.figure("max_m", **tracked) == pytest.approx(1.0, abs=1e-6)
+    assert found.figure("distance_p95_m", **tracked) == pytest.approx(1.0, abs=1e-6)
+    assert found.figure("normalised_p68", **single) == pytest.approx(1.5, abs=1e-6)
+    assert found.figure("normalised_p95", **tracked) == pytest.approx(2.0, abs=1e-6)
+    assert found.figure("positions", position="constrained_ok", **tracked) == 7
+    assert found.figure("mean_m", position="conventional", **tracked) == pytest.approx(8.0, abs=1e-6)
+    assert set(found.integrity) == {"train"}
+    assert found.runs[0].configuration != found.runs[1].configuration
+    result = CliRunner().invoke(app, ["evaluate", str(run), "--reference", "auto"])
+    assert result.exit_code == 3  # no log to look for a reference beside; both tables were asked for
+
+
+def test_the_conventional_position_of_another_run_on_the_same_log(tmp_path: Path):
+    time, place = np.arange(6.0), np.arange(100.0, 160.0, 10.0)
+    run = write_run(tmp_path / "run", time, place + 1.0, conventional=np.where(time < 2, np.nan, place + 2.0))
+    other = write_run(tmp_path / "unscreened", time, place, conventional=place + 9.0)
+    item = RunAndReference(run=run, reference=reference(time, place), conventional=other)
+    found = evaluate_runs([item])
+    assert found.figure("mean_m") == pytest.approx(1.0, abs=1e-6)
+    assert found.figure("positions", position="conventional") == 6
+    assert found.figure("mean_m", position="conventional") == pytest.approx(9.0, abs=1e-6)
+    record = json.loads((other / "run.json").read_text())
+    record["inputs"] = [{"input": "front", "path": "other.obs", "bytes": 1, "sha256": "0"}]
+    (other / "run.json").write_text(json.dumps(record))
+    with pytest.raises(MismatchError, match="is not a run on the log of"):
+        evaluate_runs([item])
+
+
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("method", ["chainage", "trajectory"])
 def test_the_sign_does_not_turn_with_the_train(tmp_path: Path, direction: float, method: str):
@@ -249,14 +305,15 @@ def test_limits_by_blocks_by_hand():
     error = np.repeat([1.0, 1.0, 1.0, 1.0, 1.0, np.nan], 10)
     has = np.isfinite(error)
     arguments = {"replicates": 2000, "seed": 3, "confidence": 0.95}
-    found = block_limits(error, np.ones(60, dtype=bool), has, block, **arguments)
+    found = block_limits(error, np.full(60, 2.0), np.ones(60, dtype=bool), has, block, **arguments)
     assert found.blocks == 6
     assert found.mean_m == (1.0, 1.0)
     assert found.p95_m == (1.0, 1.0)
+    assert found.normalised_p68 == found.normalised_p95 == (0.5, 0.5)
     # The number of draws of the empty block is binomial (6, 1/6): P(0) = 0.335, P(at least 3) = 0.062,
     # P(at least 4) = 0.0087; so the upper limit is 1 and the lower one 1/2.
     assert found.rate == (pytest.approx(0.5), 1.0)
-    few = block_limits(error[:40], np.ones(40, dtype=bool), has[:40], block[:40], **arguments)
+    few = block_limits(error[:40], np.ones(40), np.ones(40, dtype=bool), has[:40], block[:40], **arguments)
     assert few.blocks == 4
     assert np.isnan([*few.mean_m, *few.rate, *few.p95_m]).all()
 
@@ -267,8 +324,8 @@ def test_limits_widen_with_errors_that_stay():
     block = np.repeat(np.arange(40), 100)
     seen = np.ones(4000, dtype=bool)
     arguments = {"replicates": 1000, "seed": 0, "confidence": 0.95}
-    free = block_limits(rng.normal(size=4000), seen, seen, block, **arguments)
-    stuck = block_limits(np.repeat(rng.normal(size=40), 100), seen, seen, block, **arguments)
+    free = block_limits(rng.normal(size=4000), np.ones(4000), seen, seen, block, **arguments)
+    stuck = block_limits(np.repeat(rng.normal(size=40), 100), np.ones(4000), seen, seen, block, **arguments)
     width = [high - low for low, high in (free.mean_m, stuck.mean_m)]
     assert width[0] == pytest.approx(2 * 1.96 / np.sqrt(4000), rel=0.3)
     assert width[1] == pytest.approx(2 * 1.96 / np.sqrt(40), rel=0.3)
@@ -279,11 +336,15 @@ def test_percentiles_of_the_draws_are_exact_with_many_errors():
     rng = np.random.default_rng(5)
     error, block = rng.standard_cauchy(9000), rng.integers(0, 7, 9000)
     seen = np.ones(9000, dtype=bool)
-    found = block_limits(error, seen, seen, block, replicates=50, seed=2, confidence=0.9)
-    draws = []
+    sigma = rng.uniform(0.5, 2.0, 9000)
+    found = block_limits(error, sigma, seen, seen, block, replicates=50, seed=2, confidence=0.9)
+    draws, ratios = [], []
     for drawn in np.random.default_rng(2).integers(0, 7, (50, 7)):
         values = np.concatenate([np.abs(error[block == b]) for b in drawn])
         draws.append(np.quantile(values, 0.95, method="inverted_cdf"))
+        values = np.concatenate([np.abs(error[block == b]) / sigma[block == b] for b in drawn])
+        ratios.append(np.quantile(values, 0.68, method="inverted_cdf"))
+    assert found.normalised_p68 == pytest.approx(tuple(np.percentile(ratios, [5.0, 95.0])), abs=1e-9)
     assert found.p95_m == pytest.approx(tuple(np.percentile(draws, [5.0, 95.0])), abs=1e-9)
 
 
@@ -576,7 +637,7 @@ def test_the_document_shows_the_levels_of_the_demonstration(tmp_path: Path):
     counts = ("epochs", "nominal", "misleading", "hazardously_misleading", "unavailable", "no_position")
     for antenna in ("front", "rear"):
         rows = rows_of_document(antenna, 9)
-        assert [row[1] for row in rows] == ["vouched", "all"]
+        assert [row[1] for row in rows] == ["usable", "all"]
         for row in rows:
             (mine,) = table.filter(antenna=antenna, levels_of=row[1]).iter_rows(named=True)
             assert [int(cell) for cell in row[2:8]] == pytest.approx([mine[name] for name in counts], abs=3)
@@ -610,8 +671,8 @@ def test_stanford_counts_by_hand(tmp_path: Path):
     assert list(found.integrity) == ["sbas"]
     whole = found.integrity["sbas"].stanford.filter(grouping="all")
     assert whole.select("levels_of", "alarm_limit_m", "own_limit").rows() == [
-        ("vouched", 12.0, True),
-        ("vouched", 14.0, False),
+        ("usable", 12.0, True),
+        ("usable", 14.0, False),
         ("all", 12.0, True),
         ("all", 14.0, False),
     ]
@@ -631,8 +692,8 @@ def test_stanford_counts_by_hand(tmp_path: Path):
     assert urban.select(regions).row(0) == (0, 2, 0, 0, 1, 1)
     beyond = found.integrity["sbas"].beyond
     assert (beyond["error_m"].abs() - beyond["sbas_level_m"]).to_list() == pytest.approx([7, 5, 1, 1, 1], abs=1e-6)
-    assert beyond["vouched"].to_list()[:2] == [False, False]
-    assert beyond["vouched"].sum() == 3
+    assert beyond["usable"].to_list()[:2] == [False, False]
+    assert beyond["usable"].sum() == 3
     assert beyond["chainage_m"].to_list()[:2] == pytest.approx([150.0, 160.0], abs=1e-6)
     assert beyond["environment"].to_list()[:2] == ["urban", "urban"]
     assert beyond["sbas_one_fault_m"].to_list() == [3.5] * 5
@@ -672,7 +733,7 @@ def test_levels_go_into_files_named_by_what_they_rest_on(tmp_path: Path):
     arguments = ["evaluate", str(run), "--reference", str(tmp_path / "truth.csv"), "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--alarm-limit", "5", "--alarm-limit", "30"])
     assert result.exit_code == 0, result.output
-    assert "Errors over their level: 5, of them 3 vouched for; all are in beyond_sbas.csv" in result.output
+    assert "Errors over their level: 5, of them 3 usable; all are in beyond_sbas.csv" in result.output
     assert "error +9.00 m, level 2.00 m (one_fault), status ambiguous" in result.output
     counts = pl.read_csv(out / "stanford_sbas.csv").filter(grouping="all")
     assert counts["alarm_limit_m"].to_list() == [5.0, 12.0, 30.0] * 2
@@ -709,4 +770,4 @@ def test_levels_whose_kind_is_not_told(tmp_path: Path):
         with pytest.raises(InputFileError, match="alarm_limit_m"):
             evaluate_run(run, truth)
     with pytest.raises(SettingsError, match="alarm_limits_m"):
-        EvaluationOptions(alarm_limits_m=(10.0, float("inf")))
+        validated(EvaluationOptions, {"alarm_limits_m": (10.0, float("inf"))}, source="test")

@@ -140,7 +140,7 @@ def check_integrity(found: Evaluation, expected: tuple[dict, ...]) -> int:
     compared = compare(table.stanford, keys, expected[3])
     assert table.stanford["own_limit"].to_list() == [limit == 20.0 for limit in table.stanford["alarm_limit_m"]]
     listed = {
-        (row["antenna"], row["time_gpst"]): (row["error_m"], row["separation_level_m"], row["vouched"])
+        (row["antenna"], row["time_gpst"]): (row["error_m"], row["separation_level_m"], row["usable"])
         for row in table.beyond.with_columns(pl.col("time_gpst").cast(pl.Int64)).iter_rows(named=True)
     }
     assert listed.keys() == expected[4].keys()
@@ -157,10 +157,10 @@ def test_the_stanford_counts_of_a_run_with_holes(worse: tuple[Path, Path]):
     found = evaluate_run(folder, reference, options=OPTIONS)
     expected = independent_evaluation.evaluated(folder, reference)
     assert check_integrity(found, expected) > 1000
-    # The case has what it is meant to have: every region, some of the excess vouched for and some not.
+    # The case has what it is meant to have: every region, some of the excess usable and some not.
     regions = {name for counts in expected[3].values() for name in independent_evaluation.REGIONS if counts[name]}
     assert regions == set(independent_evaluation.REGIONS)
-    assert {vouched for _, _, vouched in expected[4].values()} == {True, False}
+    assert {usable for _, _, usable in expected[4].values()} == {True, False}
 
 
 @pytest.mark.requirement("C4")
@@ -169,7 +169,7 @@ def test_the_stanford_counts_of_the_demonstration(demo: Path):
     found = evaluate_run(demo, truth, options=OPTIONS)
     expected = independent_evaluation.evaluated(demo, truth)
     assert check_integrity(found, expected) > 1000
-    whole = expected[3]["all", "all", "front", "vouched", 20.0]
+    whole = expected[3]["all", "all", "front", "usable", 20.0]
     assert 0 < whole["kept_60_s"] < whole["kept_15_s"] < whole["windows_15_s"]
 
 

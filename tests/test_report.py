@@ -161,13 +161,13 @@ def test_nothing_is_fetched_and_nothing_unescaped(document: str, page: Page) -> 
 @pytest.mark.requirement("C4")
 def test_the_protection_level_has_its_section(document: str, page: Page, folder: Path) -> None:
     names = [figure["data-name"] for figure in page.figures]
-    assert names.count("stanford") == 4  # vouched for and all, of two antennas
+    assert names.count("stanford") == 4  # usable and all, of two antennas
     assert names.count("levels") == names.count("levels-chainage") == 2
     _, evaluation = read_runs([folder], [demo_truth()])
     assert evaluation is not None
     table = evaluation.integrity["separation"].stanford.filter(grouping="all", own_limit=True)
     regions = ("nominal", "misleading", "hazardously_misleading", "unavailable", "unavailable_misleading")
-    order = [(antenna, levels_of) for antenna in ("front", "rear") for levels_of in ("vouched", "all")]
+    order = [(antenna, levels_of) for antenna in ("front", "rear") for levels_of in ("usable", "all")]
     for at, (antenna, levels_of) in enumerate(order):
         (row,) = table.filter(antenna=antenna, levels_of=levels_of).iter_rows(named=True)
         values = chart(page, "stanford", at)
@@ -197,11 +197,11 @@ def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> Non
         truth.select("time_gpst", "antenna", true_m="chainage_m"), on=["time_gpst", "antenna"]
     )
     over = rows.filter((pl.col("chainage_m") - pl.col("true_m")).abs() > 0.3)
-    vouched = over.filter(
+    usable = over.filter(
         pl.col("status").cast(pl.String) == "ok", pl.col("protection_status").cast(pl.String) != "alarm"
     )
     assert len(over) > 20
-    assert f"Errors over their level: {len(over):,}, of them {len(vouched):,} vouched for; the 20 furthest" in document
+    assert f"Errors over their level: {len(over):,}, of them {len(usable):,} usable; the 20 furthest" in document
     listed = document.split("Errors over their level")[1].split("</table>")[0]
     assert listed.count("<tr>") == 1 + 20
     worst = over.select(size=(pl.col("chainage_m") - pl.col("true_m")).abs()).max().item()
@@ -222,7 +222,7 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_pa
         pl.col("protection_level_m") <= 20.0,
     )
     section = document.split("<h3>Protection level</h3>")[1].split("<h3>")[0]
-    row = next(line for line in section.split("<tr>") if "front" in line and "vouched" in line and ">20<" in line)
+    row = next(line for line in section.split("<tr>") if "front" in line and "usable" in line and ">20<" in line)
     assert f"{100 * len(within) / len(positions):.2f} %" in row
     shutil.copy(folder / "run.json", tmp_path)
     record = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))

@@ -79,7 +79,7 @@ def show_errors(evaluation: Evaluation) -> None:
 def show_levels(evaluation: Evaluation, console: Console) -> None:
     """The protection level of each antenna: how wide, how often it serves, how often an error is over it."""
     for kind, found in evaluation.integrity.items():
-        rows = found.stanford.filter(grouping="all", levels_of="vouched", own_limit=True)
+        rows = found.stanford.filter(grouping="all", levels_of="usable", own_limit=True)
         for row in rows.filter(rows["antenna"] != "all").iter_rows(named=True):
             median = median_level(evaluation, kind, row["antenna"])
             over = found.beyond.filter(antenna=row["antenna"])
@@ -87,8 +87,8 @@ def show_levels(evaluation: Evaluation, console: Console) -> None:
                 f"protection level ({kind}), {row['antenna']}: median {'-' if median is None else f'{median:.2f} m'}, "
                 f"within the alarm limit of {row['alarm_limit_m']:g} m at "
                 f"{100 * (row['availability_of_observed'] or 0.0):.2f} % of the epochs with observations, errors over "
-                f"it: {int(over['vouched'].sum())} of {row['judged']:,}, and "
-                f"{int((~over['vouched']).sum())} where the run had raised an alarm or a doubt",
+                f"it: {int(over['usable'].sum())} of {row['judged']:,}, and "
+                f"{int((~over['usable']).sum())} where the run had raised an alarm or a doubt",
                 soft_wrap=True,
             )
 

@@ -22,12 +22,31 @@ def evaluate(
             "--reference",
             metavar="FILE",
             rich_help_panel=INPUTS,
-            help="Where the antennas were (reference.csv, truth.csv, .gz, RTKLIB), once for each run in order; "
+            help="Reference trajectory (reference.csv, truth.csv, .gz, RTKLIB), once for each run in order; "
             "`auto`: truth.csv or reference.csv beside the log of each run.",
         ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder for the files; without it the tables alone.")
+    ] = None,
+    table: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--table",
+            metavar="NAME",
+            rich_help_panel=INPUTS,
+            help="Table of positions: `positions` (single epochs) or `train` (filter along the track); may be "
+            "repeated. By default every table of the run.",
+        ),
+    ] = None,
+    conventional: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN",
+            rich_help_panel=INPUTS,
+            help="Another run on the same log, whose conventional positions are compared with: one with "
+            "`--screens elevation` gives unscreened ones, as in P1.",
+        ),
     ] = None,
     sections: Annotated[
         Path | None,
@@ -122,21 +141,24 @@ def evaluate(
     1 a defect of railfix.
     """
     from railfix.cli.evaluate_tables import show_evaluation
+    from railfix.core.settings import validated
     from railfix.evaluate import EvaluationOptions, TrackFiles, evaluate_runs, write_evaluation
     from railfix.run.output import OutputFolder
 
-    options = EvaluationOptions(
-        method=method,
-        reference_sigma_m=reference_sigma,
-        reference_gap_s=reference_gap,
-        standing_mps=standing,
-        section_m=section_length,
-        speed_edges_kmh=_numbers("--speed-classes", speed_classes),
-        alarm_limits_m=tuple(alarm_limit) if alarm_limit else EvaluationOptions.alarm_limits_m,
-        seed=seed,
-    )
+    values = {
+        "method": method,
+        "reference_sigma_m": reference_sigma,
+        "reference_gap_s": reference_gap,
+        "standing_mps": standing,
+        "section_m": section_length,
+        "speed_edges_kmh": _numbers("--speed-classes", speed_classes),
+        "seed": seed,
+    }
+    if alarm_limit:
+        values["alarm_limits_m"] = tuple(alarm_limit)
+    options = validated(EvaluationOptions, values, source="railfix evaluate")
     files = TrackFiles(track=tuple(track or ()), vehicle=vehicle, crs=crs, height_datum=height_datum, geoid=geoid)
-    chosen = _paired(runs, reference, label)
+    chosen = _with_tables(_paired(runs, reference, label), table, conventional)
 
     if out is None:
         evaluation = evaluate_runs(chosen, sections=sections, files=files, options=options)
@@ -161,6 +183,21 @@ def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> 
     return [
         RunAndReference(run=run, reference=None if file == "auto" else Path(file), configuration=name)
         for run, file, name in zip(runs, references, labels, strict=True)
+    ]
+
+
+def _with_tables(
+    runs: list[RunAndReference], tables: list[str] | None, conventional: Path | None
+) -> list[RunAndReference]:
+    """Each run once per table of positions."""
+    from dataclasses import replace
+
+    from railfix.evaluate.run_folder import POSITIONS_TABLE, tables_of
+
+    return [
+        replace(item, table=name, conventional=conventional)
+        for item in runs
+        for name in tables or tables_of(item.run) or [POSITIONS_TABLE]
     ]
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 #: Epochs beyond that are shown; the files have all.
 _MOST_BEYOND: Final = 5
-_LEVELS_OF: Final = {"vouched": "vouched for", "all": "levels alone"}
+_LEVELS_OF: Final = {"usable": "usable", "all": "levels alone"}
 _COUNTS: Final = (
     "epochs", "nominal", "misleading", "hazardously_misleading", "unavailable", "unavailable_misleading", "unjudged",
     "no_position",
@@ -31,7 +31,7 @@ def show_integrity(evaluation: Evaluation, console: Console) -> None:
     for kind, found in evaluation.integrity.items():
         console.print(
             f"Protection levels against errors ({kind}): epochs of each region of the Stanford diagram, availability, "
-            "continuity over windows\n  vouched for: status ok and no alarm, every other position as without a bound; "
+            "continuity over windows\n  usable: status ok and no alarm, every other position as without a bound; "
             "levels alone: every finite level",
             markup=False,
             soft_wrap=True,
@@ -44,12 +44,12 @@ def show_integrity(evaluation: Evaluation, console: Console) -> None:
 
 def _show_environments(rows: pl.DataFrame, console: Console) -> None:
     """At the runs' own limit, of all antennas and runs of a configuration together."""
-    rows = rows.filter(pl.col("grouping") == "environment", "own_limit", pl.col("levels_of") == "vouched")
+    rows = rows.filter(pl.col("grouping") == "environment", "own_limit", pl.col("levels_of") == "usable")
     for column in ("run", "antenna"):
         if "all" in rows[column]:
             rows = rows.filter(pl.col(column) == "all")
     if rows["group"].n_unique() > 1:
-        console.print("The same by environment, vouched for, at the alarm limit of the run")
+        console.print("The same by environment, usable, at the alarm limit of the run")
         console.print(_counts(rows, first=("group",)))
 
 
@@ -78,9 +78,9 @@ def _counts(rows: pl.DataFrame, *, first: tuple[str, ...]) -> Table:
 
 def _show_beyond(found: Integrity, kind: str, console: Console) -> None:
     """How many errors are over their level, and the worst of them."""
-    beyond, vouched = found.beyond, int(found.beyond["vouched"].sum())
+    beyond, usable = found.beyond, int(found.beyond["usable"].sum())
     console.print(
-        f"Errors over their level: {len(beyond):,}, of them {vouched:,} vouched for"
+        f"Errors over their level: {len(beyond):,}, of them {usable:,} usable"
         + (f"; all are in beyond_{kind}.csv (--out)" if len(beyond) else ""),
         markup=False,
         soft_wrap=True,

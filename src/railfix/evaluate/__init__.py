@@ -4,7 +4,7 @@ The error is the distance along the map between the answer and the reference's o
 positive toward the end of the line whichever way the train runs (P1 3.3, 5).
 """
 
-from railfix.evaluate.along_track import along_track_error, interpolate_reference
+from railfix.evaluate.along_track import along_track_error, interpolate_reference, straight_distance
 from railfix.evaluate.epochs import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import EvaluatedRun, Evaluation, RunAndReference, evaluate_run, evaluate_runs
 from railfix.evaluate.figures import FIGURE_COLUMNS
@@ -36,5 +36,6 @@ __all__ = [
     "evaluate_runs",
     "interpolate_reference",
     "score",
+    "straight_distance",
     "write_evaluation",
 ]

@@ -95,3 +95,28 @@ def along_track_error(
     straight = np.linalg.norm(trajectory.at_arc(arc_m[at]) - trajectory.at_arc(nearest_arc), axis=1)
     error[at] = np.copysign(np.minimum(np.abs(error[at]), straight), error[at])
     return error
+
+
+def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory) -> Floats:
+    """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
+
+    It needs no choice between several passes of the line at one place, and never exceeds the distance along the line.
+
+    Parameters
+    ----------
+    arc_m : ndarray, shape (T,) [m]
+        Positions along the trajectory; NaN where there is none.
+    reference_ecef_m : ndarray, shape (T, 3) [m]
+    trajectory : Trajectory
+
+    Returns
+    -------
+    ndarray, shape (T,) [m]
+        NaN where either is missing.
+    """
+    distance = np.full(len(arc_m), np.nan)
+    rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
+    if len(rows):
+        nearest, _ = trajectory.nearest(reference_ecef_m[rows])
+        distance[rows] = np.linalg.norm(trajectory.at_arc(arc_m[rows]) - trajectory.at_arc(nearest), axis=1)
+    return distance

@@ -1,43 +1,47 @@
-"""How far figures can be trusted: blocks of time drawn again and again.
+"""Confidence limits by the block bootstrap.
 
-Errors of a train are alike over tens of seconds, so that epochs are no independent draws; blocks
+Errors of a train are correlated over tens of seconds, so that epochs are not independent samples; blocks
 of a minute nearly are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Integers, Masks
 
-#: With fewer blocks than this no limits are told.
+#: Fewest blocks for confidence limits.
 FEWEST_BLOCKS: Final = 5
-#: Sizes of error at which the draws are counted at a time.
+#: Number of values at which the cumulative counts are evaluated at a time.
 _NODES: Final = 400
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Limits of confidence, NaN where there are fewer than `FEWEST_BLOCKS`.
+    """Confidence limits, NaN with fewer than `FEWEST_BLOCKS` blocks.
 
     Attributes
     ----------
     blocks : int
-    mean_m, rate, p95_m : tuple of float
-        Lower and upper limit.
+    mean_m, rate, p95_m, normalised_p68, normalised_p95 : tuple of float
+        Lower and upper limit; the last two are of the error size over its standard deviation.
     """
 
     blocks: int
-    mean_m: tuple[float, float]
-    rate: tuple[float, float]
-    p95_m: tuple[float, float]
+    mean_m: tuple[float, float] = (nan, nan)
+    rate: tuple[float, float] = (nan, nan)
+    p95_m: tuple[float, float] = (nan, nan)
+    normalised_p68: tuple[float, float] = (nan, nan)
+    normalised_p95: tuple[float, float] = (nan, nan)
 
 
 def block_limits(
     error_m: Floats,
+    sigma_m: Floats,
     observed: Masks,
     positioned: Masks,
     block: Integers,
@@ -46,15 +50,17 @@ def block_limits(
     seed: int,
     confidence: float,
 ) -> Limits:
-    """Percentile limits of mean, rate and 95th percentile, by drawing blocks with replacement.
+    """Percentile limits of mean, rate and percentiles, by resampling blocks with replacement.
 
-    Each draw takes as many blocks as there are. The 95th percentile of a draw is the smallest size of
-    error that 95 % of its errors do not exceed.
+    Each resample has as many blocks as the data. A percentile of a resample is the smallest value that the given
+    share of its values do not exceed.
 
     Parameters
     ----------
     error_m : ndarray, shape (T,) [m]
         NaN where there is no error.
+    sigma_m : ndarray, shape (T,) [m]
+        Standard deviation of the position; NaN where it is not known.
     observed, positioned : ndarray of bool, shape (T,)
     block : ndarray of int, shape (T,)
     replicates, seed : int
@@ -62,9 +68,8 @@ def block_limits(
     """
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)
-    none = (float("nan"), float("nan"))
     if blocks < FEWEST_BLOCKS:
-        return Limits(blocks=blocks, mean_m=none, rate=none, p95_m=none)
+        return Limits(blocks=blocks)
     drawn = np.random.default_rng(seed).integers(0, blocks, (replicates, blocks))
     times = np.zeros((replicates, blocks))
     np.add.at(times, (np.arange(replicates)[:, None], drawn), 1.0)
@@ -79,9 +84,14 @@ def block_limits(
     def limits(values: Floats) -> tuple[float, float]:
         values = values[np.isfinite(values)]
         if not len(values):
-            return none
+            return nan, nan
         low, high = np.percentile(values, [tail, 100.0 - tail])
         return float(low), float(high)
+
+    def of_percentile(values: Floats, share: float) -> tuple[float, float]:
+        known = np.isfinite(values)
+        counts = sums(known.astype(np.float64))
+        return limits(_percentiles(values[known], member[known], times, counts, share=share))
 
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = sums(np.where(has, error_m, 0.0)) / errors
@@ -90,23 +100,25 @@ def block_limits(
         blocks=blocks,
         mean_m=limits(mean),
         rate=limits(rate),
-        p95_m=limits(_percentiles(np.abs(error_m[has]), member[has], times, errors)),
+        p95_m=of_percentile(np.abs(error_m), 0.95),
+        normalised_p68=of_percentile(np.abs(error_m) / sigma_m, 0.68),
+        normalised_p95=of_percentile(np.abs(error_m) / sigma_m, 0.95),
     )
 
 
-def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats) -> Floats:
-    """95th percentile of each draw, shape (replicates,); NaN where a draw has no error.
+def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, *, share: float) -> Floats:
+    """Percentile of each resample, shape (replicates,); NaN where a resample has no value.
 
-    Sizes are counted at nodes, and again at finer ones in the range in which the draws' percentiles lie,
-    until every size of that range is a node.
+    Values are counted at nodes, then at finer nodes in the range of the percentiles of all resamples, until every
+    value of that range is a node.
     """
     found = np.full(len(times), np.nan)
     drawn = errors > 0
     if not drawn.any():
         return found
     values, rank = np.unique(size, return_inverse=True)
-    # a tolerance, that 0.95 of 20 errors is the nineteenth
-    wanted = (0.95 * errors[drawn] - 1e-9)[:, None]
+    # a tolerance, so that 0.95 of 20 errors is the nineteenth
+    wanted = (share * errors[drawn] - 1e-9)[:, None]
     low, high, most = 0, len(values) - 1, _NODES
     while True:
         nodes = np.unique(np.linspace(low, high, min(high - low + 1, most)).round().astype(np.int64))

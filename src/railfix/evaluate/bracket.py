@@ -1,4 +1,4 @@
-"""Instants of a series between those of a reference."""
+"""Linear interpolation of a reference trajectory at other times."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.timescale import seconds
 
-#: Longest step of a reference that is bridged [s].
+#: Longest gap of a reference that is interpolated over [s].
 LARGEST_GAP_S = 2.5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bracket:
-    """Between which two instants of the reference each time lies, T times.
+    """Neighbouring instants of the reference for each of T times.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class Bracket:
     share : ndarray, shape (T,)
         0 at left, 1 at right.
     inside : ndarray of bool, shape (T,)
-        Neither outside the reference nor in one of its gaps.
+        False before the first, after the last, and in gaps of the reference.
     """
 
     left: Indices
@@ -33,20 +33,19 @@ class Bracket:
     inside: Masks
 
     def of(self, values: Floats) -> Floats:
-        """Values of the reference, shape (R,) or (R, n), at the times, linearly; NaN where not inside."""
-        share = self.share.reshape(-1, *(1,) * (values.ndim - 1))
-        between = values[self.left] + share * (values[self.right] - values[self.left])
-        between[~self.inside] = np.nan
-        return np.asarray(between, dtype=np.float64)
+        """Values of the reference, shape (R,) or (R, n), interpolated linearly; NaN where not inside."""
+        across = (-1, *(1,) * (values.ndim - 1))
+        between = values[self.left] + self.share.reshape(across) * (values[self.right] - values[self.left])
+        return np.where(self.inside.reshape(across), between, np.nan)
 
     @property
     def nearest(self) -> Indices:
-        """The nearer of the two instants, shape (T,)."""
+        """Index of the nearer instant, shape (T,)."""
         return np.where(self.share <= 0.5, self.left, self.right)
 
 
 def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
-    """Where each time lies in a reference.
+    """Neighbouring instants of a reference for each time.
 
     Parameters
     ----------
@@ -54,7 +53,7 @@ def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float 
     reference_time : ndarray of datetime64[ns], shape (R,)
         Rising, at least two.
     largest_gap_s : float [s]
-        Longest step of the reference that is bridged.
+        Longest gap that is interpolated over.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One row an epoch and antenna: what the run answered, where the train was, how far apart."""
+"""Table of epochs and antennas: position, reference, error."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.errors import MismatchError
-from railfix.core.reasons import Status
 from railfix.core.timescale import seconds
 from railfix.evaluate.bracket import bracket
-from railfix.evaluate.integrity import PARTS, TOLD
+from railfix.evaluate.integrity import PARTS, STATED
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import Answers, Errors, TrackFiles, errors_of
 from railfix.evaluate.run_folder import RunFolder, floats
 from railfix.evaluate.sections import Sections
 from railfix.io.reference_log import AntennaReference
 
-#: Status of an epoch that the log does not have though the epochs around it are there.
+#: Status of an epoch missing in the log.
 NOT_LOGGED: Final = "not_logged"
-#: Environment where nothing tells it.
+#: Environment where neither reference nor sections name it.
 UNKNOWN: Final = "unknown"
 
 #: Columns of the table of epochs, with their unit and meaning.
@@ -32,38 +31,39 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "line": "name of the track",
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
-    "status": "what became of the epoch; `not_logged` where the log has none between two it has",
+    "status": "status of the epoch; `not_logged` for epochs missing in the log between two that it has",
     "observed": "the antenna has observations",
-    "in_reference": "the reference tells where the antenna was",
-    "reference_good": "its standard deviation is within the limit, or not stated",
-    "chainage_m": "of the reference: where the antenna was",
-    "speed_mps": "of the reference, without sign; from its places where it tells none",
-    "moved_m": "distance that the train has run since the first epoch in the reference",
-    "environment": "of the reference or the sections; `unknown` where neither tells",
+    "in_reference": "the reference trajectory covers the epoch",
+    "reference_good": "the reference's standard deviation is within the limit, or not stated",
+    "chainage_m": "of the reference",
+    "speed_mps": "of the reference, unsigned; differentiated from its positions where it states none",
+    "moved_m": "distance travelled since the first epoch with a reference",
+    "environment": "of the reference or of the sections; `unknown` where neither has one",
     "reference_sigma_m": "standard deviation of the reference along the track",
-    "reference_source": "where the reference has its place from",
+    "reference_source": "source of the reference position",
     "n_used": "satellites used",
-    "positioned": "a position on the map",
-    "conventional_positioned": "a 3-D single point",
-    "error_m": "on the map, + toward the end of the line",
+    "positioned": "there is a position on the map",
+    "conventional_positioned": "there is a 3-D single point",
+    "error_m": "position on the map, + toward the end of the line",
     "conventional_error_m": "3-D single point at its nearest point of the trajectory, + toward the end",
-    "along_sigma_m": "standard deviation that the run gave",
-    "interval_m": "distance that the train has run since the position before",
-    "gap_s": "time since the position before",
-    "conventional_interval_m": "the same of the conventional positions",
-    "conventional_gap_s": "the same of the conventional positions",
-    "block": "stretch of time within the run, for the confidence",
+    "distance_m": "straight distance between the position on the map and the reference",
+    "along_sigma_m": "standard deviation that the run states",
+    "interval_m": "distance travelled since the previous position",
+    "gap_s": "time since the previous position",
+    "conventional_interval_m": "the same for the conventional positions",
+    "conventional_gap_s": "the same for the conventional positions",
+    "block": "block of time within the run, for confidence limits",
 }
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaEpochs:
-    """Rows of one antenna and what is to be said of them.
+    """Epochs of one antenna, with facts on their evaluation.
 
     Attributes
     ----------
     table : polars.DataFrame
-        `EPOCH_COLUMNS` without run, configuration and line, and the run's protection levels with their parts.
+        `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
     errors : Errors
     speed_from : {"reference", "places"}
     outside : int
@@ -71,7 +71,7 @@ class AntennaEpochs:
     step_s : float [s]
         Step of the log.
     from_sections : int
-        Epochs inside the reference whose environment the sections told.
+        Epochs with a reference whose environment is that of the sections.
     """
 
     table: pl.DataFrame
@@ -83,19 +83,19 @@ class AntennaEpochs:
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
-    """Protection levels among the columns."""
+    """Names of the columns of protection levels."""
     return [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
 
 
 def protection_columns(table: pl.DataFrame) -> list[str]:
-    """Protection levels and what else is told of them, the levels first."""
+    """Names of the columns of protection levels, then of their parts, causes and statuses."""
     levels = level_columns(table)
-    told = [f"_protection_{name}" for name in (*PARTS, *TOLD)]
+    told = [f"_protection_{name}" for name in (*PARTS, *STATED)]
     return levels + [name for name in table.columns if name.endswith(tuple(told))]
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Epochs with those put in that a log skips.
+    """Epochs of a log and those missing in its gaps.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
     Returns
     -------
     time : ndarray of datetime64[ns], shape (N,)
-        With instants at the step of the log (the median of its steps) in every gap of more than 1.5 steps.
+        With instants at the step of the log (its median step) in every gap of more than 1.5 steps.
     logged : ndarray of bool, shape (N,)
         Those of the log.
     step_s : float [s]
@@ -129,33 +129,33 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
 def travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
-    """Distance run since the first epoch whose place is known.
+    """Distance travelled since the first epoch with a known reference position.
 
-    A step counts where the train moved: by the mean of the speeds told at its ends, or by the step's
-    own where they are not told or the step is longer than the reference bridges.
+    A step counts if the train moved: by the mean of the reference speeds at its ends, or by the mean speed of the
+    step where these are unknown or the step is longer than `reference_gap_s`.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     step_m : ndarray, shape (K - 1,) [m]
-        Size of the steps between the K epochs whose place is known.
+        Length of the steps between the K epochs with a known position.
     known : ndarray of bool, shape (T,)
     speed_mps : ndarray, shape (T,) [m/s]
-        As told; NaN where it is not.
+        Of the reference; NaN where unknown.
     options : EvaluationOptions
 
     Returns
     -------
     ndarray, shape (T,) [m]
-        Between known places shared out by time; NaN before the first and after the last.
+        Interpolated by time between known positions; NaN before the first and after the last.
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)
     if not len(at):
         return moved
     duration = seconds(np.diff(time[at]))
-    told = np.abs(speed_mps[at])
-    mean = (told[1:] + told[:-1]) / 2.0
+    stated = np.abs(speed_mps[at])
+    mean = (stated[1:] + stated[:-1]) / 2.0
     speed = np.where(np.isfinite(mean) & (duration <= options.reference_gap_s), mean, step_m / duration)
     total = np.concatenate([[0.0], np.cumsum(np.where(speed >= options.standing_mps, step_m, 0.0))])
     clock = seconds(time - time[at[0]])
@@ -163,7 +163,7 @@ def travelled(
 
 
 def since_last(values: Floats, has: Masks) -> Floats:
-    """Growth of a rising quantity since the row before that `has`, at those rows, shape (T,); NaN elsewhere."""
+    """Increase of a quantity since the previous row that `has`, shape (T,); NaN at rows that do not."""
     grown = np.full(len(values), np.nan)
     at = np.flatnonzero(has & np.isfinite(values))
     grown[at[1:]] = np.diff(values[at])
@@ -179,7 +179,7 @@ def antenna_epochs(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> AntennaEpochs:
-    """Rows of one antenna of a run.
+    """Epochs of one antenna of a run with their errors.
 
     Raises
     ------
@@ -213,19 +213,19 @@ def antenna_epochs(
     errors = errors_of(run, antenna, answers, method=options.method, files=files)
     known = at.inside & (np.isfinite(chainage) if errors.method == "chainage" else np.isfinite(place[:, 0]))
     along = _steps(chainage if np.isfinite(chainage[known]).all() else place, known)
-    told = at.of(reference.speed_mps)
-    moved = travelled(time, along, known, told, options=options)
-    speed = np.where(np.isfinite(told), np.abs(told), _own_speed(time, along, known))
+    stated_speed = at.of(reference.speed_mps)
+    moved = travelled(time, along, known, stated_speed, options=options)
+    speed = np.where(np.isfinite(stated_speed), np.abs(stated_speed), _own_speed(time, along, known))
     sigma = at.of(reference.sigma_m)
     status = np.append(mine["status"].to_numpy().astype(str), NOT_LOGGED)[rows]
     clock = seconds(time - time[0])
-    told_place = np.where(known, reference.environment[at.nearest], "")
-    environment = _environment(told_place, sections, errors.reference_chainage_m)
+    stated_environment = np.where(known, reference.environment[at.nearest], "")
+    environment = _environment(stated_environment, sections, errors.reference_chainage_m)
     columns: dict[str, Any] = {
         "time_gpst": time,
         "antenna": np.full(len(time), antenna),
         "status": status,
-        "observed": logged & (status != Status.NO_OBSERVATION.text),
+        "observed": logged & np.append(mine["observed"].to_numpy(), False)[rows],
         "in_reference": known,
         "reference_good": known & ~(sigma > options.reference_sigma_m),
         "chainage_m": errors.reference_chainage_m,
@@ -239,54 +239,57 @@ def antenna_epochs(
         "conventional_positioned": np.isfinite(answers.conventional_chainage_m),
         "error_m": errors.error_m,
         "conventional_error_m": errors.conventional_error_m,
+        "distance_m": errors.distance_m,
         "along_sigma_m": column("along_sigma_m"),
     }
     for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
-        # Over gaps of the reference the way is shared out by time, so that positions there count.
+        # moved_m is interpolated by time over gaps of the reference, so that positions there count
         columns[f"{prefix}interval_m"] = since_last(moved, np.isfinite(answered))
         columns[f"{prefix}gap_s"] = since_last(np.where(np.isfinite(moved), clock, np.nan), np.isfinite(answered))
     first = run.positions["time_gpst"].to_numpy().min()
     columns["block"] = (seconds(time - first) // options.block_s).astype(np.int64)
     columns |= {run.column_of(name): column(name) for name in level_columns(mine)}
-    for name in (f"protection_{name}" for name in (*PARTS, *TOLD)):
+    for name in (f"protection_{name}" for name in (*PARTS, *STATED)):
         if name in mine.columns and run.level_kind is not None:
             columns[run.column_of(name)] = column(name) if name.endswith("_m") else _texts(mine, name, rows)
     table = pl.DataFrame(columns, nan_to_null=True).with_columns(pl.col("n_used").cast(pl.Int64))
     return AntennaEpochs(
         table=table,
         errors=errors,
-        speed_from="reference" if np.isfinite(told[known]).all() else "places",
+        speed_from="reference" if np.isfinite(stated_speed[known]).all() else "places",
         outside=int((logged & ~known).sum()),
         step_s=step_s,
-        from_sections=int((known & (told_place == "") & (environment != UNKNOWN)).sum()),
+        from_sections=int((known & (stated_environment == "") & (environment != UNKNOWN)).sum()),
     )
 
 
 def _texts(table: pl.DataFrame, name: str, rows: Indices) -> pl.Series:
-    """A column of words, null where the log has no epoch."""
-    told = table[name].cast(pl.String)
-    return pl.concat([told, pl.Series([None], dtype=pl.String)])[rows]
+    """A text column, null where the log has no epoch."""
+    texts = table[name].cast(pl.String)
+    return pl.concat([texts, pl.Series([None], dtype=pl.String)])[rows]
 
 
 def _steps(values: Floats, known: Masks) -> Floats:
-    """Size of the steps between known places: differences of chainage, or straight distances."""
+    """Lengths of the steps between known positions: differences of chainage, or straight distances."""
     step = np.diff(values[known], axis=0)
     return np.abs(step) if step.ndim == 1 else np.asarray(np.linalg.norm(step, axis=1))
 
 
 def _own_speed(time: Datetimes, step_m: Floats, known: Masks) -> Floats:
-    """Speed over the steps before and after each known place, shape (T,) [m/s]; NaN elsewhere."""
+    """Mean speed over the steps before and after each known position, shape (T,) [m/s]; NaN elsewhere."""
     speed = np.full(len(time), np.nan)
     at = np.flatnonzero(known)
     if len(at) < 2:
         return speed
     duration = seconds(np.diff(time[at]))
-    run, took = (np.concatenate([[0.0], values]) + np.concatenate([values, [0.0]]) for values in (step_m, duration))
-    speed[at] = run / took
+    length, elapsed = (
+        np.concatenate([[0.0], values]) + np.concatenate([values, [0.0]]) for values in (step_m, duration)
+    )
+    speed[at] = length / elapsed
     return speed
 
 
-def _environment(told: Strings, sections: Sections | None, chainage_m: Floats) -> Strings:
-    """What the reference tells, else what the sections tell."""
-    words = told if sections is None else np.where(told == "", sections.at(chainage_m), told)
-    return np.where(words == "", UNKNOWN, words)
+def _environment(stated: Strings, sections: Sections | None, chainage_m: Floats) -> Strings:
+    """Environment that the reference states, else that of the sections."""
+    names = stated if sections is None else np.where(stated == "", sections.at(chainage_m), stated)
+    return np.where(names == "", UNKNOWN, names)

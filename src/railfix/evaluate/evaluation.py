@@ -19,7 +19,7 @@ from railfix.evaluate.intervals import interval_table
 from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.place import TrackFiles
-from railfix.evaluate.run_folder import UNKNOWN_KIND, RunFolder, read_run
+from railfix.evaluate.run_folder import POSITIONS_TABLE, UNKNOWN_KIND, RunFolder, read_run
 from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, read_reference
 
@@ -33,7 +33,7 @@ Reference = Path | Mapping[str, AntennaReference] | None
 
 @dataclass(frozen=True, kw_only=True)
 class RunAndReference:
-    """A run and what it is measured against.
+    """A table of positions of a run, with its reference trajectory.
 
     Attributes
     ----------
@@ -42,12 +42,20 @@ class RunAndReference:
     reference : Path or mapping of str to AntennaReference or None
         A file, or references by antenna; None: the file of `BESIDE_THE_LOG` beside the run's log.
     configuration : str or None
-        Name of its settings; made from those that differ between the runs where None.
+        Name of its settings; None: composed of the settings that differ between the runs.
+    table : str
+        Table of positions (`railfix.evaluate.run_folder.tables_of`): "positions" for single epochs, "train" for
+        the filter along the track.
+    conventional : Path or None
+        Folder of another run on the same log, whose conventional positions take the place of the run's own: one
+        with the screens elevation and C/N0 alone gives those that P1 compares with.
     """
 
     run: Path
     reference: Reference = None
     configuration: str | None = None
+    table: str = POSITIONS_TABLE
+    conventional: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +67,8 @@ class EvaluatedRun:
     name, configuration, line : str
         As in the tables.
     path : Path
+    table : str
+        Table of positions.
     reference : str
         The file, or "given" for arrays.
     method, speed_from : mapping of str to str
@@ -79,6 +89,7 @@ class EvaluatedRun:
     configuration: str
     line: str
     path: Path
+    table: str
     reference: str
     method: Mapping[str, str]
     speed_from: Mapping[str, str]
@@ -202,12 +213,13 @@ def evaluate_runs(
     options, files = options or EvaluationOptions(), files or TrackFiles()
     if not runs:
         raise SettingsError("no run to evaluate; name the folders that railfix run wrote")
-    twice = [path for path, count in Counter(item.run.resolve() for item in runs).items() if count > 1]
+    counts = Counter((item.run.resolve(), item.table) for item in runs)
+    twice = [path for (path, _), count in counts.items() if count > 1]
     if twice:
         raise SettingsError(f"{twice[0]}: the run is given twice; give each run once")
     parts = [_part(item, sections=sections, files=files, options=options) for item in runs]
-    names = _names([part.folder.path for part in parts])
-    labels = configurations([part.folder.settings for part in parts], [part.configuration for part in parts])
+    names = _names([part.folder for part in parts])
+    labels = configurations([_settings(part.folder) for part in parts], [part.configuration for part in parts])
     tables = []
     for number, (part, name, label) in enumerate(zip(parts, names, labels, strict=True)):
         whole = pl.concat([antenna.table for antenna in part.antennas.values()], how="diagonal").with_columns(
@@ -241,9 +253,12 @@ def _levelled(part: _Part, name: str) -> LevelledRun | None:
 
 
 def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, options: EvaluationOptions) -> _Part:
-    folder = read_run(item.run)
+    folder = read_run(item.run, table=item.table, conventional=item.conventional)
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
     notes = []
+    if item.conventional is not None:
+        notes.append(f"the conventional positions are those of {item.conventional}")
+        inputs.append(fingerprint("conventional", read_run(item.conventional).positions_path))
     if isinstance(item.reference, Mapping):
         references, told = item.reference, "given"
         if missing := [name for name in folder.antennas if name not in references]:
@@ -279,7 +294,7 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
     if folder.level_kind == UNKNOWN_KIND:
         notes.append("run.json does not tell what the protection levels rest on; they are named unknown")
     if folder.level_kind is not None and "protection_status" not in folder.positions.columns:
-        notes.append("the run has no protection_status: levels are taken as vouched for where the status is ok")
+        notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
     said = [note for antenna in antennas.values() for note in antenna.errors.notes]
     return _Part(
         folder=folder,
@@ -327,13 +342,24 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | 
     return names
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
-    """Names of the folders, with as many of those above them as it takes to tell them apart."""
-    whole = [path.resolve().parts for path in paths]
+def _settings(folder: RunFolder) -> dict[str, Any]:
+    """Settings of a run, with the table where it is not that of single epochs."""
+    return folder.settings | ({} if folder.table == POSITIONS_TABLE else {"table": folder.table})
+
+
+def _names(folders: Sequence[RunFolder]) -> list[str]:
+    """Short names of the folders that tell them apart, with the table where it is not that of single epochs."""
+    ends = ["" if folder.table == POSITIONS_TABLE else f" ({folder.table})" for folder in folders]
+    return [name + end for name, end in zip(short_names([folder.path for folder in folders]), ends, strict=True)]
+
+
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Names of folders, with as many parent folders as are needed to tell different ones apart."""
+    parts = [path.resolve().parts for path in paths]
     depth = 1
-    while len({parts[-depth:] for parts in whole}) < len(whole):
+    while len({part[-depth:] for part in parts}) < len(set(parts)):
         depth += 1
-    return ["/".join(parts[-depth:]) for parts in whole]
+    return ["/".join(part[-depth:]) for part in parts]
 
 
 def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
@@ -342,6 +368,7 @@ def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
         configuration=label,
         line=part.folder.line_name,
         path=part.folder.path,
+        table=part.folder.table,
         reference=part.reference,
         method={antenna: found.errors.method for antenna, found in part.antennas.items()},
         speed_from={antenna: found.speed_from for antenna, found in part.antennas.items()},

@@ -30,53 +30,68 @@ ALL: Final = "all"
 FIGURE_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `status`; of several runs also "
     "`configuration` and `line`: the runs of one configuration together",
-    "group": "which of them",
-    "run": "name of the run; `all` of several together",
+    "group": "name of the group",
+    "run": "name of the run; `all` for several together",
     "configuration": "settings of the run",
     "line": "name of the track",
-    "antenna": "`front` or `rear`; `all` of both together",
-    "position": "`constrained` on the map, `constrained_ok` those of status ok alone, `conventional`",
-    "epochs_of": "`own` every epoch, `common` those where constrained and conventional both have a position",
-    "epochs": "of the run inside the reference, those put in where the log has a gap included",
-    "observed": "of them with observations",
-    "positions": "of them with a position",
-    "left_out": "positions without an error: the reference is worse than the limit",
+    "antenna": "`front` or `rear`; `all` for both together",
+    "position": "`constrained` on the map, `constrained_ok` those that passed every check, `conventional`",
+    "epochs_of": "`own`: every epoch of this kind; `common`: epochs with a constrained and a conventional position",
+    "epochs": "of the run, with a reference; epochs missing in the log included",
+    "observed": "those with observations",
+    "positions": "those with a position",
+    "left_out": "positions without an error, because the standard deviation of the reference exceeds the limit",
     "errors": "positions with an error",
-    "rate": "positions / observed",
+    "rate": "epochs with observations and position / observed",
     "rate_of_run": "positions / epochs",
     "mean_m": "error",
-    "std_m": "error, population",
+    "std_m": "error, population standard deviation",
     "rms_m": "error",
     "p50_m": "size of error",
     "p95_m": "size of error",
     "p99_m": "size of error",
     "max_m": "size of error",
     "lowest_m": "error furthest toward the start of the line",
-    "highest_m": "error furthest toward its end",
-    "max_at_time": "when the largest was, GPS time",
-    "max_at_chainage_m": "where the train was then",
-    "over_5_m": "share of the errors over this size (sizes are an option)",
-    "wrong_places": "errors over 50 m",
-    "reference_sigma_p50_m": "median standard deviation of the reference, where it states one",
-    "along_sigma_p50_m": "median standard deviation that the run gave",
-    "normalised_mean": "error / along_sigma",
-    "normalised_rms": "error / along_sigma",
-    "over_1_sigma": "share of the errors over along_sigma",
-    "over_2_sigma": "over twice",
-    "over_3_sigma": "over three times",
-    "blocks": "blocks of time for the limits below",
+    "highest_m": "error furthest toward the end of the line",
+    "max_at_time": "time of the largest error, GPS time",
+    "max_at_chainage_m": "chainage of the reference at the largest error",
+    "over_5_m": "share of errors above this size (sizes are an option)",
+    "wrong_places": "errors above 50 m",
+    "reference_sigma_p50_m": "median standard deviation of the reference, where stated",
+    "along_sigma_p50_m": "median standard deviation that the run states",
+    "distance_p50_m": "straight distance between the position on the map and the reference, median",
+    "distance_p95_m": "the same, 95th percentile",
+    "distance_max_m": "the same, largest",
+    "normalised_mean": "error / along_sigma, mean",
+    "normalised_rms": "error / along_sigma, root mean square",
+    "normalised_p68": "size of error / along_sigma, 68th percentile; 1.0 for normal errors and a correct sigma",
+    "normalised_p95": "the same, 95th percentile; 2.0",
+    "over_1_sigma": "share of errors above along_sigma",
+    "over_2_sigma": "above twice along_sigma",
+    "over_3_sigma": "above three times along_sigma",
+    "blocks": "blocks of time for the confidence limits below",
     "mean_low_m": "limit of confidence",
     "mean_high_m": "limit of confidence",
     "rate_low": "limit of confidence",
     "rate_high": "limit of confidence",
     "p95_low_m": "limit of confidence",
     "p95_high_m": "limit of confidence",
+    "normalised_p68_low": "limit of confidence",
+    "normalised_p68_high": "limit of confidence",
+    "normalised_p95_low": "limit of confidence",
+    "normalised_p95_high": "limit of confidence",
 }
-_LIMITS: Final = ("mean_low_m", "mean_high_m", "rate_low", "rate_high", "p95_low_m", "p95_high_m")
+_LIMITS: Final = tuple(
+    f"{name}_{end}{unit}"
+    for name, unit in (("mean", "_m"), ("rate", ""), ("p95", "_m"), ("normalised_p68", ""), ("normalised_p95", ""))
+    for end in ("low", "high")
+)
+#: Statuses of a position that passed every check, of single epochs and of the filter along the track.
+PASSED: Final = (Status.OK.text, "tracking")
 _USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
-    "error_m", "conventional_error_m", "along_sigma_m", "block",
+    "error_m", "conventional_error_m", "distance_m", "along_sigma_m", "block",
 )  # fmt: skip
 
 
@@ -139,19 +154,26 @@ def positioned(position: str) -> pl.Expr:
     if position == "conventional":
         return pl.col("conventional_positioned")
     if position == "constrained_ok":
-        return pl.col("positioned") & (pl.col("status") == Status.OK.text)
+        return pl.col("positioned") & pl.col("status").is_in(PASSED)
     return pl.col("positioned")
 
 
 def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     """Epochs with the columns ``has`` (a position) and ``error`` (where the reference is good) of one kind."""
-    column = "conventional_error_m" if position == "conventional" else "error_m"
+    conventional = position == "conventional"
+    column = "conventional_error_m" if conventional else "error_m"
     has = positioned(position)
     if epochs_of == "common":
         has &= pl.col("positioned") & pl.col("conventional_positioned")
-    sigma = pl.lit(None, pl.Float64) if position == "conventional" else pl.col("along_sigma_m")
+    unknown = pl.lit(None, pl.Float64)
+    good = has & pl.col("reference_good")
     return (
-        epochs.with_columns(has=has, error=pl.when(has & pl.col("reference_good")).then(pl.col(column)), sigma=sigma)
+        epochs.with_columns(
+            has=has,
+            error=pl.when(good).then(pl.col(column)),
+            distance=unknown if conventional else pl.when(good).then(pl.col("distance_m")),
+            sigma=unknown if conventional else pl.col("along_sigma_m"),
+        )
         .with_columns(size=pl.col("error").abs(), normalised=pl.col("error") / pl.col("sigma"))
         .with_columns(position=pl.lit(position), epochs_of=pl.lit(epochs_of))
     )
@@ -216,7 +238,7 @@ def _figures(options: EvaluationOptions) -> list[pl.Expr]:
         positions.cast(pl.Int64).alias("positions"),
         (has & ~pl.col("reference_good")).sum().cast(pl.Int64).alias("left_out"),
         error.count().cast(pl.Int64).alias("errors"),
-        pl.when(observed > 0).then(positions / observed).alias("rate"),
+        pl.when(observed > 0).then((has & pl.col("observed")).sum() / observed).alias("rate"),
         (positions / pl.len()).alias("rate_of_run"),
         error.mean().alias("mean_m"),
         error.std(ddof=0).alias("std_m"),
@@ -231,8 +253,11 @@ def _figures(options: EvaluationOptions) -> list[pl.Expr]:
         (size > WRONG_PLACE_M).sum().cast(pl.Int64).alias("wrong_places"),
         pl.col("reference_sigma_m").filter(good).median().alias("reference_sigma_p50_m"),
         pl.col("sigma").filter(good).median().alias("along_sigma_p50_m"),
+        *(pl.col("distance").quantile(q / 100, "linear").alias(f"distance_p{q}_m") for q in (50, 95)),
+        pl.col("distance").max().alias("distance_max_m"),
         pl.col("normalised").mean().alias("normalised_mean"),
         (pl.col("normalised") ** 2).mean().sqrt().alias("normalised_rms"),
+        *(sigmas.quantile(q / 100, "linear").alias(f"normalised_p{q}") for q in (68, 95)),
         *((sigmas > n).mean().alias(f"over_{n}_sigma") for n in (1, 2, 3)),
     ]
 
@@ -240,10 +265,10 @@ def _figures(options: EvaluationOptions) -> list[pl.Expr]:
 def _with_limits(
     table: pl.DataFrame, part: pl.DataFrame | None, by: Sequence[str], options: EvaluationOptions
 ) -> pl.DataFrame:
-    """The table with the limits of confidence, null where none are told."""
+    """The table with confidence limits, null where there are none."""
     groups = {}
     if part is not None:
-        kept = part.select(*by, "error", "observed", "has", "block")
+        kept = part.select(*by, "error", "sigma", "observed", "has", "block")
         groups = kept.partition_by(by, as_dict=True, maintain_order=True, include_key=False)
     rows: list[dict[str, Any]] = []
     for key in table.select(by).iter_rows():
@@ -251,8 +276,9 @@ def _with_limits(
             rows.append({"blocks": None, **dict.fromkeys(_LIMITS)})
             continue
         group = groups[key]
-        found = block_limits(
+        limits = block_limits(
             floats(group, "error"),
+            floats(group, "sigma"),
             group["observed"].to_numpy(),
             group["has"].to_numpy(),
             group["block"].to_numpy(),
@@ -260,7 +286,7 @@ def _with_limits(
             seed=options.seed,
             confidence=options.confidence,
         )
-        values = (*found.mean_m, *found.rate, *found.p95_m)
-        rows.append({"blocks": found.blocks, **dict(zip(_LIMITS, values, strict=True))})
+        values = (*limits.mean_m, *limits.rate, *limits.p95_m, *limits.normalised_p68, *limits.normalised_p95)
+        rows.append({"blocks": limits.blocks, **dict(zip(_LIMITS, values, strict=True))})
     schema = {"blocks": pl.Int64} | dict.fromkeys(_LIMITS, pl.Float64)
     return table.hstack(pl.DataFrame(rows, schema=schema).with_columns(pl.col(_LIMITS).fill_nan(None)))

@@ -1,8 +1,7 @@
-"""Protection levels against the errors: Stanford counts, availability, continuity, and the epochs beyond.
+"""Protection levels against errors: Stanford counts, availability, continuity, and errors above their level.
 
-Counted twice. `vouched`: a level counts where the run vouched for it, that is where the status of the
-position is ok and the verdict on the level no alarm; a position that is ambiguous, off the map or failed a
-check has no bound, as if its level were infinite. `all`: every level as it stands, whatever the verdict.
+Counted twice. `usable`: a level counts where the status of the position is ok and the level raises no alarm; any
+other position counts as having an infinite level. `all`: every level counts, whatever its status.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ import polars as pl
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.reasons import Status
 from railfix.evaluate.figures import ALL, KEYS
-from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.options import WINDOWS_S, EvaluationOptions
 from railfix.evaluate.run_folder import floats
 from railfix.integrity.stanford import Region, Stanford, stanford
 
-LevelsOf = Literal["vouched", "all"]
+LevelsOf = Literal["usable", "all"]
 
-#: Which levels count, see above.
-LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("vouched", "all")
-#: Parts of a level, and what a run says of it, by their names without "protection_".
+#: Choices of levels, see above.
+LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
+#: Parts of a level, and its cause and status, by their names without "protection_".
 PARTS: Final = ("fault_free_m", "one_fault_m", "two_faults_m")
-TOLD: Final = ("cause", "status")
+STATED: Final = ("cause", "status")
 _ALARM: Final = "alarm"
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -42,30 +41,30 @@ _REGIONS: Final = {
 #: Columns of the table of counts beside its keys, with their meaning.
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
-    "group": "which of them",
-    "levels_of": "`vouched`: status ok and no alarm, the others as infinite; `all`: every level as it stands",
-    "alarm_limit_m": "AL: levels up to it are available",
-    "own_limit": "it is the alarm limit that the run had (of rows together: all their runs)",
-    "epochs": "of the run inside the reference, those put in where the log has a gap included",
-    "observed": "of them with observations",
-    "judged": "of them with an error",
+    "group": "name of the group",
+    "levels_of": "`usable`: levels of positions with status ok and no alarm, all others infinite; `all`: every level",
+    "alarm_limit_m": "alarm limit AL",
+    "own_limit": "it is the alarm limit of the run (of rows together: of all their runs)",
+    "epochs": "of the run, with a reference; epochs missing in the log included",
+    "observed": "those with observations",
+    "judged": "those with an error",
     "nominal": "error <= level <= AL",
     "misleading": "level < error <= AL",
     "hazardously_misleading": "level <= AL < error",
     "unavailable": "AL < level, error <= level",
     "unavailable_misleading": "AL < level < error",
-    "unjudged": "a position, but the reference is worse than its limit",
+    "unjudged": "a position, but the standard deviation of the reference exceeds the limit",
     "no_position": "neither position nor level",
-    "available": "levels up to AL, judged or not",
+    "available": "levels within AL, with or without an error",
     "availability": "available / epochs",
     "availability_of_observed": "available / observed",
-    "beyond": "errors over their level, at any AL the same",
+    "beyond": "errors above their level; the same at every AL",
     "beyond_share": "beyond / judged",
-    "beyond_blocks": "stretches of time (60 s) with an error over its level, of each antenna",
+    "beyond_blocks": "blocks of time (60 s) with an error above its level, per antenna",
     "windows_15_s": "windows of 15 s that begin at an available epoch",
-    "kept_15_s": "of them those in which every epoch is available and none is missing",
-    "continuity_15_s": "kept / windows; not told by environment, whose stretches the line cuts",
-    "windows_60_s": "the same of 60 s",
+    "kept_15_s": "windows in which every epoch is available and none is missing",
+    "continuity_15_s": "kept / windows; not by environment",
+    "windows_60_s": "the same for 60 s",
     "kept_60_s": "the same",
     "continuity_60_s": "the same",
 }
@@ -75,18 +74,18 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
     "run": "name of the run",
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
-    "chainage_m": "of the reference: where the antenna was",
+    "chainage_m": "of the reference",
     "environment": "of the reference or the sections",
-    "error_m": "on the map, + toward the end of the line",
-    "KIND_level_m": "what the error is over",
-    "KIND_fault_free_m": "part of it",
-    "KIND_one_fault_m": "part of it",
-    "KIND_two_faults_m": "part of it",
-    "KIND_cause": "what set the level",
-    "KIND_status": "verdict on the level",
-    "status": "what became of the epoch",
+    "error_m": "position on the map, + toward the end of the line",
+    "KIND_level_m": "protection level",
+    "KIND_fault_free_m": "part of the level",
+    "KIND_one_fault_m": "part of the level",
+    "KIND_two_faults_m": "part of the level",
+    "KIND_cause": "cause of the level",
+    "KIND_status": "status of the level",
+    "status": "status of the epoch",
     "n_used": "satellites used",
-    "vouched": "status ok and no alarm: misleading information",
+    "usable": "status ok and no alarm: misleading information",
 }
 
 
@@ -98,9 +97,9 @@ class LevelledRun:
     ----------
     name : str
     kind : str
-        What the level rests on; prefix of its columns.
+        Kind of the levels; prefix of their columns.
     alarm_limit_m : float or None
-        That the run had.
+        Alarm limit of the run.
     """
 
     name: str
@@ -137,7 +136,7 @@ def counted_levels(
     *,
     levels_of: LevelsOf,
 ) -> Floats:
-    """Levels as they count: infinite where a position has no bound, NaN where there is no position.
+    """Levels as counted: infinite where a position has no usable level, NaN without a position.
 
     Parameters
     ----------
@@ -148,19 +147,19 @@ def counted_levels(
     status, verdict : ndarray of str, shape (T,)
         Of the position (`railfix.core.reasons.Status`), of the level (`railfix.integrity.protection.Status`);
         blank where there is none.
-    levels_of : {"vouched", "all"}
+    levels_of : {"usable", "all"}
 
     Returns
     -------
     ndarray, shape (T,) [m]
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
-    if levels_of == "vouched":
-        bound = np.where(_vouched(status, verdict), bound, np.inf)
+    if levels_of == "usable":
+        bound = np.where(_usable(status, verdict), bound, np.inf)
     return np.where(has, bound, np.nan)
 
 
-def _vouched(status: Strings, verdict: Strings) -> Masks:
+def _usable(status: Strings, verdict: Strings) -> Masks:
     return np.asarray((status == Status.OK.text) & (verdict != _ALARM))
 
 
@@ -180,9 +179,9 @@ def epochs_diagram(
     epochs : polars.DataFrame
         `railfix.evaluate.EPOCH_COLUMNS` and the levels, in order of time.
     kind : str
-        Whose levels.
+        Kind of the levels.
     alarm_limit_m : float [m]
-    levels_of : {"vouched", "all"}
+    levels_of : {"usable", "all"}
     options : EvaluationOptions
     """
     spanned = epochs.filter("in_reference")
@@ -201,14 +200,14 @@ def epochs_diagram(
 def positions_diagram(
     positions: pl.DataFrame, *, alarm_limit_m: float, levels_of: LevelsOf, options: EvaluationOptions
 ) -> Stanford:
-    """The same of a run without a reference: nothing is judged, availability and continuity are told.
+    """Stanford diagram of a run without a reference: availability and continuity only.
 
     Parameters
     ----------
     positions : polars.DataFrame
         Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`, in order of time.
     alarm_limit_m : float [m]
-    levels_of : {"vouched", "all"}
+    levels_of : {"usable", "all"}
     options : EvaluationOptions
     """
     level = counted_levels(
@@ -229,16 +228,16 @@ def _sorted(
         error_m,
         level_m,
         alarm_limit_m=alarm_limit_m,
-        windows_s=options.windows_s,
+        windows_s=WINDOWS_S,
         block_s=options.block_s,
     )
 
 
 def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: EvaluationOptions) -> dict[str, Integrity]:
-    """Levels against errors, by kind; empty where no run has any.
+    """Levels against errors by kind; empty where no run has levels.
 
-    Every run is counted at the limits asked for, at its own, and at those of the others, so that rows
-    of several runs together hold them all.
+    Every run is counted at the alarm limits of the options and at those of all runs, so that rows of several runs
+    together include each of them.
 
     Parameters
     ----------
@@ -257,14 +256,14 @@ def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: Eva
             for part in epochs.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
                 rows += _counted(part, run, limits, options)
         names = pl.col("run").is_in([run.name for run in mine])
-        found[kind] = Integrity(stanford=_pooled(rows, options), beyond=_beyond(epochs.filter(names), kind))
+        found[kind] = Integrity(stanford=_pooled(rows), beyond=_beyond(epochs.filter(names), kind))
     return found
 
 
 def _counted(
     part: pl.DataFrame, run: LevelledRun, limits: Sequence[float], options: EvaluationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Counts of one antenna of a run: as a whole, then by environment."""
+    """Counts of one antenna of a run: all epochs, then by environment."""
     keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
     groups = [(ALL, ALL, part)]
     environments = part.filter("in_reference").partition_by("environment", maintain_order=True)
@@ -295,8 +294,8 @@ def _counted(
                 yield row
 
 
-def _pooled(rows: list[dict[str, Any]], options: EvaluationOptions) -> pl.DataFrame:
-    """The rows, those of both antennas together, those of all runs of a configuration together; with shares."""
+def _pooled(rows: list[dict[str, Any]]) -> pl.DataFrame:
+    """Rows with their sums over both antennas and over all runs of a configuration; with shares."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))
@@ -305,13 +304,13 @@ def _pooled(rows: list[dict[str, Any]], options: EvaluationOptions) -> pl.DataFr
     named = [*KEYS, "grouping", "group", "levels_of", "alarm_limit_m"]
     counts = [name for name in parts[0].columns if name not in named and name != "own_limit"]
     whole = pl.concat(parts).group_by(named, maintain_order=True).agg(pl.col("own_limit").all(), pl.col(counts).sum())
-    windows = [f"{name}_{window:g}_s" for window in options.windows_s for name in ("windows", "kept")]
+    windows = [f"{name}_{window:g}_s" for window in WINDOWS_S for name in ("windows", "kept")]
     whole = whole.with_columns(pl.when(pl.col("grouping") == ALL).then(pl.col(name)).alias(name) for name in windows)
     shares = {
         "availability": ("available", "epochs"),
         "availability_of_observed": ("available", "observed"),
         "beyond_share": ("beyond", "judged"),
-        **{f"continuity_{window:g}_s": (f"kept_{window:g}_s", f"windows_{window:g}_s") for window in options.windows_s},
+        **{f"continuity_{window:g}_s": (f"kept_{window:g}_s", f"windows_{window:g}_s") for window in WINDOWS_S},
     }
     whole = whole.with_columns(
         pl.when(pl.col(below) > 0).then(pl.col(above) / pl.col(below)).alias(name)
@@ -321,16 +320,16 @@ def _pooled(rows: list[dict[str, Any]], options: EvaluationOptions) -> pl.DataFr
 
 
 def _beyond(epochs: pl.DataFrame, kind: str) -> pl.DataFrame:
-    """Epochs whose error is over a finite level, the largest excess first."""
+    """Epochs whose error exceeds a finite level, the largest excess first."""
     level = pl.col(level_name(kind))
-    told = {name: f"{kind}_protection_{name}" for name in (*PARTS, *TOLD)}
+    told = {name: f"{kind}_protection_{name}" for name in (*PARTS, *STATED)}
     absent = [name for name in told.values() if name not in epochs.columns]
     blank = [pl.lit(None, pl.Float64 if name.endswith("_m") else pl.String).alias(name) for name in absent]
     over = epochs.with_columns(blank).filter(
         "in_reference", "reference_good", "positioned", level.is_finite() & (pl.col("error_m").abs() > level)
     )
     excess = pl.col("error_m").abs() - level
-    verdict = pl.Series("vouched", _vouched(_words(over, "status"), _words(over, told["status"])))
+    verdict = pl.Series("usable", _usable(_words(over, "status"), _words(over, told["status"])))
     named = {f"{kind}_{name}": pl.col(column) for name, column in told.items()}
     listed = over.with_columns(verdict, level.alias(f"{kind}_level_m"), **named)
     return listed.sort(excess, descending=True, maintain_order=True).select(

@@ -11,21 +11,21 @@ from railfix.evaluate.figures import POSITIONS, at_largest, positioned
 #: Columns of the table of intervals beside its keys, with their unit and meaning.
 INTERVAL_COLUMNS: Final[dict[str, str]] = {
     "position": "`constrained`, `constrained_ok` or `conventional`",
-    "intervals": "pairs of positions that follow each other while the train ran",
-    "standing": "pairs while it stood, which count for the gaps of time alone",
-    "interval_mean_m": "distance that the train ran between two positions",
+    "intervals": "pairs of consecutive positions between which the train moved",
+    "standing": "pairs between which it did not move; they count for the time gaps only",
+    "interval_mean_m": "distance travelled between consecutive positions",
     "interval_p50_m": "the same",
     "interval_p95_m": "the same",
     "interval_p99_m": "the same",
     "interval_max_m": "the same",
-    "interval_max_from": "time of the position before the largest, GPS time",
-    "interval_max_chainage_m": "where the train was at it; empty in a gap of the reference",
-    "gap_p50_s": "time between two positions",
+    "interval_max_from": "time of the position before the largest interval, GPS time",
+    "interval_max_chainage_m": "chainage there; empty in a gap of the reference",
+    "gap_p50_s": "time between consecutive positions",
     "gap_p95_s": "the same",
     "gap_max_s": "the same",
-    "gap_max_from": "time of the position before the longest, GPS time",
-    "before_first_s": "from the first epoch in the reference to the first position",
-    "after_last_s": "from the last position to the last epoch in the reference",
+    "gap_max_from": "time of the position before the longest gap, GPS time",
+    "before_first_s": "from the first epoch with a reference to the first position",
+    "after_last_s": "from the last position to the last epoch with a reference",
 }
 _OF: Final = ("run", "antenna")
 

@@ -11,17 +11,17 @@ from railfix.evaluate.figures import positioned
 
 #: Columns of the table of levels beside its keys, with their unit and meaning.
 LEVEL_COLUMNS: Final[dict[str, str]] = {
-    "level": "column of the run",
+    "level": "column of the level",
     "position": "`constrained` or `constrained_ok`",
-    "observed": "epochs with observations inside the reference",
+    "observed": "epochs with observations and reference",
     "positions": "epochs with a position",
-    "infinite": "of the positions with an infinite level",
-    "with_level": "of the positions with a finite level",
+    "infinite": "positions with an infinite level",
+    "with_level": "positions with a finite level",
     "level_share": "with_level / observed",
-    "level_p50_m": "finite levels",
-    "level_p95_m": "finite levels",
-    "errors": "finite levels with an error: the reference is good",
-    "over_level": "errors over their level",
+    "level_p50_m": "finite levels, median",
+    "level_p95_m": "finite levels, 95th percentile",
+    "errors": "finite levels with an error",
+    "over_level": "errors above their level",
     "over_level_share": "over_level / errors",
 }
 

@@ -98,7 +98,7 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), "polars": pl.__version__},
         "command": list(sys.argv),
-        "options": evaluation.options.as_dict(),
+        "options": evaluation.options.model_dump(),
         "inputs": list(evaluation.inputs),
         "runs": [
             {**asdict(run), "path": str(run.path), "inputs": [entry["path"] for entry in run.inputs]}

@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
-from railfix.evaluate.along_track import along_track_error
+from railfix.evaluate.along_track import along_track_error, straight_distance
 from railfix.evaluate.options import Method
 from railfix.evaluate.run_folder import RunFolder
 from railfix.track import Track, read_track
@@ -79,6 +79,9 @@ class Errors:
     method : {"chainage", "trajectory"}
     error_m, conventional_error_m : ndarray, shape (T,) [m]
         + toward the end of the line.
+    distance_m : ndarray, shape (T,) [m]
+        Straight distance between the position on the map and the reference: its point on the map where the
+        trajectory is read, else its own position.
     reference_chainage_m : ndarray, shape (T,) [m]
         Of the reference, for places; from the map where the reference has none.
     files : tuple of Path
@@ -89,6 +92,7 @@ class Errors:
     method: Method
     error_m: Floats
     conventional_error_m: Floats
+    distance_m: Floats
     reference_chainage_m: Floats
     files: tuple[tuple[str, Path], ...] = ()
     notes: tuple[str, ...] = ()
@@ -121,6 +125,7 @@ def errors_of(
                 method="chainage",
                 error_m=answers.chainage_m - answers.reference_chainage_m,
                 conventional_error_m=answers.conventional_chainage_m - answers.reference_chainage_m,
+                distance_m=np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1),
                 reference_chainage_m=answers.reference_chainage_m,
             )
         if method == "chainage":
@@ -137,6 +142,7 @@ def errors_of(
         method="trajectory",
         error_m=along_track_error(arc, answers.reference_ecef_m, trajectory),
         conventional_error_m=along_track_error(other, answers.reference_ecef_m, trajectory),
+        distance_m=straight_distance(arc, answers.reference_ecef_m, trajectory),
         reference_chainage_m=place,
         files=used,
         notes=(*notes, *said),

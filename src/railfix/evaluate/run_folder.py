@@ -1,9 +1,9 @@
-"""The folder of a run, read back: positions, what they were made from, where those files are now."""
+"""Read the folder of a run: a table of positions, ``run.json``, and the present paths of the input files."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,48 +12,60 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, MismatchError
+from railfix.core.reasons import Status
 from railfix.pipeline.protection_levels import KINDS
 
-#: Columns of the positions without which there is nothing to evaluate.
-NEEDED: Final = (
-    "time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m", "n_used",
-    "conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m",
-)  # fmt: skip
-
-
-#: Of protection levels whose run does not tell what they rest on.
+#: Columns that every table of positions has.
+NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
+#: Columns of the conventional position.
+CONVENTIONAL: Final = (
+    "conventional_chainage_m",
+    "conventional_x_m",
+    "conventional_y_m",
+    "conventional_z_m",
+)
+#: Table of single-epoch positions. Another table of the same run, such as ``train``, takes `SINGLE_EPOCH` from it.
+POSITIONS_TABLE: Final = "positions"
+SINGLE_EPOCH: Final = ("n_used", *CONVENTIONAL)
+#: Kind of protection levels where neither positions nor ``run.json`` name it.
 UNKNOWN_KIND: Final = "unknown"
+_KEYS: Final = ("time_gpst", "antenna")
+_ENDINGS: Final = (".parquet", ".csv")
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder:
-    """A run as it was written.
+    """Results of a run, with one of its tables of positions.
 
     Attributes
     ----------
     path : Path
     positions_path : Path
-        ``positions.parquet``, or ``positions.csv`` where that is absent.
+        The Parquet file of the table, or its CSV file where that is absent.
     positions : polars.DataFrame
-        One row an epoch and antenna, see `railfix.pipeline.tables.POSITION_COLUMNS`.
+        One row per epoch and antenna, see `railfix.pipeline.tables.POSITION_COLUMNS`; ``observed`` tells whether the
+        antenna has observations.
     record : mapping
         ``run.json``.
+    table : str
+        Name of the table: "positions" for the single-epoch positions.
     """
 
     path: Path
     positions_path: Path
     positions: pl.DataFrame
     record: Mapping[str, Any]
+    table: str = POSITIONS_TABLE
 
     @property
     def antennas(self) -> list[str]:
-        """In the order of the rows."""
+        """Names in the order of the rows."""
         return [str(name) for name in self.positions["antenna"].unique(maintain_order=True)]
 
     @property
     def chainage_of(self) -> Mapping[str, str]:
-        """The point of the vehicle whose chainage is given, by antenna."""
+        """Reference point of the chainage, by antenna."""
         return dict(self._line.get("chainage_of") or {})
 
     @property
@@ -63,46 +75,48 @@ class RunFolder:
 
     @property
     def track_facts(self) -> Mapping[str, Any]:
-        """How the run had read its track."""
+        """Facts on the track that the run used."""
         return dict(self._line.get("track") or {})
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings in force, and which kinds of input there were, by dotted name."""
+        """Settings in force and kinds of input, by dotted name."""
         flat = flattened(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.record.get("inputs", ())}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
 
     @property
     def protection(self) -> Mapping[str, Any]:
-        """What the protection levels rest on; empty where they were off or the run tells nothing."""
-        found = self.record.get("protection")
-        return found if isinstance(found, Mapping) else {}
+        """Assumptions of the protection levels; empty without levels."""
+        assumptions = self.record.get("protection")
+        return assumptions if isinstance(assumptions, Mapping) else {}
 
     @property
     def level_kind(self) -> str | None:
-        """What the protection levels rest on in a word, `UNKNOWN_KIND` where the run does not tell; None without.
+        """Kind of the protection levels, `UNKNOWN_KIND` where it is not recorded, None without levels.
 
         Raises
         ------
         InputFileError
-            Positions and record tell different kinds.
+            Positions and ``run.json`` name different kinds.
         """
         level = "protection_level_m"
         if level not in self.positions.columns or self.positions[level].null_count() == len(self.positions):
-            return None if not self.protection else self._kind
+            return self._kind if self.protection and self.table == POSITIONS_TABLE else None
         return self._kind
 
     @property
     def _kind(self) -> str:
-        told = {self.protection.get("kind")}
+        if self.table != POSITIONS_TABLE:
+            return self.table
+        named = {self.protection.get("kind")}
         if "protection_kind" in self.positions.columns:
-            told |= set(self.positions["protection_kind"].cast(pl.String).unique())
-        known = [kind for kind in KINDS if kind in told]
+            named |= set(self.positions["protection_kind"].cast(pl.String).unique())
+        known = [kind for kind in KINDS if kind in named]
         if len(known) > 1:
             raise InputFileError(
                 self.positions_path,
-                f"its protection_kind and that of run.json are both {' and '.join(known)}; expected one kind in a run",
+                f"protection_kind is {' and '.join(known)} in the positions and run.json; one kind per run expected",
             )
         return known[0] if known else UNKNOWN_KIND
 
@@ -113,7 +127,7 @@ class RunFolder:
         Raises
         ------
         InputFileError
-            It is no positive number.
+            It is not a positive number.
         """
         limit = self.protection.get("alarm_limit_m")
         if limit is None:
@@ -125,7 +139,7 @@ class RunFolder:
         return float(limit)
 
     def column_of(self, name: str) -> str:
-        """Name of a column of the positions in tables of several runs: levels say what they rest on."""
+        """Name of a column of the positions in tables of several runs: levels are prefixed with their kind."""
         return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
     @property
@@ -137,10 +151,10 @@ class RunFolder:
         return [entry for entry in self.record.get("inputs", ()) if entry["input"] == kind]
 
     def located(self, kind: str) -> list[Path]:
-        """Where the files of one kind of input are now; as recorded where they are not found.
+        """Present paths of the files of one kind of input; as recorded where they are not found.
 
-        A relative path was written from another working folder, perhaps: it is looked for there, from
-        the run's folder, and from the one above it.
+        A relative path may refer to another working folder: it is searched for from the present one, from
+        the folder of the run, and from its parent.
         """
         return [self._locate(Path(entry["path"])) for entry in self.inputs(kind)]
 
@@ -150,7 +164,7 @@ class RunFolder:
 
 
 def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name; lists as words."""
+    """Nested settings by dotted name; lists as text."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         name = f"{prefix}{key}"
@@ -161,58 +175,95 @@ def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def read_run(path: Path) -> RunFolder:
+def tables_of(path: Path) -> list[str]:
+    """Names of the tables of positions in the folder of a run, the single-epoch positions first."""
+    return [name for name in (POSITIONS_TABLE, "train") if any((path / f"{name}{end}").is_file() for end in _ENDINGS)]
+
+
+def read_run(path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None) -> RunFolder:
     """Read the folder that `railfix run` wrote.
+
+    Parameters
+    ----------
+    path : Path
+    table : str
+        Which table of positions. A table other than "positions" takes the satellites used and the conventional
+        position from the single-epoch positions of the same time and antenna.
+    conventional : Path, optional
+        Folder of another run on the same log, whose conventional positions are compared with instead: a run with
+        `screens` elevation and C/N0 alone gives those of P1.
 
     Raises
     ------
     InputFileError
         No such folder, or its files are missing or not what they should be.
+    MismatchError
+        `conventional` is a run on another log.
     """
     if not path.is_dir():
-        what = "is a file" if path.exists() else "there is no such folder"
-        raise InputFileError(path, f"{what}, expected the folder that railfix run wrote; name that")
-    parquet, text = path / "positions.parquet", path / "positions.csv"
-    file = parquet if parquet.is_file() else text
-    if not file.is_file():
-        raise InputFileError(path, "holds neither positions.parquet nor positions.csv; name a folder of railfix run")
-    positions = _positions(file)
-    missing = [name for name in NEEDED if name not in positions.columns]
+        problem = "is a file" if path.exists() else "there is no such folder"
+        raise InputFileError(path, f"{problem}, expected the folder that railfix run wrote; name that")
+    record = _record(path / "run.json") if (path / "run.json").is_file() else None
+    file, rows = _read_table(path, table, (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED)
+    if table == POSITIONS_TABLE:
+        rows = rows.with_columns(observed=pl.col("status") != Status.NO_OBSERVATION.text)
+    else:
+        single = read_run(path).positions
+        added = [name for name in (*SINGLE_EPOCH, "observed") if name not in rows.columns]
+        rows = rows.join(single.select(*_KEYS, *added), on=_KEYS, how="left", maintain_order="left")
+        rows = rows.with_columns(pl.col("observed").fill_null(value=False))
+    record = _record(path / "run.json") if record is None else record
+    if conventional is not None:
+        other = read_run(conventional)
+        _check_same_log(path, record, conventional, other.record)
+        unscreened = other.positions.select(*_KEYS, *CONVENTIONAL)
+        rows = rows.drop(CONVENTIONAL).join(unscreened, on=_KEYS, how="left", maintain_order="left")
+    return RunFolder(path=path, positions_path=file, positions=rows, record=record, table=table)
+
+
+def _check_same_log(path: Path, record: Mapping[str, Any], other: Path, of_other: Mapping[str, Any]) -> None:
+    logs = [
+        sorted(str(entry.get("sha256")) for entry in entries.get("inputs", ()) if entry["input"] in ("front", "rear"))
+        for entries in (record, of_other)
+    ]
+    if logs[0] != logs[1]:
+        raise MismatchError(f"{other}: is not a run on the log of {path}; give one whose observations are the same")
+
+
+def _read_table(path: Path, name: str, needed: Sequence[str]) -> tuple[Path, pl.DataFrame]:
+    """File and rows of one table of a run, in order of time."""
+    file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
+    if file is None:
+        raise InputFileError(path, f"holds neither {name}.parquet nor {name}.csv; name a folder of railfix run")
+    rows = _table(file)
+    missing = [column for column in needed if column not in rows.columns]
     if missing:
-        raise InputFileError(file, f"has no column {missing[0]}; expected the positions of railfix run")
-    if not len(positions):
+        raise InputFileError(file, f"has no column {missing[0]}; expected the {name} of railfix run")
+    if not len(rows):
         raise InputFileError(file, "has no rows; there is nothing to evaluate")
-    if positions.select(pl.struct("antenna", "time_gpst").is_duplicated().any()).item():
-        raise InputFileError(file, "has an antenna twice at one time; expected one row an epoch and antenna")
-    return RunFolder(
-        path=path,
-        positions_path=file,
-        positions=positions.sort("time_gpst", maintain_order=True),
-        record=_record(path / "run.json"),
-    )
+    if rows.select(pl.struct(_KEYS).is_duplicated().any()).item():
+        raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
+    return file, rows.sort("time_gpst", maintain_order=True)
 
 
-def _positions(file: Path) -> pl.DataFrame:
+def _table(file: Path) -> pl.DataFrame:
     try:
         if file.suffix == ".parquet":
             table = pl.read_parquet(file)
         else:
             table = pl.read_csv(file, schema_overrides={"time_gpst": pl.Datetime("ns")}, infer_schema_length=None)
     except (PolarsError, OSError) as error:
-        told = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(file, f"cannot be read as a table ({told}); run railfix run again") from error
-    numbers = [
-        name for name in table.columns if name in NEEDED[3:8] or name.endswith("_m") or name in ("n_used", "n_rejected")
-    ]
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputFileError(file, f"cannot be read as a table ({reason}); run railfix run again") from error
+    numbers = [name for name in table.columns if name.endswith("_m") or name in ("n_used", "n_rejected")]
     try:
-        table = table.with_columns(
+        return table.with_columns(
             pl.col(numbers).cast(pl.Float64),
             pl.col("antenna", "status").cast(pl.String),
             pl.col("time_gpst").cast(pl.Datetime("ns")),
         )
     except PolarsError as error:
-        raise InputFileError(file, f"is no table of positions ({str(error).splitlines()[0]})") from error
-    return table
+        raise InputFileError(file, f"is not a table of positions ({str(error).splitlines()[0]})") from error
 
 
 def _record(file: Path) -> Mapping[str, Any]:

@@ -135,11 +135,11 @@ def _kept(*charts: Chart) -> tuple[Chart, ...]:
 
 
 def _stanford(run: ReportedRun, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
-    """The diagram of the levels that the run vouched for, and of all."""
+    """The diagram of the levels that the run usable, and of all."""
     kind = run.folder.level_kind
     if kind is None:
         return
-    for levels_of, words in zip(LEVELS_OF, ("levels vouched for", "levels alone"), strict=True):
+    for levels_of, words in zip(LEVELS_OF, ("usable levels", "levels alone"), strict=True):
         diagram = epochs_diagram(errors, kind, alarm_limit_m=limit_m, levels_of=levels_of, options=EvaluationOptions())
         yield stanford(diagram, title=f"Stanford diagram, {words} ({kind})")
 

@@ -23,9 +23,9 @@ _KINDS: Final = {
     "separation": "of solutions without one or two satellites; hypotheses of faults of satellites and of the "
     "surroundings of the antenna",
 }
-_LEVELS: Final = {"vouched": "vouched", "all": "all"}
+_LEVELS: Final = {"usable": "usable", "all": "all"}
 _EXPLAINED: Final = (
-    "Levels vouched (for): where the status is ok and no alarm was raised; every other position counts as without a "
+    "Usable levels: where the status is ok and no alarm was raised; every other position counts as without a "
     "bound. All: every finite level, whatever the verdict on it."
 )
 _REGIONS: Final = {
@@ -132,9 +132,9 @@ def _worst(found: Integrity, name: str, run: ReportedRun) -> str:
     kind = run.folder.level_kind
     beyond = found.beyond.filter(pl.col("run") == name)
     if not len(beyond):
-        return "<p>No error is over its level, vouched for or not.</p>"
-    vouched = int(beyond["vouched"].sum())
-    head = "time|antenna|chainage|environment|error|level|parts|set by|verdict|status|satellites|vouched for".split("|")
+        return "<p>No error is over its level, usable or not.</p>"
+    usable = int(beyond["usable"].sum())
+    head = "time|antenna|chainage|environment|error|level|parts|set by|verdict|status|satellites|usable".split("|")
     rows = []
     for row in beyond.head(WORST).iter_rows(named=True):
         parts = (row[f"{kind}_{part}"] for part in ("fault_free_m", "one_fault_m", "two_faults_m"))
@@ -151,11 +151,11 @@ def _worst(found: Integrity, name: str, run: ReportedRun) -> str:
                 _word(row[f"{kind}_status"]),
                 _word(row["status"]),
                 number(row["n_used"], 0),
-                "yes" if row["vouched"] else "no",
+                "yes" if row["usable"] else "no",
             ]
         )
     caption = (
-        f"Errors over their level: {len(beyond):,}, of them {vouched:,} vouched for"
+        f"Errors over their level: {len(beyond):,}, of them {usable:,} usable"
         f"{f'; the {WORST} furthest over it' if len(beyond) > WORST else ''}. Metres; parts: without a fault, "
         "one fault, two faults"
     )

@@ -1,4 +1,4 @@
-"""What a nearby reference station says of each satellite: errors that both receivers have in common."""
+"""Common range errors per satellite, measured by a nearby reference station."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from railfix.positioning.section_search import SearchIndex
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Half the length of the north-south line through the station that its codes are prepared on [deg]: about 50 m.
+#: Half length of the north-south track through the station on which its ranges are corrected [deg]; about 50 m.
 _HALF_LINE_DEG = 0.0005
 
 
@@ -38,9 +38,9 @@ class BaseStation:
     time : ndarray of datetime64[ns], shape (B,)
     satellite : ndarray of str, shape (S,)
     error_m : ndarray, shape (B, S) [m]
-        Corrected code less range and clock; NaN where not observed.
+        Corrected pseudorange minus range and receiver clock; NaN where not observed.
     smoothed : bool
-        Whether the codes were smoothed by their phases.
+        Whether the pseudoranges were smoothed by carrier phase.
     """
 
     name: str
@@ -50,7 +50,7 @@ class BaseStation:
     smoothed: bool
 
     def at(self, time: Datetimes, satellite: Strings, *, largest_gap_s: float) -> Floats:
-        """Errors at other times, linearly between the station's epochs, shape (T, K) [m].
+        """Errors at other times, interpolated linearly between the station's epochs, shape (T, K) [m].
 
         NaN for satellites that the station does not see, outside its log and in gaps.
         """
@@ -73,17 +73,17 @@ class BaseStation:
 def base_station(
     parts: Iterable[Observations], processor: EpochProcessor, position_ecef_m: Floats, *, name: str
 ) -> BaseStation:
-    """Errors of a station that stands at a known place.
+    """Common range errors from the log of a station at a known position.
 
-    Its codes are corrected as the train's are, with the same settings; where it has carrier phases they
-    smooth its codes, so that little of its own noise goes into the result. Its own multipath stays in.
+    Its pseudoranges are corrected like those of the train, with the same settings, and smoothed by carrier phase
+    where available, which reduces the station's own noise. The station's own multipath remains.
 
     Parameters
     ----------
     parts : iterable of Observations
-        Pieces of its log, in order of time.
+        Parts of its log, in order of time.
     processor : EpochProcessor
-        Of the train: its settings, records, ionosphere and SBAS correct the station's codes, too.
+        Of the train; its settings, ephemerides, ionosphere and SBAS also correct the station's pseudoranges.
     position_ecef_m : ndarray, shape (3,) [m]
     name : str
 
@@ -100,19 +100,19 @@ def base_station(
     times: list[Datetimes] = []
     errors: list[dict[str, Floats]] = []
     for obs in parts:
-        one = prepare(obs, book.of(obs), config, navigation, index, processor.klobuchar, sbas=processor.sbas)
-        slips, state = slips_of(one, navigation, config, state)
-        one, state = smoothed(one, slips, config, state)
+        prepared = prepare(obs, book.of(obs), config, navigation, index, processor.klobuchar, sbas=processor.sbas)
+        slips, state = slips_of(prepared, navigation, config, state)
+        prepared, state = smoothed(prepared, slips, config, state)
         phases |= bool(np.isfinite(obs.phase_cycles).any())
-        distance, _ = range_with_rotation(one.satellites.position_ecef_m, position_ecef_m)
-        residual = np.where(one.reason == Reason.USED, one.corrected_code_m - distance, np.nan)
-        clock = robust_clock(residual, one.sigma_m, one.groups).clock_m
+        distance, _ = range_with_rotation(prepared.satellites.position_ecef_m, position_ecef_m)
+        residual = np.where(prepared.reason == Reason.USED, prepared.corrected_code_m - distance, np.nan)
+        clock = robust_clock(residual, prepared.sigma_m, prepared.groups).clock_m
         owner = np.zeros(residual.shape[1], dtype=np.intp)
-        for g, group in enumerate(one.groups):
+        for g, group in enumerate(prepared.groups):
             owner[group] = g
         error = residual - clock[:, owner]
         of_satellite: dict[str, Floats] = {}
-        for k, satellite in enumerate(one.satellite.tolist()):
+        for k, satellite in enumerate(prepared.satellite.tolist()):
             before = of_satellite.get(satellite)
             of_satellite[satellite] = error[:, k] if before is None else np.where(np.isnan(before), error[:, k], before)
         times.append(obs.time)
@@ -136,12 +136,12 @@ def base_station(
 def base_station_from_files(
     paths: Sequence[Path], processor: EpochProcessor, *, position_ecef_m: Floats | None = None
 ) -> BaseStation:
-    """The same from RINEX files; the place is that of the header where none is given.
+    """Common range errors from RINEX files; the position is that of the header where none is given.
 
     Raises
     ------
     InputFileError
-        No place is known, or no satellite's error can be told.
+        No position is known, or no error could be computed.
     """
     parts = list(scan_observations(paths, epochs=20_000))
     place = position_ecef_m if position_ecef_m is not None else parts[0].header.approximate_ecef_m
@@ -149,7 +149,5 @@ def base_station_from_files(
         raise InputFileError(paths[0], "its header has no position; give that of the station (--base-position)")
     station = base_station(parts, processor, np.asarray(place), name=parts[0].header.marker or paths[0].name)
     if not np.isfinite(station.error_m).any():
-        raise InputFileError(
-            paths[0], "of no satellite the station's error can be told; is the navigation file of the same day?"
-        )
+        raise InputFileError(paths[0], "gives no range error of any satellite; is the navigation file of the same day?")
     return station

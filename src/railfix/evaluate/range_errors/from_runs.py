@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,20 +21,20 @@ from railfix.run.chunks import aligned
 from railfix.run.driver import open_inputs
 from railfix.run.past import past_run
 
-#: Told after each chunk: name of the run and epochs done in it.
-Told = Callable[[str, int], None]
+#: Called after each chunk with the name of the run and the epochs processed so far.
+OnChunk = Callable[[str, int], None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelInputs:
-    """One run that a model is made from.
+    """A run with its reference trajectory, and optionally a reference station.
 
     Attributes
     ----------
     run : Path
         Folder written by ``railfix run``.
     reference : Path
-        Where its antennas were (`railfix.io.reference_log`).
+        Reference trajectory of its antennas (`railfix.io.reference_log`).
     base : tuple of Path
         RINEX files of a nearby reference station; may be empty.
     base_position_ecef_m : ndarray, shape (3,), or None [m]
@@ -47,14 +47,16 @@ class ModelInputs:
     base_position_ecef_m: Floats | None = None
 
 
-@dataclass(kw_only=True)
-class _Gathered:
-    samples: list[ErrorSamples] = field(default_factory=list)
-    times: list[np.datetime64] = field(default_factory=list)
-    epochs: int = 0
-    files: dict[str, str] = field(default_factory=dict)
-    bases: list[str] = field(default_factory=list)
-    conditions: list[str] = field(default_factory=list)
+@dataclass(frozen=True, kw_only=True)
+class _RunErrors:
+    """Range errors of one run, with what the model's source says of it."""
+
+    samples: tuple[ErrorSamples, ...]
+    times: tuple[np.datetime64, ...]
+    epochs: int
+    files: Mapping[str, str]
+    base: str
+    conditions: str
 
 
 def error_model_from_runs(
@@ -62,17 +64,17 @@ def error_model_from_runs(
     *,
     fit: ErrorModelFit | None = None,
     limits: GatherLimits | None = None,
-    progress: Told | None = None,
+    progress: OnChunk | None = None,
 ) -> tuple[ErrorModel, ErrorSamples]:
-    """Errors of all runs' pseudoranges by bin, before and after the screens.
+    """Error model of the pseudoranges of several runs, before and after the screens.
 
-    Each run is positioned once more with the settings it was done with, so that the corrected codes,
-    the satellites and the verdict of every screen are at hand.
+    Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the
+    verdict of every screen.
 
     Parameters
     ----------
     inputs : sequence of ModelInputs
-        All of them with a reference station, or none.
+        All with a reference station, or all without.
     fit : ErrorModelFit, optional
     limits : GatherLimits, optional
     progress : callable, optional
@@ -81,81 +83,86 @@ def error_model_from_runs(
     -------
     ErrorModel
     ErrorSamples
-        What it was fitted to.
+        The samples that the model was fitted to.
 
     Raises
     ------
     MismatchError
-        Some runs have a reference station and others none, their screens differ, or no range has an error that
-        can be told.
+        Some runs have a reference station and others have none, their conditions differ, or no range error
+        could be computed.
     RailfixError
         A file is not what it should be, or has changed since the run.
     """
-    fit = fit or ErrorModelFit()
-    with_base = {bool(one.base) for one in inputs}
+    fit, limits = fit or ErrorModelFit(), limits or GatherLimits()
+    with_base = {bool(source.base) for source in inputs}
     if len(with_base) != 1:
-        raise MismatchError("give a reference station for every run or for none: their errors are of another kind")
-    gathered = _Gathered()
-    for number, one in enumerate(inputs):
-        _gather(one, number, gathered, fit, limits or GatherLimits(), progress)
-    samples = joined(gathered.samples) if gathered.samples else None
-    if samples is None or not len(samples.error_m):
-        raise MismatchError(
-            "no pseudorange has an error that can be told; do run, reference and station belong together?"
-        )
-    if len(set(gathered.conditions)) > 1:
-        told = " and ".join(sorted(set(gathered.conditions)))
-        raise MismatchError(f"the runs were done under different conditions: {told}; make a model for each")
+        raise MismatchError("give a reference station for every run or for none: the errors are of different kinds")
+    runs = [_run_errors(source, number, fit, limits, progress) for number, source in enumerate(inputs)]
+    parts = [samples for run in runs for samples in run.samples]
+    if not any(len(part.error_m) for part in parts):
+        raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
+    samples = joined(parts)
+    conditions = sorted({run.conditions for run in runs})
+    if len(conditions) > 1:
+        raise MismatchError(f"the runs have different conditions: {' and '.join(conditions)}; make a model for each")
+    times = [time for run in runs for time in run.times]
+    files = {path: digest for run in runs for path, digest in run.files.items()}
     model = ErrorModel(
         bins=fit.bins,
         before=fit_bins(samples, np.ones(len(samples.error_m), dtype=np.bool_), fit),
         after=fit_bins(samples, samples.used, fit),
-        covers="local" if with_base.pop() else "satellite_and_atmosphere",
+        covers="local" if with_base == {True} else "satellite_and_atmosphere",
         source=ErrorModelSource(
-            runs=tuple(str(one.run) for one in inputs),
-            base=", ".join(dict.fromkeys(gathered.bases)),
-            conditions=gathered.conditions[0],
-            epochs=gathered.epochs,
-            start=str(min(gathered.times)),
-            end=str(max(gathered.times)),
+            runs=tuple(str(source.run) for source in inputs),
+            base=", ".join(dict.fromkeys(run.base for run in runs if run.base)),
+            conditions=conditions[0],
+            epochs=sum(run.epochs for run in runs),
+            start=str(min(times)),
+            end=str(max(times)),
             railfix_version=__version__,
-            files=tuple(gathered.files.items()),
+            files=tuple(files.items()),
         ),
     )
     return model, samples
 
 
-def _gather(
-    one: ModelInputs, number: int, into: _Gathered, fit: ErrorModelFit, limits: GatherLimits, progress: Told | None
-) -> None:
-    """Errors of one run, chunk by chunk."""
-    past = past_run(one.run)
+def _run_errors(
+    source: ModelInputs, number: int, fit: ErrorModelFit, limits: GatherLimits, progress: OnChunk | None
+) -> _RunErrors:
+    """Range errors of one run, chunk by chunk."""
+    past = past_run(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options)
-    references = read_reference(one.reference, tuple(past.inputs.logs))
-    processor, state, done = EpochProcessor(past.config, navigation, line.trajectories), State(), 0
+    references = read_reference(source.reference, tuple(past.inputs.logs))
+    processor, state = EpochProcessor(past.config, navigation, line.trajectories), State()
     base: BaseStation | None = None
-    if one.base:
-        base = base_station_from_files(one.base, processor, position_ecef_m=one.base_position_ecef_m)
-        into.bases.append(base.name)
-    into.conditions.append(conditions_of(past.config))
+    if source.base:
+        base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)
+    parts: list[ErrorSamples] = []
+    times: list[np.datetime64] = []
+    epochs = processed = 0
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
         result, state = processor.process(chunk, state)
-        for antenna, (name, found) in enumerate(result.antennas.items()):
-            if not len(found):
+        for antenna, (name, positions) in enumerate(result.antennas.items()):
+            if not len(positions):
                 continue
             errors = range_errors(
-                found, line.trajectories[name], references[name], base, limits=limits, block_s=fit.block_s
+                positions, line.trajectories[name], references[name], base, limits=limits, block_s=fit.block_s
             )
-            samples = errors.samples
-            # Passes of different runs and antennas are different ones.
-            samples.block[:] += (2 * number + antenna) * 10**16
-            into.samples.append(samples)
-            into.epochs += errors.epochs
-            into.times += [found.time[0], found.time[-1]]
-            done += len(found)
+            # satellite passes of different runs and antennas are independent blocks
+            offset = (2 * number + antenna) * 10**16
+            parts.append(replace(errors.samples, block=errors.samples.block + offset))
+            epochs += errors.epochs
+            times += [positions.time[0], positions.time[-1]]
+            processed += len(positions)
         if progress is not None:
-            progress(str(one.run), done)
-    for path in (one.reference, *one.base):
-        into.files[str(path)] = file_sha256(path)
-    into.files |= {entry["path"]: entry["sha256"] for entry in past.record["inputs"]}
+            progress(str(source.run), processed)
+    files = {str(path): file_sha256(path) for path in (source.reference, *source.base)}
+    return _RunErrors(
+        samples=tuple(parts),
+        times=tuple(times),
+        epochs=epochs,
+        files=files | {entry["path"]: entry["sha256"] for entry in past.record["inputs"]},
+        base="" if base is None else base.name,
+        conditions=conditions_of(past.config),
+    )

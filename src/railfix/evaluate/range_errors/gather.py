@@ -1,4 +1,4 @@
-"""Errors of the train's pseudoranges: corrected code less range to the reference, clock and common errors (P1 7)."""
+"""Pseudorange errors of the train: corrected pseudorange minus reference range, clock and common errors (P1 7)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference
 from railfix.evaluate.range_errors.base_station import BaseStation
@@ -21,7 +23,7 @@ from railfix.positioning.normal_equations import clock_groups
 from railfix.ranges.error_model import ErrorSamples
 from railfix.track.trajectory import Trajectory
 
-#: Reasons of ranges that have no error to speak of: no code, no satellite, no correction.
+#: Rejection reasons without a defined range error: no pseudorange, no ephemeris, no correction.
 NO_RANGE: Final = (
     Reason.NOT_OBSERVED
     | Reason.IMPLAUSIBLE_CODE
@@ -39,29 +41,28 @@ NO_RANGE: Final = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class GatherLimits:
-    """What is good enough to take an error from.
+class GatherLimits(Settings):
+    """Limits for the range errors of a run.
 
     Attributes
     ----------
-    largest_reference_sigma_m : float
-        Epochs whose reference is stated to be worse are left out.
-    largest_reference_gap_s, largest_base_gap_s : float
-        Longest step of the reference and of the reference station that is interpolated over.
+    largest_reference_sigma_m : float [m]
+        Epochs whose reference has a larger standard deviation are left out.
+    largest_reference_gap_s, largest_base_gap_s : float [s]
+        Longest gap of the reference trajectory and of the reference station that is interpolated over.
     least_ranges : int
-        Ranges that passed the screens, of one constellation, without which there is no clock to compare with.
+        Fewest ranges of one constellation, after the screens, from which its receiver clock is estimated.
     """
 
-    largest_reference_sigma_m: float = 0.5
-    largest_reference_gap_s: float = 2.5
-    largest_base_gap_s: float = 35.0
-    least_ranges: int = 4
+    largest_reference_sigma_m: float = Field(default=0.5, gt=0.0)
+    largest_reference_gap_s: float = Field(default=2.5, gt=0.0)
+    largest_base_gap_s: float = Field(default=35.0, gt=0.0)
+    least_ranges: int = Field(default=4, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RangeErrors:
-    """Errors of n pseudoranges, and where they belong.
+    """Errors of n pseudoranges with time and satellite.
 
     Attributes
     ----------
@@ -69,7 +70,7 @@ class RangeErrors:
     time : ndarray of datetime64[ns], shape (n,)
     satellite : ndarray of str, shape (n,)
     epochs : int
-        Epochs that had a reference.
+        Epochs with a reference position.
     """
 
     samples: ErrorSamples
@@ -87,21 +88,21 @@ def range_errors(
     limits: GatherLimits | None = None,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Errors of one antenna's chunk.
+    """Pseudorange errors of one antenna over one chunk.
 
-    The clock of each constellation is the robust mean of the ranges that passed the screens. What it takes
-    away of their own errors is given back by ``1 / sqrt(1 - share)``; a common error of all satellites stays
-    in the clock, where it does no harm to a position.
+    The clock of each constellation is the robust mean of the ranges that passed the screens. Each range
+    contributes to its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An
+    error common to all satellites stays in the clock and does not affect the position.
 
     Parameters
     ----------
     result : AntennaResult
         T epochs.
     trajectory : Trajectory
-        Of the antenna; tells which way the car points.
+        Of the antenna; gives the azimuth of the vehicle.
     reference : AntennaReference
     base : BaseStation, optional
-        Without one, errors of satellites and atmosphere stay in.
+        Without one, satellite and atmospheric errors remain.
     limits : GatherLimits, optional
     block_s : float [s]
         Length of the blocks of `ErrorSamples.block`.
@@ -113,15 +114,15 @@ def range_errors(
     Raises
     ------
     MismatchError
-        The reference is nowhere good enough.
+        Fewer than two reference positions have a sigma within the limit.
     """
     limits = limits or GatherLimits()
     columns = result.columns
     good = ~(reference.sigma_m > limits.largest_reference_sigma_m)
     if np.count_nonzero(good) < 2:
         raise MismatchError(
-            f"of {len(good)} positions of the reference fewer than two have a sigma of "
-            f"{limits.largest_reference_sigma_m:g} m or less; a better reference is needed"
+            f"fewer than two of the {len(good)} reference positions have a sigma of "
+            f"{limits.largest_reference_sigma_m:g} m or less; a more accurate reference is needed"
         )
     place = interpolate_reference(
         result.time, reference.time[good], reference.ecef_m[good], largest_gap_s=limits.largest_reference_gap_s
@@ -137,9 +138,8 @@ def range_errors(
     clock = robust_clock(
         np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=limits.least_ranges
     )
-    for g, group in enumerate(groups):
-        residual[:, group] -= clock.clock_m[:, g][:, None]
-    error = residual / np.sqrt(1.0 - clock.share)
+    widths = [group.stop - group.start for group in groups]
+    error = (residual - np.repeat(clock.clock_m, widths, axis=1)) / np.sqrt(1.0 - clock.share)
     arc, _ = trajectory.nearest(place)
     turned = result.azimuth_deg[:, columns] - trajectory.body_azimuth_deg(arc)[:, None]
     epoch, channel = np.nonzero(np.isfinite(error) & (result.elevation_deg[:, columns] > 0.0))
@@ -161,7 +161,7 @@ def range_errors(
 
 
 def joined(parts: list[ErrorSamples]) -> ErrorSamples:
-    """Samples of several chunks, antennas and runs together."""
+    """Samples of several chunks, antennas and runs concatenated."""
     return ErrorSamples(
         **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ErrorSamples)}
     )
