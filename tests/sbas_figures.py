@@ -37,7 +37,7 @@ def of_hour(folder: Path) -> None:
     for what, number in log.account().items():
         print(f"  {what}: {number}")
     started = clock.perf_counter()
-    engine = SbasCorrections(log)
+    engine = SbasCorrections.from_log(log)
     print(f"tables in {clock.perf_counter() - started:.2f} s")
     for note in engine.notes:
         print(f"  {note}")
@@ -51,8 +51,8 @@ def of_hour(folder: Path) -> None:
     codes = np.full((len(time), len(GPS)), 2.2e7)
     signal = np.full(len(GPS), "1C")
     states = satellite_states(time, GPS, signal, codes, navigation, record=found.record)
-    masks = decode.grid_masks(log)
-    last = {int(band): int(mask.sum()) for band, mask in zip(masks.band, masks.mask, strict=True)}
+    masks = decode.decode(log, 18)
+    last = {int(band): int(mask.sum()) for band, mask in zip(masks["band"], masks["mask"], strict=True)}
     print(f"grid points in the last masks by band: {last}")
     for name, (latitude, longitude) in PLACES.items():
         receiver = np.broadcast_to(ecef_from_geodetic(latitude, longitude, 50.0), (len(time), 3))
@@ -78,7 +78,7 @@ def of_crescent(folder: Path) -> None:
     satellite = np.array(sorted(set(navigation.kepler.satellite.tolist())))
     for incomplete in ("refuse", "inflate"):
         for prn in log.prns:
-            engine = SbasCorrections(log, prn=prn, limits=SbasLimits(incomplete=incomplete))
+            engine = SbasCorrections.from_log(log, prn=prn, limits=SbasLimits(incomplete=incomplete))
             found = engine.satellites(time, satellite, navigation)
             ok = (found.state == SatelliteState.OK).sum(axis=1)
             print(

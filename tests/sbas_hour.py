@@ -28,15 +28,9 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
 from railfix.pipeline.protection_levels import risk_of
 from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
 from railfix.ranges.error_model import ErrorModel, read_error_model
-from railfix.ranges.sbas import (
-    IonosphereState,
-    SatelliteCorrections,
-    SatelliteState,
-    SbasCorrections,
-    read_sbas,
-    sigma_tropo_m,
-)
+from railfix.ranges.sbas import IonosphereState, SatelliteCorrections, SatelliteState, SbasCorrections, read_sbas
 from railfix.ranges.sbas_delays import corrected_satellites
 from railfix.ranges.weights import CodeNoise, code_sigma_m
 from railfix.track import Track
@@ -111,7 +105,7 @@ def sky(data: Path, *, step_s: int = 10) -> Sky:
     """Corrected satellites of the hour."""
     folder = data / "sbas" / "msas_20250215"
     log, navigation = read_sbas(folder / "046r_sbas_prn137.txt"), read_navigation(folder / "046r_rnx.nav")
-    engine = SbasCorrections(log)
+    engine = SbasCorrections.from_log(log)
     time = log.time[0] + np.arange(0, 3600, step_s) * np.timedelta64(1, "s")
     fixes = engine.satellites(time, GPS, navigation)
     # A range for the time of transmission: its error of a few ms moves a satellite by metres.
@@ -133,7 +127,7 @@ def sigmas_of_sbas(
     sight = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
     flt = above.fixes.sigma_flt_m(above.engine.delta_udre(above.time, above.fixes, sight, latitude, longitude))
     uire = np.where(grid.state == IonosphereState.OK, grid.sigma_uire_m, np.nan)
-    return flt, uire, sigma_tropo_m(elevation)
+    return flt, uire, rtca_troposphere_sigma_m(elevation)
 
 
 def ranges_at(above: Sky, place: np.ndarray, sigma: np.ndarray, used: np.ndarray) -> Ranges:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from railfix.ranges.sbas import SbasLog
-from railfix.ranges.sbas.parity import PREAMBLES, with_parity
+from railfix.ranges.sbas import SbasMessages
+from railfix.ranges.sbas.messages import PREAMBLES, with_parity
 
 START = np.datetime64("2025-02-15T12:00:00", "ns")
 
@@ -25,12 +25,12 @@ def message(kind: int, second: int, *fields: Field) -> np.ndarray:
     return with_parity(np.packbits(bits)[None, :])[0]
 
 
-def made(rows: Sequence[tuple[float, int, np.ndarray]], prn: int = 137) -> SbasLog:
+def made(rows: Sequence[tuple[float, int, np.ndarray]], prn: int = 137) -> SbasMessages:
     """Log of (second of reception, PRN or 0 for the usual one, message) in the order of time."""
     rows = sorted(rows, key=lambda row: row[0])
     bits = np.array([row[2] for row in rows], dtype=np.uint8).reshape(-1, 32)
     count = len(rows)
-    return SbasLog(
+    return SbasMessages(
         time=START + np.array([round(row[0] * 1e9) for row in rows], dtype="timedelta64[ns]"),
         prn=np.array([row[1] or prn for row in rows], dtype=np.int64),
         type=(bits[:, 1] >> 2).astype(np.int64),

@@ -9,7 +9,7 @@ import pyrtklib5 as rtk
 
 from pyrtklib_orbits import instant, satellite_number
 from railfix.core.timescale import to_week
-from railfix.ranges.sbas import SbasLog
+from railfix.ranges.sbas import SbasMessages
 
 
 class RtklibSbas:
@@ -18,7 +18,7 @@ class RtklibSbas:
     def __init__(self) -> None:
         self.nav = rtk.nav_t()
 
-    def feed(self, log: SbasLog, row: int) -> int:
+    def feed(self, log: SbasMessages, row: int) -> int:
         """Hand over one message; type 9 is left out, as it needs tables of GEO satellites that are not made here."""
         if log.type[row] == 9:
             return 9
@@ -68,7 +68,7 @@ def troposphere(time: np.datetime64, latitude: float, longitude: float, height: 
     return float(rtk.sbstropcorr(instant(time), place, sight, variance))
 
 
-def replay(log: SbasLog, times: np.ndarray) -> Iterator[tuple[int, RtklibSbas]]:
+def replay(log: SbasMessages, times: np.ndarray) -> Iterator[tuple[int, RtklibSbas]]:
     """RTKLIB at each instant, with what had been received by then."""
     program, row = RtklibSbas(), 0
     for number, time in enumerate(times):

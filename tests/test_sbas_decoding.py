@@ -10,25 +10,29 @@ import numpy as np
 import pytest
 
 import sbas_made as made
-from railfix.ranges.sbas import SbasLog, decode, decode_service, read_sbas
+from railfix.ranges.sbas import SbasMessages, decode, read_sbas
 
 pytestmark = pytest.mark.requirement("C1")
 
 
 @pytest.fixture(scope="module")
-def log(recordings: Path) -> SbasLog:
+def log(recordings: Path) -> SbasMessages:
     return read_sbas(recordings / "sbas" / "msas_20250215" / "046r_sbas_prn137.txt")
 
 
-def sidereon_message(log: SbasLog, row: int) -> Any:
+def named(decoded: dict[str, np.ndarray]) -> SimpleNamespace:
+    return SimpleNamespace(**decoded)
+
+
+def sidereon_message(log: SbasMessages, row: int) -> Any:
     sidereon = pytest.importorskip("sidereon", reason="sidereon (the oracle) is not installed")
     body = bytes([*log.bits[row, :28].tolist(), int(log.bits[row, 28]) & 0xC0])
     return sidereon.decode_sbas_block(body, sidereon.SbasWireForm.BODY226).message
 
 
-def test_geo_navigation_is_that_of_sidereon(log: SbasLog) -> None:
+def test_geo_navigation_is_that_of_sidereon(log: SbasMessages) -> None:
     """Its fields are the numbers of the message; the units are those of DO-229D, A.4.4.11."""
-    ours = decode_service.geo_navigation(log)
+    ours = named(decode.geo_navigation(log))
     assert len(ours.row) == 59
     units = {"m": (0.08, 0.08, 0.4), "rate_m_s": (0.000625, 0.000625, 0.004), "accel_m_s2": (1.25e-5, 1.25e-5, 6.25e-5)}
     tables = (ours.position_ecef_m, ours.velocity_ecef_mps, ours.acceleration_ecef_mps2)
@@ -47,8 +51,8 @@ def test_geo_navigation_is_that_of_sidereon(log: SbasLog) -> None:
     assert np.abs(radius - 42_164e3).max() < 100e3
 
 
-def test_degradation_factors_and_masks_are_those_of_sidereon(log: SbasLog) -> None:
-    factors, masks = decode.fast_degradation(log), decode.grid_masks(log)
+def test_degradation_factors_and_masks_are_those_of_sidereon(log: SbasMessages) -> None:
+    factors, masks = named(decode.decode(log, 7)), named(decode.decode(log, 18))
     for i, row in enumerate(factors.row.tolist()):
         theirs = sidereon_message(log, row).fast_degradation
         assert factors.indicator[i].tolist() == list(theirs.ai)[:51]
@@ -58,8 +62,8 @@ def test_degradation_factors_and_masks_are_those_of_sidereon(log: SbasLog) -> No
         assert (masks.band[i], masks.iodi[i]) == (theirs.band_number, theirs.iodi)
 
 
-def test_delays_are_those_of_sidereon(log: SbasLog) -> None:
-    ours = decode.grid_delays(log)
+def test_delays_are_those_of_sidereon(log: SbasMessages) -> None:
+    ours = named(decode.grid_delays(log))
     assert len(ours.row) == 236
     for i, row in enumerate(ours.row.tolist()):
         theirs = sidereon_message(log, row).iono_delays
@@ -69,10 +73,10 @@ def test_delays_are_those_of_sidereon(log: SbasLog) -> None:
         assert np.array_equal(ours.delay_m[i], np.where(raw == 511, np.nan, raw * 0.125), equal_nan=True)
 
 
-def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasLog) -> None:
+def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasMessages) -> None:
     """cssrlib writes E23 in place of E24 and C_ltc_v1 ten times too large: those two are left out."""
     sbas = pytest.importorskip("cssrlib.sbas", reason="cssrlib (the oracle) is not installed")
-    ten, cover = decode_service.degradation(log), decode_service.covariance(log)
+    ten, cover = named(decode.decode(log, 10)), named(decode.covariance(log))
     decoder = sbas.sbasDec()
     for i, row in enumerate(ten.row.tolist()):
         decoder.decode_sbas_degradation_param(log.bits[row].tobytes(), 14)
@@ -84,12 +88,13 @@ def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasLog) -> None:
         ]  # fmt: skip
         for number, values in enumerate(ours):
             assert values is None or float(values[i]) == pytest.approx(float(theirs[number])), number
-    row, fields = decode.of_types(log, 28)
+    row = decode.rows_of(log, 28)
     compared = 0
     for start in (16, 121):
-        for i in np.flatnonzero(fields.unsigned(start, 6))[::5].tolist():
+        sent = decode.read_fields(log.bits[row], {"slot": decode.BitField(start, 6)})["slot"]
+        for i in np.flatnonzero(sent)[::5].tolist():
             _, theirs = decoder.decode_cov(log.bits[row[i]].tobytes(), start + 6)
-            slot = fields.unsigned(start, 6)[i] - 1
+            slot = sent[i] - 1
             (at,) = np.flatnonzero((cover.row == row[i]) & (cover.slot == slot))
             ours_matrix = cover.factor[at].T @ cover.factor[at]
             assert ours_matrix[:3, :3] == pytest.approx(np.asarray(theirs)[:3, :3])
@@ -98,12 +103,15 @@ def test_covariances_and_degradation_are_those_of_cssrlib(log: SbasLog) -> None:
     assert compared > 90
 
 
-def test_almanacs_agree_with_the_navigation_message(log: SbasLog) -> None:
+def test_almanacs_agree_with_the_navigation_message(log: SbasMessages) -> None:
     """The sender's almanac lies within its resolution (2.6 km, and 26 km in z) of its navigation message."""
-    almanac, navigation = decode_service.geo_almanacs(log), decode_service.geo_navigation(log)
+    almanac, navigation = named(decode.geo_almanacs(log)), named(decode.geo_navigation(log))
     own = np.flatnonzero(almanac.prn == 137)
     assert len(own) == 23
-    precise, _ = navigation.state(np.full(len(own), 30), almanac.reference[own])
+    since = ((almanac.reference[own] - navigation.reference[30]) / np.timedelta64(1, "s"))[:, None]
+    motion = (navigation.position_ecef_m, navigation.velocity_ecef_mps, navigation.acceleration_ecef_mps2)
+    position, velocity, acceleration = (part[30] for part in motion)
+    precise = position + velocity * since + 0.5 * acceleration * since**2
     assert (np.abs(almanac.position_ecef_m[own] - precise) < (8_000.0, 8_000.0, 40_000.0)).all()
     assert set(almanac.prn.tolist()) <= set(range(120, 159)) | set(range(183, 203))
 
@@ -111,8 +119,8 @@ def test_almanacs_agree_with_the_navigation_message(log: SbasLog) -> None:
 def test_network_time_by_hand() -> None:
     fields = [(-5, 24), (123_456, 32), (30, 8), (49, 8), (18, 8), (137, 8), (7, 8), (18, 8), (3, 3), (302_400, 20),
               (305, 10)]  # fmt: skip
-    found = decode_service.network_time(made.made([(0, 0, made.message(12, 0, *fields))]))
-    shown = SimpleNamespace(**{name: value[0] for name, value in vars(found).items()})
+    decoded = decode.decode(made.made([(0, 0, made.message(12, 0, *fields))]), 12)
+    shown = SimpleNamespace(**{name: value[0] for name, value in decoded.items()})
     assert (shown.drift, shown.offset_s) == (-5 * 2.0**-50, 123_456 * 2.0**-30)
     assert (shown.reference_s, shown.reference_week, shown.leap_s) == (30 * 4096.0, 49, 18)
     assert (shown.leap_week, shown.leap_day, shown.next_leap_s) == (137, 7, 18)
@@ -124,5 +132,5 @@ def test_reference_times_cross_midnight() -> None:
     bits = made.moving(0, 1, 48, (0.0, 0.0, 0.0), (0, 0, 0), 0, 0, 86_384)
     midnight = np.datetime64("2025-02-16T00:00:10", "ns")
     base = made.made([(0, 0, bits)])
-    log = SbasLog(**{**vars(base), "time": np.array([midnight])})
-    assert decode.long_term(log).reference[0] == np.datetime64("2025-02-15T23:59:44")
+    log = SbasMessages(**{**vars(base), "time": np.array([midnight])})
+    assert decode.long_term(log)["reference"][0] == np.datetime64("2025-02-15T23:59:44")

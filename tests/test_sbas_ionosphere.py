@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 
 import sbas_made as made
-from railfix.ranges.sbas import (
-    IonosphereDelays,
-    IonosphereState,
-    SbasCorrections,
-    SbasLimits,
-    sigma_tropo_m,
-    troposphere_m,
-)
+from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
+from railfix.ranges.sbas import IonosphereDelays, IonosphereState, SbasCorrections, SbasLimits
 from railfix.ranges.sbas.grid import BANDS, CELLS_OF_POINT, POINT_OF_BIT, point_number
 from railfix.ranges.sbas.ionosphere import EARTH_RADIUS_KM, LAYER_HEIGHT_KM, pierce_point
 
@@ -52,7 +46,7 @@ def grid(
 
 def overhead(rows: Rows, latitude: float, longitude: float, second: float = 30.0) -> IonosphereDelays:
     """Delay straight up: the pierce point is the place."""
-    engine = SbasCorrections(made.made(rows))
+    engine = SbasCorrections.from_log(made.made(rows))
     time = np.array([made.START + np.timedelta64(round(second * 1000), "ms")])
     return engine.ionosphere(time, np.array([latitude]), np.array([longitude]), ZENITH, np.zeros((1, 1)))
 
@@ -193,7 +187,7 @@ def test_the_pierce_point_lies_on_the_layer_in_the_direction_of_the_satellite() 
 
 def test_a_slant_delay_is_longer_by_the_obliquity() -> None:
     rows = grid(square((2.0, 0), (2.0, 0), (2.0, 0), (2.0, 0)))
-    engine = SbasCorrections(made.made(rows))
+    engine = SbasCorrections.from_log(made.made(rows))
     time = np.array([made.START + np.timedelta64(30, "s")])
     found = engine.ionosphere(
         time, np.array([37.5]), np.array([137.5]), np.array([[60.0, 0.0, -5.0]]), np.zeros((1, 3))
@@ -243,7 +237,7 @@ def test_delays_of_another_mask_are_not_used() -> None:
     rows = grid(square(*FOUR))
     rows.append((20, 0, made.grid_delay(20, 7, 0, [9.0] * 15, [0] * 15, iodi=1)))
     assert overhead(rows, 35.0, 135.0).delay_m.item() == 1.0
-    engine = SbasCorrections(made.made(rows))
+    engine = SbasCorrections.from_log(made.made(rows))
     assert engine.unused["grid delays without a mask of their IODI"] == 15
     # With its mask it is: the first point of the new mask is another.
     rows.append((19, 0, made.grid_mask(19, 7, bits_of(7, [(40, 135)]), 1)))
@@ -280,7 +274,7 @@ def test_without_a_grid_there_is_no_delay() -> None:
 def test_the_troposphere_by_hand() -> None:
     """Mid-latitude, sea level, day 28: 1015.75 + 2.25 mbar give 2.32 m of dry delay; sigma is 0.12 m upward."""
     time = np.array(["2025-01-28T00:00:00"], dtype="datetime64[ns]")
-    found = troposphere_m(time, np.array([45.0]), np.array([0.0]), np.array([[90.0, 30.0, 3.0, 1.0]]))
+    found = rtca_troposphere_m(time, np.array([45.0]), np.array([0.0]), np.array([[90.0, 30.0, 3.0, 1.0]]))
     pressure, temperature, vapour, lapse, power = 1018.0, 272.15, 4.42, 5.26e-3, 2.11
     dry = 1e-6 * 77.604 * 287.054 * pressure / 9.784
     wet = 1e-6 * 382_000.0 * 287.054 / (9.784 * (power + 1.0) - lapse * 287.054) * vapour / temperature
@@ -290,18 +284,18 @@ def test_the_troposphere_by_hand() -> None:
     low = 1.001 / np.sqrt(0.002001 + np.sin(np.radians(3.0)) ** 2) * 1.015
     assert found[0, 2] == pytest.approx((dry + wet) * low, abs=1e-9)
     assert np.isnan(found[0, 3])
-    assert sigma_tropo_m(np.array([90.0, 3.0])) == pytest.approx([0.12 * upward, 0.12 * low])
+    assert rtca_troposphere_sigma_m(np.array([90.0, 3.0])) == pytest.approx([0.12 * upward, 0.12 * low])
 
 
 def test_limits_of_the_height_are_kept() -> None:
     time = np.array(["2025-01-28"] * 3, dtype="datetime64[ns]")
-    found = troposphere_m(time, np.full(3, 35.0), np.array([-200.0, 100.0, 2e4]), np.full((3, 1), 45.0))
+    found = rtca_troposphere_m(time, np.full(3, 35.0), np.array([-200.0, 100.0, 2e4]), np.full((3, 1), 45.0))
     assert np.isnan(found[:, 0]).tolist() == [True, False, True]
 
 
 def test_precision_of_the_mode_does_not_touch_the_grid() -> None:
     rows = again(grid(square(*[(2.0, 2)] * 4)), 10, 400)
-    engine = SbasCorrections(made.made(rows), limits=SbasLimits(mode="en_route"))
+    engine = SbasCorrections.from_log(made.made(rows), limits=SbasLimits(mode="en_route"))
     time = np.array([made.START + np.timedelta64(360, "s"), made.START + np.timedelta64(361, "s")])
     place = np.full(2, 37.5), np.full(2, 137.5), np.full((2, 1), 90.0), np.zeros((2, 1))
     assert engine.ionosphere(time, *place).state[:, 0].tolist() == [OK, IonosphereState.NO_DEGRADATION]

@@ -79,7 +79,7 @@ def test_every_state_of_a_satellite_has_a_reason() -> None:
 
 
 def test_a_satellite_is_used_or_refused_as_its_corrections_are(recording: Recording, corrected: AntennaResult) -> None:
-    engine = SbasCorrections(read_sbas([recording.sbas]), prn=137)
+    engine = SbasCorrections.from_log(read_sbas([recording.sbas]), prn=137)
     satellite = corrected.satellite[corrected.columns]
     fixes = engine.satellites(corrected.time, satellite, recording.navigation)
     reason = corrected.reason[:, corrected.columns]
@@ -100,7 +100,7 @@ def test_a_satellite_is_used_or_refused_as_its_corrections_are(recording: Record
 
 
 def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, corrected: AntennaResult) -> None:
-    engine = SbasCorrections(read_sbas([recording.sbas]), prn=137)
+    engine = SbasCorrections.from_log(read_sbas([recording.sbas]), prn=137)
     columns = corrected.columns
     satellite, code = corrected.satellite[columns], recording.observations.code_m[:, columns]
     fixes = engine.satellites(corrected.time, satellite, recording.navigation)

@@ -12,9 +12,9 @@ import pytest
 import sbas_made as made
 from railfix.core.errors import InputFileError
 from railfix.core.timescale import from_week, to_week
-from railfix.ranges.sbas import SbasLog, read_sbas
-from railfix.ranges.sbas.names import DECODED, system_name, type_name
-from railfix.ranges.sbas.parity import carried_parity, message_parity
+from railfix.ranges.sbas import SbasMessages, read_sbas
+from railfix.ranges.sbas.messages import carried_parity, message_parity
+from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
 pytestmark = pytest.mark.requirement("C1")
 
@@ -50,7 +50,7 @@ def digits(bits: np.ndarray, count: int) -> str:
     return bits.tobytes().hex().upper()[:count]
 
 
-def as_rtklib(log: SbasLog, *, count: int) -> str:
+def as_rtklib(log: SbasMessages, *, count: int) -> str:
     rows = []
     for i in range(len(log)):
         week, tow = to_week(log.time[i])
@@ -58,7 +58,7 @@ def as_rtklib(log: SbasLog, *, count: int) -> str:
     return "\n".join(rows) + "\n"
 
 
-def as_ems(log: SbasLog) -> str:
+def as_ems(log: SbasMessages) -> str:
     rows = []
     for i in range(len(log)):
         t = log.time[i].astype("datetime64[s]").item()
@@ -66,7 +66,7 @@ def as_ems(log: SbasLog) -> str:
     return "\n".join(rows) + "\n"
 
 
-def as_rinex(log: SbasLog) -> str:
+def as_rinex(log: SbasMessages) -> str:
     """Type B: the time is that of the first bit, a second before the message is there."""
     rows = [
         f"{2.10:9.2f}           {'B: SBAS BROADCAST':40s}RINEX VERSION / TYPE",
@@ -81,7 +81,7 @@ def as_rinex(log: SbasLog) -> str:
     return "\n".join(rows) + "\n"
 
 
-def a_log() -> SbasLog:
+def a_log() -> SbasMessages:
     messages = [
         made.mask(0, [1, 5, 32]),
         made.fast(1, [1.5, -2.0], [3, 4]),
@@ -124,7 +124,7 @@ def test_a_bit_flipped_anywhere_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", [lambda log: as_rtklib(log, count=64), as_ems, as_rinex])
-def test_formats_say_the_same(tmp_path: Path, write: Callable[[SbasLog], str]) -> None:
+def test_formats_say_the_same(tmp_path: Path, write: Callable[[SbasMessages], str]) -> None:
     log = a_log()
     path = tmp_path / "messages.gz"
     path.write_bytes(gzip.compress(write(log).replace("\n", "\r\n").encode()))

@@ -17,22 +17,15 @@ from railfix.core.timescale import from_week
 from railfix.gnss.orbits.states import satellite_states
 from railfix.io.rinex.navigation import read_navigation
 from railfix.io.rinex.observations import read_observations
-from railfix.ranges.sbas import (
-    IonosphereState,
-    SatelliteState,
-    SbasCorrections,
-    SbasLimits,
-    SbasLog,
-    read_sbas,
-    troposphere_m,
-)
+from railfix.ranges.atmosphere import rtca_troposphere_m
+from railfix.ranges.sbas import IonosphereState, SatelliteState, SbasCorrections, SbasLimits, SbasMessages, read_sbas
 
 GPS = np.array([f"G{i:02d}" for i in range(1, 33)])
 #: What RTKLIB does: corrections as sent, at the second of their tag, whatever their degradation data and UDREI.
 AS_RTKLIB = SbasLimits(range_rate="off", incomplete="inflate", message_s=0.0, max_udrei=13, type0="as_type2")
 
 
-def seconds_of(log: SbasLog, step: int) -> np.ndarray:
+def seconds_of(log: SbasMessages, step: int) -> np.ndarray:
     first, last = log.time[[0, -1]].astype("datetime64[s]")
     return np.arange(first, last + 1, step).astype("datetime64[ns]")
 
@@ -52,7 +45,7 @@ def test_corrections_are_those_of_rtklib(recordings: Path, name: str, prn: int, 
     from sbas_rtklib import replay
 
     log = read_sbas(recordings / "sbas" / name).of(prn)
-    engine = SbasCorrections(log, prn=prn, limits=AS_RTKLIB)
+    engine = SbasCorrections.from_log(log, prn=prn, limits=AS_RTKLIB)
     time = seconds_of(log, step)
     ours = engine.satellites(time, GPS)
     compared = 0
@@ -85,7 +78,7 @@ def test_delays_are_those_of_rtklib(recordings: Path, name: str, prn: int, fewes
     from sbas_rtklib import replay
 
     log = read_sbas(recordings / "sbas" / name).of(prn)
-    engine = SbasCorrections(log, prn=prn, limits=AS_RTKLIB)
+    engine = SbasCorrections.from_log(log, prn=prn, limits=AS_RTKLIB)
     time = seconds_of(log, 10 if len(log) > 1000 else 1)
     random = np.random.default_rng(2008)
     latitude, longitude = random.uniform(20.0, 46.0, len(time)), random.uniform(123.0, 146.0, len(time))
@@ -116,7 +109,7 @@ def test_the_troposphere_is_that_of_rtklib() -> None:
     time = np.datetime64("2008-05-26", "ns") + random.integers(0, 400 * 86_400, count) * np.timedelta64(1, "s")
     latitude, height = random.uniform(-80.0, 80.0, count), random.uniform(-50.0, 3000.0, count)
     elevation = random.uniform(4.5, 90.0, count)
-    ours = troposphere_m(time, latitude, height, elevation[:, None])[:, 0]
+    ours = rtca_troposphere_m(time, latitude, height, elevation[:, None])[:, 0]
     for i in range(count):
         assert abs(troposphere(time[i], latitude[i], 0.0, height[i], elevation[i]) - ours[i]) < 1e-4
 
@@ -165,7 +158,7 @@ def test_whole_runs_agree(recordings: Path, tmp_path: Path) -> None:
     column = np.flatnonzero((np.char.startswith(observations.satellite, "G")) & (observations.signal == "1C"))
     satellite, code = observations.satellite[column], observations.code_m[np.ix_(at, column)]
     log = read_sbas(stem + ".sbs")
-    engine = SbasCorrections(replace(log, time=log.time + np.timedelta64(1, "s")), prn=137, limits=AS_RTKLIB)
+    engine = SbasCorrections.from_log(replace(log, time=log.time + np.timedelta64(1, "s")), prn=137, limits=AS_RTKLIB)
     sbas = engine.satellites(time, satellite, navigation)
     states = satellite_states(time, satellite, observations.signal[column], code, navigation, record=sbas.record)
     receiver = np.array([place[tag] for tag in tags])
@@ -173,7 +166,7 @@ def test_whole_runs_agree(recordings: Path, tmp_path: Path) -> None:
     elevation, azimuth = elevation_azimuth(position, receiver)
     latitude, longitude, height = geodetic_from_ecef(receiver)
     delay = engine.ionosphere(time, latitude, longitude, elevation, azimuth).delay_m
-    delay = delay + troposphere_m(time, latitude, height, elevation)
+    delay = delay + rtca_troposphere_m(time, latitude, height, elevation)
     clock = states.clock_m - states.group_delay_m + SPEED_OF_LIGHT * sbas.clock_s
     corrected = code + clock + sbas.fast_m - delay
     distance, _ = range_with_rotation(position, receiver[:, None, :])

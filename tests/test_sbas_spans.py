@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.ranges.sbas.spans import Spans, looked_up, once_each
+from railfix.ranges.sbas.grid import Spans, distinct_lookups, looked_up
 
 pytestmark = pytest.mark.requirement("C1")
 START = np.datetime64("2025-02-15T12:00:00", "ns")
@@ -38,6 +38,6 @@ def test_each_combination_is_asked_once_and_answered_everywhere() -> None:
     found = looked_up(answer, spans.number(time), point, time, 2664)
     np.testing.assert_array_equal(found, answer(point, time))
     assert asked[0] < 400
-    first, which = once_each(spans.number(time), point, 2664)
+    first, which = distinct_lookups(spans.number(time), point, 2664)
     np.testing.assert_array_equal(point[first][which], point)
     np.testing.assert_array_equal(spans.number(time)[first][which], spans.number(time))

@@ -56,7 +56,7 @@ from .pipeline import (
     positions_table,
     to_xarray,
 )
-from .ranges.sbas import SbasLog, read_sbas
+from .ranges.sbas import SbasMessages, read_sbas
 from .report import write_report
 from .run import RunInputs, RunOptions, RunSummary, run_files
 from .simulate import Scenario, demo_files, load_scenario, write_run
@@ -95,7 +95,7 @@ __all__ = [
     "RunInputs",
     "RunOptions",
     "RunSummary",
-    "SbasLog",
+    "SbasMessages",
     "Scenario",
     "SettingsError",
     "State",

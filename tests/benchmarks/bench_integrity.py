@@ -141,7 +141,7 @@ def parts_of_sbas(log: Log, rounds: int) -> None:
     """The engine's own functions on what the run gives them, chunk by chunk: least of the rounds."""
     config = parse_config({"protection": "off", "sbas": [str(MESSAGES)]})
     found = EpochProcessor(config, log.navigation, {"front": log.trajectory}).process({"front": log.observations})[0]
-    result, engine = found.antennas["front"], SbasCorrections(read_sbas(MESSAGES))
+    result, engine = found.antennas["front"], SbasCorrections.from_log(read_sbas(MESSAGES))
     satellite, size = result.satellite[result.columns], RunOptions().chunk_epochs
     place = log.trajectory.ecef_m[0]
     latitude, longitude, height = (float(x) for x in geodetic_from_ecef(place))

@@ -391,7 +391,7 @@ def _opened_sbas(config: Config) -> SbasCorrections:
     """The corrections that the settings ask for."""
     log = read_sbas(list(config.sbas))
     try:
-        return SbasCorrections(log, prn=config.sbas_prn, limits=config.sbas_limits)
+        return SbasCorrections.from_log(log, prn=config.sbas_prn, limits=config.sbas_limits)
     except ValueError as error:
         raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
 

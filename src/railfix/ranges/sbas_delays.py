@@ -15,14 +15,13 @@ from railfix.core.arrays import Bits, Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits import SatelliteStates
+from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.atmospheric_delays import Delays, SeenFrom
 from railfix.ranges.sbas import (
     IonosphereState,
     SatelliteCorrections,
     SatelliteState,
     SbasCorrections,
-    sigma_tropo_m,
-    troposphere_m,
 )
 
 #: The signal that corrections are made for: GPS L1 C/A, as RINEX 3 calls it.
@@ -103,11 +102,11 @@ def sbas_delays(
         flt = part.sigma_flt_m(sbas.delta_udre(time, part, sight, latitude, longitude))
         scale = (FREQUENCY_L1 / frequency_hz[some]) ** 2
         known = (grid.state == IonosphereState.OK) & np.isfinite(grid.sigma_uire_m)
-        variance = flt**2 + (scale * grid.sigma_uire_m) ** 2 + sigma_tropo_m(elevation) ** 2
+        variance = flt**2 + (scale * grid.sigma_uire_m) ** 2 + rtca_troposphere_sigma_m(elevation) ** 2
         unknown = np.where(known, 0, int(Reason.SBAS_NO_IONOSPHERE))
         corrected = part.state == SatelliteState.OK
         ionosphere[:, some] = scale * np.where(known & corrected, grid.delay_m, np.nan)
-        troposphere[:, some] = np.where(corrected, troposphere_m(time, latitude, height, elevation), np.nan)
+        troposphere[:, some] = np.where(corrected, rtca_troposphere_m(time, latitude, height, elevation), np.nan)
         sigma[:, some] = np.where(corrected, np.sqrt(variance), np.nan)
         reason[:, some] = np.where(corrected, unknown, 0)
     return Delays(ionosphere_m=ionosphere, troposphere_m=troposphere, sigma_m=sigma, reason=reason)

@@ -1,11 +1,10 @@
-"""SBAS: messages read and decoded, and what they say about satellites and delays (RTCA DO-229D, appendix A)."""
+"""SBAS: messages read and decoded, and the corrections that they give (RTCA DO-229D, appendix A)."""
 
-from railfix.ranges.sbas.corrections import SbasCorrections
-from railfix.ranges.sbas.limits import SbasLimits
-from railfix.ranges.sbas.log import SbasLog
-from railfix.ranges.sbas.read import read_sbas
+from railfix.ranges.sbas.corrections import SbasCorrections, SbasState, best_prn
+from railfix.ranges.sbas.files import read_sbas
+from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.results import IonosphereDelays, IonosphereState, SatelliteCorrections, SatelliteState
-from railfix.ranges.sbas.troposphere import sigma_tropo_m, troposphere_m
+from railfix.ranges.sbas.standard import SbasLimits
 
 __all__ = [
     "IonosphereDelays",
@@ -14,8 +13,8 @@ __all__ = [
     "SatelliteState",
     "SbasCorrections",
     "SbasLimits",
-    "SbasLog",
+    "SbasMessages",
+    "SbasState",
+    "best_prn",
     "read_sbas",
-    "sigma_tropo_m",
-    "troposphere_m",
 ]

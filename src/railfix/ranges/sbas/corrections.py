@@ -2,56 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Final, Literal
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.issues import issue_records
-from railfix.ranges.sbas.choose import best_prn
-from railfix.ranges.sbas.degrade import Growth, delta_udre_covariance, growth
-from railfix.ranges.sbas.fast import FastCorrected, fast_corrected
 from railfix.ranges.sbas.grid import GridTables
 from railfix.ranges.sbas.ionosphere import ionosphere
-from railfix.ranges.sbas.limits import DO_NOT_USE, INFLATION_M, NOT_MONITORED, STOP_S, UDRE_VARIANCE_M2, SbasLimits
-from railfix.ranges.sbas.log import SbasLog
-from railfix.ranges.sbas.names import mask_satellite, system_name
+from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.results import IonosphereDelays, SatelliteCorrections, SatelliteState
-from railfix.ranges.sbas.service import ServiceTable
-from railfix.ranges.sbas.tables import LONG_AGO, SatelliteTables
+from railfix.ranges.sbas.satellites import (
+    FastInForce,
+    Growth,
+    LongTermInForce,
+    ServiceTable,
+    covariance_in_force,
+    delta_udre_covariance,
+    fast_in_force,
+    growth,
+    long_term_in_force,
+)
+from railfix.ranges.sbas.standard import (
+    DO_NOT_USE,
+    INFLATION_M,
+    KEPT_S,
+    NOT_MONITORED,
+    STOP_S,
+    UDRE_VARIANCE_M2,
+    SbasLimits,
+    mask_satellite,
+    system_name,
+)
+from railfix.ranges.sbas.tables import SatelliteTables
 
-_NUMBER_OF = {mask_satellite(number): number for number in range(1, 211) if mask_satellite(number)}
-_SIGMA_UDRE = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan]))
+_NUMBER_OF: Final = {mask_satellite(number): number for number in range(1, 211) if mask_satellite(number)}
+_SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan]))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _LongTerm:
-    """Long-term correction in force, all (T, K)."""
+def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
+    """PRN with the most usable fast corrections, of equal ones the smallest, and a sentence on the choice.
 
-    row: Integers
-    record: Integers
-    missing: Masks
-    timed_out: Masks
-    mismatch: Masks
+    The choice looks at all messages: make it on recorded messages before the positioning begins. What is
+    received while a train runs cannot be judged in advance; there the PRN is given.
+    """
+    limits, scores = limits or SbasLimits(), []
+    for number in messages.prns:
+        fast = SatelliteTables(messages.of(number), limits).fast
+        monitored = np.zeros(0) if fast.empty else fast.series[fast["udrei"] < NOT_MONITORED]
+        scores.append((-len(monitored), number, len(np.unique(monitored))))
+    ordered = sorted(scores)
+    listed = "; ".join(
+        f"{system_name(number)} {number}: {-usable} of {satellites} satellites"
+        for usable, number, satellites in ordered
+    )
+    return ordered[0][1], f"best SBAS PRN by usable fast corrections: {ordered[0][1]} ({listed})"
 
 
 class SbasCorrections:
-    """What one GEO's messages say at any epochs; the tables are made once, then searched.
+    """Corrections by one GEO's messages at any epochs; the tables are built once, then searched.
 
-    A message counts from the moment it had been received (`SbasLog.time`), never before. Nothing
-    depends on the other epochs or satellites of a call.
+    A message counts from the moment it had been received (`SbasMessages.time`), never before. Nothing
+    depends on the other epochs or satellites of a call, nor on messages received later.
 
     Parameters
     ----------
-    log : SbasLog
-    prn : int or "best"
-        Whose messages; "best" takes the GEO with the most usable fast corrections, of equal ones the
-        smallest PRN.
+    messages : SbasMessages
+        Those of other PRNs are left out; there may be none.
+    prn : int
+        Chosen beforehand, for example by `best_prn`.
     limits : SbasLimits, optional
+    notes : sequence of str
+        Sentences on the origin of the messages, put before those of the corrections.
 
     Attributes
     ----------
@@ -60,28 +86,49 @@ class SbasCorrections:
     notes : tuple of str
         What was asked and what was used.
     span : tuple of datetime64[ns]
-        Reception of the first and the last message of that GEO.
-
-    Raises
-    ------
-    ValueError
-        The log has no message of that PRN.
+        Reception of the first and the last message of that GEO; NaT without messages.
+    unused : mapping of str to int
+        Corrections without a mask of their issue, by kind.
     """
 
-    def __init__(self, log: SbasLog, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None) -> None:
-        self.limits = limits or SbasLimits()
-        self.prn, why = best_prn(log, prn, self.limits)
-        of_prn = log.of(self.prn)
-        self.span: tuple[np.datetime64, np.datetime64] = (of_prn.time.min(), of_prn.time.max())
+    def __init__(
+        self, messages: SbasMessages, *, prn: int, limits: SbasLimits | None = None, notes: Sequence[str] = ()
+    ) -> None:
+        self.prn, self.limits = prn, limits or SbasLimits()
+        of_prn = messages.of(prn)
+        never = np.datetime64("NaT", "ns")
+        self.span: tuple[np.datetime64, np.datetime64] = (
+            (of_prn.time.min(), of_prn.time.max()) if len(of_prn) else (never, never)
+        )
         self._tables = SatelliteTables(of_prn, self.limits)
         self._grid = GridTables(of_prn, self.limits, self._tables.stops)
         self._service = ServiceTable(of_prn, self.limits)
         self.unused: Mapping[str, int] = {
-            what: number for what, number in sorted((self._tables.unused + self._grid.unused).items()) if number
+            kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
-        self.notes = (*log.notes, why, *self._notes(of_prn))
+        self.notes = (*notes, *self._notes(of_prn))
 
-    def _notes(self, log: SbasLog) -> list[str]:
+    @classmethod
+    def from_log(
+        cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None
+    ) -> SbasCorrections:
+        """Corrections from recorded messages, of the PRN asked for or of `best_prn`.
+
+        Raises
+        ------
+        ValueError
+            There is no message of that PRN.
+        """
+        known = ", ".join(str(number) for number in messages.prns)
+        if prn == "best":
+            prn, choice = best_prn(messages, limits)
+        elif prn in messages.prns:
+            choice = f"SBAS PRN {prn} was asked for; the log has {known}"
+        else:
+            raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
+        return cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
+
+    def _notes(self, messages: SbasMessages) -> list[str]:
         limits = self.limits
         notes = [
             f"SBAS corrections of {system_name(self.prn)} PRN {self.prn}: time-outs of "
@@ -89,11 +136,11 @@ class SbasCorrections:
             f"{limits.type0.replace('_', ' ')}, range rate {limits.range_rate}, incomplete degradation data "
             f"{limits.incomplete}"
         ]
-        zeros = int((log.type == 0).sum())
+        zeros = int((messages.type == 0).sum())
         if zeros:
             used = "read as type 2" if limits.type0 == "as_type2" else "each stopped the GEO for 60 s"
             notes.append(f"PRN {self.prn} sent {zeros} messages of type 0 (do not use for safety): {used}")
-        notes += [f"PRN {self.prn}: {number} {what}, not used" for what, number in self.unused.items()]
+        notes += [f"PRN {self.prn}: {number} {kind}, not used" for kind, number in self.unused.items()]
         return notes
 
     def satellites(
@@ -117,11 +164,11 @@ class SbasCorrections:
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]
         stop = tables.stops.last(time)[:, None]
-        fast = fast_corrected(tables, limits, at, number[None, :], stop)
-        long = self._long_term(time, satellite, number, stop, navigation)
+        fast = fast_in_force(tables, limits, at, number[None, :], stop)
+        long = long_term_in_force(tables, limits, time, satellite, number, stop, navigation)
         has_mask, in_mask = tables.masks.holds(number, time)
         grown = growth(tables, limits, at, fast, long.row, stop)
-        covariance, lacks_covariance = self._covariance(time, number, stop)
+        covariance, lacks_covariance = covariance_in_force(tables, limits, time, number, stop)
         incomplete = fast.no_factor | grown.missing | lacks_covariance
         state = np.select(
             [
@@ -160,25 +207,25 @@ class SbasCorrections:
         self,
         time: Datetimes,
         state: Integers,
-        fast: FastCorrected,
-        long: _LongTerm,
+        fast: FastInForce,
+        long: LongTermInForce,
         grown: Growth,
         inflated: Masks,
         covariance: Integers,
     ) -> SatelliteCorrections:
-        """Put the parts together; nothing but states where they are not OK."""
+        """Put the parts together; NaN where the state is not OK."""
         used = state == SatelliteState.OK
         table = self._tables.long_term
         has = used & (long.row >= 0)
         position, clock = np.zeros((*state.shape, 3)), np.zeros(state.shape)
         t, k = np.nonzero(has)
         row = long.row[t, k]
-        since = np.nan_to_num(seconds(time[t] - table.reference[row]))
-        position[t, k] = table.position_m[row] + table.velocity_mps[row] * since[:, None]
-        clock[t, k] = table.clock_s[row] + table.clock_rate[row] * since
+        since = np.nan_to_num(seconds(time[t] - table["reference"][row]))
+        position[t, k] = table["position_m"][row] + table["velocity_mps"][row] * since[:, None]
+        clock[t, k] = table["clock_s"][row] + table["clock_rate"][row] * since
         iode = np.full(state.shape, -1, dtype=np.int64)
         known = long.row >= 0
-        iode[known] = table.iode[long.row[known]]
+        iode[known] = table["iode"][long.row[known]]
 
         def kept(values: Floats) -> Floats:
             return np.where(used, values, np.nan)
@@ -204,63 +251,6 @@ class SbasCorrections:
             rss=grown.rss,
             covariance=covariance,
         )
-
-    def _long_term(
-        self,
-        time: Datetimes,
-        satellite: Strings,
-        number: Integers,
-        stop: Datetimes,
-        navigation: Navigation | None,
-    ) -> _LongTerm:
-        """Newest long-term correction that a record goes with; satellites of SBAS itself need none."""
-        table, limit = self._tables.long_term, self.limits.timeout_s("long_term")
-        newest = table.newest.newest(number[None, :], time[:, None])
-        other = table.other[newest] if len(table.other) else newest
-        other = np.where(newest >= 0, other, -1)
-
-        def judged(row: Integers) -> tuple[Masks, Masks, Integers]:
-            received = table.time[row] if len(table.time) else np.full(row.shape, LONG_AGO)
-            known = (row >= 0) & (received > stop)
-            iodp = table.iodp[row] if len(table.iodp) else row
-            late = (seconds(time[:, None] - received) > limit) | ~self._tables.masks.active(iodp, time[:, None])
-            issue = np.where(known, table.iode[row] if len(table.iode) else -1, -1)
-            record = np.full(row.shape, -1, dtype=np.int64)
-            if navigation is not None:
-                record = issue_records(navigation, satellite, time, issue)
-            return known, known & late, record
-
-        known, late, record = judged(newest)
-        taken = newest
-        if navigation is not None:
-            other_known, other_late, other_record = judged(other)
-            swap = known & (late | (record < 0)) & other_known & ~other_late & (other_record >= 0)
-            taken, record, late = (
-                np.where(swap, other, newest),
-                np.where(swap, other_record, record),
-                late & ~swap,
-            )
-        needless = np.char.startswith(satellite, "S")[None, :]
-        mismatch = known & (record < 0) & (navigation is not None)
-        return _LongTerm(
-            row=np.where(known, taken, -1),
-            record=record,
-            missing=~known & ~needless,
-            timed_out=late & ~needless,
-            mismatch=mismatch & ~needless,
-        )
-
-    def _covariance(self, time: Datetimes, number: Integers, stop: Datetimes) -> tuple[Integers, Masks]:
-        """Row of the covariance in force, and where the GEO sends some and this satellite has none."""
-        table, limit = self._tables.covariance, self.limits.timeout_s("covariance")
-        row = table.newest.newest(number[None, :], time[:, None])
-        if not len(table.time):
-            return row, np.zeros(row.shape, dtype=bool)
-        active = (row >= 0) & (seconds(time[:, None] - table.time[row]) <= limit) & (table.time[row] > stop)
-        last = np.searchsorted(table.all_times, time, side="right") - 1
-        newest = table.all_times[np.maximum(last, 0)]
-        sent = (last >= 0) & (seconds(time - newest) <= limit) & (newest > stop[:, 0])
-        return np.where(active, row, -1), sent[:, None] & ~active
 
     def delta_udre(
         self,
@@ -288,10 +278,10 @@ class SbasCorrections:
             1 where the GEO sends neither; NaN where the service messages are incomplete and
             incomplete data are refused.
         """
-        place = self._service.factor(self.limits, time, latitude_deg, longitude_deg)
+        factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)
         along = delta_udre_covariance(self._tables, time, corrections.covariance, line_of_sight)
-        by_place = np.isfinite(place.factor) | place.incomplete
-        return np.where(by_place[:, None], place.factor[:, None], along)
+        by_place = np.isfinite(factor) | incomplete
+        return np.where(by_place[:, None], factor[:, None], along)
 
     def ionosphere(
         self,
@@ -316,3 +306,48 @@ class SbasCorrections:
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SbasState:
+    """Messages of one GEO received so far: a value that new messages are added to as they arrive.
+
+    Corrections at an epoch are the same as from the whole log, however it was cut: a message counts from its
+    reception on, and `kept_from` drops only messages that no later epoch can use.
+
+    ::
+
+        state = SbasState(prn=137)
+        state = state.received(messages)  # whenever some arrive
+        fixes = state.corrections.satellites(time, satellite, navigation)
+        state = state.kept_from(time[-1])  # what later epochs need
+
+    Attributes
+    ----------
+    prn : int
+        Chosen beforehand: which GEO is best is known only after all messages were received.
+    limits : SbasLimits
+    messages : SbasMessages
+        Of that PRN, in the order of reception.
+    """
+
+    prn: int
+    limits: SbasLimits = field(default_factory=SbasLimits)
+    messages: SbasMessages = field(default_factory=SbasMessages.none)
+
+    def received(self, messages: SbasMessages) -> SbasState:
+        """The state after more messages; those of other PRNs are left out."""
+        return replace(self, messages=self.messages.joined(messages.of(self.prn)))
+
+    @cached_property
+    def corrections(self) -> SbasCorrections:
+        """Corrections by the messages received so far."""
+        return SbasCorrections(self.messages, prn=self.prn, limits=self.limits)
+
+    def kept_from(self, time: np.datetime64) -> SbasState:
+        """The state without the messages that no epoch from `time` on can use."""
+        kind, age = self.messages.type, seconds(time - self.messages.time)
+        kept = age <= np.where(kind == 27, 2.0 * self.limits.timeout_s("service"), KEPT_S)
+        # The covariance constant of type 10 has no time-out.
+        kept[np.flatnonzero((kind == 10) & (age >= 0.0))[-1:]] = True
+        return self if kept.all() else replace(self, messages=self.messages.take(kept))

@@ -1,272 +1,373 @@
-"""Messages that correct satellites and the ionosphere, decoded (DO-229D, A.4.4).
+"""SBAS messages decoded by tables of bit fields (RTCA DO-229D, A.4.4).
 
-Every table holds `row`, the row of the log that its own rows come from. Numbers are those of the
-message in SI units; nothing is applied here and no message is held against another.
+`LAYOUTS` names the fields of each message type: first bit, length, scale, sign, and how many follow one
+another. Numbers are those of the messages in SI units; nothing is applied here and no message is compared
+with another. Every decoder returns arrays by name, all with n rows, among them `row`: the row of the
+messages that each of its own rows comes from.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks
-from railfix.ranges.sbas.fields import Fields, day_time
-from railfix.ranges.sbas.log import SbasLog
+from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Masks
+from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
+from railfix.ranges.sbas.messages import SbasMessages
 
+#: Arrays by the name of their field.
+Decoded = dict[str, NDArray[Any]]
 #: Satellites that a PRN mask may name; corrections are sent for its slots 0 to 50.
 SLOTS: Final = 51
-#: Slots of one message of type 2 to 5, and of one of type 24.
+#: Slots of one message of type 2 to 5.
 BLOCK: Final = 13
-HALF_BLOCK: Final = 6
-_PRC_M: Final = 0.125
-_DELAY_M: Final = 0.125
-_DO_NOT_USE_DELAY: Final = 0x1FF
+#: Regions of one message of type 27.
+_REGIONS: Final = 5
+_DO_NOT_USE_DELAY_M: Final = 0x1FF * 0.125
+_UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
-@dataclass(frozen=True, kw_only=True)
-class PrnMasks:
-    """Type 1: `number` (n, 51) of the PRN mask by slot, 0 where there is none; `iodp` (n,)."""
+class BitField(NamedTuple):
+    """One number of a message, or `number` numbers that begin `step` bits (default: their length) apart."""
 
-    row: Integers
-    iodp: Integers
-    number: Integers
-
-
-@dataclass(frozen=True, kw_only=True)
-class FastCorrections:
-    """Types 2 to 5, 24 and (asked for) 0, one row a slot: `prc_m`, `udrei`, `iodf`, `iodp`, all (n,)."""
-
-    row: Integers
-    slot: Integers
-    prc_m: Floats
-    udrei: Integers
-    iodf: Integers
-    iodp: Integers
+    first: int
+    length: int
+    #: Unit of the number; None leaves an integer.
+    scale: float | None = None
+    signed: bool = False
+    number: int | None = None
+    step: int | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Integrity:
-    """Type 6: `iodf` (n, 4) of the blocks, `udrei` (n, 51)."""
-
-    row: Integers
-    iodf: Integers
-    udrei: Integers
+def _signed(first: int, length: int, scale: float | None = None, number: int | None = None) -> BitField:
+    return BitField(first, length, scale, True, number)
 
 
-@dataclass(frozen=True, kw_only=True)
-class FastDegradation:
-    """Type 7: `latency_s` and `iodp` (n,), `indicator` (n, 51)."""
+#: Fields of a message or of a part of it; a sequence of fields becomes one array of as many columns.
+Layout = Mapping[str, BitField | Sequence[BitField]]
 
-    row: Integers
-    latency_s: Floats
-    iodp: Integers
-    indicator: Integers
+#: Whole messages by type, and parts of messages, whose bits count from the beginning of the part.
+LAYOUTS: Final[dict[str, Layout]] = {
+    "type 1": {"member": BitField(14, 1, number=210), "iodp": BitField(224, 2)},
+    "type 2": {
+        "iodf": BitField(14, 2),
+        "iodp": BitField(16, 2),
+        "prc_m": _signed(18, 12, 0.125, BLOCK),
+        "udrei": BitField(174, 4, number=BLOCK),
+    },
+    "type 6": {"iodf": BitField(14, 2, number=4), "udrei": BitField(22, 4, number=SLOTS)},
+    "type 7": {
+        "latency_s": BitField(14, 4, 1.0),
+        "iodp": BitField(18, 2),
+        "indicator": BitField(22, 4, number=SLOTS),
+    },
+    "type 9": {
+        "time_of_day_s": BitField(22, 13, 16.0),
+        "accuracy": BitField(35, 4),
+        "position_ecef_m": (_signed(39, 30, 0.08), _signed(69, 30, 0.08), _signed(99, 25, 0.4)),
+        "velocity_ecef_mps": (_signed(124, 17, 0.000625), _signed(141, 17, 0.000625), _signed(158, 18, 0.004)),
+        "acceleration_ecef_mps2": (
+            _signed(176, 10, 0.0000125),
+            _signed(186, 10, 0.0000125),
+            _signed(196, 10, 0.0000625),
+        ),
+        "clock_s": _signed(206, 12, 2.0**-31),
+        "clock_rate": _signed(218, 8, 2.0**-40),
+    },
+    # How errors grow (table A-9).
+    "type 10": {
+        "range_rate_m": BitField(14, 10, 0.002),
+        "long_term_step_m": BitField(24, 10, 0.002),
+        "long_term_rate_mps": BitField(34, 10, 0.00005),
+        "long_term_interval_s": BitField(44, 9, 1.0),
+        "still_step_m": BitField(53, 10, 0.002),
+        "still_interval_s": BitField(63, 9, 1.0),
+        "geo_step_m": BitField(72, 10, 0.0005),
+        "geo_rate_mps": BitField(82, 10, 0.00005),
+        "geo_interval_s": BitField(92, 9, 1.0),
+        "en_route_m": BitField(101, 6, 0.5),
+        "iono_step_m": BitField(107, 10, 0.001),
+        "iono_interval_s": BitField(117, 9, 1.0),
+        "iono_rate_mps": BitField(126, 10, 0.000005),
+        "rss_udre": BitField(136, 1),
+        "rss_iono": BitField(137, 1),
+        "covariance": BitField(138, 7, 0.1),
+    },
+    "type 12": {
+        "drift": _signed(14, 24, 2.0**-50),
+        "offset_s": _signed(38, 32, 2.0**-30),
+        "reference_s": BitField(70, 8, 4096.0),
+        "reference_week": BitField(78, 8),
+        "leap_s": _signed(86, 8),
+        "leap_week": BitField(94, 8),
+        "leap_day": BitField(102, 8),
+        "next_leap_s": _signed(110, 8),
+        "utc_standard": BitField(118, 3),
+        "time_of_week_s": BitField(121, 20, 1.0),
+        "week": BitField(141, 10),
+    },
+    "type 17": {"time_of_day_s": BitField(215, 11, 64.0)},
+    "type 18": {
+        "bands": BitField(14, 4),
+        "band": BitField(18, 4),
+        "iodi": BitField(22, 2),
+        "mask": BitField(24, 1, number=201),
+    },
+    "type 24": {
+        "prc_m": _signed(14, 12, 0.125, 6),
+        "udrei": BitField(86, 4, number=6),
+        "iodp": BitField(110, 2),
+        "block": BitField(112, 2),
+        "iodf": BitField(114, 2),
+    },
+    "type 26": {
+        "band": BitField(14, 4),
+        "block": BitField(18, 4),
+        "delay_m": BitField(22, 9, 0.125, number=15, step=13),
+        "givei": BitField(31, 4, number=15, step=13),
+        "iodi": BitField(217, 2),
+    },
+    "type 27": {
+        "issue": BitField(14, 3),
+        "messages": BitField(17, 3),
+        "message": BitField(20, 3),
+        "regions": BitField(23, 3),
+        "priority": BitField(26, 2),
+        "inside": BitField(28, 4),
+        "outside": BitField(32, 4),
+        "latitude_1_deg": BitField(36, 8, 1.0, True, _REGIONS, 35),
+        "longitude_1_deg": BitField(44, 9, 1.0, True, _REGIONS, 35),
+        "latitude_2_deg": BitField(53, 8, 1.0, True, _REGIONS, 35),
+        "longitude_2_deg": BitField(61, 9, 1.0, True, _REGIONS, 35),
+        "square": BitField(70, 1, number=_REGIONS, step=35),
+    },
+    "type 28": {"iodp": BitField(14, 2)},
+    "almanac of type 17": {
+        "prn": BitField(2, 8),
+        "health": BitField(10, 8),
+        "position_ecef_m": (_signed(18, 15, 2600.0), _signed(33, 15, 2600.0), _signed(48, 9, 26_000.0)),
+        "velocity_ecef_mps": (_signed(57, 3, 10.0), _signed(60, 3, 10.0), _signed(63, 4, 60.0)),
+    },
+    # Half of type 25 with velocity code 0: two satellites; their issue of the mask stands behind both.
+    "half of type 25": {"velocity_code": BitField(0, 1), "iodp": BitField(103, 2)},
+    "satellite of type 25": {
+        "slot": BitField(0, 6),
+        "iode": BitField(6, 8),
+        "position_m": _signed(14, 9, 0.125, 3),
+        "clock_s": _signed(41, 10, 2.0**-31),
+    },
+    # Half of type 25 with velocity code 1: one satellite.
+    "moving satellite of type 25": {
+        "slot": BitField(1, 6),
+        "iode": BitField(7, 8),
+        "position_m": _signed(15, 11, 0.125, 3),
+        "clock_s": _signed(48, 11, 2.0**-31),
+        "velocity_mps": _signed(59, 8, 2.0**-11, 3),
+        "clock_rate": _signed(83, 8, 2.0**-39),
+        "time_of_day_s": BitField(91, 13, 16.0),
+        "iodp": BitField(104, 2),
+    },
+    "satellite of type 28": {
+        "slot": BitField(0, 6),
+        "exponent": BitField(6, 3, 1.0),
+        "diagonal": BitField(9, 9, number=4),
+        "upper": _signed(45, 10, number=6),
+    },
+}
 
 
-@dataclass(frozen=True, kw_only=True)
-class LongTerm:
-    """Types 24 and 25, one row a satellite.
+def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
+    """Fields of messages of one layout.
 
-    `slot`, `iode`, `iodp`, `velocity_code` (n,); `position_m`, `velocity_mps` (n, 3), `clock_s`,
-    `clock_rate` (n,), and `reference` (n,), the instant they hold for, NaT without velocity.
+    Parameters
+    ----------
+    bits : ndarray of uint8, shape (n, 32)
+        As in `SbasMessages.bits`.
+    layout : Layout
+    offset : int
+        Bit at which the part of the message begins that the layout describes.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (n,) or (n, number)
+        int64, or float64 where the field has a scale.
     """
+    unpacked = np.unpackbits(np.ascontiguousarray(bits), axis=1)
 
-    row: Integers
-    slot: Integers
-    iode: Integers
-    iodp: Integers
-    velocity_code: Integers
-    position_m: Floats
-    velocity_mps: Floats
-    clock_s: Floats
-    clock_rate: Floats
-    reference: Datetimes
+    def read(field: BitField | Sequence[BitField]) -> NDArray[Any]:
+        if not isinstance(field, BitField):
+            return np.stack([read(part) for part in field], axis=1)
+        step = field.length if field.step is None else field.step
+        begins = offset + field.first + step * np.arange(1 if field.number is None else field.number)
+        at = begins[:, None] + np.arange(field.length)
+        value = unpacked[:, at].astype(np.int64) @ (np.int64(1) << np.arange(field.length - 1, -1, -1, dtype=np.int64))
+        if field.signed:
+            value = np.where(value >> (field.length - 1), value - (np.int64(1) << field.length), value)
+        if field.number is None:
+            value = value[:, 0]
+        return value if field.scale is None else np.asarray(value * field.scale, dtype=np.float64)
 
-
-@dataclass(frozen=True, kw_only=True)
-class GridMasks:
-    """Type 18: `band`, `iodi`, `bands` (n,), `mask` (n, 201)."""
-
-    row: Integers
-    band: Integers
-    iodi: Integers
-    bands: Integers
-    mask: Masks
+    return {name: read(field) for name, field in layout.items()}
 
 
-@dataclass(frozen=True, kw_only=True)
-class GridDelays:
-    """Type 26: `band`, `block`, `iodi` (n,), `delay_m` (n, 15), NaN for do not use, `givei` (n, 15)."""
-
-    row: Integers
-    band: Integers
-    block: Integers
-    iodi: Integers
-    delay_m: Floats
-    givei: Integers
+def rows_of(messages: SbasMessages, *types: int) -> Integers:
+    """Rows of some message types."""
+    return np.flatnonzero(np.isin(messages.type, types)).astype(np.int64)
 
 
-def of_types(log: SbasLog, *types: int) -> tuple[Integers, Fields]:
-    """Rows of some message types, and their bits."""
-    row = np.flatnonzero(np.isin(log.type, types)).astype(np.int64)
-    return row, Fields(log.bits[row])
+def decode(messages: SbasMessages, kind: int) -> Decoded:
+    """Fields of all messages of a type that has a layout of its own, as they stand in the message."""
+    row = rows_of(messages, kind)
+    return {"row": row, **read_fields(messages.bits[row], LAYOUTS[f"type {kind}"])}
 
 
-def prn_masks(log: SbasLog) -> PrnMasks:
-    """Decode type 1."""
-    row, field = of_types(log, 1)
-    message, bit = np.nonzero(field.flags(14, 210))
+def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
+    """Instants with a time of day that lie nearest to other instants; NaT where it is NaN."""
+    midnight = near.astype("datetime64[D]").astype("datetime64[ns]")
+    offset = time_of_day_s - seconds(near - midnight)
+    return np.asarray(near + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY)), "datetime64[ns]")
+
+
+def prn_masks(messages: SbasMessages) -> Decoded:
+    """Type 1: `iodp` (n,), and `number` (n, 51), the number of the PRN mask by slot, 0 where there is none."""
+    decoded = decode(messages, 1)
+    message, bit = np.nonzero(decoded.pop("member"))
     slot = np.arange(len(message)) - np.searchsorted(message, message)
-    number = np.zeros((len(row), SLOTS), dtype=np.int64)
+    number = np.zeros((len(decoded["row"]), SLOTS), dtype=np.int64)
     kept = slot < SLOTS
     number[message[kept], slot[kept]] = bit[kept] + 1
-    return PrnMasks(row=row, iodp=field.unsigned(224, 2), number=number)
+    return {**decoded, "number": number}
 
 
-def fast_corrections(log: SbasLog, *, type0: Literal["stop", "as_type2"]) -> FastCorrections:
-    """Decode types 2 to 5, 24, and 0 where it stands for 2 and is not empty."""
-    parts = [_fast_block(log, *of_types(log, 2, 3, 4, 5))]
+def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2"]) -> Decoded:
+    """Types 2 to 5, 24, and 0 where it stands for 2 and is not empty; one row a slot.
+
+    `slot`, `prc_m`, `udrei`, `iodf`, `iodp`, all (n,).
+    """
+    row = rows_of(messages, 2, 3, 4, 5)
     if type0 == "as_type2":
-        row, field = of_types(log, 0)
-        filled = field.flags(14, 212).any(axis=1)
-        parts.append(_fast_block(log, row[filled], Fields(log.bits[row[filled]])))
-    row, field = of_types(log, 24)
-    parts.append(
-        _fast_rows(
-            row,
-            BLOCK * field.unsigned(112, 2),
-            field.signed_row(14, 12, HALF_BLOCK),
-            field.unsigned_row(86, 4, HALF_BLOCK),
-            field.unsigned(114, 2),
-            field.unsigned(110, 2),
-        )
-    )
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-    order = np.argsort(joined["row"], kind="stable")
-    return FastCorrections(**{name: values[order] for name, values in joined.items()})
-
-
-def _fast_block(log: SbasLog, row: Integers, field: Fields) -> FastCorrections:
-    return _fast_rows(
-        row,
-        BLOCK * np.maximum(log.type[row] - 2, 0),
-        field.signed_row(18, 12, BLOCK),
-        field.unsigned_row(174, 4, BLOCK),
-        field.unsigned(14, 2),
-        field.unsigned(16, 2),
-    )
-
-
-def _fast_rows(
-    row: Integers, first: Integers, prc: Integers, udrei: Integers, iodf: Integers, iodp: Integers
-) -> FastCorrections:
-    count = prc.shape[1]
-    slot = first[:, None] + np.arange(count)
-    message, column = np.nonzero(slot < SLOTS)
-    return FastCorrections(
-        row=row[message],
-        slot=slot[message, column],
-        prc_m=np.asarray(prc[message, column] * _PRC_M, dtype=np.float64),
-        udrei=udrei[message, column],
-        iodf=iodf[message],
-        iodp=iodp[message],
-    )
-
-
-def integrity(log: SbasLog) -> Integrity:
-    """Decode type 6."""
-    row, field = of_types(log, 6)
-    return Integrity(row=row, iodf=field.unsigned_row(14, 2, 4), udrei=field.unsigned_row(22, 4, SLOTS))
-
-
-def fast_degradation(log: SbasLog) -> FastDegradation:
-    """Decode type 7."""
-    row, field = of_types(log, 7)
-    return FastDegradation(
-        row=row,
-        latency_s=field.unsigned(14, 4).astype(np.float64),
-        iodp=field.unsigned(18, 2),
-        indicator=field.unsigned_row(22, 4, SLOTS),
-    )
-
-
-def long_term(log: SbasLog) -> LongTerm:
-    """Decode the halves of type 25 and the one of type 24."""
-    row, field = of_types(log, 25)
-    parts = _half(log, row, field, 14) + _half(log, row, field, 120)
-    row, field = of_types(log, 24)
-    parts += _half(log, row, field, 120)
-    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
-    keep = np.flatnonzero((joined["slot"] >= 0) & (joined["slot"] < SLOTS))
-    order = keep[np.argsort(joined["row"][keep], kind="stable")]
-    return LongTerm(**{name: values[order] for name, values in joined.items()})
-
-
-def _half(log: SbasLog, row: Integers, field: Fields, start: int) -> list[LongTerm]:
-    """One half message: two satellites without velocity, or one with it."""
-    moving = field.unsigned(start, 1) == 1
-    still, with_velocity = Fields(log.bits[row[~moving]]), Fields(log.bits[row[moving]])
-    return [
-        _still(row[~moving], still, start + 1, start + 103),
-        _still(row[~moving], still, start + 52, start + 103),
-        _moving(log, row[moving], with_velocity, start + 1),
+        zero = rows_of(messages, 0)
+        row = np.concatenate([row, zero[has_data(messages.bits[zero])]])
+    parts = [
+        _by_slot(row, BLOCK * np.maximum(messages.type[row] - 2, 0), read_fields(messages.bits[row], LAYOUTS["type 2"]))
     ]
+    mixed = decode(messages, 24)
+    parts.append(_by_slot(mixed.pop("row"), BLOCK * mixed.pop("block"), mixed))
+    return _joined(parts)
 
 
-def _still(row: Integers, field: Fields, start: int, iodp: int) -> LongTerm:
-    zero = np.zeros(len(row), dtype=np.int64)
-    return LongTerm(
-        row=row,
-        slot=field.unsigned(start, 6) - 1,
-        iode=field.unsigned(start + 6, 8),
-        iodp=field.unsigned(iodp, 2),
-        velocity_code=zero,
-        position_m=field.real_row(start + 14, 9, 3, 0.125),
-        velocity_mps=np.zeros((len(row), 3)),
-        clock_s=field.real(start + 41, 10, 2.0**-31),
-        clock_rate=np.zeros(len(row)),
-        reference=np.full(len(row), np.datetime64("NaT"), dtype="datetime64[ns]"),
-    )
+def has_data(bits: Bytes) -> Masks:
+    """Whether any data bit of messages is set, shape (n,)."""
+    return np.asarray(np.unpackbits(np.ascontiguousarray(bits), axis=1)[:, 14:226].any(axis=1))
 
 
-def _moving(log: SbasLog, row: Integers, field: Fields, start: int) -> LongTerm:
-    return LongTerm(
-        row=row,
-        slot=field.unsigned(start, 6) - 1,
-        iode=field.unsigned(start + 6, 8),
-        iodp=field.unsigned(start + 103, 2),
-        velocity_code=np.ones(len(row), dtype=np.int64),
-        position_m=field.real_row(start + 14, 11, 3, 0.125),
-        velocity_mps=field.real_row(start + 58, 8, 3, 2.0**-11),
-        clock_s=field.real(start + 47, 11, 2.0**-31),
-        clock_rate=field.real(start + 82, 8, 2.0**-39),
-        reference=day_time(field.positive(start + 90, 13, 16.0), log.time[row]),
-    )
+def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
+    """One row a slot of fast corrections."""
+    slot = first[:, None] + np.arange(fields["prc_m"].shape[1])
+    message, column = np.nonzero(slot < SLOTS)
+    return {
+        "row": row[message],
+        "slot": slot[message, column],
+        **{name: values[message, column] if values.ndim == 2 else values[message] for name, values in fields.items()},
+    }
 
 
-def grid_masks(log: SbasLog) -> GridMasks:
-    """Decode type 18."""
-    row, field = of_types(log, 18)
-    return GridMasks(
-        row=row,
-        bands=field.unsigned(14, 4),
-        band=field.unsigned(18, 4),
-        iodi=field.unsigned(22, 2),
-        mask=field.flags(24, 201),
-    )
+def _joined(parts: Sequence[Decoded], slot: str = "slot") -> Decoded:
+    """Rows of several decoders in the order of the messages, without those of empty slots."""
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    kept = np.flatnonzero((joined[slot] >= 0) & (joined[slot] < SLOTS)) if slot else np.arange(len(joined["row"]))
+    order = kept[np.argsort(joined["row"][kept], kind="stable")]
+    return {name: values[order] for name, values in joined.items()}
 
 
-def grid_delays(log: SbasLog) -> GridDelays:
-    """Decode type 26."""
-    row, field = of_types(log, 26)
-    delay = field.unsigned_row(22, 9, 15, 13)
-    return GridDelays(
-        row=row,
-        band=field.unsigned(14, 4),
-        block=field.unsigned(18, 4),
-        iodi=field.unsigned(217, 2),
-        delay_m=np.where(delay == _DO_NOT_USE_DELAY, np.nan, delay * _DELAY_M),
-        givei=field.unsigned_row(31, 4, 15, 13),
-    )
+def long_term(messages: SbasMessages) -> Decoded:
+    """Both halves of type 25 and that of type 24, one row a satellite.
+
+    `slot`, `iode`, `iodp`, `velocity_code` (n,); `position_m`, `velocity_mps` (n, 3), `clock_s`, `clock_rate`
+    (n,), and `reference` (n,), the instant they hold for, NaT without velocity.
+    """
+    parts: list[Decoded] = []
+    for kind, start in ((25, 14), (25, 120), (24, 120)):
+        row = rows_of(messages, kind)
+        half = read_fields(messages.bits[row], LAYOUTS["half of type 25"], start)
+        moves = half["velocity_code"] == 1
+        still, moving = row[~moves], row[moves]
+        for first in (1, 52):
+            part = read_fields(messages.bits[still], LAYOUTS["satellite of type 25"], start + first)
+            parts.append(
+                {
+                    "row": still,
+                    **part,
+                    "slot": part["slot"] - 1,
+                    "iodp": half["iodp"][~moves],
+                    "velocity_code": np.zeros(len(still), dtype=np.int64),
+                    "velocity_mps": np.zeros((len(still), 3)),
+                    "clock_rate": np.zeros(len(still)),
+                    "reference": np.full(len(still), np.datetime64("NaT"), dtype="datetime64[ns]"),
+                }
+            )
+        part = read_fields(messages.bits[moving], LAYOUTS["moving satellite of type 25"], start)
+        reference = time_near(part.pop("time_of_day_s"), messages.time[moving])
+        code = np.ones(len(moving), dtype=np.int64)
+        parts.append({"row": moving, **part, "slot": part["slot"] - 1, "velocity_code": code, "reference": reference})
+    return _joined(parts)
+
+
+def grid_delays(messages: SbasMessages) -> Decoded:
+    """Type 26: `band`, `block`, `iodi` (n,), `delay_m` (n, 15), NaN for do not use, `givei` (n, 15)."""
+    decoded = decode(messages, 26)
+    delay = decoded["delay_m"]
+    return {**decoded, "delay_m": np.where(delay == _DO_NOT_USE_DELAY_M, np.nan, delay)}
+
+
+def covariance(messages: SbasMessages) -> Decoded:
+    """Both halves of type 28, one row a satellite.
+
+    `slot`, `iodp`, `scale` (n,), `factor` (n, 4, 4), upper triangular, scaled.
+    """
+    decoded = decode(messages, 28)
+    row, parts = decoded["row"], []
+    for start in (16, 121):
+        part = read_fields(messages.bits[row], LAYOUTS["satellite of type 28"], start)
+        scale = np.exp2(part["exponent"] - 5.0)
+        factor = np.zeros((len(row), 4, 4))
+        factor[:, range(4), range(4)] = part["diagonal"]
+        factor[:, _UPPER[0], _UPPER[1]] = part["upper"]
+        slot = part["slot"] - 1
+        parts.append({**decoded, "slot": slot, "scale": scale, "factor": factor * scale[:, None, None]})
+    return _joined(parts)
+
+
+def service(messages: SbasMessages) -> Decoded:
+    """Type 27: `issue`, `messages`, `message`, `regions`, `priority`, `inside`, `outside` (n,); corners (n, 5)."""
+    decoded = decode(messages, 27)
+    return {
+        **decoded,
+        "messages": decoded["messages"] + 1,
+        "message": decoded["message"] + 1,
+        "regions": np.minimum(decoded["regions"], _REGIONS),
+    }
+
+
+def geo_navigation(messages: SbasMessages) -> Decoded:
+    """Type 9: motion (n, 3) and clock (n,) of the sender at `reference`; `accuracy` is the URA index, 15 unusable."""
+    decoded = decode(messages, 9)
+    row = decoded["row"]
+    reference = time_near(decoded.pop("time_of_day_s"), messages.time[row])
+    return {**decoded, "prn": messages.prn[row], "reference": reference}
+
+
+def geo_almanacs(messages: SbasMessages) -> Decoded:
+    """Type 17, one row a satellite: `prn`, `health`, `reference` (n,), position and velocity (n, 3)."""
+    decoded = decode(messages, 17)
+    row = decoded["row"]
+    reference = time_near(decoded["time_of_day_s"], messages.time[row])
+    parts = []
+    for start in (14, 81, 148):
+        part = read_fields(messages.bits[row], LAYOUTS["almanac of type 17"], start)
+        used = part["prn"] != 0
+        parts.append({name: values[used] for name, values in {"row": row, "reference": reference, **part}.items()})
+    return _joined(parts, slot="")

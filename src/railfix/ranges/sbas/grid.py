@@ -1,21 +1,22 @@
-"""The ionospheric grid: where its points are, and what one GEO says about them (DO-229D, A.4.4.9 and A.4.4.10)."""
+"""The ionospheric grid: its points, and the delays that one GEO sends for them (DO-229D, A.4.4.9 and A.4.4.10)."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Integers, Masks
-from railfix.core.timescale import seconds
-from railfix.ranges.sbas.decode import grid_delays, grid_masks
-from railfix.ranges.sbas.limits import STOP_S, SbasLimits
-from railfix.ranges.sbas.log import SbasLog
-from railfix.ranges.sbas.spans import Spans
-from railfix.ranges.sbas.tables import LONG_AGO, Stops
-from railfix.ranges.sbas.timeline import Timeline, series_order
+from railfix.core.arrays import Datetimes, Indices, Integers, Masks
+from railfix.core.timescale import seconds, timedelta
+from railfix.ranges.sbas.decode import decode, grid_delays
+from railfix.ranges.sbas.messages import SbasMessages
+from railfix.ranges.sbas.standard import STOP_S, SbasLimits
+from railfix.ranges.sbas.tables import Series, Stops
+
+Answer = TypeVar("Answer", bound=np.generic)
 
 #: Bands, bits of a mask, points of one message of type 26.
 BANDS: Final = 11
@@ -79,77 +80,117 @@ class GridTables:
 
     Attributes
     ----------
-    delay_m : ndarray, shape (n,) [m]
-        Vertical, NaN for do not use.
-    givei : ndarray of int, shape (n,)
-    time : ndarray of datetime64[ns], shape (n,)
-    newest : Timeline
-        Of points.
+    delays : Series
+        By grid point: `delay_m`, vertical, NaN for do not use; `givei`; `issue` of the mask (4 band + IODI).
     spans : Spans
         In which nothing about the grid changes.
+    unused : Counter of str
+        Delays that no mask fits.
     """
 
-    def __init__(self, log: SbasLog, limits: SbasLimits, stops: Stops) -> None:
+    def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
         self.unused: Counter[str] = Counter()
         self._stops = stops
-        timeouts = [limits.timeout_s(what) for what in ("grid_mask", "grid_delay", "degradation")]
-        self.spans = Spans(log.time, [*timeouts, STOP_S])
+        timeouts = [limits.timeout_s(kind) for kind in ("grid_mask", "grid_delay", "degradation")]
+        self.spans = Spans(messages.time, [*timeouts, STOP_S])
         self._mask_limit = limits.timeout_s("grid_mask")
-        masks = grid_masks(log)
-        known = np.flatnonzero(masks.band < BANDS)
-        time, band, mask = log.time[masks.row[known]], masks.band[known], masks.mask[known]
+        masks = decode(messages, 18)
+        known = masks["band"] < BANDS
+        time, band, mask = messages.time[masks["row"][known]], masks["band"][known], masks["mask"][known] != 0
         cell = (band[:, None] * BITS + np.arange(BITS)).ravel()
-        cell_time = np.repeat(time, BITS)
-        order = series_order(cell, cell_time)
-        self._member, self._member_time = mask.ravel()[order], cell_time[order]
-        self._by_cell = Timeline(cell[order], self._member_time)
-        issue = band * 4 + masks.iodi[known]
-        order = series_order(issue, time)
-        self._mask_time = time[order]
-        self._by_issue = Timeline(issue[order], self._mask_time)
-        self._fill(log, mask[order])
+        self._by_cell = Series.of(cell, np.repeat(time, BITS), {"member": mask.ravel()})
+        self._by_issue = Series.of(band * 4 + masks["iodi"][known], time, {"mask": mask})
+        self.delays = self._delays(messages)
 
-    def _fill(self, log: SbasLog, masks: Masks) -> None:
+    def _delays(self, messages: SbasMessages) -> Series:
         """Delays by point: the k-th of a block belongs to the k-th point of the mask of its issue."""
-        decoded = grid_delays(log)
-        kept = np.flatnonzero(decoded.band < BANDS)
-        band, time = decoded.band[kept], log.time[decoded.row[kept]]
-        issue = band * 4 + decoded.iodi[kept]
-        mask = self._by_issue.newest(issue, time)
+        decoded = grid_delays(messages)
+        kept = np.flatnonzero(decoded["band"] < BANDS)
+        time, issue = messages.time[decoded["row"][kept]], 4 * decoded["band"][kept] + decoded["iodi"][kept]
         fits = self.mask_active(issue, time)
         self.unused["grid delays without a mask of their IODI"] += int((~fits).sum()) * BLOCK
-        kept, band, time, issue, mask = kept[fits], band[fits], time[fits], issue[fits], mask[fits]
-        rank = np.full((len(masks), BITS), -1, dtype=np.int64)
+        kept, time, issue = kept[fits], time[fits], issue[fits]
+        masks = self._by_issue["mask"]
+        rank = np.full(masks.shape, -1, dtype=np.int64)
         row, bit = np.nonzero(masks)
         rank[row, np.arange(len(row)) - np.searchsorted(row, row)] = bit
-        place = decoded.block[kept][:, None] * BLOCK + np.arange(BLOCK)
-        bits = np.where(place < BITS, rank[mask[:, None], np.minimum(place, BITS - 1)], -1) if len(mask) else place
-        point = np.where(bits >= 0, POINT_OF_BIT[band[:, None], np.maximum(bits, 0)], -1).ravel()
-        used = np.flatnonzero(point >= 0)
-        when = np.repeat(time, BLOCK)
-        order = used[series_order(point[used], when[used])]
-        self.point, self.time = point[order], when[order]
-        self.delay_m = decoded.delay_m[kept].ravel()[order]
-        self.givei = decoded.givei[kept].ravel()[order]
-        self.issue = np.repeat(issue, BLOCK)[order]
-        self.newest = Timeline(self.point, self.time)
+        place = decoded["block"][kept][:, None] * BLOCK + np.arange(BLOCK)
+        mask = self._by_issue.newest(issue, time)
+        bits = np.where(place < BITS, rank[mask[:, None], np.minimum(place, BITS - 1)], -1)
+        band = decoded["band"][kept]
+        point = np.where(bits >= 0, POINT_OF_BIT[band[:, None], np.maximum(bits, 0)], -1)
+        columns = {name: decoded[name][kept].ravel() for name in ("delay_m", "givei")}
+        return Series.of(point.ravel(), np.repeat(time, BLOCK), {**columns, "issue": np.repeat(issue, BLOCK)})
+
+    def _active(self, table: Series, row: Integers, time: Datetimes) -> Masks:
+        received = table.received(row)
+        in_time = seconds(time - received) <= self._mask_limit
+        return np.asarray((row >= 0) & in_time & (received > self._stops.last(time)))
 
     def mask_active(self, issue: Integers, time: Datetimes) -> Masks:
         """Whether the mask of a band and issue (4 band + IODI) is known and not timed out."""
-        row = self._by_issue.newest(issue, time)
-        if not len(self._mask_time):
-            return np.zeros(row.shape, dtype=bool)
-        received = np.where(row >= 0, self._mask_time[row], LONG_AGO)
-        return (row >= 0) & (seconds(time - received) <= self._mask_limit) & (received > self._stops.last(time))
+        return self._active(self._by_issue, self._by_issue.newest(issue, time), time)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
         """Whether points are in the newest mask of a band of theirs that has not timed out."""
-        found = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool)
-        if not len(self._member):
-            return found
+        inside = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
-            received = np.where(row >= 0, self._member_time[row], LONG_AGO)
-            fresh = (seconds(time - received) <= self._mask_limit) & (received > self._stops.last(time))
-            found |= (row >= 0) & self._member[row] & fresh
-        return found
+            inside |= self._by_cell["member"][row] & self._active(self._by_cell, row, time)
+        return inside
+
+
+class Spans:
+    """Spans of time between receptions and time-outs, in which no value of the grid changes.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        Reception of all messages.
+    timeouts_s : sequence of float
+    """
+
+    def __init__(self, time: Datetimes, timeouts_s: Sequence[float]) -> None:
+        ends = [time, *(time + timedelta(np.asarray(float(seconds))) for seconds in timeouts_s)]
+        self._edges = np.unique(np.concatenate(ends)) if len(time) else time
+
+    def number(self, time: Datetimes) -> Integers:
+        """Number of the span of instants; an instant that is an edge has a number of its own."""
+        before = np.searchsorted(self._edges, time, side="left")
+        return np.asarray(before + np.searchsorted(self._edges, time, side="right"), dtype=np.int64)
+
+
+def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indices, Indices]:
+    """First row of each different combination of span and four points, and the combination of each row.
+
+    Parameters
+    ----------
+    span : ndarray of int, shape (M,)
+    point : ndarray of int, shape (M, 4)
+        From -1 to below `points`.
+    points : int
+
+    Returns
+    -------
+    first : ndarray of int, shape (U,)
+    which : ndarray of int, shape (M,)
+    """
+    # Runs of one span have one number; that a span has two where it comes twice does no harm.
+    key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
+    pairs = (point[:, ::2] + 1) * (points + 1) + point[:, 1::2] + 1
+    # Numbered anew half-way, so that the keys stay small however long the log is.
+    _, key = np.unique(key * (points + 1) ** 2 + pairs[:, 0], return_inverse=True)
+    _, first, which = np.unique(key * (points + 1) ** 2 + pairs[:, 1], return_index=True, return_inverse=True)
+    return first, which
+
+
+def looked_up(
+    answer: Callable[[Integers, Datetimes], NDArray[Answer]],
+    span: Integers,
+    point: Integers,
+    time: Datetimes,
+    points: int,
+) -> NDArray[Answer]:
+    """Value of `answer` at four points and an instant, computed once for each span: shape (M, ...)."""
+    first, which = distinct_lookups(span, point, points)
+    return np.asarray(answer(point[first], time[first])[which])

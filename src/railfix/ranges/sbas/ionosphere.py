@@ -10,12 +10,11 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.timescale import seconds
-from railfix.ranges.sbas.degrade import degradation_row
-from railfix.ranges.sbas.grid import COLUMNS, ROWS, GridTables, point_number
-from railfix.ranges.sbas.limits import GIVE_VARIANCE_M2, STOP_S, SbasLimits
+from railfix.ranges.sbas.grid import COLUMNS, ROWS, GridTables, looked_up, point_number
 from railfix.ranges.sbas.results import IonosphereDelays, IonosphereState
-from railfix.ranges.sbas.spans import looked_up
-from railfix.ranges.sbas.tables import LONG_AGO, SatelliteTables
+from railfix.ranges.sbas.satellites import degradation_row
+from railfix.ranges.sbas.standard import GIVE_VARIANCE_M2, STOP_S, SbasLimits
+from railfix.ranges.sbas.tables import SatelliteTables
 
 #: Earth's radius and height of the layer [km] (DO-229D, A.4.4.10.1).
 EARTH_RADIUS_KM: Final = 6378.1363
@@ -29,7 +28,7 @@ _NO_POINT: Final = -1
 def pierce_point(
     latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Where signals cross the layer, and how much longer their way in it is than the vertical one.
+    """Pierce points of signals in the ionospheric layer, and the obliquity factor of their paths.
 
     Parameters
     ----------
@@ -217,21 +216,19 @@ def ionosphere(
 def _judge(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, point: Integers
 ) -> tuple[Integers, Integers]:
-    """Newest delay of each corner, and whether it may be used (M, 4)."""
-    at = time[:, None]
-    row = grid.newest.newest(point, at)
-    if not len(grid.time):
-        return row, np.full(row.shape, IonosphereState.NOT_MONITORED, dtype=np.int64)
-    received = np.where(row >= 0, grid.time[row], LONG_AGO)
+    """Newest delay of each corner, and its `IonosphereState` (M, 4)."""
+    at, delays = time[:, None], grid.delays
+    row = delays.newest(point, at)
+    received = delays.received(row)
     late = seconds(at - received) > limits.timeout_s("grid_delay")
-    late |= ~grid.mask_active(np.where(row >= 0, grid.issue[row], -1), at)
+    late |= ~grid.mask_active(np.where(row >= 0, delays["issue"][row], -1), at)
     state = np.select(
         [
             point < 0,
             (row < 0) | (received <= tables.stops.last(time)[:, None]),
             late,
-            np.isnan(grid.delay_m[row]),
-            grid.givei[row] == _NOT_MONITORED,
+            np.isnan(delays["delay_m"][row]),
+            delays["givei"][row] == _NOT_MONITORED,
         ],
         [
             IonosphereState.NO_GRID,
@@ -269,17 +266,12 @@ def _values(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
     """Vertical delay and variance of corners (M, 4), and where type 10 is in force (M,); t is the epoch of each."""
-    if not len(grid.time):
-        nothing = np.full(row.shape, np.nan)
-        return nothing, nothing, np.zeros(len(row), dtype=bool)
     newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
-    of_ten, active = newest[t], in_force[t]
-    variance = _GIVE_VARIANCE[grid.givei[row]]
-    if not len(tables.degradation.time):
-        return grid.delay_m[row], variance, active
-    values = tables.degradation.values
-    age = seconds(time[t][:, None] - grid.time[row]) + limits.message_s
-    interval = np.maximum(values.iono_interval_s[of_ten], 1.0)[:, None]
-    grown = values.iono_step_m[of_ten][:, None] * np.floor(age / interval) + values.iono_rate_mps[of_ten][:, None] * age
-    squares = (values.rss_iono[of_ten] == 1)[:, None]
-    return grid.delay_m[row], np.where(squares, variance + grown**2, (np.sqrt(variance) + grown) ** 2), active
+    of_ten, delays, ten = newest[t], grid.delays, tables.degradation
+    variance = _GIVE_VARIANCE[delays["givei"][row]]
+    age = seconds(time[t][:, None] - delays.time[row]) + limits.message_s
+    step, interval, rate = (ten[f"iono_{name}"][of_ten][:, None] for name in ("step_m", "interval_s", "rate_mps"))
+    grown = step * np.floor(age / np.maximum(interval, 1.0)) + rate * age
+    squares = (ten["rss_iono"][of_ten] == 1)[:, None]
+    total = np.where(squares, variance + grown**2, (np.sqrt(variance) + grown) ** 2)
+    return delays["delay_m"][row], total, in_force[t]

@@ -1,4 +1,4 @@
-"""What SBAS says about satellites and delays at epochs."""
+"""Corrections of satellites and ionospheric delays at epochs, with their states."""
 
 from __future__ import annotations
 

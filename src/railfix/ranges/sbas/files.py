@@ -1,0 +1,333 @@
+"""Files of SBAS messages: RTKLIB, EGNOS message server (EMS), RINEX broadcast data (type B)."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from os import PathLike
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix.core.arrays import Bytes, Integers, Masks
+from railfix.core.errors import InputFileError
+from railfix.core.files import BrokenLines, FilePath, read_text_lines
+from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
+from railfix.ranges.sbas.messages import ROW_BYTES, SbasMessages, carried_parity, message_parity, preamble_number
+from railfix.ranges.sbas.standard import GEO_PRNS
+
+_RTKLIB: Final = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+(\d+)\s+(\d+)\s*:\s*([0-9A-Fa-f]+)")
+_EMS: Final = re.compile(r"(\d+)((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)\s+(\d+)\s+([0-9A-Fa-f]+)")
+_RINEX_HEAD: Final = re.compile(r"(\d{1,3})((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)(?:\s+([A-Z]\d)\s+(\d+)\b.*)?")
+_RINEX_BYTES: Final = 18
+#: Seconds from the first bit, to which RINEX type B refers, to the reception of the whole message.
+_RINEX_SHIFT_S: Final = 1.0
+
+
+@dataclass(frozen=True)
+class RawMessage:
+    """One message as written: nanoseconds since 1980-01-06 in GPS time, PRN, type (-1 unsaid), hexadecimal digits."""
+
+    line: int
+    time_ns: int
+    prn: int
+    kind: int
+    digits: str
+
+
+def kind_of_file(path: str, lines: Sequence[str]) -> str:
+    """Format, told by the first line that says anything: "rtklib", "ems" or "rinex".
+
+    Raises
+    ------
+    InputFileError
+        None of them.
+    """
+    for number, text in enumerate(lines, start=1):
+        line = text.strip()
+        if not line or line[0] in "#%":
+            continue
+        if text[60:80].startswith("RINEX VERSION / TYPE"):
+            if text[20:21] == "B":
+                return "rinex"
+            raise InputFileError(
+                path, f"is RINEX of type {text[20:21]!r}, type B (broadcast data) was expected", line=1
+            )
+        if _RTKLIB.fullmatch(line):
+            return "rtklib"
+        if _EMS.fullmatch(line):
+            return "ems"
+        raise InputFileError(
+            path,
+            f"{line[:40]!r} begins no SBAS file; '1481 108093 129 26 : 5369C4...' (RTKLIB), "
+            "'120 08 05 26 06 01 33 26 5369C4...' (EMS) or a RINEX header of type B was expected",
+            line=number,
+        )
+    raise InputFileError(path, "holds no SBAS message")
+
+
+def parse(path: str, kind: str, lines: Sequence[str]) -> Iterator[RawMessage | InputFileError]:
+    """Every message of a file in its order; a broken one as the error that describes it."""
+    if kind == "rinex":
+        yield from _parse_rinex(path, lines)
+        return
+    for number, text in enumerate(lines, start=1):
+        line = text.strip()
+        if line and line[0] not in "#%":
+            yield (_rtklib if kind == "rtklib" else _ems)(path, number, line)
+
+
+def _rtklib(path: str, number: int, line: str) -> RawMessage | InputFileError:
+    found = _RTKLIB.fullmatch(line)
+    if found is None:
+        return InputFileError(path, f"{line[:40]!r} is no 'week tow prn type : hexadecimal message'", line=number)
+    week, tow, prn, kind, digits = found.groups()
+    seconds = float(tow)
+    if not (0 < int(week) < 10_000 and 0.0 <= seconds < SECONDS_PER_WEEK):
+        return InputFileError(path, f"week {week}, time of week {tow} is no GPS time", line=number)
+    time = int(week) * SECONDS_PER_WEEK * 10**9 + round(seconds * 1e9)
+    return _checked_line(path, RawMessage(number, time, int(prn), int(kind), digits))
+
+
+def _ems(path: str, number: int, line: str) -> RawMessage | InputFileError:
+    found = _EMS.fullmatch(line)
+    if found is None:
+        return InputFileError(
+            path, f"{line[:40]!r} is no 'prn yy mm dd hh mm ss type hexadecimal message'", line=number
+        )
+    prn, date, second, kind, digits = found.groups()
+    try:
+        time = _instant(date, second)
+    except ValueError:
+        return InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
+    return _checked_line(path, RawMessage(number, time, int(prn), int(kind), digits))
+
+
+def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | InputFileError]:
+    """Records of RINEX type B: PRN and epoch, then lines of up to 18 bytes, the type before the first."""
+    end = next((i for i, text in enumerate(lines) if text[60:].startswith("END OF HEADER")), None)
+    if end is None:
+        raise InputFileError(path, "the header has no END OF HEADER; the file is cut, give the whole one")
+    rest = [(i, text) for i, text in enumerate(lines[end + 1 :], start=end + 2) if text.strip()]
+    at = 0
+    while at < len(rest):
+        number, text = rest[at]
+        at += 1
+        found = _RINEX_HEAD.fullmatch(text.strip())
+        if found is None:
+            yield InputFileError(path, f"{text.strip()[:40]!r} is no 'prn yy mm dd hh mm ss'", line=number)
+            while at < len(rest) and _RINEX_HEAD.fullmatch(rest[at][1].strip()) is None:
+                at += 1
+            continue
+        prn, date, second, band, length = found.groups()
+        count = int(length or 32)
+        body = rest[at : at + -(-count // _RINEX_BYTES)]
+        digits = "".join("".join(row[7:].split()) for _, row in body)[: 2 * count]
+        head = body[0][1][:7].strip() if body else ""
+        if len(digits) != 2 * count or not re.fullmatch(r"[0-9A-Fa-f]+", digits) or not re.fullmatch(r"\d*", head):
+            yield InputFileError(path, f"the record has no {count} bytes of two hexadecimal digits", line=number)
+            while at < len(rest) and _RINEX_HEAD.fullmatch(rest[at][1].strip()) is None:
+                at += 1
+            continue
+        at += len(body)
+        if band not in (None, "L1"):
+            yield InputFileError(path, f"the message is of band {band}, L1 was expected", line=number)
+            continue
+        try:
+            time = _instant(date, second) + round(_RINEX_SHIFT_S * 1e9)
+        except ValueError:
+            yield InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
+            continue
+        # Before 2004 the satellite number was the PRN less 100.
+        whole = int(prn) + (100 if int(prn) < 100 else 0)
+        yield _checked_line(path, RawMessage(number, time, whole, int(head or -1), digits))
+
+
+def _checked_line(path: str, raw: RawMessage) -> RawMessage | InputFileError:
+    if raw.prn not in GEO_PRNS:
+        return InputFileError(
+            path, f"PRN {raw.prn} sends no SBAS; 120 to 158 or 183 to 202 was expected", line=raw.line
+        )
+    if len(raw.digits) == 250 and set(raw.digits) <= {"0", "1"}:
+        digits = f"{int(raw.digits, 2) << 6:064X}"
+        return RawMessage(raw.line, raw.time_ns, raw.prn, raw.kind, digits)
+    if len(raw.digits) not in (58, 63, 64):
+        what = (
+            f"the message has {len(raw.digits)} hexadecimal digits, 58 (226 bits) or 63 or 64 (250 bits) were expected"
+        )
+        return InputFileError(path, what, line=raw.line)
+    kind = (int(raw.digits[2:4], 16) >> 2) & 0x3F
+    if raw.kind not in (-1, kind):
+        return InputFileError(path, f"type {raw.kind} is written, the message says {kind}", line=raw.line)
+    return raw
+
+
+def _instant(date: str, second: str) -> int:
+    """Nanoseconds since the GPS epoch of a calendar time in GPS time."""
+    year, month, day, hour, minute = (int(part) for part in date.split())
+    year += 0 if year >= 100 else 1900 if year >= 80 else 2000
+    value = float(second)
+    if not 0.0 <= value <= 60.0:
+        raise ValueError(second)
+    start = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "ns")
+    return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
+
+
+#: Digits of a message cut after its data: 226 bits, and 6 of the parity or nothing.
+_SHORT: Final = 58
+
+
+@dataclass
+class _Gathered:
+    """Messages of all files while they are read."""
+
+    raw: list[RawMessage] = field(default_factory=list)
+    source: list[int] = field(default_factory=list)
+    refused: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+
+
+def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> SbasMessages:
+    """SBAS messages of one or several files.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        RTKLIB (.sbs), EGNOS message server (.ems) or RINEX broadcast data (type B), told by their
+        content; plain, gzip or compress.
+    broken_lines : {"stop", "count"}
+        A line that is no message stops the reading, or is counted under "line" in `refused` and
+        named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
+        left out and counted in either case.
+
+    Returns
+    -------
+    SbasMessages
+        In the order of reception. Times of RTKLIB and EMS files are taken as the ends of the
+        messages, those of RINEX, which are of the first bit, become so by adding 1 s.
+
+    Raises
+    ------
+    InputFileError
+        A file is missing or of another kind, (stop) a line is broken, or no message is left.
+    """
+    files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
+    if not files:
+        raise ValueError("at least one SBAS file is needed")
+    gathered = _Gathered()
+    for number, path in enumerate(files):
+        _read_file(str(path), number, broken_lines, gathered)
+    sources = tuple(str(path) for path in files)
+    if not gathered.raw:
+        raise InputFileError(", ".join(sources), "holds no SBAS message that can be read")
+    log = _checked(gathered, sources)
+    if not len(log):
+        counts = ", ".join(f"{number} by {reason}" for reason, number in sorted(log.refused.items()))
+        raise InputFileError(", ".join(sources), f"has no SBAS message left: refused {counts}")
+    return log
+
+
+def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gathered) -> None:
+    lines = read_text_lines(path)
+    broken = 0
+    for item in parse(path, kind_of_file(path, lines), lines):
+        if isinstance(item, RawMessage):
+            gathered.raw.append(item)
+            gathered.source.append(number)
+        elif broken_lines == "stop":
+            raise item
+        else:
+            broken += 1
+            if broken == 1:
+                gathered.notes.append(f"{item}; passed over")
+    if broken > 1:
+        gathered.notes.append(f"{path}: {broken} lines were passed over")
+    gathered.refused["line"] += broken
+
+
+def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
+    """Parity, preamble and order."""
+    raw = gathered.raw
+    text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
+    bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()
+    bits[:, 31] &= 0xC0
+    source = np.array(gathered.source, dtype=np.int64)
+    carried = _carried_bits(np.array([len(item.digits) for item in raw]), source, bits)
+    wrong = _wrong_parity(bits, carried)
+    preamble = preamble_number(bits)
+    stray = (preamble < 0) & ~wrong
+    gathered.refused["parity"] += int(wrong.sum())
+    gathered.refused["preamble"] += int(stray.sum())
+    since = np.array([item.time_ns for item in raw], dtype=np.int64).astype("timedelta64[ns]")
+    log = SbasMessages(
+        time=np.asarray(GPS_EPOCH + since, dtype="datetime64[ns]"),
+        prn=np.array([item.prn for item in raw], dtype=np.int64),
+        type=(bits[:, 1] >> 2).astype(np.int64),
+        bits=bits,
+        parity_bits=carried,
+        source=source,
+        line=np.array([item.line for item in raw], dtype=np.int64),
+        sources=sources,
+    )
+    kept = log.take(~(wrong | stray))
+    kept = kept.take(np.lexsort((kept.prn, kept.time)))
+    again = np.zeros(len(kept), dtype=bool)
+    again[1:] = (kept.time[1:] == kept.time[:-1]) & (kept.prn[1:] == kept.prn[:-1])
+    gathered.refused["duplicate"] += int(again.sum())
+    kept = kept.take(~again)
+    notes = [*gathered.notes, *_parity_notes(sources, source, carried), *_order_notes(kept)]
+    return replace(kept, refused=dict(gathered.refused), notes=tuple(notes))
+
+
+def _carried_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
+    """Bits of parity that each message carries: 24 in whole messages, in cut ones 6 or none.
+
+    A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as
+    they came: in a file of the latter most of them are the first of the parity, by chance 1 in 64.
+    """
+    carried = np.full(len(digits), 24, dtype=np.int64)
+    short = digits == _SHORT
+    for number in np.unique(source[short]):
+        of_file = short & (source == number)
+        first_six = message_parity(bits[of_file]) >> 18
+        carried[of_file] = 6 if (first_six == bits[of_file, 28] & 0x3F).mean() > 0.5 else 0
+    return carried
+
+
+def _wrong_parity(bits: Bytes, carried: Integers) -> Masks:
+    shift = 24 - carried
+    return np.asarray((message_parity(bits) >> shift) != (carried_parity(bits) >> shift))
+
+
+def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers) -> list[str]:
+    notes = []
+    for number, path in enumerate(sources):
+        of_file = carried[source == number]
+        for count, words in ((0, "no parity"), (6, "6 of 24 bits of parity")):
+            messages = int((of_file == count).sum())
+            if messages:
+                notes.append(
+                    f"{path}: {messages} messages carry {words}; "
+                    + ("errors of reception cannot be seen" if count == 0 else "1 damaged message in 64 passes")
+                )
+    return notes
+
+
+def _order_notes(log: SbasMessages) -> list[str]:
+    """Preambles follow each other second by second; where they do not, a time tag is wrong."""
+    notes = []
+    second = log.time.astype("datetime64[s]").astype(np.int64)
+    number = preamble_number(log.bits)
+    for prn in log.prns:
+        of_prn = log.prn == prn
+        phase = (number[of_prn] - second[of_prn]) % 3
+        counts = np.bincount(phase, minlength=3)
+        if counts.max() < counts.sum():
+            notes.append(
+                f"PRN {prn}: the preambles of {int(counts.sum() - counts.max())} of {int(counts.sum())} messages are "
+                "out of turn with their seconds"
+            )
+    return notes

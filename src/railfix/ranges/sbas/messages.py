@@ -1,0 +1,205 @@
+"""SBAS messages as they were received, with their preambles and 24-bit parity."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, read_only
+from railfix.ranges.sbas.standard import DECODED, system_name, type_name
+
+#: CRC-24Q, x^24 included (DO-229D, A.4.3.3).
+POLYNOMIAL: Final = 0x1864CFB
+#: First eight bits of three successive messages (DO-229D, A.4.3.1).
+PREAMBLES: Final = (0x53, 0x9A, 0xC6)
+#: Preamble, type and data; parity; bytes a message takes in `SbasMessages.bits`.
+DATA_BITS: Final = 226
+PARITY_BITS: Final = 24
+ROW_BYTES: Final = 32
+
+
+def _table() -> Integers:
+    value = np.arange(256, dtype=np.int64) << 16
+    for _ in range(8):
+        value = value << 1
+        value = np.where(value & 0x1000000, value ^ POLYNOMIAL, value)
+    return value
+
+
+_TABLE: Final = _table()
+
+
+def crc24q(rows: Bytes) -> Integers:
+    """Parity of whole bytes, first bit first.
+
+    Parameters
+    ----------
+    rows : ndarray of uint8, shape (N, B)
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+        24 bits.
+    """
+    crc = np.zeros(len(rows), dtype=np.int64)
+    for column in rows.T:
+        crc = ((crc << 8) & 0xFFFFFF) ^ _TABLE[(crc >> 16) ^ column]
+    return crc
+
+
+def message_parity(bits: Bytes) -> Integers:
+    """Parity that belongs to the 226 data bits of each message, shape (N,).
+
+    Parameters
+    ----------
+    bits : ndarray of uint8, shape (N, 32)
+        Messages from their first bit on.
+    """
+    # Six zero bits in front make whole bytes of 226 bits and do not change the parity.
+    data = bits[:, :29].astype(np.int64)
+    before = np.concatenate([np.zeros((len(bits), 1), dtype=np.int64), data[:, :-1]], axis=1)
+    return crc24q((((before << 2) & 0xFF) | (data >> 6)).astype(np.uint8))
+
+
+def carried_parity(bits: Bytes) -> Integers:
+    """The 24 bits that stand after the data bits of each message, shape (N,)."""
+    tail = bits[:, 28:32].astype(np.int64)
+    return ((tail[:, 0] & 0x3F) << 18) | (tail[:, 1] << 10) | (tail[:, 2] << 2) | (tail[:, 3] >> 6)
+
+
+def with_parity(bits: Bytes) -> Bytes:
+    """The same messages with the parity that belongs to them, shape (N, 32); what follows it is zero."""
+    whole = np.zeros((len(bits), ROW_BYTES), dtype=np.uint8)
+    whole[:, :29] = bits[:, :29]
+    parity = message_parity(whole)
+    whole[:, 28] = (whole[:, 28] & 0xC0) | (parity >> 18).astype(np.uint8)
+    whole[:, 29] = ((parity >> 10) & 0xFF).astype(np.uint8)
+    whole[:, 30] = ((parity >> 2) & 0xFF).astype(np.uint8)
+    whole[:, 31] = ((parity << 6) & 0xFF).astype(np.uint8)
+    return whole
+
+
+def preamble_number(bits: Bytes) -> Integers:
+    """0, 1 or 2 for the three preambles, -1 for anything else, shape (N,)."""
+    number = np.full(len(bits), -1, dtype=np.int64)
+    for i, preamble in enumerate(PREAMBLES):
+        number[bits[:, 0] == preamble] = i
+    return number
+
+
+@dataclass(frozen=True, kw_only=True)
+class SbasMessages:
+    """Messages that passed every check, N rows in the order of their reception.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        GPS time at which the message had been received whole: from here on it may be used.
+    prn : ndarray of int, shape (N,)
+    type : ndarray of int, shape (N,)
+        0 to 63.
+    bits : ndarray of uint8, shape (N, 32)
+        The message from its first preamble bit, eight bits a byte; parity from bit 226 on where
+        the source carries it, zero behind.
+    parity_bits : ndarray of int, shape (N,)
+        How many bits of parity the source carried, and were checked: 24, 6 or 0.
+    source : ndarray of int, shape (N,)
+        Row of `sources`.
+    line : ndarray of int, shape (N,)
+        1-based line of the file.
+    sources : tuple of str
+        Files.
+    refused : mapping of str to int
+        Messages left out, by reason: "parity", "preamble", "line", "duplicate".
+    notes : tuple of str
+        What a reader of the results must know, one sentence each.
+    """
+
+    time: Datetimes
+    prn: Integers
+    type: Integers
+    bits: Bytes
+    parity_bits: Integers
+    source: Integers
+    line: Integers
+    sources: tuple[str, ...] = ()
+    refused: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                if len(value) != len(self.time):
+                    raise ValueError(f"{item.name} has {len(value)} messages, time has {len(self.time)}")
+                object.__setattr__(self, item.name, read_only(value))
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def prns(self) -> tuple[int, ...]:
+        """PRNs that sent anything, rising."""
+        return tuple(int(prn) for prn in np.unique(self.prn))
+
+    def account(self) -> dict[str, int]:
+        """Every message once: decoded by type, not decoded by type and name, or refused by reason.
+
+        Returns
+        -------
+        dict of str to int
+            "MSAS 137 type 2 fast corrections": 600, "MSAS 137 type 63 null, not decoded": 569,
+            "refused: parity": 0 ... The values sum to the messages of the files.
+        """
+        counts = Counter(zip(self.prn.tolist(), self.type.tolist(), strict=True))
+        rows = {
+            f"{system_name(prn)} {prn} type {kind} {type_name(kind, prn)}"
+            + ("" if kind in DECODED else ", not decoded"): number
+            for (prn, kind), number in sorted(counts.items())
+        }
+        return rows | {f"refused: {reason}": number for reason, number in sorted(self.refused.items())}
+
+    def of(self, prn: int) -> SbasMessages:
+        """Messages of one PRN; the counts of rejected messages are those of all PRNs."""
+        return self.take(self.prn == prn)
+
+    @classmethod
+    def none(cls) -> SbasMessages:
+        """No message."""
+        time, number = np.zeros(0, dtype="datetime64[ns]"), np.zeros(0, dtype=np.int64)
+        bits = np.zeros((0, ROW_BYTES), dtype=np.uint8)
+        return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
+
+    def joined(self, later: SbasMessages) -> SbasMessages:
+        """These messages and others, in the order of reception; counts are added, a note stands once."""
+        if not len(later):
+            return self
+        joined = {
+            item.name: np.concatenate([getattr(self, item.name), getattr(later, item.name)])
+            for item in fields(self)
+            if isinstance(getattr(self, item.name), np.ndarray)
+        }
+        sources = tuple(dict.fromkeys((*self.sources, *later.sources)))
+        number = np.array([sources.index(name) for name in (*self.sources, *later.sources)] or [0], dtype=np.int64)
+        own = np.where(np.arange(len(joined["time"])) < len(self), 0, len(self.sources))
+        joined["source"] = number[np.minimum(joined["source"] + own, len(number) - 1)]
+        order = np.argsort(joined["time"], kind="stable")
+        return SbasMessages(
+            **{name: values[order] for name, values in joined.items()},
+            sources=sources,
+            refused=dict(Counter(self.refused) + Counter(later.refused)),
+            notes=tuple(dict.fromkeys((*self.notes, *later.notes))),
+        )
+
+    def take(self, rows: Masks | Integers) -> SbasMessages:
+        """Some of the messages."""
+        arrays = {
+            item.name: getattr(self, item.name)[rows]
+            for item in fields(self)
+            if isinstance(getattr(self, item.name), np.ndarray)
+        }
+        return SbasMessages(**arrays, sources=self.sources, refused=self.refused, notes=self.notes)

@@ -1,0 +1,187 @@
+"""Names, time-outs and variances of RTCA DO-229D, and the settings that choose between them."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+
+#: Types decoded into corrections or into records.
+DECODED: Final = (0, 1, 2, 3, 4, 5, 6, 7, 9, 10, 12, 17, 18, 24, 25, 26, 27, 28)
+
+#: Message types of L1 (DO-229D, table A-3).
+TYPE_NAMES: Final = {
+    0: "do not use for safety",
+    1: "PRN mask",
+    2: "fast corrections",
+    3: "fast corrections",
+    4: "fast corrections",
+    5: "fast corrections",
+    6: "integrity",
+    7: "fast correction degradation",
+    9: "GEO navigation",
+    10: "degradation parameters",
+    12: "network time",
+    17: "GEO almanacs",
+    18: "ionospheric grid mask",
+    24: "mixed fast and long-term corrections",
+    25: "long-term corrections",
+    26: "ionospheric delays",
+    27: "service region",
+    28: "clock-ephemeris covariance",
+    62: "internal test",
+    63: "null",
+}
+#: Types that QZSS sends beside those of SBAS: L1-SAIF (IS-QZSS), and L1S, which took its place
+#: (IS-QZSS-L1S, IS-QZSS-DCR).
+QZSS_TYPE_NAMES: Final = {
+    43: "L1S disaster report of the Japan Meteorological Agency",
+    44: "L1S disaster report of other organisations",
+    47: "L1S monitoring stations",
+    48: "L1S PRN mask",
+    49: "L1S data issue number",
+    50: "L1S code corrections",
+    51: "L1S satellite health",
+    52: "L1-SAIF tropospheric grid mask",
+    53: "L1-SAIF tropospheric delays",
+    56: "L1-SAIF inter-signal biases",
+    58: "L1-SAIF QZS ephemeris",
+}
+#: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).
+_SYSTEMS: Final = {
+    "EGNOS": (120, 121, 123, 124, 126, 136),
+    "WAAS": (131, 133, 135, 138),
+    "MSAS": (129, 137),
+    "GAGAN": (127, 128, 132),
+    "SDCM": (125, 140, 141),
+    "BDSBAS": (130, 143, 144),
+    "KASS": (134,),
+    "SouthPAN": (122,),
+    "ASECNA": (147,),
+    "QZSS L1S": tuple(range(183, 192)),
+}
+_SYSTEM_OF: Final = {prn: name for name, prns in _SYSTEMS.items() for prn in prns}
+
+#: PRNs that can send these messages: SBAS, and QZSS L1-SAIF or L1S.
+GEO_PRNS: Final = (*range(120, 159), *range(183, 203))
+
+
+def system_name(prn: int) -> str:
+    """Name of the system that a PRN belongs to ("MSAS"); "SBAS" where it is not assigned."""
+    return _SYSTEM_OF.get(prn, "SBAS")
+
+
+def type_name(number: int, prn: int) -> str:
+    """Name of a message type as sent by a PRN; "reserved" for a number without meaning."""
+    if prn >= 183 and number in QZSS_TYPE_NAMES:
+        return QZSS_TYPE_NAMES[number]
+    return TYPE_NAMES.get(number, "reserved")
+
+
+def mask_satellite(number: int) -> str:
+    """Satellite of a number of the PRN mask (DO-229D, table A-1); empty for numbers without one.
+
+    183 to 202 are QZSS as in IS-QZSS for L1-SAIF; DO-229D leaves them to the future.
+    """
+    if 1 <= number <= 37:
+        return f"G{number:02d}"
+    if 38 <= number <= 61:
+        return f"R{number - 37:02d}"
+    if 120 <= number <= 138:
+        return f"S{number - 100:02d}"
+    if 193 <= number <= 202:
+        return f"J{number - 192:02d}"
+    return ""
+
+
+#: Seconds since reception for which a message may be used, (precision approach, en route to
+#: non-precision approach) (DO-229D, table A-25). Fast corrections have `FAST_TIMEOUT_S`.
+TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
+    "mask": (600.0, 600.0),
+    "udrei": (12.0, 18.0),
+    "long_term": (240.0, 360.0),
+    "fast_degradation": (240.0, 360.0),
+    "degradation": (240.0, 360.0),
+    "grid_mask": (1200.0, 1200.0),
+    "grid_delay": (600.0, 600.0),
+    "service": (86_400.0, 86_400.0),
+    "covariance": (240.0, 360.0),
+}
+#: The same for fast corrections by degradation indicator ai (DO-229D, table A-8).
+FAST_TIMEOUT_S: Final[dict[str, tuple[float, ...]]] = {
+    "precision": (120, 120, 102, 90, 90, 78, 66, 54, 42, 30, 30, 18, 18, 18, 12, 12),
+    "en_route": (180, 180, 153, 135, 135, 117, 99, 81, 63, 45, 45, 27, 27, 27, 18, 18),
+}
+#: Acceleration of the error of a fast correction by ai [m/s^2] (DO-229D, table A-8).
+FAST_DEGRADATION_MPS2: Final = (
+    0.0, 0.00005, 0.00009, 0.00012, 0.00015, 0.00020, 0.00030, 0.00045,
+    0.00060, 0.00090, 0.00150, 0.00210, 0.00270, 0.00330, 0.00460, 0.00580,
+)  # fmt: skip
+#: Variance of fast and long-term corrections by UDREI [m^2]; 14 and 15 have none (DO-229D, table A-6).
+UDRE_VARIANCE_M2: Final = (
+    0.0520, 0.0924, 0.1444, 0.2830, 0.4678, 0.8315, 1.2992, 1.8709,
+    2.5465, 3.3260, 5.1968, 20.7870, 230.9661, 2078.695,
+)  # fmt: skip
+#: Variance of a grid point's delay by GIVEI [m^2]; 15 has none (DO-229D, table A-17).
+GIVE_VARIANCE_M2: Final = (
+    0.0084, 0.0333, 0.0749, 0.1331, 0.2079, 0.2994, 0.4075, 0.5322,
+    0.6735, 0.8315, 1.1974, 1.8709, 3.3260, 20.7870, 187.0826,
+)  # fmt: skip
+#: Factor on sigma UDRE by indicator of message type 27 (DO-229D, table A-20).
+SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0, 40.0, 50.0, 100.0)
+#: UDREI from which a satellite is not monitored, and must not be used.
+NOT_MONITORED: Final = 14
+DO_NOT_USE: Final = 15
+#: A message of type 0 stops the use of its sender for so long [s] (DO-229D, A.4.4.1).
+STOP_S: Final = 60.0
+#: No fast correction older than this is used, however long type 6 renews its UDREI [s].
+LONGEST_FAST_S: Final = 3600.0
+#: For so long a message can matter: as a correction, and as the mask or the earlier correction of one [s].
+KEPT_S: Final = 2.0 * LONGEST_FAST_S
+#: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
+INFLATION_M: Final = 8.0
+
+
+class SbasLimits(Settings):
+    """How SBAS messages are used.
+
+    Attributes
+    ----------
+    mode : {"precision", "en_route"}
+        Time-outs: those of precision approach (shorter, the default), or of en route to non-precision
+        approach.
+    type0 : {"stop", "as_type2"}
+        A message of type 0 discards all data of its sender and stops its use for 60 s (default), or, as
+        systems under test send it, holds fast corrections of type 2 unless it is empty.
+    range_rate : {"mops", "off"}
+        Fast corrections change with the rate of the last two of them (default; DO-229D, A.4.4.3), or
+        stay as sent.
+    incomplete : {"refuse", "inflate"}
+        A satellite whose degradation data (types 7, 10, and 28 where it is sent) are missing gets no
+        sigma and is rejected (default: precision approach), or has sigma UDRE plus 8 m (DO-229D, J.2.2),
+        and the shortest time-out of fast corrections.
+    max_udrei : int or None
+        Largest UDREI used; None is 11 for precision approach and 13 en route.
+    message_s : float
+        From the first bit of a message, to which its corrections refer, to its reception [s].
+    """
+
+    mode: Literal["precision", "en_route"] = "precision"
+    type0: Literal["stop", "as_type2"] = "stop"
+    range_rate: Literal["mops", "off"] = "mops"
+    incomplete: Literal["refuse", "inflate"] = "refuse"
+    max_udrei: int | None = Field(default=None, ge=0, le=13)
+    message_s: float = Field(default=1.0, ge=0.0, le=2.0)
+
+    def timeout_s(self, kind: str) -> float:
+        """Time-out of a kind of message in this mode [s]."""
+        return TIMEOUT_S[kind][0 if self.mode == "precision" else 1]
+
+    @property
+    def largest_udrei(self) -> int:
+        """Largest UDREI used."""
+        if self.max_udrei is not None:
+            return self.max_udrei
+        return 11 if self.mode == "precision" else 13
