@@ -303,9 +303,9 @@ def test_vehicle_file(tmp_path: Path) -> None:
         ("1.067", "'wide'", SettingsError, "gauge_m"),
         ("along_m = 9.1", "along = 9.1", SettingsError, "is 'along_m' meant"),
         ("up_m = 4.1", "up_m = 4100", SettingsError, "antennas.front.up_m"),
-        ("antennas.rear", "antennas.reer", SettingsError, "'front' and 'rear'"),
+        ("antennas.rear", "antennas.reer", SettingsError, "'front' or 'rear'"),
         ('name = "test car"', 'facing = "north"', SettingsError, "facing"),
-        ("[antennas.front]", "[antennas.front", InputFileError, "not TOML"),
+        ("[antennas.front]", "[antennas.front", InputFileError, "not valid TOML"),
     ],
 )
 def test_broken_vehicle_files(tmp_path: Path, old: str, new: str, error: type[RailfixError], said: str) -> None:
@@ -320,7 +320,13 @@ def test_broken_vehicle_files(tmp_path: Path, old: str, new: str, error: type[Ra
 
 
 def test_vehicle_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(InputFileError, match="no such file"):
+    with pytest.raises(InputFileError, match="No such file"):
         read_vehicle(tmp_path / "none.toml")
-    with pytest.raises(InputFileError, match="folder"):
+    with pytest.raises(InputFileError, match="directory"):
         read_vehicle(tmp_path)
+
+
+def test_a_vehicle_file_with_a_byte_order_mark(tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text("\ufeffbogie_distance_m = 13.8\n[antennas.front]\nalong_m = 9.1\nup_m = 4.1\n", encoding="utf-8")
+    assert read_vehicle(path).antennas["front"].along_m == 9.1

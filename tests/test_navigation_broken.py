@@ -111,7 +111,7 @@ def test_files_that_are_no_text(tmp_path: Path, content: bytes, words: str) -> N
 def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="no such file"):
         read_navigation(tmp_path / "none.nav")
-    with pytest.raises(InputFileError, match="directory"):
+    with pytest.raises(InputFileError, match="folder"):
         read_navigation(tmp_path)
     with pytest.raises(ValueError, match="at least one"):
         read_navigation([])

@@ -225,7 +225,7 @@ def test_wrong_file(tmp_path: Path, name: str) -> None:
 def test_missing_and_unreadable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputFileError, match="no such file"):
         read_observations(tmp_path / "nowhere.obs")
-    with pytest.raises(InputFileError, match="is a directory"):
+    with pytest.raises(InputFileError, match="is a folder"):
         read_observations(tmp_path)
     path = write(tmp_path / "log", good_3())
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 
@@ -159,7 +160,8 @@ def test_heights_are_never_guessed(
     [
         ("", "is empty"),
         ("\n \n", "is empty"),
-        (b"\x1f\x8b\0\0binary", "binary"),
+        (b"\x1f\x8b\0\0binary", "gzip data are damaged"),
+        (bytes(range(256)), "binary"),
         ("緯度,経度\n".encode("shift_jis"), "not UTF-8"),
         ("35.0,139.0,50\n35.1,139,50\n", "line 1: numbers where a header"),
         (HEADER + "\n", "0 point(s)"),
@@ -396,3 +398,25 @@ def test_arrays_that_are_no_track(latitude: list[float], options: dict[str, obje
     other = np.zeros(len(latitude))
     with pytest.raises(ValueError, match=said):
         Track.from_geodetic(latitude, other, other, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"], ids=["plain", "byte order mark"])
+@pytest.mark.parametrize("kind", ["csv", "geojson"])
+def test_packed_maps_and_byte_order_marks(tmp_path: Path, kind: str, mark: str) -> None:
+    line = [[139.0, 35.0, 10.0], [139.0, 35.001, 11.0]]
+    document = {"type": "LineString", "coordinates": line, "height_datum": "ellipsoidal"}
+    text = GOOD if kind == "csv" else json.dumps(document)
+    plain = read_track(write(tmp_path, text, f"line.{kind}"))
+    packed = read_track(write(tmp_path, gzip.compress((mark + text).encode()), f"LINE.{kind.upper()}.GZ"))
+    assert np.array_equal(packed.ecef_m, plain.ecef_m)
+    assert read_track(write(tmp_path, mark + text, f"line.{kind}")).ecef_m.tolist() == plain.ecef_m.tolist()
+
+
+def test_arrays_of_a_track_are_read_only_and_the_given_ones_stay_as_they_are(tmp_path: Path) -> None:
+    given = np.array([35.0, 35.001])
+    track = Track.from_geodetic(given, [139.0, 139.0], [10.0, 11.0])
+    with pytest.raises(ValueError, match="read-only"):
+        track.latitude_deg[0] = 0.0
+    given[0] = 0.0
+    assert track.latitude_deg[0] == 35.0
+    assert read_track(write(tmp_path, GOOD)).kilometrage_m.flags.writeable is False

@@ -145,7 +145,7 @@ def open_stream(path: FilePath) -> ByteStream:
     Raises
     ------
     InputFileError
-        The file is missing, a directory, unreadable, empty, binary, an archive of another kind;
+        The file is missing, a folder, unreadable, empty, binary, an archive of another kind;
         while reading: the compressed data end early or are damaged.
     """
     held = ExitStack()
@@ -179,6 +179,32 @@ def read_bytes(path: FilePath) -> bytes:
     """
     with open_stream(path) as stream:
         return stream.read()
+
+
+def read_text(path: FilePath) -> str:
+    """The whole decompressed content of a small UTF-8 file, without a byte order mark.
+
+    Raises
+    ------
+    InputFileError
+        As `open_stream`; not UTF-8.
+    """
+    content = read_bytes(path)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise InputFileError(path, "is not UTF-8 text; save the file as UTF-8", line=line) from None
+
+
+def ending(path: FilePath) -> str:
+    """Ending of a file's name in lower case, that of a packed file without ``.gz`` or ``.Z``.
+
+    >>> ending("Line.GeoJSON.gz")
+    '.geojson'
+    """
+    name = Path(Path(path).name.lower())
+    return name.with_suffix("").suffix if name.suffix in (".gz", ".z") else name.suffix
 
 
 def file_sha256(path: FilePath) -> str:
@@ -256,7 +282,7 @@ def read_text_lines(path: FilePath) -> list[str]:
 def _open_plain(path: FilePath) -> IO[bytes]:
     file = Path(path)
     if file.is_dir():
-        raise InputFileError(path, "is a directory; name the file inside it")
+        raise InputFileError(path, "is a folder; name the file inside it")
     try:
         if file.exists() and not file.is_file():
             raise InputFileError(path, "is not a regular file; write its content to a file first")
@@ -277,7 +303,7 @@ def _refuse_content(path: FilePath, head: bytes) -> None:
     if not head.strip():
         raise InputFileError(path, "is empty")
     if b"\0" in head:
-        raise InputFileError(path, "is binary, a text file (RINEX, SP3) was expected; convert a receiver's log first")
+        raise InputFileError(path, "is binary, a text file was expected; convert a receiver's log to RINEX first")
 
 
 def _temporary(held: ExitStack) -> IO[bytes]:

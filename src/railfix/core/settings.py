@@ -9,13 +9,14 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, get_args, get_origin
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, write_whole
+from railfix.core.spelling import misspelt
 
 
 class Settings(BaseModel):
@@ -56,11 +57,16 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
     try:
         return model.model_validate(dict(values))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
+        # a misspelt name before the name that is missing in its place
+        first = min(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
+        where = ".".join(str(part) for part in first["loc"] if part != "[key]")
         if first["type"] == "extra_forbidden":
-            known = ", ".join(sorted(_fields_at(model, first["loc"][:-1])))
-            raise SettingsError(f"{source}: unknown setting {where}; known are {known}") from None
+            known = sorted(_fields_at(model, first["loc"][:-1]))
+            close = misspelt([str(first["loc"][-1])], known).values()
+            hint = "".join(f"; is {name!r} meant?" for name in close)
+            raise SettingsError(f"{source}: unknown setting {where}; known are {', '.join(known)}{hint}") from None
+        if first["type"] == "missing":
+            raise SettingsError(f"{source}: setting {where} is missing") from None
         message = first["msg"].removeprefix("Value error, ")
         given = "" if isinstance(first["input"], (Mapping, BaseModel)) else f", got {first['input']!r}"
         raise SettingsError(f"{source}: setting {where}: {message}{given}") from None
@@ -68,12 +74,15 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
     """Names of the settings of the group at a location of a nested model."""
+    kind: Any = model
     for part in location:
-        field = model.model_fields.get(str(part))
-        if field is None or not isinstance(field.annotation, type) or not issubclass(field.annotation, BaseModel):
+        if get_origin(kind) is dict:
+            kind = get_args(kind)[1]
+        elif isinstance(kind, type) and issubclass(kind, BaseModel) and part in kind.model_fields:
+            kind = kind.model_fields[str(part)].annotation
+        else:
             return set()
-        model = field.annotation
-    return set(model.model_fields)
+    return set(kind.model_fields) if isinstance(kind, type) and issubclass(kind, BaseModel) else set()
 
 
 def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:

@@ -1,51 +1,20 @@
 """Text tables whose columns have names: the shape of the CSV files that railfix reads.
 
-Comma separated, UTF-8 with or without a byte order mark, LF or CR LF. Lines that begin with ``#``
-are comments; those above the header line may carry ``# key: value``. Every complaint names the
-line.
+Comma separated, UTF-8 with or without a byte order mark, LF or CR LF, plain or packed (.gz, .Z). Lines
+that begin with ``#`` are comments; those above the header line may carry ``# key: value``. Every error
+names the line.
 """
 
 from __future__ import annotations
 
 import csv
-import difflib
-from collections.abc import Iterable
 from dataclasses import dataclass
-from os import PathLike
-from pathlib import Path
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
-
-
-def read_text(path: str | PathLike[str]) -> str:
-    """Text of a file, or one sentence on why there is none.
-
-    Raises
-    ------
-    InputFileError
-        Missing, a folder, unreadable, empty, binary, or not UTF-8.
-    """
-    file = Path(path)
-    try:
-        content = file.read_bytes()
-    except FileNotFoundError:
-        raise InputFileError(path, "there is no such file") from None
-    except IsADirectoryError:
-        raise InputFileError(path, "this is a folder; give the file itself") from None
-    except OSError as error:
-        raise InputFileError(path, f"the file cannot be read ({error.strerror})") from None
-    if not content.strip():
-        raise InputFileError(path, "the file is empty")
-    if b"\0" in content:
-        raise InputFileError(path, "this is a binary file; a text file was expected")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise InputFileError(path, "this is not UTF-8 text; save the file as UTF-8", line=line) from None
+from railfix.core.files import FilePath, read_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +94,7 @@ def _split_comment(line: str) -> tuple[str, str] | None:
     return (key.strip().lower(), value.strip()) if colon else None
 
 
-def read_named_columns(path: str | PathLike[str]) -> NamedColumns:
+def read_named_columns(path: FilePath) -> NamedColumns:
     """Read a comma-separated table with a header line of column names.
 
     Raises
@@ -136,7 +105,7 @@ def read_named_columns(path: str | PathLike[str]) -> NamedColumns:
     return parse_named_columns(read_text(path), path)
 
 
-def parse_named_columns(text: str, path: str | PathLike[str]) -> NamedColumns:
+def parse_named_columns(text: str, path: FilePath) -> NamedColumns:
     """The same from the text of the file; `path` is for the messages."""
     metadata: dict[str, str] = {}
     header: list[str] = []
@@ -170,7 +139,7 @@ def parse_named_columns(text: str, path: str | PathLike[str]) -> NamedColumns:
     )
 
 
-def _check_header(path: str | PathLike[str], header: list[str], line: int) -> None:
+def _check_header(path: FilePath, header: list[str], line: int) -> None:
     if not header:
         raise InputFileError(path, "there is no header line with the names of the columns")
     if all(_is_number(cell) for cell in header):
@@ -178,23 +147,3 @@ def _check_header(path: str | PathLike[str], header: list[str], line: int) -> No
     twice = sorted({name for name in header if header.count(name) > 1})
     if twice:
         raise InputFileError(path, f"column {twice[0]!r} occurs twice in the header", line=line)
-
-
-def misspelt(names: Iterable[str], known: Iterable[str]) -> dict[str, str]:
-    """Names that are close to a known one but not it, with that one.
-
-    Examples
-    --------
-    >>> misspelt(["lattitude_deg", "remark"], ["latitude_deg", "height_m"])
-    {'lattitude_deg': 'latitude_deg'}
-    """
-    known = list(known)
-    found: dict[str, str] = {}
-    for name in names:
-        if name in known:
-            continue
-        lowered = name.lower().replace(" ", "_")
-        close = difflib.get_close_matches(lowered, known, n=1, cutoff=0.75)
-        if close:
-            found[name] = close[0]
-    return found

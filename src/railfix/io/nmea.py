@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines, read_text_lines
+from railfix.core.files import BrokenLines, ending, read_text_lines
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import utc_to_gpst
 from railfix.gnss.observations import capped_problems
@@ -207,7 +206,6 @@ def read_any_positions(
     date : datetime64, optional
         For NMEA; see `read_nmea`.
     """
-    name = Path(path).name.lower().removesuffix(".gz")
-    if name.endswith((".nmea", ".nma", ".gga")):
+    if ending(path) in (".nmea", ".nma", ".gga"):
         return read_nmea(path, broken_lines=broken_lines, date=date)
     return read_positions(path)

@@ -12,9 +12,11 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import ending, read_text
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.spelling import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
-from railfix.io.named_columns import NamedColumns, misspelt, read_named_columns, read_text
+from railfix.io.named_columns import NamedColumns, read_named_columns
 
 #: RTKLIB's solution quality (RTKLIB manual 2.4.2, B.1).
 QUALITY_NAMES: Final = {1: "fix", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
@@ -81,7 +83,7 @@ def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | No
     SettingsError
         `columns` names a column that railfix does not know.
     """
-    if Path(path).suffix.lower() == ".csv":
+    if ending(path) == ".csv":
         return _read_csv(path, dict(columns or {}))
     if columns:
         raise SettingsError(f"{path}: columns can be renamed in a .csv file only")

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_bytes, write_whole
-from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
+from railfix.core.files import ending, write_whole
+from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog, positions_of_table
 
@@ -135,14 +135,7 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
 
 def _table(path: Path) -> NamedColumns | None:
     """The file as a table, or None where it is no CSV."""
-    name = path.name.lower()
-    if name.endswith(".csv.gz"):
-        try:
-            text = read_bytes(path).decode("utf-8-sig")
-        except UnicodeDecodeError:
-            raise InputFileError(path, "this is not UTF-8 text; save the file as UTF-8") from None
-        return parse_named_columns(text, path)
-    return read_named_columns(path) if name.endswith(".csv") else None
+    return read_named_columns(path) if ending(path) == ".csv" else None
 
 
 def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[np.generic]]:

@@ -12,9 +12,8 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_bytes
 from railfix.core.timescale import seconds
-from railfix.io.named_columns import NamedColumns, parse_named_columns
+from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
 from railfix.io.position_log import positions_times
 
 #: How times are written.
@@ -156,11 +155,7 @@ def _table(path: str | PathLike[str]) -> NamedColumns:
             return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO), path)
         except (OSError, pl.exceptions.PolarsError) as error:
             raise InputFileError(path, f"cannot be read as a Parquet table ({error})") from None
-    try:
-        text = read_bytes(Path(path)).decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputFileError(path, "this is not UTF-8 text; save the file as UTF-8") from None
-    return parse_named_columns(text, path)
+    return read_named_columns(path)
 
 
 def _rising_times(table: NamedColumns) -> Datetimes:

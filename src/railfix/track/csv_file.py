@@ -12,7 +12,8 @@ from pyproj.exceptions import CRSError
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import write_whole
-from railfix.io.named_columns import NamedColumns, misspelt, read_named_columns
+from railfix.core.spelling import misspelt
+from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
 from railfix.track.segment import Segment
 from railfix.track.track import Track

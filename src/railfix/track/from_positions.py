@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
@@ -19,8 +21,7 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 
 
-@dataclass(frozen=True, kw_only=True)
-class ThinningLimits:
+class ThinningLimits(Settings):
     """How positions become points of a map.
 
     Attributes
@@ -40,15 +41,11 @@ class ThinningLimits:
         Neighbouring points further apart are reported, for a straight line bridges them.
     """
 
-    spacing_m: float = 5.0
-    chord_m: float = 0.30
-    standing_mps: float = 0.2
-    standing_window_s: float = 3.0
-    jump_m: float = 50.0
-
-    def __post_init__(self) -> None:
-        if not min(self.spacing_m, self.chord_m, self.jump_m, self.standing_window_s) > 0 or self.standing_mps < 0:
-            raise ValueError("limits of thinning must be positive (standing_mps may be 0)")
+    spacing_m: float = Field(default=5.0, gt=0)
+    chord_m: float = Field(default=0.30, gt=0)
+    standing_mps: float = Field(default=0.2, ge=0)
+    standing_window_s: float = Field(default=3.0, gt=0)
+    jump_m: float = Field(default=50.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)

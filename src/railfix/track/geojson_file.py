@@ -13,7 +13,8 @@ from pyproj.exceptions import CRSError
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.io.named_columns import misspelt, read_text
+from railfix.core.files import read_text
+from railfix.core.spelling import misspelt
 from railfix.track.csv_file import OPTIONAL_COLUMNS, straight_radius
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
 from railfix.track.segment import Segment

@@ -7,20 +7,21 @@ found here (P1 2.2(1), 4.1(3)).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Masks
+from railfix.core.settings import Settings
 from railfix.track.geometry import Geometry, geometry_of, windowed_gradients
 from railfix.track.track import Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapLimits:
+class MapLimits(Settings):
     """Limits of a track map; a value on the limit passes.
 
     Attributes
@@ -48,22 +49,17 @@ class MapLimits:
         Largest cant either way.
     """
 
-    mid_chord_m: float = 0.30
-    spacing_m: float = 50.0
-    near_duplicate_m: float = 0.10
-    kink_deg: float = 3.0
-    sharp_kink_deg: float = 15.0
-    least_radius_m: float = 60.0
-    gradient_permille: float = 60.0
-    height_spike_m: float = 0.50
-    gradient_difference_permille: float = 5.0
-    gradient_window_m: float = 100.0
-    cant_m: float = 0.20
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            if not getattr(self, item.name) > 0:
-                raise ValueError(f"{item.name} must be positive")
+    mid_chord_m: float = Field(default=0.30, gt=0)
+    spacing_m: float = Field(default=50.0, gt=0)
+    near_duplicate_m: float = Field(default=0.10, gt=0)
+    kink_deg: float = Field(default=3.0, gt=0)
+    sharp_kink_deg: float = Field(default=15.0, gt=0)
+    least_radius_m: float = Field(default=60.0, gt=0)
+    gradient_permille: float = Field(default=60.0, gt=0)
+    height_spike_m: float = Field(default=0.50, gt=0)
+    gradient_difference_permille: float = Field(default=5.0, gt=0)
+    gradient_window_m: float = Field(default=100.0, gt=0)
+    cant_m: float = Field(default=0.20, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)

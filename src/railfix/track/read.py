@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from os import PathLike
-from pathlib import Path
 
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.files import ending
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.heights import check_height_datum
@@ -27,7 +27,7 @@ def read_track(
     sigma_height_m: float | None = None,
     duplicates: str = "refuse",
 ) -> Track:
-    """Read the centreline of a route from CSV (``.csv``) or GeoJSON (``.geojson``, ``.json``) files.
+    """Read the centreline of a route from CSV (``.csv``) or GeoJSON (``.geojson``, ``.json``) files, plain or packed.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def read_track(
         raise SettingsError("no track map was given")
     segments: list[Segment] = []
     for file in files:
-        kind = Path(file).suffix.lower()
+        kind = ending(file)
         if kind in (".geojson", ".json"):
             segments += read_geojson_segments(
                 file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates

@@ -7,18 +7,17 @@ above the rail tops, square to the body's floor.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 from os import PathLike
 from typing import Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
-from railfix.io.named_columns import misspelt, read_text
+from railfix.core.settings import Settings, load_settings
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
@@ -35,16 +34,16 @@ _MAX_ITERATIONS: Final = 200
 _SETTLED_M: Final = 1e-7
 
 
-class AntennaOffset(BaseModel):
+class AntennaOffset(Settings):
     """Phase centre of one antenna in the axes of the vehicle [m]."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(strict=True)
     along_m: float = Field(ge=-30.0, le=30.0)
     across_m: float = Field(default=0.0, ge=-2.5, le=2.5)
     up_m: float = Field(ge=0.0, le=8.0)
 
 
-class Vehicle(BaseModel):
+class Vehicle(Settings):
     """A vehicle as its TOML file gives it.
 
     Attributes
@@ -59,7 +58,7 @@ class Vehicle(BaseModel):
         Offsets by name: ``front``, ``rear``.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(strict=True)
     name: str = "vehicle"
     bogie_distance_m: float = Field(gt=0.5, le=30.0)
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
@@ -82,31 +81,7 @@ def read_vehicle(path: str | PathLike[str]) -> Vehicle:
     SettingsError
         A key is unknown, missing or out of range.
     """
-    try:
-        values = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise InputFileError(path, f"this is not TOML ({error})") from None
-    try:
-        return Vehicle.model_validate(values)
-    except ValidationError as error:
-        raise SettingsError(f"{path}: {_first_fault(error)}") from None
-
-
-def _first_fault(error: ValidationError) -> str:
-    """One sentence about the first fault, unknown names before missing ones."""
-    faults = sorted(error.errors(), key=lambda fault: fault["type"] != "extra_forbidden")
-    fault = faults[0]
-    key = ".".join(str(part) for part in fault["loc"] if part != "[key]")
-    last = str(fault["loc"][-1]) if fault["loc"] else ""
-    if fault["type"] == "extra_forbidden":
-        known = (*Vehicle.model_fields, *AntennaOffset.model_fields)
-        near = misspelt([last], known).get(last)
-        return f"{key} is unknown" + (f"; is {near!r} meant?" if near else f"; known are {', '.join(known)}")
-    if fault["type"] == "missing":
-        return f"{key} is missing"
-    if fault["type"] == "literal_error" and fault["loc"] and fault["loc"][0] == "antennas":
-        return f"{key} is unknown; antennas are named 'front' and 'rear'"
-    return f"{key}: {fault['msg']}, got {fault['input']!r}"
+    return load_settings(Vehicle, path, what="a vehicle file")
 
 
 @dataclass(frozen=True, kw_only=True)
