@@ -20,7 +20,7 @@ from railfix.gnss.observations import ObservationHeader, Observations, concatena
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.io.rinex.packing import packing_of
 from railfix.io.rinex.write import _fixed_3, write_navigation, write_observations
-from railfix.simulate import Scenario, SkySettings, made_navigation
+from railfix.simulate import Scenario, SkySettings, simulated_navigation
 
 START = np.datetime64("2024-03-05T23:59:58.5", "ns")
 CHANNELS = [("G01", "1C"), ("G01", "2W"), ("G12", "1C"), ("R05", "1C"), ("E11", "1C"), ("J02", "1C"), ("C19", "2I")]
@@ -240,7 +240,7 @@ def test_a_folder_that_is_not_there_is_an_output_error(tmp_path: Path) -> None:
 def navigation() -> Navigation:
     """Five constellations, three issues each, with transmission in the week before toe."""
     scenario = Scenario(start=np.datetime64("2024-03-03T00:10:00", "ns"), sky=SkySettings(systems="GJEC"))
-    made = made_navigation(scenario)
+    made = simulated_navigation(scenario)
     rng = np.random.default_rng(1)
     toe = np.datetime64("2024-03-03T00:15:18", "ns") + np.arange(3) * np.timedelta64(1800, "s")
     sent = toe - np.timedelta64(600, "s")

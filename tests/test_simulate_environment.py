@@ -25,11 +25,11 @@ from railfix.simulate.environment import (
     SectionSettings,
     drawn_sections,
 )
-from railfix.simulate.environment.bars import Electrification
 from railfix.simulate.environment.correlator import tracked
-from railfix.simulate.environment.faces import Rays, mirrored, shadow
-from railfix.simulate.environment.place import built
-from railfix.simulate.environment.waves import edge_amplitude, strip_field
+from railfix.simulate.environment.diffraction import edge_amplitude, strip_field
+from railfix.simulate.environment.masts import Electrification
+from railfix.simulate.environment.structures import build_structures
+from railfix.simulate.environment.walls import Rays, reflections, shadow
 
 pytestmark = pytest.mark.requirement("D4")
 
@@ -100,7 +100,7 @@ def environment(*rows: RowSettings, settings: EnvironmentSettings = BARE, seed: 
     return Environment(settings.replaced(sections=(section(*rows),)), line_length_m=LINE_M, seed=seed)
 
 
-# Waves ---------------------------------------------------------------------------------------------------------------
+# Diffraction ---------------------------------------------------------------------------------------------
 
 
 def test_the_edge_is_that_of_the_fresnel_integral() -> None:
@@ -223,10 +223,10 @@ def test_what_turns_fast_is_averaged() -> None:
 def test_the_extra_path_is_that_of_the_mirror_image(yaw_deg: float, azimuth_deg: float, elevation_deg: float) -> None:
     """Against the satellite mirrored in the wall's plane, in ECEF, at 20 000 km."""
     heading, s, distance = 63.0, 430.0, 18.0
-    place = built((section(wall("right", distance, 500.0, yaw_deg=yaw_deg)),), LINE_M, 1)
-    row = place.faces[0]
+    place = build_structures((section(wall("right", distance, 500.0, yaw_deg=yaw_deg)),), LINE_M, 1)
+    row = place.walls[0]
     ray = rays(s, elevation_deg, azimuth_deg - heading)
-    found = mirrored(row, ray)
+    found = reflections(row, ray)
     assert found.amplitude[0] == pytest.approx(0.8)
 
     antenna = ecef_from_geodetic(35.0, 135.0, 100.0)
@@ -291,8 +291,8 @@ def test_a_reflection_does_not_come_over_a_higher_house() -> None:
 
 def test_a_slope_hides_up_to_its_own_horizon() -> None:
     """A face 8 m off, its top 6 m over the antenna: 36.9 deg abeam; 6 dB on the edge; behind the train's beam less."""
-    place = built((section(wall("left", 8.0, 10.0, reflection=0.0)),), LINE_M, 1)
-    row = place.faces[0]
+    place = build_structures((section(wall("left", 8.0, 10.0, reflection=0.0)),), LINE_M, 1)
+    row = place.walls[0]
     abeam = np.degrees(np.arctan2(6.0, 8.0))
     assert shadow(row, rays(500.0, abeam, -90.0))[0] == pytest.approx(0.0, abs=1e-6)
     # 45 deg ahead the face is 8 * sqrt(2) m away.
@@ -311,8 +311,8 @@ def test_a_slope_hides_up_to_its_own_horizon() -> None:
 def test_a_gap_between_houses_lets_the_satellite_through() -> None:
     """Houses of 30 m with gaps of 20 m at 15 m distance: in the middle of gap and house, straight abeam."""
     row = wall("left", 15.0, 40.0, reflection=0.0).replaced(length_m=(30.0, 30.0), gap_m=(20.0, 20.0))
-    place = built((section(row),), LINE_M, 1)
-    strips = place.faces[0]
+    place = build_structures((section(row),), LINE_M, 1)
+    strips = place.walls[0]
     house = int(np.searchsorted(strips.start_m[: len(strips.start_m) - 1], 300.0))
     middle = strips.start_m[house] + 15.0
     got = environment(row)(seen(np.array([middle, middle + 25.0]), 30.0, -90.0))
@@ -407,8 +407,8 @@ def test_faster_codes_suffer_less() -> None:
 def test_a_rough_face_reflects_less() -> None:
     """2 cm uneven, hit at 45 deg: g = 4 pi 0.02 cos 45 / 0.1903 = 0.934, amplitude exp(-0.436) = 0.647."""
     rough = wall("right", 20.0, 100.0).replaced(roughness_m=(0.02, 0.02))
-    row = built((section(rough),), LINE_M, 1).faces[0]
-    assert mirrored(row, rays(500.0, 45.0, -90.0)).amplitude[0] == pytest.approx(0.8 * 0.647, abs=1e-3)
+    row = build_structures((section(rough),), LINE_M, 1).walls[0]
+    assert reflections(row, rays(500.0, 45.0, -90.0)).amplitude[0] == pytest.approx(0.8 * 0.647, abs=1e-3)
 
 
 # Masts, beams, wires -------------------------------------------------------------------------------------------------
@@ -441,14 +441,14 @@ def test_a_mast_is_passed_under_where_the_satellite_stands_above_it() -> None:
     """The top is 5 m over the antenna and 3 m away: 59 deg."""
     bars = Electrification(MASTS)
     for elevation, least, most in ((30.0, 0.5, 0.85), (75.0, 0.97, 1.03)):
-        assert least < abs(bars.left_over(rays(500.0, elevation, 90.0))[0]) < most
+        assert least < abs(bars.transmitted(rays(500.0, elevation, 90.0))[0]) < most
 
 
 def test_a_beam_is_passed_when_it_is_in_the_line_of_sight() -> None:
     """3.5 m over the antenna, satellite 45 deg ahead: the beam of mast 500 stands in its way from 496.5 m."""
     settings = MASTS.replaced(beam_every=1, sides="right", lateral_m=4.0)
     bars = Electrification(settings)
-    there, before, after = (abs(bars.left_over(rays(s, 45.0, 0.0))[0]) for s in (496.5, 493.0, 500.5))
+    there, before, after = (abs(bars.transmitted(rays(s, 45.0, 0.0))[0]) for s in (496.5, 493.0, 500.5))
     assert there < 0.85
     assert before == pytest.approx(1.0, abs=0.15)
     assert after == pytest.approx(1.0, abs=0.15)
@@ -458,7 +458,7 @@ def test_a_beam_is_passed_when_it_is_in_the_line_of_sight() -> None:
 def test_what_a_mast_throws_goes_the_shortest_way(relative_deg: float, elevation_deg: float) -> None:
     """Fermat: the extra path is the least of |P| - P . u over the points P of the mast."""
     ray = rays(501.0, elevation_deg, relative_deg)
-    amplitude, extra, growth = Electrification(MASTS).thrown(ray)[0]
+    amplitude, extra, growth = Electrification(MASTS).scattered(ray)[0]
     u = np.array([ray.x[0], ray.y[0], ray.z[0]])
     foot = np.array([-1.0, -3.0 if relative_deg > 0.0 else 3.0, 0.0])
 

@@ -25,8 +25,8 @@ from railfix.simulate import (
     Terrain,
     VehicleSettings,
     antenna_truth,
-    made_alignment,
-    made_motion,
+    build_alignment,
+    build_motion,
     shuttle,
 )
 from railfix.simulate.motion import Sway
@@ -36,7 +36,7 @@ from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 pytestmark = pytest.mark.requirement("D4")
 
-LINE = made_alignment(LineSettings())
+LINE = build_alignment(LineSettings())
 
 
 def local(ecef_m: np.ndarray) -> np.ndarray:
@@ -99,14 +99,14 @@ def test_heights_follow_the_gradient_and_chainage_is_arc_length() -> None:
 
 
 def test_a_long_line_keeps_its_pattern_height_and_direction() -> None:
-    line = made_alignment(LineSettings(length_m=20_000.0))
+    line = build_alignment(LineSettings(length_m=20_000.0))
     track = line.track()
     assert track.chainage_m[-1] == pytest.approx(20_000.0, abs=0.1)
     assert track.height_m.min() > 160.0
     assert track.height_m.max() < 165.0
     radii = np.unique(np.round(track.radius_m[np.isfinite(track.radius_m)], 6))
     assert set(np.abs(radii[np.abs(radii) < 301.0])) >= {160.0, 300.0}
-    # Mirrored patterns undo each other's turning: the line goes on, and nowhere meets itself.
+    # Reflections patterns undo each other's turning: the line goes on, and nowhere meets itself.
     assert np.linalg.norm(track.ecef_m[-1] - track.ecef_m[0]) > 17_000.0
     head = line.tangent_at(np.arange(0.0, 20_000.0, 2 * 756.0))
     assert (head @ head[0] > 0.999).all()
@@ -213,7 +213,7 @@ def elements_line(**more: object) -> LineSettings:
 
 
 def test_a_line_of_elements_is_what_they_say() -> None:
-    line = made_alignment(elements_line())
+    line = build_alignment(elements_line())
     assert line.length_m == pytest.approx(700.0)
     assert line.curvature_at([100.0, 230.0, 300.0, 440.0]) == pytest.approx(np.array([0.0, 0.5, 1.0, 0.5]) / 300.0)
     assert line.lean_at([100.0, 230.0, 300.0]) == pytest.approx([0.0, 0.040, 0.080])
@@ -239,10 +239,10 @@ def test_a_line_of_elements_is_what_they_say() -> None:
         (lambda: LineSettings(generated=GeneratedLine(seed=2)), "generated"),
         (lambda: LineSettings(kind="file", file=LineFile(path="x.csv"), length_m=5.0), "the file's own"),
         (lambda: GeneratedLine(terrain=(Terrain(from_m=5.0),)), "begin at 0"),
-        (lambda: made_alignment(LineSettings(kind="elements", elements=(
+        (lambda: build_alignment(LineSettings(kind="elements", elements=(
             Element(kind="straight", length_m=100.0), Element(kind="curve", length_m=90.0, radius_m=400.0)))),
          "without a transition"),
-        (lambda: made_alignment(LineSettings(kind="elements", elements=(Element(kind="straight", length_m=700.0),),
+        (lambda: build_alignment(LineSettings(kind="elements", elements=(Element(kind="straight", length_m=700.0),),
             gradients=(Gradient(from_m=300.0, permille=9.0), Gradient(from_m=310.0, permille=0.0)))), "overlaps"),
     ],
 )  # fmt: skip
@@ -258,8 +258,8 @@ def test_a_generated_line_keeps_its_ranges() -> None:
     settings = LineSettings(
         kind="generated", length_m=20_000.0, generated=GeneratedLine(seed=5, terrain=(Terrain(), MOUNTAIN))
     )
-    line = made_alignment(settings)
-    again = made_alignment(settings)
+    line = build_alignment(settings)
+    again = build_alignment(settings)
     np.testing.assert_array_equal(line.at([0.0, 9999.0, 20_000.0]), again.at([0.0, 9999.0, 20_000.0]))
     s = np.arange(0.0, 20_000.0, 1.0)
     bend = np.abs(line.curvature_at(s))
@@ -276,14 +276,14 @@ def test_a_generated_line_keeps_its_ranges() -> None:
     assert np.abs(np.diff(line.lean_at(s))).max() < 1.0 / 400.0 + 1e-9
     # It goes somewhere: no loop.
     assert np.linalg.norm(line.at(20_000.0) - line.at(0.0)) > 10_000.0
-    other = made_alignment(LineSettings(kind="generated", length_m=20_000.0, generated=GeneratedLine(seed=6)))
+    other = build_alignment(LineSettings(kind="generated", length_m=20_000.0, generated=GeneratedLine(seed=6)))
     assert np.linalg.norm(other.at(20_000.0) - line.at(20_000.0)) > 100.0
 
 
 def test_a_track_file_becomes_the_line_it_was_sampled_from(tmp_path: Path) -> None:
     """The spline through a map's points against the clothoids that the map was sampled from."""
     write_track_csv(LINE.track(), tmp_path / "track.csv")
-    line = made_alignment(LineSettings(kind="file", file=LineFile(path=str(tmp_path / "track.csv"))))
+    line = build_alignment(LineSettings(kind="file", file=LineFile(path=str(tmp_path / "track.csv"))))
     assert line.length_m == pytest.approx(756.0, abs=1e-3)
     s = np.linspace(0.0, line.length_m, 5001)
     assert np.linalg.norm(line.at(s) - LINE.at(s), axis=1).max() < 0.005
@@ -291,7 +291,7 @@ def test_a_track_file_becomes_the_line_it_was_sampled_from(tmp_path: Path) -> No
     assert np.abs(line.lean_at(s) - LINE.lean_at(s)).max() < 1e-4
     assert np.abs(line.kilometrage_at(s) - LINE.kilometrage_at(s)).max() < 1e-3
     np.testing.assert_array_equal(line.track().latitude_deg, read_track(tmp_path / "track.csv").latitude_deg)
-    part = made_alignment(
+    part = build_alignment(
         LineSettings(kind="file", file=LineFile(path=str(tmp_path / "track.csv"), from_m=100.0, to_m=400.0))
     )
     assert 270.0 < part.length_m < 300.0
@@ -301,9 +301,9 @@ def test_a_track_file_that_jitters_or_lacks_points_is_refused(tmp_path: Path) ->
     track = LINE.track()
     rough = read_track_with_jitter(tmp_path, track.latitude_deg, track.longitude_deg, track.height_m)
     with pytest.raises(InputFileError, match="radius of"):
-        made_alignment(LineSettings(kind="file", file=LineFile(path=str(rough))))
+        build_alignment(LineSettings(kind="file", file=LineFile(path=str(rough))))
     with pytest.raises(InputFileError, match="at least 4"):
-        made_alignment(LineSettings(kind="file", file=LineFile(path=str(rough), from_m=5e5)))
+        build_alignment(LineSettings(kind="file", file=LineFile(path=str(rough), from_m=5e5)))
 
 
 def read_track_with_jitter(folder: Path, lat: np.ndarray, lon: np.ndarray, height: np.ndarray) -> Path:
@@ -317,8 +317,8 @@ def read_track_with_jitter(folder: Path, lat: np.ndarray, lon: np.ndarray, heigh
 
 def test_the_map_is_off_by_the_error_that_was_asked_for() -> None:
     error = MapError(plan_sigma_m=0.3, height_sigma_m=0.6, correlation_m=200.0, seed=3)
-    line = made_alignment(LineSettings(length_m=60_000.0, map_error=error))
-    clean = made_alignment(LineSettings(length_m=60_000.0))
+    line = build_alignment(LineSettings(length_m=60_000.0, map_error=error))
+    clean = build_alignment(LineSettings(length_m=60_000.0))
     s = line.sampled_chainage_m()
     np.testing.assert_array_equal(line.at(s[:50]), clean.at(s[:50]), "the truth is the same")
     latitude, longitude, _ = geodetic_from_ecef(clean.at(s))
@@ -335,7 +335,7 @@ def test_the_map_is_off_by_the_error_that_was_asked_for() -> None:
 
 
 def test_a_run_curve_keeps_all_limits_and_stops() -> None:
-    line = made_alignment(LineSettings(length_m=6_000.0))
+    line = build_alignment(LineSettings(length_m=6_000.0))
     run = RunSettings(
         cruise_mps=25.0,
         stations=(Station(at_m=50.0), Station(at_m=2_500.0, dwell_s=40.0), Station(at_m=5_900.0, dwell_s=20.0)),
@@ -343,7 +343,7 @@ def test_a_run_curve_keeps_all_limits_and_stops() -> None:
         cant_deficiency_m=0.05,
     )
     scenario = Scenario(duration_s=1500.0, line=LineSettings(length_m=6_000.0), run=run)
-    motion = made_motion(line, scenario)
+    motion = build_motion(line, scenario)
     time = np.arange(0.0, 1500.0, 0.05)
     chainage, speed = motion.at(time)
     assert chainage.min() == pytest.approx(50.0)
@@ -366,9 +366,9 @@ def test_a_run_curve_keeps_all_limits_and_stops() -> None:
 
 
 def test_a_run_the_other_way_is_its_mirror_and_ends_standing() -> None:
-    line = made_alignment(LineSettings())
+    line = build_alignment(LineSettings())
     up, down = (
-        made_motion(line, Scenario(run=RunSettings(direction=way, at_end="stand", acceleration_mps2=0.8)))  # type: ignore[arg-type]
+        build_motion(line, Scenario(run=RunSettings(direction=way, at_end="stand", acceleration_mps2=0.8)))  # type: ignore[arg-type]
         for way in ("rising", "falling")
     )
     time = np.arange(0.0, 300.0, 0.1)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from railfix.simulate import Scenario, SkySettings, made_alignment, made_navigation
+from railfix.simulate import Scenario, SkySettings, build_alignment, simulated_navigation
 from railfix.simulate.satellites import SatelliteTable, links
 
 pytestmark = pytest.mark.requirement("D4")
 
 SCENARIO = Scenario(duration_s=7200.0, sky=SkySettings(systems="GJEC"))
-NAVIGATION = made_navigation(SCENARIO)
+NAVIGATION = simulated_navigation(SCENARIO)
 NAMES = sorted({str(s) for s in NAVIGATION.kepler.satellite})
 LAST = SCENARIO.start + np.timedelta64(7200, "s")
-PLACE = made_alignment(SCENARIO.line).at(np.zeros(1))[0]
+PLACE = build_alignment(SCENARIO.line).at(np.zeros(1))[0]
 
 
 def test_the_table_is_the_formulas_within_a_micrometre() -> None:

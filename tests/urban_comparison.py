@@ -1,7 +1,7 @@
 """Simulated surroundings beside recorded cities: errors of the codes and C/N0 by elevation, printed.
 
 Run ``python tests/urban_comparison.py`` with the recordings beside the checkout; without them only the
-simulated columns are printed. Nothing is fitted: the kinds of `railfix.simulate.environment.kinds` are
+simulated columns are printed. Nothing is fitted: the kinds of `railfix.simulate.environment.section_kinds` are
 chosen from what such places look like. ``python tests/urban_comparison.py speed`` prints what they cost.
 """
 

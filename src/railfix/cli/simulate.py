@@ -1,4 +1,4 @@
-"""``railfix simulate``: runs that never happened, as files, with their truth."""
+"""``railfix simulate``: simulated runs with ground truth, as files."""
 
 from __future__ import annotations
 

@@ -1,16 +1,16 @@
-"""Runs that never happened, with their truth: RINEX logs of two antennas on a made line under a made sky.
+"""Simulated runs with ground truth: RINEX logs of two antennas of a train on a given or generated line.
 
-`Scenario` holds every choice, `load_scenario` reads one from TOML, `write_run` makes the files,
-`Simulation` gives the arrays piece by piece. The same scenario gives the same numbers.
+`Scenario` holds all settings, `load_scenario` reads one from TOML, `write_run` writes the files,
+`Simulation` gives the arrays in chunks. The same scenario gives the same numbers.
 ``railfix simulate`` is the same from the command line.
 
-The orbits, the delays and the rigid body are computed here apart from the rooms that the estimators
-use, by the same published formulas, so that an error in either shows as a position that is off.
+Atmospheric delays and the rigid body are computed here independently of the packages that the estimators
+use, by the same published formulas, so that an error in either shows as a position error.
 """
 
-from railfix.simulate.alignment import Alignment, made_alignment
+from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
-from railfix.simulate.constellation import made_navigation
+from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.demo_data import DEMO_FILES, demo_files, demo_folder
 from railfix.simulate.disturbance import Disturbance, Disturbances, Geometry
 from railfix.simulate.errors import ErrorSettings
@@ -23,7 +23,7 @@ from railfix.simulate.line_settings import (
     MapError,
     Terrain,
 )
-from railfix.simulate.motion import Motion, made_motion, run_curve, shuttle
+from railfix.simulate.motion import Motion, build_motion, run_curve, shuttle
 from railfix.simulate.run import section_table, truth_table, write_run
 from railfix.simulate.scenario import (
     ANTENNAS,
@@ -69,19 +69,19 @@ __all__ = [
     "Terrain",
     "VehicleSettings",
     "antenna_truth",
+    "build_alignment",
+    "build_motion",
     "demo_files",
     "demo_folder",
     "load_recipe",
     "load_scenario",
-    "made_alignment",
-    "made_motion",
-    "made_navigation",
     "run_curve",
     "scenario_table",
     "section_table",
     "sensor_tables",
     "shipped_scenarios",
     "shuttle",
+    "simulated_navigation",
     "truth_table",
     "write_run",
 ]

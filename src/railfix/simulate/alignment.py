@@ -1,6 +1,6 @@
 """The continuous line: curvature, cant and gradient as functions of chainage, integrated to a curve in space.
 
-The truth is this curve; the track map is its sampling, off by `MapError` where that is asked for.
+The ground truth is this curve; the track map samples it, with the error `MapError` where set.
 Chainage is the arc length in three dimensions. Curvature changes linearly in transitions (clothoids),
 and with it the cant (ramps); the gradient changes linearly in vertical curves. The curve is laid on
 the ellipsoid, so that a line of 200 km stays at its height and its curves stay curves. A line of a
@@ -22,7 +22,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.simulate.line_elements import Knots, generated_knots, knots_of_elements
 from railfix.simulate.line_file import FileLine, line_of_file
 from railfix.simulate.line_settings import PATTERN_LENGTH_M, LineSettings
-from railfix.simulate.waves import Waves
+from railfix.simulate.random_functions import RandomFunction
 from railfix.track import Track, interpolate_kilometrage
 
 _SEMI_MAJOR_M: Final = 6_378_137.0
@@ -119,7 +119,7 @@ class Alignment:
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
 
     def sampled_chainage_m(self) -> Floats:
-        """Chainage of the map's points: the elements' ends, and evenly between within the spacing; a file's own."""
+        """Chainage of the map's points: the elements' ends, and even steps between within the spacing; a file's own."""
         if self.file is not None:
             return self.file.point_m
         points = [np.zeros(1)]
@@ -132,15 +132,15 @@ class Alignment:
         return np.concatenate(points)
 
     def map_error_m(self, chainage_m: ArrayLike) -> Floats:
-        """How far the map lies from the line, to the east, to the north and up, shape (..., 3) [m]."""
+        """Offset of the map from the line, to the east, to the north and up, shape (..., 3) [m]."""
         error = self.settings.map_error
         rng = np.random.default_rng([error.seed, 12])
         sigmas = (error.plan_sigma_m, error.plan_sigma_m, error.height_sigma_m)
-        waves = [Waves.smooth(rng, sigma=sigma, correlation=error.correlation_m) for sigma in sigmas]
-        return np.stack([wave.at(chainage_m) for wave in waves], axis=-1)
+        offsets = [RandomFunction.smooth(rng, sigma=sigma, correlation=error.correlation_m) for sigma in sigmas]
+        return np.stack([offset.at(chainage_m) for offset in offsets], axis=-1)
 
     def track(self) -> Track:
-        """The track map: the curve at `sampled_chainage_m`, with its attributes, off by the map's error."""
+        """The track map: the curve at `sampled_chainage_m`, with its attributes and the map's error."""
         chainage = self.sampled_chainage_m()
         ecef = self.at(chainage)
         exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
@@ -166,7 +166,7 @@ class Alignment:
         )
 
 
-def made_alignment(settings: LineSettings) -> Alignment:
+def build_alignment(settings: LineSettings) -> Alignment:
     """The line of a scenario, of any of the four kinds.
 
     Raises

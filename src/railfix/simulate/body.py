@@ -1,6 +1,6 @@
-"""Where the antennas truly are: a rigid body with both bogie centres on the continuous line.
+"""True positions of the antennas: a rigid body with both bogie centres on the continuous line.
 
-Computed apart from `railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method
+Computed independently of `railfix.track.vehicle`, which works on the polyline of the map: here by Newton's method
 on the curve and by rotation about the body's axis (Rodrigues).
 """
 
@@ -21,13 +21,13 @@ _RAIL_HEAD_M = 0.070
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaTruth:
-    """One antenna at n places of the vehicle's middle.
+    """True positions of one antenna at n positions of the vehicle's middle.
 
     Attributes
     ----------
     ecef_m : ndarray, shape (n, 3) [m]
     chainage_m : ndarray, shape (n,) [m]
-        Centreline point in the plane through the antenna square to the body's long axis.
+        Centreline point in the plane through the antenna perpendicular to the body's long axis.
     forward : ndarray, shape (n, 3)
         Unit vector of the body's long axis.
     """
@@ -44,7 +44,7 @@ def antenna_truth(
     middle_m: Floats,
     sway_rad: Floats | float = 0.0,
 ) -> AntennaTruth:
-    """True place of an antenna.
+    """True position of an antenna.
 
     Parameters
     ----------

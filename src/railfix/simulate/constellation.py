@@ -1,9 +1,9 @@
-"""A made sky: broadcast records of satellites that do not exist.
+"""Broadcast records of simulated satellites.
 
-Orbits have the size, shape and tilt of the real constellations, the places in them are invented, and
-one QZSS satellite stands near the zenith of the line at the start of the run. Each satellite's
-records describe the same orbit and clock to within a millimetre, whichever a reader takes, but the
-newer ones of the satellites named in `SkySettings.unhealthy` say unhealthy.
+Orbits have the semi-major axis, eccentricity and inclination of the real constellations, the satellites'
+positions in them are invented, and one QZSS satellite is near the zenith of the line at the start of the
+run. All records of a satellite describe the same orbit and clock to within a millimetre; the newer ones of
+the satellites named in `SkySettings.unhealthy` are flagged unhealthy.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.constants import BDT_MINUS_GPST_S
+from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS
 from railfix.core.timescale import gpst_minus_utc, to_week
 from railfix.gnss.navigation import KeplerRecords, Navigation
-from railfix.simulate.satellites import EARTH, FRAME_ROTATION
+from railfix.gnss.orbits.kepler import GM, ROTATION
+from railfix.simulate.navigation_file import navigation_of_file, no_glonass
 from railfix.simulate.scenario import Scenario
-from railfix.simulate.sky_file import no_glonass, sky_of_file
 
 #: Klobuchar coefficients of GPS, alpha then beta (invented, of ordinary size); they serve all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
@@ -44,11 +44,11 @@ class _Orbit:
     mean_anomaly: float
 
 
-def made_navigation(scenario: Scenario) -> Navigation:
+def simulated_navigation(scenario: Scenario) -> Navigation:
     """Broadcast records for the whole of a run, as `railfix.io.rinex.write.write_navigation` writes them.
 
     All values are already rounded to the digits of the file, so that the file and the arrays are the
-    same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.sky_file`).
+    same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.navigation_file`).
 
     Raises
     ------
@@ -56,7 +56,7 @@ def made_navigation(scenario: Scenario) -> Navigation:
         The navigation file cannot be read, or does not serve the scenario's time.
     """
     if scenario.sky.nav is not None:
-        return sky_of_file(scenario, scenario.sky.nav)
+        return navigation_of_file(scenario, scenario.sky.nav)
     rng = np.random.default_rng([scenario.seed, 1])
     rows: list[dict[str, Any]] = []
     for system in scenario.sky.systems:
@@ -146,13 +146,13 @@ def _synchronous(name: str, eccentricity: float, tilt_deg: float, longitude: flo
 
 
 def _synchronous_radius() -> float:
-    return float((EARTH["J"][0] / FRAME_ROTATION**2) ** (1.0 / 3.0))
+    return float((GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0))
 
 
 def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Generator) -> list[dict[str, Any]]:
     """Records of one satellite: the one before the run, the one in force, and those that follow."""
     every, shift = _ISSUE_S[system], BDT_MINUS_GPST_S if system == "C" else 0.0
-    mu, rotation = EARTH[system]
+    mu, rotation = GM[system], ROTATION[system]
     start_sow = float(to_week(scenario.start)[1])
     first = float(np.floor((start_sow - _SENT_AFTER_S) / every) - 1.0) * every
     count = int((start_sow + scenario.duration_s - _SENT_AFTER_S) // every - first // every) + 1

@@ -1,7 +1,7 @@
-"""Delays of the atmosphere, computed apart from `railfix.ranges.atmosphere` by the same models.
+"""Ionospheric and tropospheric delays, computed independently of `railfix.ranges.atmosphere` by the same models.
 
 Klobuchar (IS-GPS-200, 20.3.3.5.2.5) and Saastamoinen with the standard atmosphere and 70 % relative
-humidity: what a receiver corrects is what the simulation put in, unless a scale says otherwise.
+humidity: a receiver that applies them corrects the simulated delays exactly, unless a scale changes them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where the demonstration run that railfix ships is found."""
+"""Files of the demonstration run that is part of railfix."""
 
 from __future__ import annotations
 

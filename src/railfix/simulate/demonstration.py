@@ -1,4 +1,4 @@
-"""The demonstration: the run that comes with railfix, and its truth."""
+"""Inputs and ground truth of the demonstration run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def demo_inputs() -> RunInputs:
 
 
 def demo_truth() -> Path:
-    """Where the antennas of the demonstration run really were, for `railfix.evaluate`.
+    """File of the reference trajectory of the demonstration run, for `railfix.evaluate`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Lines put together from elements: those of a scenario, and those that a seed makes up."""
+"""Lines of alignment elements: given ones, and generated ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from railfix.simulate.line_settings import Element, GeneratedLine, Gradient, Lin
 _GRAVITY: Final = 9.806_65
 #: Distance between the wheels' contact points of the generated lines [m], for the equilibrium cant.
 _CONTACT_M: Final = 1.137
-#: A generated line turns back when it has turned away from its first direction by this [rad],
+#: A generated line turns back when its direction differs from the first by this [rad],
 _FAR_RAD: Final = np.radians(50.0)
 #: and when it has climbed or fallen by this [m].
 _HIGH_M: Final = 150.0
@@ -52,13 +52,16 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
         A curve meets a straight or another curve without a transition; two transitions in a row;
         vertical curves that overlap or lie beyond the ends.
     """
-    for k, (one, other) in enumerate(pairwise(elements)):
-        both = {one.kind, other.kind}
+    for k, (element, following) in enumerate(pairwise(elements)):
+        both = {element.kind, following.kind}
         if both == {"transition"}:
             raise SettingsError(f"line.elements {k + 1} and {k + 2} are both transitions; make them one")
-        if "transition" not in both and (one.radius_m, one.cant_m) != (other.radius_m, other.cant_m):
+        if "transition" not in both and (element.radius_m, element.cant_m) != (
+            following.radius_m,
+            following.cant_m,
+        ):
             raise SettingsError(
-                f"line.elements {k + 1} ({one.kind}) and {k + 2} ({other.kind}) meet without a transition"
+                f"line.elements {k + 1} ({element.kind}) and {k + 2} ({following.kind}) meet without a transition"
             )
     knot = np.concatenate([[0.0], np.cumsum([item.length_m for item in elements])])
     ends = np.zeros((2, len(knot)))
@@ -92,7 +95,7 @@ def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, F
 
 
 def generated_knots(settings: LineSettings) -> Knots:
-    """Knots of a line that a seed makes up, straights and curves in turn."""
+    """Knots of a generated line, straights and curves in turn."""
     rng = np.random.default_rng([settings.generated.seed, 11])
     return knots_of_elements(_plan(settings, rng), _profile(settings, rng))
 
@@ -102,19 +105,19 @@ def _terrain(generated: GeneratedLine, chainage_m: float) -> Terrain:
 
 
 def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
-    made = settings.generated
+    limits = settings.generated
     elements: list[Element] = []
     place, heading = 0.0, 0.0
     while place < settings.length_m:
-        here = _terrain(made, place)
+        here = _terrain(limits, place)
         radius = float(np.round(rng.uniform(*here.radius_m), -1))
         straight, curve = (float(np.round(rng.uniform(*r))) for r in (here.straight_m, here.curve_m))
         to_right = rng.random() < 0.5 if abs(heading) < _FAR_RAD else heading < 0.0
         side = 1.0 if to_right else -1.0
         # Equilibrium cant; transition of 400 times the cant and of 8 times cant and speed in km/h, m each.
-        cant = min(made.speed_mps**2 / (_GRAVITY * radius) * _CONTACT_M, made.largest_cant_m)
+        cant = min(limits.speed_mps**2 / (_GRAVITY * radius) * _CONTACT_M, limits.largest_cant_m)
         cant = float(np.round(np.round(cant / _CANT_STEP_M) * _CANT_STEP_M, 3))
-        speed_kmh = 3.6 * min(made.speed_mps, np.sqrt(_GRAVITY * radius * (cant + 0.06) / _CONTACT_M))
+        speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(_GRAVITY * radius * (cant + 0.06) / _CONTACT_M))
         ramp = float(np.ceil(max(20.0, 400.0 * cant, 8.0 * cant * speed_kmh)))
         turn = (curve + ramp) / radius
         if turn > 2.0 * _FAR_RAD:
@@ -138,20 +141,20 @@ def _cut(elements: list[Element], length_m: float) -> list[Element]:
 
 
 def _profile(settings: LineSettings, rng: np.random.Generator) -> list[Gradient]:
-    made = settings.generated
+    limits = settings.generated
     changes: list[Gradient] = []
     place, height, before, behind = 0.0, 0.0, 0.0, np.inf
     while True:
-        here = _terrain(made, place)
+        here = _terrain(limits, place)
         step = float(np.round(rng.uniform(*here.gradient_m)))
         permille = float(np.round(rng.uniform(-here.permille, here.permille) * 2.0) / 2.0)
         if abs(height) > _HIGH_M:
             permille = -float(np.sign(height)) * abs(permille)
         # Half of the vertical curve ahead and half of the one behind have to fit.
-        fits = 0.9 * min(step, behind) / made.vertical_radius_m * 1e3
+        fits = 0.9 * min(step, behind) / limits.vertical_radius_m * 1e3
         permille = float(np.clip(permille, before - fits, before + fits))
         if place + 2.0 * step > settings.length_m:
             break
-        changes.append(Gradient(from_m=place, permille=permille, vertical_radius_m=made.vertical_radius_m))
+        changes.append(Gradient(from_m=place, permille=permille, vertical_radius_m=limits.vertical_radius_m))
         height, before, place, behind = height + 1e-3 * permille * step, permille, place + step, step
     return changes

@@ -1,10 +1,10 @@
 """A track file as the line: a smooth curve through its points.
 
-What is assumed: the file's points lie on the line; between them it is a cubic spline in space (not a
-knot at its ends), whose arc length is the chainage. Cant changes linearly from point to point; where
+Assumptions: the file's points lie on the line; between them it is a cubic spline in space (not-a-knot
+end conditions), whose arc length is the chainage. Cant changes linearly from point to point; where
 the file has none the track is not canted. The side to which cant leans the vehicle is that of the
-file's radius, of the spline's curvature where the file has none. A file with points that jitter makes
-a line that jitters: one with a curve tighter than 30 m somewhere is refused.
+file's radius, of the spline's curvature where the file has none. Noise in the points becomes
+curvature of the line: a file with a curve tighter than 30 m is an error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from railfix.track import Track, read_track
 
 #: Spacing of the points by which the spline is turned into one of arc length [m].
 _STEP_M: Final = 0.5
-#: Tightest curve that is believed [m].
+#: Tightest plausible curve [m].
 _TIGHTEST_M: Final = 30.0
 
 

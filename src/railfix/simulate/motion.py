@@ -1,6 +1,6 @@
-"""Chainage and speed of the train over time: pieces of even acceleration.
+"""Chainage and speed of the train over time: pieces of constant acceleration.
 
-A shuttle between two places, or a run curve: as fast as the line, its curves and the train allow,
+A shuttle between two points, or a run curve: as fast as the line, its curves and the train allow,
 stopping at stations.
 """
 
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats
 from railfix.simulate.alignment import Alignment
+from railfix.simulate.random_functions import RandomFunction
 from railfix.simulate.scenario import RunSettings, Scenario, Station
-from railfix.simulate.waves import Waves
 
 #: Spacing of the places at which a run curve looks at the limits [m].
 _STEP_M: Final = 2.0
@@ -29,7 +29,7 @@ _FULL_SWAY_MPS: Final = 20.0
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Pieces of even acceleration; the last one goes on.
+    """Pieces of constant acceleration; the last one continues.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Motion:
         return np.where(piece < 0, 0.0, self.acceleration_mps2[np.maximum(piece, 0)])
 
 
-def made_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
+def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
     """Motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or the like are given.
 
     Parameters
@@ -91,14 +91,14 @@ def made_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None
 
 @dataclass(frozen=True, kw_only=True)
 class Sway:
-    """Swaying of the body about its forward axis, beyond the lean of the cant.
+    """Roll of the body about its forward axis, beyond that of the cant.
 
     Attributes
     ----------
-    waves : Waves
+    function : RandomFunction
     """
 
-    waves: Waves
+    function: RandomFunction
 
     @classmethod
     def of(cls, scenario: Scenario) -> Sway:
@@ -106,16 +106,18 @@ class Sway:
         vehicle = scenario.vehicle
         rng = np.random.default_rng([scenario.seed, 13])
         return cls(
-            waves=Waves.narrow(rng, sigma=float(np.radians(vehicle.sway_sigma_deg)), period=vehicle.sway_period_s)
+            function=RandomFunction.periodic(
+                rng, sigma=float(np.radians(vehicle.sway_sigma_deg)), period=vehicle.sway_period_s
+            )
         )
 
     def roll_rad(self, time_s: Floats, speed_mps: Floats) -> Floats:
         """Lean to the right [rad] at times and speeds; none while the train stands."""
-        return self.waves.at(time_s) * np.minimum(np.abs(speed_mps) / _FULL_SWAY_MPS, 1.0)
+        return self.function.at(time_s) * np.minimum(np.abs(speed_mps) / _FULL_SWAY_MPS, 1.0)
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """A train that runs between two chainages, standing at each, for at least a duration.
+    """Motion between two chainages, standing at each, for at least a duration.
 
     Parameters
     ----------
@@ -149,7 +151,7 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
 
 
 def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, contact_m: float) -> Motion:
-    """A train that runs from stop to stop as fast as it may, for at least a duration.
+    """Motion from stop to stop at the highest allowed speed, for at least a duration.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Noise of a receiver that goes on in time, what it loses and finds again, and the state carried between pieces."""
+"""Time-correlated receiver noise, loss of lock and re-acquisition, with the state carried between chunks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.simulate.errors.settings import NoiseSettings, TrackingSettings
 
 
 class CarriedNoise:
-    """Correlated noise of a receiver's channels, piece by piece; any cutting gives the same numbers.
+    """Correlated noise of a receiver's channels, chunk by chunk; results do not depend on the chunks.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class CarriedNoise:
         return np.asarray(np.sqrt(1.0 - share) * white + np.sqrt(share) * self._code.next(len(white)))
 
     def cn0_db(self, epochs: int) -> Floats | float:
-        """Wander of C/N0 [dB], shape (T, M), of the next epochs; 0 where there is none."""
+        """Variation of C/N0 [dB] over the next epochs, shape (T, M); 0 where there is none."""
         sigma = self._settings.cn0_wander_sigma_db
         return 0.0 if sigma == 0.0 else sigma * self._cn0.next(epochs)
 
@@ -59,8 +59,8 @@ class _FirstOrder:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracked:
-    """What a receiver makes of its signals.
+class LockState:
+    """Lock state of a receiver's channels.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Tracked:
 
 
 class Tracking:
-    """Loss and re-acquisition of a receiver's channels; the state goes on from piece to piece.
+    """Loss of lock and re-acquisition of a receiver's channels; the state is carried from chunk to chunk.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Tracking:
         self._settings = settings
         self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
         self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
-        # Epochs since the signal was last too bad to be tracked, as if it had been good for ever.
+        # Epochs since the signal could last not be tracked; at the start as if it always could.
         self._since = np.full(channels, self._wait + 1, dtype=np.int64)
         self._seen = np.zeros(channels, dtype=np.bool_)
         self._present = np.zeros(channels, dtype=np.bool_)
@@ -105,8 +105,8 @@ class Tracking:
         threshold = self._settings.threshold_dbhz
         return np.zeros(cn0_dbhz.shape, dtype=np.bool_) if threshold is None else np.asarray(cn0_dbhz < threshold)
 
-    def follow(self, bad: Masks) -> Tracked:
-        """What becomes of signals that cannot be tracked where `bad`, shape (T, M), the epochs that follow."""
+    def follow(self, bad: Masks) -> LockState:
+        """Lock state over the next epochs of channels that cannot be tracked where `bad`, shape (T, M)."""
         epoch = np.arange(1, len(bad) + 1, dtype=np.int64)[:, None]
         last_bad = np.maximum.accumulate(np.where(bad, epoch, -self._since), axis=0)
         since = epoch - last_bad
@@ -118,8 +118,8 @@ class Tracking:
         self._since = np.minimum(since[-1], self._wait + 1)
         self._present, self._seen, self._losses = here[-1], seen[-1], losses[-1]
         if self._settings.slips == "none":
-            return Tracked(lost=lost, slip_cycles=0.0, loss_of_lock=np.zeros(bad.shape, dtype=np.uint8))
-        return Tracked(lost=lost, slip_cycles=_cycles(self._salt, losses), loss_of_lock=back.astype(np.uint8))
+            return LockState(lost=lost, slip_cycles=0.0, loss_of_lock=np.zeros(bad.shape, dtype=np.uint8))
+        return LockState(lost=lost, slip_cycles=_cycles(self._salt, losses), loss_of_lock=back.astype(np.uint8))
 
 
 def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:

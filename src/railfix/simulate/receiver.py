@@ -1,4 +1,4 @@
-"""A simulated receiver: its channels, their constants, and the noise and locks that go on from piece to piece."""
+"""A simulated receiver: its channels, their constants, and the noise and lock state carried between chunks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _WHITE, _CARRIED, _SLIPS = 2, 3, 4
 
 
 class Receiver:
-    """One receiver's channels, and all of it that goes on from piece to piece."""
+    """One receiver's channels, and its state that is carried between chunks."""
 
     def __init__(self, simulation: Simulation, antenna: str) -> None:
         scenario, errors, channels = simulation.scenario, simulation.scenario.errors, simulation.channels
@@ -36,7 +36,7 @@ class Receiver:
         self.column = np.searchsorted(simulation.satellites, self.names)
         frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in channels])
         self.wavelength_m = SPEED_OF_LIGHT / frequency
-        #: Ionosphere in parts of that on L1.
+        #: Ionospheric delay relative to that on L1.
         self.scale = (FREQUENCY_L1 / frequency) ** 2
         self.second = np.array([g != SIGNALS[n[0]][0] for n, g in channels])
         self.group_delay_error_m = simulation.common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
@@ -44,7 +44,7 @@ class Receiver:
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if number else 0.0) for o in offsets])
         self.offset_drift_mps = np.array([o.drift_mps for o in offsets])
         self._rng = np.random.default_rng([scenario.seed, _WHITE, number])
-        # Whole cycles that the phases are off, one number a channel.
+        # Integer ambiguity of each channel.
         self.ambiguity = self._rng.integers(-2_000_000, 2_000_000, len(channels)).astype(np.float64)
         self.carried = CarriedNoise(
             errors.noise,
@@ -65,7 +65,7 @@ class Receiver:
 
 
 def group_delay_s(records: KeplerRecords, satellite: str, signal: str, time: Datetimes) -> Floats:
-    """What a signal's code is late by against the broadcast clock, shape (T,) [s].
+    """Group delay of a signal's code against the broadcast clock, shape (T,) [s].
 
     GPS and QZSS: TGD on L1, scaled by (f1/f)^2 on L2 (IS-GPS-200, 20.3.3.3.3.2). Galileo I/NAV: BGD E5b/E1
     likewise (OS SIS ICD, 5.1.5). BeiDou: TGD1 on B1I, none on B3I, which the clock refers to.

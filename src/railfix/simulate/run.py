@@ -1,4 +1,4 @@
-"""A simulated run as files: what receivers and a surveyor would hand over, and the truth."""
+"""A simulated run as files: observations, navigation, track map, vehicle, sensors and ground truth."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",
 
 
 def truth_table(simulation: Simulation) -> pl.DataFrame:
-    """Where the antennas truly are when their receivers tag an epoch.
+    """Ground truth of the antennas at the epochs of their receivers.
 
     Returns
     -------
     polars.DataFrame
         One row an epoch and antenna: `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point
-        abeam the antenna, as the track map counts), `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps`
+        abeam the antenna, on the track map's chainage), `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps`
         (negative toward falling chainage), `acceleration_mps2` (along the line, positive toward rising
-        chainage), `environment` (what stands along the line there, "open" where nothing). The place is
+        chainage), `environment` (kind of section, "open" outside all). The position is
         that of the true instant, which is the tag less the receiver clock's bias.
     """
     line, time = simulation.line, simulation.time()
@@ -72,7 +72,7 @@ def truth_table(simulation: Simulation) -> pl.DataFrame:
 
 
 def section_table(simulation: Simulation) -> pl.DataFrame:
-    """What stands along the line, from end to end: `from_m`, `to_m` (as the track map counts), `environment`."""
+    """Sections of the line from end to end: `from_m`, `to_m` (on the track map's chainage), `environment`."""
     line = simulation.line
     ends = [m for part in simulation.environment.sections for m in (part.from_m, part.to_m)]
     edges = np.unique(np.clip([0.0, *ends, line.length_m], 0.0, line.length_m))
@@ -102,14 +102,14 @@ def write_run(
     sections.csv                 `section_table`
     tachometer.parquet, ...      sensors, where the scenario has any (`sensor_tables`)
     scenario.toml                the scenario, as `load_scenario` reads it
-    README.md                    what this is and how it was made
+    README.md                    contents and settings of the run
     ============================ ===================================================
 
     Parameters
     ----------
     scenario : Scenario
     folder : path-like
-        Made where it does not exist.
+        Created where it does not exist.
     packing : {"packed", "plain"}
         Plain: nothing is compressed, and sensors are CSV.
     command : str

@@ -1,4 +1,4 @@
-"""The README of a simulated run: what its files are, what is in the signals, every setting."""
+"""README of a simulated run: its files, its signals, its settings."""
 
 from __future__ import annotations
 
@@ -64,18 +64,18 @@ def _invented(scenario: Scenario) -> str:
 
 def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
     error = simulation.scenario.line.map_error
-    off = ", off by its error (line.map_error)" if error.plan_sigma_m or error.height_sigma_m else ""
+    off = ", with an error (line.map_error)" if error.plan_sigma_m or error.height_sigma_m else ""
     what = {
         "front": "RINEX 3.04 observations of the front roof antenna",
         "rear": "the same of the rear antenna",
         "nav": "RINEX 3.04 broadcast records",
         "track": f"track map, {len(simulation.line.track())} points; ellipsoidal heights{off}",
         "vehicle": "bogie distance, gauge, antennas",
-        "truth": "truth: chainage of the centreline point abeam each antenna, its place (ECEF), speed, acceleration, "
-        "what stands along the line there",
-        "sections": "truth: what stands along the line",
-        "scenario": "all settings; `railfix simulate` makes the same run of it",
-        "readme": "this",
+        "truth": "ground truth: chainage of the centreline point abeam each antenna, its position (ECEF), speed, "
+        "acceleration, kind of section",
+        "sections": "ground truth: sections of the line",
+        "scenario": "all settings, a scenario file for `railfix simulate`",
+        "readme": "this file",
     }
     sensors = {name: "; ".join(f"`{c}`: {t}" for c, t in columns.items()) for name, columns in COLUMNS.items()}
     return {path.name: (what | sensors)[name] for name, path in files.items()}
@@ -90,9 +90,9 @@ def _switched_on(scenario: Scenario) -> str:
         f"Errors of satellites, atmosphere and receivers: {', '.join(errors)}."
         if errors
         else "No errors of satellites or atmosphere.",
-        "No multipath and nothing in the way."
+        "No multipath and no blockage."
         if scenario.environment.empty and not scenario.multipath
-        else "Multipath and shadows of what stands along the line (truth and sections name it).",
+        else "Multipath and blockage by structures along the line (see the sections).",
         "No sensors besides the receivers." if scenario.sensors is None else "Sensors besides the receivers.",
     ]
     if scenario.vehicle.sway_sigma_deg:

@@ -1,8 +1,6 @@
-"""Positions and clocks of Keplerian records, computed apart from `railfix.gnss.orbits`.
+"""Signals of satellites that arrive at a receiver: orbits of `railfix.gnss.orbits`, light time, Earth rotation.
 
-The user algorithm of IS-GPS-200 (table 20-IV), Galileo OS SIS ICD (5.1.1) and BDS-SIS-ICD-B1I
-(5.2.4.12), written anew for the simulation, so that an error in either shows. `links` works it out at
-every instant; `SatelliteTable` at nodes once, and interpolates all satellites together.
+`links` computes every instant; `SatelliteTable` computes nodes once, and interpolates all satellites together.
 """
 
 from __future__ import annotations
@@ -14,27 +12,11 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
-from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import KeplerRecords
+from railfix.gnss.orbits.kepler import Orbits, kepler_state
 
-_PARAMETERS: Final = (
-    "af0_s", "af1", "af2", "sqrt_a", "eccentricity", "m0", "delta_n", "omega0", "i0", "omega", "omega_dot", "i_dot",
-    "cuc", "cus", "crc", "crs", "cic", "cis", "toe_sow_s",
-)  # fmt: skip
-
-#: Gravitational constant [m^3/s^2] and Earth rotation [rad/s] by constellation letter.
-EARTH: Final[dict[str, tuple[float, float]]] = {
-    "G": (3.986_005e14, 7.292_115_146_7e-5),
-    "J": (3.986_005e14, 7.292_115_146_7e-5),
-    "E": (3.986_004_418e14, 7.292_115_146_7e-5),
-    "C": (3.986_004_418e14, 7.292_115_0e-5),
-}
-#: Rotation of the frame during the signal's flight [rad/s] (WGS 84).
-FRAME_ROTATION: Final = 7.292_115_146_7e-5
-#: Geostationary satellites of BeiDou, whose frame is tilted by 5 degrees (BDS-SIS-ICD-B1I, 5.2.4.12).
-_GEO: Final = frozenset(f"C{n:02d}" for n in (1, 2, 3, 4, 5, *range(59, 64)))
-_GEO_TILT: Final = np.radians(-5.0)
 #: Longest piece of `SatelliteTable` [s], nodes of a piece, and the flight time it is worked out for [s].
 _PIECE_S: Final = 60.0
 _NODES: Final = 7
@@ -63,48 +45,19 @@ class Links:
 def record_state(
     records: KeplerRecords, row: Indices, since_toe_s: Floats, since_toc_s: Floats
 ) -> tuple[Floats, Floats]:
-    """Position in the Earth-fixed frame of the instant, shape (T, 3) [m], and clock, shape (T,) [s].
+    """Position in the Earth-fixed frame of the instant, shape (T, 3) [m], and clock with relativity, shape (T,) [s].
 
     Parameters
     ----------
     records : KeplerRecords
     row : ndarray of int, shape (T,)
-        Record of each instant, all of one satellite.
+        Record of each instant.
     since_toe_s, since_toc_s : ndarray, shape (T,) [s]
     """
-    name = str(records.satellite[row[0]])
-    mu, rotation = EARTH[name[0]]
-    r = {name: getattr(records, name)[row] for name in _PARAMETERS}
-    t, e, a = since_toe_s, r["eccentricity"], r["sqrt_a"] ** 2
-    mean = r["m0"] + (np.sqrt(mu / a**3) + r["delta_n"]) * t
-    ecc = mean + e * np.sin(mean)
-    for _ in range(4):
-        ecc = ecc - (ecc - e * np.sin(ecc) - mean) / (1.0 - e * np.cos(ecc))
-    phi = 2.0 * np.arctan(np.sqrt((1.0 + e) / (1.0 - e)) * np.tan(ecc / 2.0)) + r["omega"]
-    sin2, cos2 = np.sin(2.0 * phi), np.cos(2.0 * phi)
-    u = phi + r["cus"] * sin2 + r["cuc"] * cos2
-    radius = a * (1.0 - e * np.cos(ecc)) + r["crs"] * sin2 + r["crc"] * cos2
-    tilt = r["i0"] + r["i_dot"] * t + r["cis"] * sin2 + r["cic"] * cos2
-    turning = 0.0 if name in _GEO else rotation
-    node = r["omega0"] + (r["omega_dot"] - turning) * t - rotation * r["toe_sow_s"]
-    x, y = radius * np.cos(u), radius * np.sin(u)
-    cos_tilt, cos_node, sin_node = np.cos(tilt), np.cos(node), np.sin(node)
-    place = np.stack(
-        [x * cos_node - y * cos_tilt * sin_node, x * sin_node + y * cos_tilt * cos_node, y * np.sin(tilt)], axis=-1
-    )
-    if name in _GEO:
-        place = _from_geo_frame(place, rotation * t)
+    position, _, relativity = kepler_state(Orbits.from_records(records).take(row), since_toe_s)
     dt = since_toc_s
-    relativity = -2.0 * np.sqrt(mu * a) / SPEED_OF_LIGHT**2 * e * np.sin(ecc)
-    return place, r["af0_s"] + r["af1"] * dt + r["af2"] * dt**2 + relativity
-
-
-def _from_geo_frame(place: Floats, angle: Floats) -> Floats:
-    """Tilted about x by 5 degrees, then turned with the Earth about z."""
-    y = np.cos(_GEO_TILT) * place[:, 1] + np.sin(_GEO_TILT) * place[:, 2]
-    z = np.cos(_GEO_TILT) * place[:, 2] - np.sin(_GEO_TILT) * place[:, 1]
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([cos * place[:, 0] + sin * y, cos * y - sin * place[:, 0], z], axis=-1)
+    clock = records.af0_s[row] + records.af1[row] * dt + records.af2[row] * dt**2 + relativity
+    return np.stack(position, axis=-1), clock
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
@@ -117,8 +70,7 @@ def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> In
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
     """Signals of a satellite that arrive at a receiver.
 
-    The equation of the transmit time is solved by iteration: the flight lasts as long as the distance
-    from where the satellite was, in the frame of reception.
+    The light-time equation is solved by iteration, in the Earth-fixed frame of reception.
 
     Parameters
     ----------
@@ -126,7 +78,7 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
     satellite : str
     tag : ndarray of datetime64[ns], shape (T,)
     late_s : ndarray, shape (T,) [s]
-        The signal arrives so much before the tag says: the receiver clock's bias.
+        Receiver clock bias: the signal arrives by this much before its tag.
     receiver_ecef_m : ndarray, shape (T, 3) [m]
 
     Returns
@@ -139,7 +91,7 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
     flight = np.full(late_s.shape, 0.08)
     for _ in range(3):
         place, clock = record_state(records, row, since_toe - flight, since_toc - flight)
-        angle = FRAME_ROTATION * flight
+        angle = EARTH_ROTATION_RATE * flight
         cos, sin = np.cos(angle), np.sin(angle)
         turned = np.stack(
             [cos * place[:, 0] + sin * place[:, 1], cos * place[:, 1] - sin * place[:, 0], place[:, 2]], axis=-1
@@ -150,17 +102,17 @@ def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats
 
 
 class SatelliteTable:
-    """Satellites over a span of time: worked out at nodes once, interpolated by polynomials of degree 6.
+    """Satellites over a span of time: computed at nodes once, interpolated by polynomials of degree 6.
 
-    Of the distance of `links` it differs by less than 1e-6 m. The pieces are laid once for the whole
-    span, so any cutting of the instants gives the same numbers.
+    The distance differs from that of `links` by less than 1e-6 m. The pieces are fixed for the whole
+    span, so results do not depend on how the instants are cut into chunks.
 
     Parameters
     ----------
     records : KeplerRecords
     satellites : sequence of str, length S
     first, last : datetime64
-        Tags that will be asked for; others are refused.
+        First and last tag of the span; a tag outside raises ValueError.
 
     Attributes
     ----------
@@ -204,7 +156,7 @@ class SatelliteTable:
         ----------
         tag : ndarray of datetime64[ns], shape (T,)
         late_s : ndarray, shape (T,) [s]
-            The signal arrives so much before the tag says: the receiver clock's bias.
+            Receiver clock bias: the signal arrives by this much before its tag.
         receiver_ecef_m : ndarray, shape (T, 3) [m]
 
         Returns
@@ -236,7 +188,7 @@ class SatelliteTable:
         for _ in range(3):
             dt = (_FLIGHT_S - flight)[..., None]
             place = value + dt * (slope + dt * bend)
-            angle = FRAME_ROTATION * flight
+            angle = EARTH_ROTATION_RATE * flight
             cos, sin = np.cos(angle), np.sin(angle)
             sky = (cos * place[..., 0] + sin * place[..., 1], cos * place[..., 1] - sin * place[..., 0], place[..., 2])
             distance = np.sqrt((sky[0] - x) ** 2 + (sky[1] - y) ** 2 + (sky[2] - z) ** 2)

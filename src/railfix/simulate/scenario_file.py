@@ -41,7 +41,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -49,8 +48,8 @@ from typing import Any, Final
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.settings import read_toml, validated
-from railfix.simulate.alignment import made_alignment
-from railfix.simulate.motion import made_motion
+from railfix.simulate.alignment import build_alignment
+from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
 
 #: Word for a duration that the run curve gives.
@@ -110,7 +109,7 @@ class Recipe:
 
 def whole_run_s(scenario: Scenario) -> float:
     """Time to the end of the stop at the end of the first leg, in whole seconds."""
-    motion = made_motion(made_alignment(scenario.line), scenario, duration_s=0.0)
+    motion = build_motion(build_alignment(scenario.line), scenario, duration_s=0.0)
     run = scenario.run
     last = run.stations[-1 if run.direction == "rising" else 0].dwell_s if run.stations else run.stand_s
     return float(math.ceil(float(motion.time_s[-1]) + last))
@@ -170,26 +169,25 @@ def load_recipe(name: str | PathLike[str]) -> Recipe:
         if len(below.names) > 1 or below.names[0]:
             raise SettingsError(f"{path}: base {table['base']!r} is a recipe itself; name a single run")
         base = below.tables[0]
-    names = [run.pop("name", "") for run in runs]
+    names = [run.get("name", "") for run in runs]
     for name_of in names:
         if not isinstance(name_of, str) or not re.fullmatch(r"[\w.-]*\w", name_of) or names.count(name_of) > 1:
             raise SettingsError(
                 f"{path}: each of [[runs]] has its own name, letters, digits, - and _ (its folder), got {name_of!r}"
             )
-    tables = tuple(_over(_with_parts(base, run, table.get("parts", {}), path), run) for run in runs)
+    tables = tuple(_run_table(base, run, table.get("parts", {}), path) for run in runs)
     return Recipe(path=path, description=description, names=tuple(names), tables=tables)
 
 
-def _with_parts(
-    base: Mapping[str, Any], run: dict[str, Any], parts: Mapping[str, Any], path: Path
+def _run_table(
+    base: Mapping[str, Any], run: Mapping[str, Any], parts: Mapping[str, Any], path: Path
 ) -> Mapping[str, Any]:
-    """The base with the parts that a run names; paths in the run and its parts made absolute."""
-    _absolute(run, path)
-    for name in run.pop("parts", []):
+    """Settings of one of [[runs]]: the base, overridden by the parts that the run names, and by the run's own."""
+    for name in run.get("parts", []):
         if not isinstance(parts.get(name), dict):
             raise SettingsError(f"{path}: parts has no table {name!r}; it has {', '.join(parts) or 'none'}")
-        base = _over(base, _absolute(deepcopy(parts[name]), path))
-    return base
+        base = _over(base, _absolute(parts[name], path))
+    return _over(base, _absolute({key: run[key] for key in run if key not in ("name", "parts")}, path))
 
 
 def load_scenario(name: str | PathLike[str]) -> Scenario:
@@ -229,14 +227,15 @@ def _without_none(value: Any) -> Any:
     return "none" if value is None else value
 
 
-def _absolute(table: dict[str, Any], path: Path) -> dict[str, Any]:
+def _absolute(table: Mapping[str, Any], path: Path) -> dict[str, Any]:
     """The same settings with absolute paths."""
+    changes: dict[str, Any] = {}
     sky, line = table.get("sky"), table.get("line")
     if isinstance(sky, dict) and isinstance(sky.get("nav"), str) and sky["nav"] != "none":
-        sky["nav"] = str(path.resolve().parent / sky["nav"])
+        changes["sky"] = {"nav": str(path.resolve().parent / sky["nav"])}
     if isinstance(line, dict) and isinstance(file := line.get("file"), dict) and isinstance(file.get("path"), str):
-        file["path"] = str(path.resolve().parent / file["path"])
-    return table
+        changes["line"] = {"file": {"path": str(path.resolve().parent / file["path"])}}
+    return _over(table, changes)
 
 
 def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,29 +15,29 @@ from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
-from railfix.simulate.alignment import Alignment, made_alignment
+from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ, CN0_SECOND_DB
-from railfix.simulate.constellation import made_navigation
+from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
 from railfix.simulate.disturbance import Disturbances, Geometry
 from railfix.simulate.environment import Environment
 from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import ClockWalk
-from railfix.simulate.motion import Motion, Sway, made_motion
+from railfix.simulate.motion import Motion, Sway, build_motion
 from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
 from railfix.simulate.satellites import SatelliteTable, links
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 #: Receivers report C/N0 in steps [dB-Hz].
 CN0_STEP_DBHZ: Final = 0.25
-#: Epochs that are simulated at once.
+#: Epochs of one chunk.
 CHUNK_EPOCHS: Final = 2000
-#: Spacing of the instants at which it is looked which satellites rise during the run [s].
+#: Spacing of the instants at which satellites above the cutoff are searched [s].
 _LOOK_S: Final = 60.0
 #: Half the interval of the difference that gives range rates [s].
 _RATE_S: Final = 0.005
-#: C/N0 that the sigmas of the receiver are given for, and above which it grows no quieter [dB-Hz].
+#: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise no longer falls [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
 _BEST_DBHZ: Final = 50.0
 #: Stream of random numbers of the clocks' wander.
@@ -46,13 +46,13 @@ _WALK: Final = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
-    """Truth and observations of one antenna for some epochs.
+    """Ground truth and observations of one antenna for some epochs.
 
     Attributes
     ----------
     observations : Observations
     geometry : Geometry
-        Where antenna and satellites truly are.
+        True positions of antenna and satellites.
     clock_m : ndarray, shape (T,) [m]
         Receiver clock times the speed of light.
     code_sigma_m : ndarray, shape (T, M) [m]
@@ -60,8 +60,8 @@ class Piece:
     clean_code_m : ndarray, shape (T, M) [m]
         The codes without noise and without disturbances.
     error_m : ndarray, shape (T, M) [m]
-        What of `clean_code_m` is there by `Scenario.errors` and a receiver does not correct: satellites,
-        atmosphere, faults and inter-system offsets.
+        Part of `clean_code_m` that comes from `Scenario.errors` and that no model corrects: satellites,
+        atmosphere, faults and inter-system biases.
     """
 
     observations: Observations
@@ -73,7 +73,7 @@ class Piece:
 
 
 class Simulation:
-    """A scenario worked out: line, motion, sky, and pieces of observations.
+    """Simulation of a scenario: line, motion, satellites, and observations in chunks.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class Simulation:
     sway : Sway
         Of the vehicle's body.
     environment : Environment
-        What stands along the line.
+        Structures along the line.
     disturbances : tuple of Disturbances
         The environment where there is any, then the scenario's `multipath`.
     navigation : Navigation
@@ -96,13 +96,13 @@ class Simulation:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self.line: Alignment = made_alignment(scenario.line)
-        self.motion: Motion = made_motion(self.line, scenario)
+        self.line: Alignment = build_alignment(scenario.line)
+        self.motion: Motion = build_motion(self.line, scenario)
         self.sway: Sway = Sway.of(scenario)
         self.environment = Environment(scenario.environment, line_length_m=self.line.length_m, seed=scenario.place_seed)
         place = () if scenario.environment.empty else (self.environment,)
         self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
-        self.navigation: Navigation = made_navigation(scenario)
+        self.navigation: Navigation = simulated_navigation(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Datetimes:
         """Time tags of epochs `first` to before `last`, GPS time."""
@@ -133,7 +133,7 @@ class Simulation:
         return even if walk is None else even + walk.rate(tag_s)[:, 0]
 
     def _walk(self, antenna: str) -> ClockWalk | None:
-        """Wander of a receiver's clock, the same one for both where they share it."""
+        """Random walk of a receiver's clock, the same for both where the clock is common."""
         return self._walks[0 if self.scenario.receiver.clocks == "common" else ANTENNAS.index(antenna)]
 
     @cached_property
@@ -187,11 +187,11 @@ class Simulation:
         return float(latitude[0]), float(longitude[0])
 
     def truth(self, antenna: str, seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
-        """True place of an antenna at seconds after the start, and the train's speed [m/s]."""
+        """True position of an antenna at seconds after the start, and the train's speed [m/s]."""
         return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
 
     def body_truth(self, offset_m: tuple[float, float, float], seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
-        """True place of a point of the body, given as the antennas are, at seconds after the start, and the speed."""
+        """True position of a point of the body at seconds after the start, and the speed."""
         middle, speed = self.motion.at(seconds_s)
         roll = self.sway.roll_rad(seconds_s, speed)
         return antenna_truth(self.line, self.scenario.vehicle, offset_m, middle, roll), speed

@@ -1,11 +1,11 @@
-"""Multipath and blockage that belong to the place: masts, beams, buildings, slopes, roofs, tunnels.
+"""Multipath and blockage by structures along the line: masts, beams, buildings, slopes, roofs, tunnels.
 
-`EnvironmentSettings` says what stands along the line; `Environment` makes one fixed place of it, a source
+`EnvironmentSettings` describes the structures; `Environment` draws them from a seed and is a source
 of disturbances for `Scenario.multipath`. docs/simulator-multipath.md has the physics.
 """
 
-from railfix.simulate.environment.kinds import drawn_sections
 from railfix.simulate.environment.model import Environment
+from railfix.simulate.environment.section_kinds import drawn_sections
 from railfix.simulate.environment.settings import (
     KINDS,
     CorrelatorSettings,

@@ -1,10 +1,10 @@
-"""What an early-late receiver measures where several paths arrive at once: closed forms, no memory.
+"""Code, phase and C/N0 of an early-late receiver that several paths reach at once: closed forms, no memory.
 
 The loop is the coherent one on a phase lock to the sum: its code error is the zero of
 ``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths in the early, late and prompt
 correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14), with the
 triangle of unlimited bandwidth. On the stretches where the triangle is straight that zero is a
-quotient, so a few repetitions find it.
+quotient, so a few iterations find it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from railfix.core.arrays import Complexes, Floats, Indices
 
 Singles = NDArray[np.float32]
 
-#: Repetitions: with an error of few hundredths of a chip three settle it, a wide spacing wants more.
+#: Iterations: three suffice for errors of a few hundredths of a chip, a wide spacing needs more.
 _ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12
 #: Up to this spacing the correlator is narrow [chips].
@@ -28,18 +28,18 @@ _NARROW_CHIPS: Final = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Tracked:
-    """What is tracked, shapes (N,).
+    """Tracked signals, shapes (N,).
 
     Attributes
     ----------
     code_m, phase_m : ndarray [m]
-        Later than the clear direct signal.
+        Delay beyond the unobstructed direct signal.
     rate_mps : ndarray [m/s]
-        Of the phase, the paths' strengths held.
+        Of the phase, at constant amplitudes of the paths.
     gain_db : ndarray [dB]
-        Of the prompt correlator over the clear direct signal.
+        Of the prompt correlator relative to the unobstructed direct signal.
     main : ndarray of int
-        Path that is locked to.
+        Path that the loops lock to.
     """
 
     code_m: Floats
@@ -62,18 +62,18 @@ def tracked(
 ) -> Tracked:
     """Code, phase, rate and strength of the sum of P paths, for N signals.
 
-    The strongest path is locked to; the code's error about it stays within half the spacing.
-    What turns against it faster than a loop follows is averaged: its part that swings is weakened as
-    a loop of first order does, by ``1 / sqrt(1 + (f / loop_hz)^2)``; of its power nothing is lost.
+    The loops lock to the strongest path; the code error about it stays within half the spacing.
+    Fading faster than a loop's bandwidth is attenuated as by a loop of first order,
+    ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept.
 
     Parameters
     ----------
     field : ndarray of complex, shape (P, N)
-        Amplitude over the clear direct signal's, and the phase that is not the path's length.
+        Relative to the unobstructed direct signal, without the phase of the extra path.
     extra_m : ndarray, shape (P, N) [m]
-        By which the path is longer.
+        Excess path.
     rate_mps : ndarray, shape (P, N) [m/s]
-        By which it grows.
+        Its rate.
     wavelength_m, chip_m : ndarray, shape (N,)
     spacing_chips : float
         Early to late.

@@ -1,4 +1,4 @@
-"""The environment as one source of disturbances, a function of the geometry alone."""
+"""Multipath and blockage along a line as one source of disturbances, a function of the geometry alone."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ
 from railfix.simulate.disturbance import Disturbance, Geometry
-from railfix.simulate.environment.bars import Electrification
 from railfix.simulate.environment.correlator import Tracked, tracked
-from railfix.simulate.environment.faces import FREE_V, Rays, mirrored, roof_amplitude, shadow
-from railfix.simulate.environment.kinds import drawn_sections
-from railfix.simulate.environment.place import built
+from railfix.simulate.environment.diffraction import edge_amplitude, roughness_loss
+from railfix.simulate.environment.masts import Electrification
+from railfix.simulate.environment.section_kinds import drawn_sections
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.environment.waves import edge_amplitude, roughness_loss
+from railfix.simulate.environment.structures import build_structures
+from railfix.simulate.environment.walls import FREE_V, Rays, reflections, roof_amplitude, shadow
 
 #: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
-#: Weaker fields count as none.
+#: Weaker fields are neglected.
 _NO_FIELD: Final = 0.01
-#: The platforms of a station stand so high over the rails [m].
+#: Height of a station's platforms over the rails [m].
 PLATFORM_M: Final = 1.1
-#: Signals worked out at once: arrays of these stay in the processor's cache.
+#: Signals computed at once, so that their arrays stay in the processor's cache.
 _BLOCK: Final = 8192
-#: Below this elevation nothing is worked out: no receiver tracks there [deg].
+#: Lowest elevation that is computed [deg].
 _LEAST_ELEVATION_DEG: Final = 0.5
 
 
@@ -40,10 +40,10 @@ class Paths:
     Attributes
     ----------
     field : ndarray of complex
-        Over the clear direct signal, without the phase of the extra path.
+        Relative to the unobstructed direct signal, without the phase of the extra path.
     extra_m : ndarray [m]
     growth : ndarray [m/m]
-        Of the extra path with the antenna's way along the line.
+        Of the extra path with the antenna's chainage.
     """
 
     field: Complexes
@@ -59,15 +59,14 @@ class Environment:
     settings : EnvironmentSettings
     line_length_m : float
     seed : int
-        The same seed gives the same place; another one other buildings and, where they are drawn,
-        other sections.
+        The same seed gives the same structures and, where they are drawn, the same sections.
 
     Attributes
     ----------
     settings : EnvironmentSettings
     sections : tuple of SectionSettings
         As given, or as drawn.
-    place : Place
+    structures : Structures
     """
 
     def __init__(self, settings: EnvironmentSettings, *, line_length_m: float, seed: int) -> None:
@@ -77,12 +76,12 @@ class Environment:
             self.sections = drawn_sections(
                 settings.shares, line_length_m, section_length_m=settings.section_length_m, seed=seed
             )
-        self.place = built(self.sections, line_length_m, seed)
-        self._bars = None if settings.electrification is None else Electrification(settings.electrification)
+        self.structures = build_structures(self.sections, line_length_m, seed)
+        self._conductors = None if settings.electrification is None else Electrification(settings.electrification)
 
     def label_at(self, chainage_m: ArrayLike) -> Strings:
         """Kind of section at chainages; "open" outside all sections."""
-        return self.place.kind_at(np.asarray(chainage_m, dtype=np.float64))
+        return self.structures.kind_at(np.asarray(chainage_m, dtype=np.float64))
 
     def __call__(self, geometry: Geometry) -> Disturbance:
         """Disturbance of every channel and epoch, shapes (T, M)."""
@@ -126,15 +125,15 @@ class Environment:
         )
 
     def _paths(self, rays: Rays, platform: Masks) -> Paths:
-        """Direct path, ground, what bars throw, and one reflection a row of faces."""
+        """Direct path, ground reflection, scattering by masts and beams, and one reflection for each row of walls."""
         field, delay = self._direct(rays)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
         if self.settings.ground_reflection > 0.0:
             rows.append((-self._ground(rays), 2.0 * (rays.height_m - PLATFORM_M * platform) * rays.z, nothing))
-        if self._bars is not None:
-            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._bars.thrown(rays)]
-        rows += [self._reflection(r, rays) for r in range(len(self.place.faces))]
+        if self._conductors is not None:
+            rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._conductors.scattered(rays)]
+        rows += [self._reflection(r, rays) for r in range(len(self.structures.walls))]
         return Paths(
             field=np.stack([row[0].astype(np.complex128) for row in rows]),
             extra_m=np.stack([row[1] for row in rows]),
@@ -142,19 +141,19 @@ class Environment:
         )
 
     def _direct(self, rays: Rays) -> tuple[Complexes, Floats]:
-        """Direct field, and by how much the way round the edge is longer.
+        """Direct field, and the excess of the diffracted path.
 
-        Of several faces one behind the other the one deepest in the way counts.
+        Of several walls one behind the other the one that obstructs most counts.
         """
         v = np.full(len(rays.x), FREE_V)
-        for row in self.place.faces:
+        for row in self.structures.walls:
             v = np.maximum(v, shadow(row, rays))
         amplitude = edge_amplitude(v)
-        for roofs in self.place.roofs:
+        for roofs in self.structures.roofs:
             amplitude = amplitude * roof_amplitude(roofs, rays)
         field = amplitude.astype(np.complex128)
-        if self._bars is not None:
-            field *= self._bars.left_over(rays)
+        if self._conductors is not None:
+            field *= self._conductors.transmitted(rays)
         # h^2 / (2 D) of a clearance h at distance D.
         return field, 0.25 * rays.wavelength_m * np.clip(v, 0.0, 30.0) ** 2
 
@@ -164,18 +163,18 @@ class Environment:
         return np.asarray(strength * roughness_loss(rough, rays.z, rays.wavelength_m))
 
     def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Amplitude (turned by half a wave), extra path and growth of the reflection in row r.
+        """Amplitude (with a phase shift of half a cycle), extra path and growth of the reflection in row r.
 
-        The way in passes over the rows of the satellite's side, seen from the antenna's mirror image;
-        the way back over the other rows of the reflecting side.
+        The incident ray passes the rows of the satellite's side, seen from the antenna's mirror image;
+        the reflected ray passes the nearer rows of the reflecting side.
         """
-        image = mirrored(self.place.faces[r], rays)
+        image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()
         kept = np.flatnonzero(amplitude > _NO_FIELD)
         if len(kept):
             some = rays.take(kept)
             v = np.full(len(kept), FREE_V)
-            for row in self.place.faces:
+            for row in self.structures.walls:
                 v = np.maximum(v, shadow(row, some, x0=image.x_m[kept], y0=image.y_m[kept]))
             back = Rays(
                 chainage_m=some.chainage_m,
@@ -185,11 +184,11 @@ class Environment:
                 z=some.z,
                 wavelength_m=some.wavelength_m,
             )
-            for q, row in enumerate(self.place.faces):
+            for q, row in enumerate(self.structures.walls):
                 if q < r:
                     v = np.maximum(v, shadow(row, back))
             open_above = np.ones(len(kept))
-            for roofs in self.place.roofs:
+            for roofs in self.structures.roofs:
                 open_above = open_above * roof_amplitude(roofs, back)
             amplitude[kept] *= edge_amplitude(v) * open_above
         return -amplitude, image.extra_m, image.rate

@@ -1,4 +1,4 @@
-"""Errors that a receiver cannot correct: satellites, atmosphere, clocks; the same for every receiver nearby."""
+"""Errors that broadcast models do not correct: satellites, atmosphere, receiver clocks, noise."""
 
 from railfix.simulate.errors.settings import (
     ClockWalkSettings,

@@ -1,7 +1,7 @@
-"""Errors that every receiver nearby sees alike: satellites, ionosphere, troposphere, faults.
+"""Errors common to all receivers nearby: satellites, ionosphere, troposphere, faults.
 
-A receiver is told apart only by where it is, so the two antennas of the train and a reference
-station beside the line get what the same satellite and the same air give them.
+They depend on time and the receiver's position alone, so the two antennas of the train and a reference
+station beside the line share them.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from railfix.core.arrays import Floats
+from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.errors.processes import GaussMarkov, satellite_key
 from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings
-from railfix.simulate.satellites import FRAME_ROTATION, newest_record, record_state
+from railfix.simulate.satellites import newest_record, record_state
 
 #: Radius of the Earth and height of the layer that the residual ionosphere lies in [km] (DO-229D, A.4.4.10).
 _EARTH_KM: Final = 6378.1363
@@ -90,9 +91,9 @@ class CommonErrors:
 
     @cached_property
     def active(self) -> bool:
-        """Whether `path_m` or `ionosphere_m` is anything but 0."""
-        air = self._settings.ionosphere.vertical_sigma_m, self._settings.ionosphere.gradient_mm_per_km
-        return any((*air, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
+        """Whether `path_m` or `ionosphere_m` can differ from 0."""
+        atmosphere = self._settings.ionosphere.vertical_sigma_m, self._settings.ionosphere.gradient_mm_per_km
+        return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
     def _columns(self, letter: str) -> list[int]:
         return [k for k, name in enumerate(self._satellites) if name[0] == letter]
@@ -135,7 +136,7 @@ class CommonErrors:
             place, after, before = (
                 record_state(self._records, row, since_toe + dt, since_toe)[0] for dt in (0.0, 0.5, -0.5)
             )
-            velocity = after - before + np.cross([0.0, 0.0, FRAME_ROTATION], place)
+            velocity = after - before + np.cross([0.0, 0.0, EARTH_ROTATION_RATE], place)
             radial = place / np.linalg.norm(place, axis=-1, keepdims=True)
             cross = np.cross(radial, velocity)
             cross /= np.linalg.norm(cross, axis=-1, keepdims=True)
@@ -144,18 +145,22 @@ class CommonErrors:
 
     @cached_property
     def _vertical(self) -> GaussMarkov:
-        air = self._settings.ionosphere
+        atmosphere = self._settings.ionosphere
         key = (self._seed, _IONOSPHERE)
-        return GaussMarkov([key], sigma=air.vertical_sigma_m, time_s=air.vertical_time_s, duration_s=self._duration_s)
+        return GaussMarkov(
+            [key], sigma=atmosphere.vertical_sigma_m, time_s=atmosphere.vertical_time_s, duration_s=self._duration_s
+        )
 
     @cached_property
     def _zenith(self) -> GaussMarkov:
-        air = self._settings.troposphere
+        atmosphere = self._settings.troposphere
         key = (self._seed, _TROPOSPHERE)
-        return GaussMarkov([key], sigma=air.zenith_sigma_m, time_s=air.zenith_time_s, duration_s=self._duration_s)
+        return GaussMarkov(
+            [key], sigma=atmosphere.zenith_sigma_m, time_s=atmosphere.zenith_time_s, duration_s=self._duration_s
+        )
 
     def orbit_error_m(self, time_s: Floats) -> Floats:
-        """True minus broadcast place, shape (T, S, 3) [m], in the Earth-fixed frame."""
+        """True minus broadcast position, shape (T, S, 3) [m], in the Earth-fixed frame."""
         error = np.zeros((len(time_s), len(self._satellites), 3))
         if self._orbits:
             axes = self._axes(time_s)
@@ -196,15 +201,15 @@ class CommonErrors:
         elevation_deg: Floats,
         azimuth_deg: Floats,
     ) -> Floats:
-        """What the ionosphere is more than the model on L1, shape (T, S) [m]; places of shape (T, 1) [deg]."""
-        air = self._settings.ionosphere
+        """Ionospheric delay on L1 beyond the model, shape (T, S) [m]; positions of shape (T, 1) [deg]."""
+        atmosphere = self._settings.ionosphere
         vertical = np.zeros(np.shape(elevation_deg))
-        if air.vertical_sigma_m > 0.0:
+        if atmosphere.vertical_sigma_m > 0.0:
             vertical += self._vertical.at(time_s)
-        if air.gradient_mm_per_km > 0.0:
+        if atmosphere.gradient_mm_per_km > 0.0:
             apart = pierce_point_km(latitude_deg, longitude_deg, elevation_deg, azimuth_deg, self._origin_deg)
-            direction = np.radians(air.gradient_azimuth_deg)
-            vertical += 1e-3 * air.gradient_mm_per_km * (apart @ [np.cos(direction), np.sin(direction)])
+            direction = np.radians(atmosphere.gradient_azimuth_deg)
+            vertical += 1e-3 * atmosphere.gradient_mm_per_km * (apart @ [np.cos(direction), np.sin(direction)])
         return np.asarray(vertical * ionosphere_mapping(elevation_deg))
 
     def group_delay_m(self, satellites: Sequence[str], signals: Sequence[str]) -> Floats:
@@ -221,7 +226,7 @@ class CommonErrors:
         )
 
     def fault_m(self, time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-        """What faults add to the ranges [m] and their rates [m/s], shapes (T, M)."""
+        """Range errors of faults [m] and their rates [m/s], shapes (T, M)."""
         names = np.asarray(satellites)
         added, rate = np.zeros((2, len(time_s), len(names)))
         for fault in self._settings.faults:

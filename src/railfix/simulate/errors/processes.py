@@ -1,4 +1,4 @@
-"""Gauss-Markov processes as functions of time: the same at every instant for whoever asks, in whatever pieces.
+"""Gauss-Markov processes as functions of time, independent of the chunks in which they are evaluated.
 
 The exact process is drawn at nodes, a small part of the correlation time apart, and interpolated by
 cubics through four nodes each (Catmull and Rom 1974), so that it has a rate of change too. The
@@ -18,13 +18,13 @@ from railfix.core.arrays import Floats, Indices
 #: Nodes in one correlation time.
 _NODES_A_TIME: Final = 32
 #: Least number of nodes before the start of the run, and least room before and after it [s]: a receiver's
-#: clock that is late or early asks for instants outside.
+#: clock bias puts instants outside.
 _BEFORE: Final = 3
 _ROOM_S: Final = (0.1, 1.0)
 
 
 def satellite_key(satellite: str) -> tuple[int, int]:
-    """Two numbers that name a satellite, for seeds: nobody's errors depend on who else is in the sky."""
+    """Two numbers that identify a satellite in seeds, so that its errors do not depend on other satellites."""
     return ord(satellite[0]), int(satellite[1:])
 
 
@@ -110,7 +110,7 @@ def _interpolated_sigma(rho: float) -> float:
 
 
 class ClockWalk(Interpolated):
-    """Wander of a receiver's clock [m]: random walks of bias and drift with nodes at the epochs, 0 at the start.
+    """Variation of a receiver's clock [m]: random walks of bias and drift with nodes at the epochs, 0 at the start.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Sensors on board besides the satellite receivers: tachometer, inertial sensor, radar."""
+"""Vehicle sensors besides the satellite receivers: tachometer, inertial sensor, radar."""
 
 from railfix.simulate.sensors.settings import (
     DrawnSlips,

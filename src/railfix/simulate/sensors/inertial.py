@@ -1,6 +1,6 @@
-"""What three accelerometers and three gyroscopes fixed to the body measure.
+"""Specific force and angular rate of an inertial sensor fixed to the body.
 
-The place and the attitude of the body are those of the antennas' truth (bogies on the curve, cant,
+The position and the attitude of the body are those of the antennas' truth (bogies on the curve, cant,
 gradient, sway); specific force and angular rate are their differences in time, in the frame of the
 Earth, with its gravity and its rotation (Groves 2013, 2.3 to 2.5 and 5.2).
 """
@@ -14,9 +14,9 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from railfix.core.arrays import Floats
+from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.errors.processes import GaussMarkov
-from railfix.simulate.satellites import FRAME_ROTATION
 from railfix.simulate.sensors.settings import InertialSettings
 
 if TYPE_CHECKING:
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 #: Longest half interval of the differences in time [s].
 _HALF_S: Final = 0.02
-#: Samples worked out at once.
+#: Samples computed at once.
 _BLOCK: Final = 50_000
-#: A long lever makes the rounding of places small beside the attitude [m].
+#: Lever arm of the attitude, long so that rounding of positions is negligible [m].
 _LEVER_M: Final = 10.0
 #: Normal gravity of WGS 84 at the equator [m/s^2], Somigliana's constant, flattening, m, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
@@ -46,7 +46,7 @@ def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
 
 
 def _pose(simulation: Simulation, offset_m: tuple[float, float, float], time_s: Floats) -> tuple[Floats, Floats]:
-    """Place, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
+    """Structures, shape (n, 3) [m], and the axes forward, right, down in its rows, shape (n, 3, 3)."""
     along, across, up = offset_m
     truth, _ = simulation.body_truth(offset_m, time_s)
     aside, _ = simulation.body_truth((along, across + _LEVER_M, up), time_s)
@@ -62,12 +62,12 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
     """
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now
-    # Differences of whole places first: the sum of two would lose digits.
+    # Differences of positions first, which keeps the digits.
     acceleration = ((after[0] - place) - (place - before[0])) / half_s**2
     velocity = (after[0] - before[0]) / (2.0 * half_s)
     latitude, longitude, height = geodetic_from_ecef(place)
     up = enu_axes(latitude, longitude)[:, 2]
-    earth = np.array([0.0, 0.0, FRAME_ROTATION])
+    earth = np.array([0.0, 0.0, EARTH_ROTATION_RATE])
     force = acceleration + 2.0 * np.cross(earth, velocity) + gravity_mps2(latitude, height)[:, None] * up
     turn = np.einsum("nai,nbi->nab", before[1], after[1])
     sine = 0.5 * np.stack(
@@ -96,7 +96,7 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
 
 
 def _with_errors(true: Floats, time_s: Floats, settings: InertialSettings, seed: int) -> Floats:
-    """Turn of the box, scales, biases and their drifts, noise, steps: in this order."""
+    """Samples with misalignment, scale errors, biases and drifts, noise, quantisation, applied in this order."""
     turned = Rotation.from_rotvec(settings.misalignment_rad).inv()
     measured = np.concatenate([turned.apply(true[:, :3]), turned.apply(true[:, 3:])], axis=1)
     measured *= 1.0 + np.array([*settings.accel_scale, *settings.gyro_scale])

@@ -1,4 +1,4 @@
-"""What a Doppler radar under the car measures (P2, chapter 3)."""
+"""Speeds of a Doppler radar under the car (P2, chapter 3)."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from railfix.simulate.sensors.wheel import pulse_table, slip_table
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
-#: What the columns of each table are.
+#: Columns of each table.
 COLUMNS: Final[dict[str, dict[str, str]]] = {
     "tachometer": {
         "time_gpst": "instant of a pulse, GPS time",

@@ -1,4 +1,4 @@
-"""Pulses of a tachometer: the times at which a wheel of the vehicle has turned by another part of a turn."""
+"""Pulse times of a tachometer on one wheel."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 
-#: Spacing of the instants between which the wheel is taken to accelerate evenly [s].
+#: Spacing of the instants between which the wheel's acceleration is constant [s].
 _STEP_S: Final = 0.01
-#: Spacing at which accelerations and brakings are looked for [s], and what counts as one [m/s^2].
+#: Spacing of the search for accelerations and brakings [s], and their least size [m/s^2].
 _LOOK_S: Final = 0.1
 _HARD_MPS2: Final = 0.05
 #: Streams of random numbers.
@@ -26,7 +26,7 @@ _WHEEL, _SLIPS = 20, 21
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Slips and slides of the run, given and drawn, in order; a drawn one that meets another is left out."""
+    """Slips and slides of the run, given and drawn, in order; a drawn one that overlaps another is left out."""
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _SLIPS])
     slips = list(settings.slips)
@@ -45,7 +45,7 @@ def _drawn(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # The numbers are drawn whether they are used or not: one phase's do not move another's.
+        # Always drawn, so that the slips of one phase do not depend on another's.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
             continue

@@ -1,4 +1,4 @@
-"""What stands along each kind of section, and sections drawn from their shares of a line."""
+"""Structures along each kind of section, and random sections with given shares of a line."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _CONCOURSE: Final = RoofSettings(
     inner_m=0.0, outer_m=40.0, height_m=8.0, length_m=(12.0, 30.0), gap_m=(150.0, 300.0), loss_db=40.0
 )
 
-#: Rows of faces by kind of section.
+#: Rows of walls by kind of section.
 ROWS: Final[Mapping[Kind, tuple[RowSettings, ...]]] = MappingProxyType(
     {
         "open": (),
@@ -84,7 +84,7 @@ TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, los
 def drawn_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
-    """Sections of a line that take up given shares of it exactly, in random order.
+    """Sections with exactly the given shares of a line, in random order.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def drawn_sections(
     length_m : float
         Of the line.
     section_length_m : tuple of float
-        About between these the sections' lengths lie; a small share makes one shorter section.
+        Approximate range of the sections' lengths; a small share gives one shorter section.
     seed : int
 
     Returns

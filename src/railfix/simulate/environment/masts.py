@@ -1,4 +1,4 @@
-"""Masts, beams and wires: straight bars that take a strip out of the wave, and throw some of it about."""
+"""Masts, beams and wires: diffraction of the direct signal by straight conductors, and scattering off them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Complexes, Floats
-from railfix.simulate.environment.faces import Rays
+from railfix.simulate.environment.diffraction import edge_amplitude, per_metre, strip_field
 from railfix.simulate.environment.settings import ElectrificationSettings
-from railfix.simulate.environment.waves import edge_amplitude, per_metre, strip_field
+from railfix.simulate.environment.walls import Rays
 
-#: Bars are left out where less of them than this counts.
+#: Conductors are left out below this weight.
 _LEAST_WEIGHT: Final = 0.005
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bar:
-    """One bar for each of N rays.
+class Conductor:
+    """One straight conductor for each of N rays.
 
     Attributes
     ----------
     p, q : ndarray, shape (N,) [m]
-        Its axis in the plane square to it, from the antenna.
+        Its axis in the plane perpendicular to it, from the antenna.
     ray_p, ray_q, ray_axis : ndarray, shape (N,)
-        Direction to the satellite in that plane, and along the bar.
+        Direction to the satellite in that plane, and along the conductor.
     low_m, high_m : ndarray or float [m]
         Ends along the axis, from the antenna.
     width_m : float
@@ -40,10 +40,10 @@ class Bar:
     high_m: Floats | float
     width_m: float
 
-    def taken(self, wavelength_m: Floats) -> Complexes:
-        """What a bar ahead takes from the direct wave (0: nothing), shape (N,).
+    def obstruction(self, wavelength_m: Floats) -> Complexes:
+        """Field that the conductor removes from the direct signal (0: nothing), shape (N,).
 
-        The strip's field times the share of its length, and the cosine of the angle to the bar: none from the side.
+        The field of a strip times the share of its length that obstructs, and the cosine of the angle to it.
         """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
@@ -57,12 +57,12 @@ class Bar:
         field[kept] = weight[kept] * strip_field(beside[kept] * scale[kept], self.width_m * scale[kept])
         return field
 
-    def thrown(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Amplitude, extra path [m], and direction (p, q) of what a bar behind throws to the antenna.
+    def scattered(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Amplitude, extra path [m], and direction (p, q) of the signal scattered to the antenna from behind.
 
         A metal cylinder in geometrical optics: sqrt(a cos(b/2) / (2 rho)) with radius a, distance rho and
-        bistatic angle b; extra path rho c (1 - cos(phi)), c the part of the ray square to the bar and phi its
-        angle to the bar. Half the power is of the antenna's polarisation.
+        bistatic angle b; extra path rho c (1 - cos(phi)), c the part of the ray perpendicular to the conductor and
+        phi its angle to it. Half the power has the antenna's polarisation.
         """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
@@ -76,13 +76,13 @@ class Bar:
         return amplitude * behind, away * plane * (1.0 - cosine), plane * self.p / away, plane * self.q / away
 
     def _share(self, at_m: Floats, scale: Floats) -> Floats:
-        """1 between the bar's ends, 0 beyond."""
+        """Share of the conductor that obstructs: 1 between its ends, 0 beyond."""
         inside = np.minimum(at_m - self.low_m, self.high_m - at_m) * scale
         return 1.0 - edge_amplitude(inside)
 
 
 class Electrification:
-    """The bars of an electrified line.
+    """Masts, beams and wires of an electrified line.
 
     Parameters
     ----------
@@ -93,13 +93,13 @@ class Electrification:
         self.settings = settings
 
     def _numbered(self, chainage_m: Floats, every: int) -> Floats:
-        """Chainage of the nearest mast, of every so-manieth."""
+        """Chainage of the nearest of every n-th mast."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 
-    def _mast(self, rays: Rays, sign: Floats, near_m: Floats) -> Bar:
+    def _mast(self, rays: Rays, sign: Floats, near_m: Floats) -> Conductor:
         s = self.settings
-        return Bar(
+        return Conductor(
             p=self._numbered(near_m, 1) - rays.chainage_m,
             q=sign * s.lateral_m,
             ray_p=rays.x,
@@ -110,9 +110,9 @@ class Electrification:
             width_m=s.width_m,
         )
 
-    def _beam(self, rays: Rays, near_m: Floats) -> Bar:
+    def _beam(self, rays: Rays, near_m: Floats) -> Conductor:
         s = self.settings
-        return Bar(
+        return Conductor(
             p=self._numbered(near_m, s.beam_every) - rays.chainage_m,
             q=np.full(len(near_m), s.beam_height_m - rays.height_m),
             ray_p=rays.x,
@@ -124,28 +124,28 @@ class Electrification:
         )
 
     def _stands(self, sign: Floats) -> Floats:
-        """1 where the side has masts, else 0."""
+        """1 on sides with masts, else 0."""
         side = {"both": sign, "right": 1.0, "left": -1.0}[self.settings.sides]
         return np.where(sign == side, 1.0, 0.0)
 
-    def left_over(self, rays: Rays) -> Complexes:
-        """Direct field behind the bars ahead: 1 where nothing is in the way, shape (N,)."""
+    def transmitted(self, rays: Rays) -> Complexes:
+        """Direct field behind masts, beam and wires: 1 where nothing obstructs, shape (N,)."""
         s = self.settings
         sign = np.where(rays.y > 0.0, 1.0, -1.0)
         lateral = np.maximum(np.abs(rays.y), 1e-3)
         mast = self._mast(rays, sign, rays.chainage_m + s.lateral_m * rays.x / lateral)
-        field = 1.0 - mast.taken(rays.wavelength_m) * self._stands(sign)
+        field = 1.0 - mast.obstruction(rays.wavelength_m) * self._stands(sign)
         if s.beam_every:
             over = s.beam_height_m - rays.height_m
             beam = self._beam(rays, rays.chainage_m + over * rays.x / np.maximum(rays.z, 0.02))
-            field = field * (1.0 - beam.taken(rays.wavelength_m))
+            field = field * (1.0 - beam.obstruction(rays.wavelength_m))
         for height in (s.wire_height_m, s.messenger_height_m):
-            field = field * (1.0 - self._wire(rays, height).taken(rays.wavelength_m))
+            field = field * (1.0 - self._wire(rays, height).obstruction(rays.wavelength_m))
         return np.asarray(field)
 
-    def _wire(self, rays: Rays, height_m: float) -> Bar:
+    def _wire(self, rays: Rays, height_m: float) -> Conductor:
         n = len(rays.x)
-        return Bar(
+        return Conductor(
             p=np.zeros(n),
             q=np.full(n, height_m - rays.height_m),
             ray_p=rays.y,
@@ -156,15 +156,17 @@ class Electrification:
             width_m=self.settings.wire_width_m,
         )
 
-    def thrown(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
-        """Amplitude, extra path and its growth [m/m] of what mast and beam behind throw, each of shape (N,)."""
+    def scattered(self, rays: Rays) -> list[tuple[Floats, Floats, Floats]]:
+        """Amplitude, extra path and its growth [m/m] of the signals scattered by mast and beam, each of shape (N,)."""
         sign = np.where(rays.y > 0.0, -1.0, 1.0)
-        bars = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
+        conductors = [(self._mast(rays, sign, rays.chainage_m), self._stands(sign))]
         if self.settings.beam_every:
             half = 0.5 * self.settings.spacing_m * self.settings.beam_every
-            bars.append((self._beam(rays, rays.chainage_m - np.sign(rays.x) * half * 0.999), np.ones(len(rays.x))))
-        found = []
-        for bar, stands in bars:
-            amplitude, extra, toward_x, _ = bar.thrown(rays.wavelength_m)
-            found.append((amplitude * stands, extra, rays.x - toward_x))
-        return found
+            conductors.append(
+                (self._beam(rays, rays.chainage_m - np.sign(rays.x) * half * 0.999), np.ones(len(rays.x)))
+            )
+        rows = []
+        for conductor, stands in conductors:
+            amplitude, extra, toward_x, _ = conductor.scattered(rays.wavelength_m)
+            rows.append((amplitude * stands, extra, rays.x - toward_x))
+        return rows

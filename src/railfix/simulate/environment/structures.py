@@ -1,4 +1,4 @@
-"""One fixed place out of settings and a seed: faces and roofs as sorted arrays, looked up by side and chainage."""
+"""Walls and roofs along a line, drawn from settings and a seed: sorted arrays, searched by side and chainage."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings
-from railfix.simulate.environment.kinds import ROOFS, ROWS, TUNNEL_CROWN
+from railfix.simulate.environment.section_kinds import ROOFS, ROWS, TUNNEL_CROWN
 from railfix.simulate.environment.settings import RoofSettings, RowSettings, SectionSettings
 from railfix.simulate.setting_types import Between
 
 #: The first and the last section go on so far beyond the line [m].
 BEYOND_M: Final = 500.0
-#: Words of the sides, in the order in which they stand in the arrays.
+#: Sides of the line, in the order of the arrays.
 SIDES: Final = ("left", "right")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """Things along the line that do not overlap on one side, left ones first, sorted by chainage; n of them.
+    """Structures that do not overlap on one side, left ones first, sorted by chainage; n of them.
 
     Attributes
     ----------
     start_m, end_m : ndarray, shape (n,) [m]
         Chainages.
     border_m : ndarray, shape (n,) [m]
-        Where the thing begins to be the nearest, as `side * reach_m + chainage`.
+        Chainage from which the structure is the nearest, as `side * reach_m + chainage`.
     reach_m : float
         More than all chainages.
     value : dict of str to ndarray
@@ -42,19 +42,19 @@ class Strips:
     value: dict[str, Floats]
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
-        """The thing nearest along the line on a side (0 left, 1 right); both sides always hold at least one."""
+        """Index of the nearest structure on a side (0 left, 1 right); both sides always hold at least one."""
         low = np.clip(chainage_m, -0.25 * self.reach_m, 0.5 * self.reach_m)
         return np.searchsorted(self.border_m, side * self.reach_m + low, side="right") - 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
-    """Everything that stands along a line.
+class Structures:
+    """Walls, roofs and sections of a line.
 
     Attributes
     ----------
-    faces : tuple of Strips
-        Upright faces, row by row, with `distance_m` (at their middle), `height_m`, `reflection`,
+    walls : tuple of Strips
+        Vertical walls, row by row, with `distance_m` (at their middle), `height_m`, `reflection`,
         `roughness_m`, `slope` (tangent of the yaw).
     roofs : tuple of Strips
         With `inner_m`, `outer_m`, `height_m`, `through` (amplitude).
@@ -64,7 +64,7 @@ class Place:
         Kind before the first border, between, and after the last.
     """
 
-    faces: tuple[Strips, ...]
+    walls: tuple[Strips, ...]
     roofs: tuple[Strips, ...]
     borders_m: Floats
     kinds: Strings
@@ -74,8 +74,8 @@ class Place:
         return self.kinds[np.searchsorted(self.borders_m, chainage_m, side="right")]
 
 
-def built(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Place:
-    """Build the place.
+def build_structures(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Structures:
+    """Walls and roofs of given sections.
 
     Parameters
     ----------
@@ -83,15 +83,15 @@ def built(sections: Sequence[SectionSettings], line_length_m: float, seed: int) 
         Rising.
     line_length_m : float
     seed : int
-        Another seed, other buildings.
+        The same seed gives the same structures.
 
     Returns
     -------
-    Place
+    Structures
     """
     ends = np.array([section.to_m for section in sections])
     reach = 4.0 * (max(line_length_m, ends.max(initial=0.0)) + 2.0 * BEYOND_M)
-    faces: dict[int, list[list[list[float]]]] = {}
+    walls: dict[int, list[list[list[float]]]] = {}
     roofs: dict[int, list[list[list[float]]]] = {}
     for i, section in enumerate(sections):
         low = section.from_m - (BEYOND_M if i == 0 and section.kind != "tunnel" else 0.0)
@@ -102,22 +102,22 @@ def built(sections: Sequence[SectionSettings], line_length_m: float, seed: int) 
             for s, side in enumerate(SIDES):
                 if row.sides in (side, "both"):
                     rng = np.random.default_rng([seed, 7102, i, r, s])
-                    faces.setdefault(r, [[], []])[s] += _row(row, low, high, rng)
+                    walls.setdefault(r, [[], []])[s] += _row(row, low, high, rng)
         if section.kind == "tunnel":
             over = (TUNNEL_CROWN,)
         for r, roof in enumerate(over):
             for s, side in enumerate(SIDES):
-                # Both sides of a bridge are one bridge.
+                # A roof over the track is the same structure on both sides.
                 rng = np.random.default_rng([seed, 7103, i, r, 0 if roof.inner_m == 0.0 else s])
-                whole = [(low, high)] if section.kind == "tunnel" else None
+                tunnel = [(low, high)] if section.kind == "tunnel" else None
                 if roof.sides in (side, "both"):
-                    spans = whole or _spans(roof.length_m, roof.gap_m, low, high, rng)
+                    spans = tunnel or _spans(roof.length_m, roof.gap_m, low, high, rng)
                     roofs.setdefault(r, [[], []])[s] += [_roof(roof, *span) for span in spans]
     names = ("distance_m", "height_m", "reflection", "roughness_m", "slope")
     over_names = ("inner_m", "outer_m", "height_m", "through")
     kinds = [kind for section in sections for kind in ("open", section.kind)]
-    return Place(
-        faces=tuple(_strips(sides, names, reach) for _, sides in sorted(faces.items())),
+    return Structures(
+        walls=tuple(_strips(sides, names, reach) for _, sides in sorted(walls.items())),
         roofs=tuple(_strips(sides, over_names, reach) for _, sides in sorted(roofs.items())),
         borders_m=np.array([x for section in sections for x in (section.from_m, section.to_m)]),
         kinds=np.array([*kinds, "open"]),
@@ -127,7 +127,7 @@ def built(sections: Sequence[SectionSettings], line_length_m: float, seed: int) 
 def _spans(
     length_m: Between, gap_m: Between, low: float, high: float, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Lots between two chainages, one after the other."""
+    """Plots between two chainages, one after the other."""
     spans = []
     at = low + rng.uniform(0.0, 1.0) * gap_m[1]
     while at < high:
@@ -138,13 +138,13 @@ def _spans(
 
 
 def _row(row: RowSettings, low: float, high: float, rng: np.random.Generator) -> list[list[float]]:
-    found = []
+    walls = []
     for start, end in _spans(row.length_m, row.gap_m, low, high, rng):
         drawn = [rng.uniform(*pair) for pair in (row.distance_m, row.height_m, row.reflection, row.roughness_m)]
         slope = float(np.tan(np.radians(rng.uniform(*row.yaw_deg))))
         if rng.uniform() < row.share:
-            found.append([start, end, *drawn, slope])
-    return found
+            walls.append([start, end, *drawn, slope])
+    return walls
 
 
 def _roof(roof: RoofSettings, start: float, end: float) -> list[float]:
@@ -152,7 +152,7 @@ def _roof(roof: RoofSettings, start: float, end: float) -> list[float]:
 
 
 def _strips(sides: list[list[list[float]]], names: tuple[str, ...], reach: float) -> Strips:
-    """Arrays of both sides; a side without anything gets something without extent far behind the line."""
+    """Arrays of both sides; an empty side gets a structure without extent far behind the line."""
     absent = [-0.3 * reach, -0.3 * reach, *([1.0] * (len(names) - 1)), 0.0]
     tables = [np.array([absent, *side]) for side in sides]
     borders = []

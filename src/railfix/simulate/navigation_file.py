@@ -1,8 +1,7 @@
-"""Satellites of a real navigation file: the records that a run needs.
+"""Satellites of a recorded navigation file: the records that a run needs.
 
-The simulated signals follow the file's records as a receiver takes them, the newest transmitted, so
-that a change of records is a small step in the ranges (decimetres), which a receiver that changes
-with them does not see.
+The simulated signals follow the newest record transmitted, as receivers use it, so that a change of
+records is a small step in the ranges (decimetres), which a receiver that changes with them does not see.
 """
 
 from __future__ import annotations
@@ -19,19 +18,19 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex import read_navigation
 from railfix.simulate.scenario import Scenario
 
-#: Farthest from its reference time that a record serves [s]: half of GPS' and QZSS' least fit interval, Galileo's
+#: Validity of a record about its reference time [s]: half of GPS' and QZSS' least fit interval, Galileo's
 #: and BeiDou's as `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
-#: A record whose transmission time is not known or not believed was sent so long before its reference time [s].
+#: Time from transmission to reference time, where the transmission time is absent or implausible [s].
 _SENT_BEFORE_S: Final = {"G": 7200.0, "J": 3600.0, "E": 600.0, "C": 3600.0}
 _SIGNALS_MESSAGE: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV",), "C": ("D1", "D2")}
 
 
-def sky_of_file(scenario: Scenario, path: str) -> Navigation:
+def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     """Records of the scenario's constellations that serve its time.
 
     A satellite takes part when at every moment of the run the newest record transmitted is within its
-    validity. Galileo's are the I/NAV ones. A transmission time that the file does not tell is set to
+    validity. Galileo's are the I/NAV ones. A transmission time that is absent is set to
     the constellation's usual one. Klobuchar's coefficients are GPS'; they serve all.
 
     Raises
@@ -67,7 +66,7 @@ def sky_of_file(scenario: Scenario, path: str) -> Navigation:
 
 
 def no_glonass() -> GlonassRecords:
-    """No record of GLONASS, which is not simulated."""
+    """Empty GLONASS records; GLONASS is not simulated."""
     none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
     vectors = np.empty((0, 3))
     whole = np.empty(0, dtype=np.int64)
@@ -83,7 +82,7 @@ def _rows(records: KeplerRecords, rows: Indices | Masks) -> KeplerRecords:
 
 
 def _believed(records: KeplerRecords, systems: str) -> KeplerRecords:
-    """Records of the signals that are simulated, with transmission times that can be true."""
+    """Records of the simulated signals, with plausible transmission times."""
     letter = records.satellite.astype("<U1")
     usable = np.zeros(len(records), dtype=np.bool_)
     delay = np.where(letter == "E", records.group_delay_2_s, records.group_delay_1_s)

@@ -1,4 +1,4 @@
-"""Smooth random functions of one variable: sums of cosines of drawn frequencies, the same however they are asked."""
+"""Smooth random functions of one variable: sums of cosines with random frequencies and phases."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats
 
-#: Cosines of one function.
-_WAVES: Final = 64
+#: Number of cosines of one function.
+_COSINES: Final = 64
 
 
 @dataclass(frozen=True, kw_only=True)
-class Waves:
-    """One drawn function.
+class RandomFunction:
+    """Realisation of a stationary Gaussian function.
 
     Attributes
     ----------
@@ -32,21 +32,21 @@ class Waves:
 
     @classmethod
     def smooth(cls, rng: np.random.Generator, *, sigma: float, correlation: float) -> Self:
-        """Correlation exp(-d^2 / (2 correlation^2)): frequencies drawn from its spectrum."""
-        return cls._of(rng, sigma, rng.normal(0.0, 1.0 / correlation, _WAVES))
+        """Function with the correlation exp(-d^2 / (2 correlation^2))."""
+        return cls._of(rng, sigma, rng.normal(0.0, 1.0 / correlation, _COSINES))
 
     @classmethod
-    def narrow(cls, rng: np.random.Generator, *, sigma: float, period: float) -> Self:
-        """Swinging about one period, frequencies within some fifteen percent."""
-        return cls._of(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _WAVES)))
+    def periodic(cls, rng: np.random.Generator, *, sigma: float, period: float) -> Self:
+        """Oscillation about one period, with a relative bandwidth of 15 percent."""
+        return cls._of(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _COSINES)))
 
     @classmethod
     def _of(cls, rng: np.random.Generator, sigma: float, frequency: Floats) -> Self:
-        phase = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
-        return cls(amplitude=sigma * float(np.sqrt(2.0 / _WAVES)), frequency=frequency, phase=phase)
+        phase = rng.uniform(0.0, 2.0 * np.pi, _COSINES)
+        return cls(amplitude=sigma * float(np.sqrt(2.0 / _COSINES)), frequency=frequency, phase=phase)
 
     def at(self, x: ArrayLike) -> Floats:
-        """Values at places or times, same shape as `x`."""
+        """Values at positions or times, same shape as `x`."""
         where = np.asarray(x, dtype=np.float64)
         if self.amplitude == 0.0:
             return np.zeros(where.shape)

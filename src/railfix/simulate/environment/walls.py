@@ -1,6 +1,6 @@
-"""Rays and upright faces along the line: shadows behind them, mirror images in them.
+"""Vertical walls along the line: shadowing of direct signals and specular reflection.
 
-Frame of the antenna: x along the line (rising chainage), y to the right, z up; about one antenna the
+Frame of the antenna: x along the line (rising chainage), y to the right, z up; near one antenna the
 line is taken as straight.
 """
 
@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
-from railfix.simulate.environment.place import Strips
-from railfix.simulate.environment.waves import edge_amplitude, per_metre, roughness_loss
+from railfix.simulate.environment.diffraction import edge_amplitude, per_metre, roughness_loss
+from railfix.simulate.environment.structures import Strips
 
-#: Fresnel parameter where nothing is in the way.
+#: Fresnel parameter of an unobstructed ray.
 FREE_V: Final = -99.0
-#: Lateral part of a direction is at least this: rays along the line meet no face.
+#: Least lateral component of a direction: rays along the line meet no wall.
 _LEAST_LATERAL: Final = 1e-3
 
 
@@ -43,7 +43,7 @@ class Rays:
     wavelength_m: Floats
 
     def take(self, rows: Indices) -> Rays:
-        """Some of them."""
+        """Rays of some rows."""
         return Rays(
             chainage_m=self.chainage_m[rows],
             height_m=self.height_m,
@@ -55,72 +55,72 @@ class Rays:
 
 
 def _met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
-    """Index of the face that a level ray meets: from (x0, lateral0), growing by (along, lateral).
+    """Index of the wall that a horizontal ray meets, from (x0, lateral0) in direction (along, lateral).
 
-    Faces stand at various distances, so the place is found twice: with the distance of the face
-    abeam, then with that of the face found.
+    Walls stand at various distances, so the search is repeated: with the distance of the wall
+    abeam, then with that of the wall found.
     """
     distance = row.value["distance_m"]
     slant = along / lateral
-    found = row.nearest(side, x0)
+    wall = row.nearest(side, x0)
     for _ in range(2):
-        found = row.nearest(side, x0 + (distance[found] - lateral0) * slant)
-    return found
+        wall = row.nearest(side, x0 + (distance[wall] - lateral0) * slant)
+    return wall
 
 
-def _in_front(row: Strips, face: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
-    """Fresnel parameter of a ray at a face: positive inside its outline.
+def _in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
+    """Fresnel parameter of a ray at a wall: positive inside its outline.
 
-    `across` is the lateral part of the ray's direction; the top edge is level, the ends are upright.
+    `across` is the lateral component of the ray's direction; the top edge is horizontal, the ends are vertical.
     """
     scale = per_metre(far_m, rays.wavelength_m)
     rise = np.abs(across) / np.sqrt(across**2 + rays.z**2)
     level = np.abs(across) / np.sqrt(np.maximum(1.0 - rays.z**2, 1e-9))
-    top = (row.value["height_m"][face] - rays.height_m - z) * rise
-    ends = np.minimum(x - row.start_m[face], row.end_m[face] - x) * level
+    top = (row.value["height_m"][wall] - rays.height_m - z) * rise
+    ends = np.minimum(x - row.start_m[wall], row.end_m[wall] - x) * level
     return np.minimum(top, ends) * scale
 
 
 def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | float = 0.0) -> Floats:
-    """Fresnel parameter of the faces of a row in the way to the satellites, shape (N,).
+    """Fresnel parameter of the walls of a row that obstruct the satellites, shape (N,).
 
     Parameters
     ----------
     row : Strips
     rays : Rays
     x0, y0 : ndarray or float [m]
-        Where the rays begin, from the antenna: a mirror image of it.
+        Origin of the rays from the antenna: the mirror image of it for a reflection.
     """
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     begin = np.where(rays.y > 0.0, 1.0, -1.0) * y0
     start = rays.chainage_m + x0
-    face = _met(row, side, start, begin, rays.x, lateral)
-    slope = row.value["slope"][face]
-    middle = 0.5 * (row.start_m[face] + row.end_m[face])
-    far = (row.value["distance_m"][face] + (start - middle) * slope - begin) / np.maximum(
+    wall = _met(row, side, start, begin, rays.x, lateral)
+    slope = row.value["slope"][wall]
+    middle = 0.5 * (row.start_m[wall] + row.end_m[wall])
+    far = (row.value["distance_m"][wall] + (start - middle) * slope - begin) / np.maximum(
         lateral - rays.x * slope, _LEAST_LATERAL
     )
-    v = _in_front(row, face, rays, start + far * rays.x, far * rays.z, far, lateral)
+    v = _in_front(row, wall, rays, start + far * rays.x, far * rays.z, far, lateral)
     return np.where(far > 0.0, np.maximum(v, FREE_V), FREE_V)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mirrored:
-    """Reflections by one row of faces, shapes (N,).
+class Reflections:
+    """Reflections by one row of walls, shapes (N,).
 
     Attributes
     ----------
     amplitude : ndarray
-        0 where the face is absent or too small.
+        0 where the wall is absent or too small.
     extra_m : ndarray [m]
-        By which the path is longer than the direct one.
+        Excess over the direct path.
     rate : ndarray
-        By which that grows with the antenna's way along the line [m/m].
+        Growth of the excess with the antenna's chainage [m/m].
     x_m, y_m : ndarray [m]
         Mirror image of the antenna, from the antenna.
     back_x, back_y : ndarray
-        Direction from which the reflection comes.
+        Horizontal direction of arrival.
     far_m : ndarray [m]
         From the antenna to the place of reflection.
     """
@@ -135,29 +135,29 @@ class Mirrored:
     far_m: Floats
 
 
-def mirrored(row: Strips, rays: Rays) -> Mirrored:
+def reflections(row: Strips, rays: Rays) -> Reflections:
     """Reflection of each satellite in the row on the other side of the line.
 
-    Extra path 2 D (-n . u) with D the distance from the antenna to the face's plane and n its normal
+    Extra path 2 D (-n . u) with D the distance from the antenna to the wall's plane and n its normal
     away from the antenna (image method).
     """
     sign = np.where(rays.y > 0.0, -1.0, 1.0)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
-    face = _met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
-    slope = row.value["slope"][face]
+    wall = _met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
+    slope = row.value["slope"][wall]
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     sine = slope * cosine
-    middle = 0.5 * (row.start_m[face] + row.end_m[face])
-    distance = (row.value["distance_m"][face] + (rays.chainage_m - middle) * slope) * cosine
+    middle = 0.5 * (row.start_m[wall] + row.end_m[wall])
+    distance = (row.value["distance_m"][wall] + (rays.chainage_m - middle) * slope) * cosine
     # Normal (-sine, cosine) in (x, lateral); the satellite stands at (x, -lateral).
     facing = sine * rays.x + cosine * lateral
     back_x = rays.x - 2.0 * facing * sine
     back = -lateral + 2.0 * facing * cosine
     seen = (distance > 0.5) & (facing > 0.01) & (back > 0.01)
     far = np.where(seen, distance / np.maximum(facing, 0.01), 1.0)
-    v = _in_front(row, face, rays, rays.chainage_m + far * back_x, far * rays.z, far, back)
-    strength = row.value["reflection"][face] * roughness_loss(row.value["roughness_m"][face], facing, rays.wavelength_m)
-    return Mirrored(
+    v = _in_front(row, wall, rays, rays.chainage_m + far * back_x, far * rays.z, far, back)
+    strength = row.value["reflection"][wall] * roughness_loss(row.value["roughness_m"][wall], facing, rays.wavelength_m)
+    return Reflections(
         amplitude=np.where(seen, strength * edge_amplitude(-v), 0.0),
         extra_m=2.0 * distance * facing,
         rate=2.0 * sine * facing,

@@ -1,4 +1,4 @@
-"""Edges and strips in the way of a plane wave (ITU-R P.526-15, section 4.1; Born & Wolf, chapter 8)."""
+"""Diffraction by edges and strips, and loss by roughness (ITU-R P.526-15, section 4.1; Born & Wolf, chapter 8)."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def edge_amplitude(v: Floats) -> Floats:
 
 
 def strip_field(v: Floats, width_v: Floats) -> Complexes:
-    """What a strip takes from a wave of amplitude 1, by Kirchhoff and Babinet.
+    """Field that a strip removes from a wave of amplitude 1, by Kirchhoff and Babinet.
 
-    Behind the strip the field is 1 less this: ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip.
+    The field behind the strip is 1 minus this: ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def strip_field(v: Floats, width_v: Floats) -> Complexes:
 
 
 def roughness_loss(roughness_m: Floats, cosine: Floats, wavelength_m: Floats) -> Floats:
-    """Amplitude of the mirrored wave left by an uneven face: exp(-g^2/2), g = 4 pi sigma cos(incidence)/lambda.
+    """Amplitude factor of specular reflection off a rough wall: exp(-g^2/2), g = 4 pi sigma cos(incidence)/lambda.
 
     Ament (1953), Proc. IRE 41, 142; the criterion of Rayleigh is g of about 1.6.
     """
