@@ -24,7 +24,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.carrier import (
     PhaseLimits,
     PhasePositions,
@@ -44,6 +44,7 @@ from railfix.positioning.carrier import (
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, clock_groups
 from railfix.ranges.atmosphere import saastamoinen_delay_m
+from railfix.run.processor import processor_of
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -144,7 +145,7 @@ def on_track(case: Case, result: AntennaResult, slips: Slips, used: np.ndarray) 
 def carried(case: Case, *, limits: PhaseLimits | None = None) -> Carried:
     """All forms on one log, as a pipeline would call them."""
     obs = case.observations
-    processor = EpochProcessor(case.config, case.navigation, {"front": case.trajectory})
+    processor = processor_of(case.config, case.navigation, {"front": case.trajectory})
     result = processor.process({"front": obs})[0].antennas["front"]
     columns = result.columns
     names = obs.satellite[columns], obs.signal[columns]

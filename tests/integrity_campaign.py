@@ -29,7 +29,6 @@ from railfix.integrity.protection import Status as LevelStatus
 from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult, State
 from railfix.ranges.error_model import (
     ErrorBins,
@@ -40,6 +39,7 @@ from railfix.ranges.error_model import (
     read_error_model,
     write_error_model,
 )
+from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
@@ -87,7 +87,7 @@ class Played:
 
     def results(self, settings: dict[str, Any]) -> Iterator[dict[str, tuple[AntennaResult, Any]]]:
         """Results of the chunks, each with the simulator's own piece."""
-        processor = EpochProcessor(parse_config(settings), self.simulation.navigation, self.trajectories)
+        processor = processor_of(parse_config(settings), self.simulation.navigation, self.trajectories)
         state = State()
         for pieces in zip(*(self.simulation.pieces(name) for name in ANTENNAS), strict=True):
             result, state = processor.process(

@@ -32,13 +32,14 @@ from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.protection_levels import risk_of
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, fit
 from railfix.ranges.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
 from railfix.run.driver import open_inputs
 from railfix.run.past import past_run
+from railfix.run.processor import processor_of
 from railfix.track.trajectory import Trajectory
 
 MASK: Final = {"elevation": {"mask_deg": 15.0}}
@@ -255,7 +256,7 @@ def judged(
 ) -> Judged:
     """Positions weighted by a model, levels, errors of positions and of ranges; judged from an epoch on."""
     config = parse_config({**MASK, **({} if file is None else {"error_model": str(file)})})
-    processor = EpochProcessor(config, one.navigation, {"front": one.trajectory})
+    processor = processor_of(config, one.navigation, {"front": one.trajectory})
     result = processor.process({"front": one.observations})[0].antennas["front"]
     if least_scale < 1.0:
         level = _with_scale(one, result, config, np.maximum(result.noise_scale, least_scale))

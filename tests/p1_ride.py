@@ -17,6 +17,7 @@ from railfix.core.settings import write_toml
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
+from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario import ANTENNAS, RunSettings
@@ -158,7 +159,7 @@ class Bench:
                 settings = {**way.settings, **common}
                 key = (letters, repr(way.settings))
                 if key not in self.processors:
-                    self.processors[key] = EpochProcessor(
+                    self.processors[key] = processor_of(
                         parse_config(settings), self.simulation.navigation, self.trajectories
                     )
 

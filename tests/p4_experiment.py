@@ -21,7 +21,8 @@ from railfix.gnss.observations import Observations
 from railfix.integrity.raim import Outcome, RaimLimits
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.processor import AntennaResult
+from railfix.run.processor import processor_of
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -115,7 +116,7 @@ def play(data: Path, station: Station, beside_m: float, map_sigma_m: float | Non
             "raim_protection": "on",
         }
     )
-    processor = EpochProcessor(config, read_navigation([folder / station.navigation]), {"front": trajectory})
+    processor = processor_of(config, read_navigation([folder / station.navigation]), {"front": trajectory})
     result = processor.process({"front": observations})[0].antennas["front"]
     reference = np.broadcast_to(place, (len(result), 3))
     latitude, longitude, _ = geodetic_from_ecef(place)

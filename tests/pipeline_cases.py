@@ -73,7 +73,7 @@ def processor(
     trajectories: Mapping[str, Trajectory] | None = None,
 ) -> EpochProcessor:
     config: Config = parse_config(dict(settings or {}))
-    return EpochProcessor(config, navigation or clean_navigation(), trajectories or clean_trajectories())
+    return EpochProcessor(config, trajectories or clean_trajectories(), navigation=navigation or clean_navigation())
 
 
 def front_alone(observations: Observations, settings: Mapping[str, Any] | None = None, **kwargs: Any) -> AntennaResult:

@@ -22,7 +22,7 @@ from railfix.integrity.raim import constrained_model, exclude
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
 from railfix.positioning.noise_scale import noise_scale, own_sigma_m
@@ -30,6 +30,7 @@ from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import single_point
 from railfix.ranges.weights import code_sigma_m
+from railfix.run.processor import processor_of
 from railfix.track import Track, from_positions
 from railfix.track.trajectory import Trajectory
 
@@ -68,7 +69,7 @@ def run_rinex(
 ) -> Outcome:
     time, ecef = truth
     trajectory = trajectory_of(time, ecef)
-    processor = EpochProcessor(config, read_navigation(navigation), {"front": trajectory})
+    processor = processor_of(config, read_navigation(navigation), {"front": trajectory})
     result, _ = processor.process({"front": read_observations(observations)})
     antenna = result.antennas["front"]
     reference = interpolate_reference(antenna.time, time, ecef)
@@ -128,7 +129,7 @@ def geonet(data: Path, station: str, azimuth_deg: float, config: Config = SETTIN
     place = observations.header.approximate_ecef_m
     trajectory = straight_line(place, azimuth_deg)
     navigation = read_navigation([folder / f"{station}0920.05n"])
-    processor = EpochProcessor(config, navigation, {"front": trajectory})
+    processor = processor_of(config, navigation, {"front": trajectory})
     result, _ = processor.process({"front": observations})
     antenna = result.antennas["front"]
     reference = np.broadcast_to(place, (len(antenna), 3))

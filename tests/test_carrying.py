@@ -11,7 +11,7 @@ import pytest
 from railfix.evaluate import along_track_error
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor
+from railfix.run.processor import processor_of
 from railfix.simulate import demo_files
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -34,7 +34,7 @@ def demo():
 
 def run(carrier: str, cuts: int):
     observations, navigation, trajectory, _ = demo()
-    processor = EpochProcessor(parse_config({"carrier": carrier}), navigation, {"front": trajectory})
+    processor = processor_of(parse_config({"carrier": carrier}), navigation, {"front": trajectory})
     state, parts = None, []
     for first in range(0, EPOCHS, cuts):
         result, state = processor.process({"front": observations[first : first + cuts]}, state)

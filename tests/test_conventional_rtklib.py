@@ -31,10 +31,11 @@ from railfix.gnss.signals import carrier_frequency_hz
 from railfix.io.position_log import read_positions
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
+from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import klobuchar_delay_m
+from railfix.run.processor import processor_of
 from railfix.track.trajectory import Trajectory
 from recordings_score import straight_line, trajectory_of
 
@@ -169,7 +170,7 @@ def positions(log: Log, choose: Callable[[Navigation], Navigation]) -> tuple[Ant
     observations, trajectory = whole[::step], log.trajectory(whole)
     navigation = choose(read_navigation([log.navigation]))
     settings = {"systems": list(log.systems), "screens": ["elevation"], "elevation": {"mask_deg": MASK_DEG}}
-    processor = EpochProcessor(parse_config(settings), navigation, {"front": trajectory})
+    processor = processor_of(parse_config(settings), navigation, {"front": trajectory})
     result, _ = processor.process({"front": observations})
     return result.antennas["front"], trajectory, navigation
 

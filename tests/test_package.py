@@ -45,7 +45,8 @@ def demo() -> dict[str, object]:
     front = railfix.read_observations(files["front"])[:20]
     navigation = railfix.read_navigation(files["nav"])
     trajectory = railfix.antenna_trajectory(track, vehicle, "front")
-    result, _ = railfix.EpochProcessor(railfix.Config(), navigation, {"front": trajectory}).process({"front": front})
+    processor = railfix.EpochProcessor(railfix.Config(), {"front": trajectory}, navigation=navigation)
+    result, _ = processor.process({"front": front})
     return {
         "Track": track,
         "Trajectory": trajectory,

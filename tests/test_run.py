@@ -19,7 +19,7 @@ from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status, reaso
 from railfix.evaluate import evaluate_run
 from railfix.io.rinex import read_navigation, read_observations, scan_observations
 from railfix.pipeline.config import Config
-from railfix.pipeline.processor import EpochProcessor, Result
+from railfix.pipeline.processor import Result
 from railfix.pipeline.tables import (
     OBSERVATION_COLUMNS,
     POSITION_COLUMNS,
@@ -28,6 +28,7 @@ from railfix.pipeline.tables import (
     to_xarray,
 )
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
+from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -60,7 +61,7 @@ def result() -> Result:
         "front": antenna_trajectory(track, vehicle, "front"),
         "rear": antenna_trajectory(track, vehicle, "rear"),
     }
-    return EpochProcessor(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
+    return processor_of(Config(), read_navigation(inputs.nav), trajectories).process(observations)[0]
 
 
 def inputs_of(bench: Bench) -> RunInputs:

@@ -21,14 +21,15 @@ from railfix.gnss.orbits import satellite_states
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
-from railfix.pipeline.processor import AntennaResult, EpochProcessor
-from railfix.pipeline.protection_levels import level_facts, protect
+from railfix.pipeline.processor import AntennaResult
+from railfix.pipeline.protection_levels import level_facts, protection_levels
 from railfix.pipeline.results import AntennaState, State
 from railfix.pipeline.solve import place_on_line
 from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
 from railfix.ranges.sbas_delays import REASONS
+from railfix.run.processor import processor_of
 from railfix.simulate import demo_files
 from railfix.track import Track, write_track_csv
 from railfix.track.trajectory import Trajectory
@@ -47,7 +48,7 @@ class Recording:
         self.nav = folder / "cres_20080526.bin.nav"
         self.observations: Observations = read_observations(self.front)
         self.navigation: Navigation = read_navigation([self.nav])
-        without = EpochProcessor(parse_config({}), self.navigation, {"front": self.line_at(None)})
+        without = processor_of(parse_config({}), self.navigation, {"front": self.line_at(None)})
         found = without.process({"front": self.observations[:200]})[0].antennas["front"]
         self.parked = np.nanmedian(found.conventional_ecef_m, axis=0)
         self.line = self.line_at(self.parked)
@@ -59,7 +60,7 @@ class Recording:
         return parse_config({**SETTINGS, "sbas": [str(self.sbas)], **settings})
 
     def process(self, config: Config, observations: Observations | None = None) -> AntennaResult:
-        processor = EpochProcessor(config, self.navigation, {"front": self.line})
+        processor = processor_of(config, self.navigation, {"front": self.line})
         return processor.process({"front": observations or self.observations})[0].antennas["front"]
 
 
@@ -122,7 +123,7 @@ def test_a_corrected_code_is_the_sum_of_its_parts(recording: Recording, correcte
 
 
 def test_any_cutting_gives_the_same(recording: Recording, corrected: AntennaResult) -> None:
-    processor = EpochProcessor(recording.config(), recording.navigation, {"front": recording.line})
+    processor = processor_of(recording.config(), recording.navigation, {"front": recording.line})
     for size in (1, 7):
         state, parts = State(), []
         for first in range(140, 200, size):
@@ -154,8 +155,9 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     assert level_facts(config)["kind"] == "sbas"
     assert set(level_facts(config)["satellite_prior"].values()) == {0.0}
     assert level_facts(parse_config({}))["kind"] == "separation"
-    processor = EpochProcessor(config, recording.navigation, {"front": recording.line})
-    one, _ = processor._screened("front", recording.observations[180:200], AntennaState())
+    processor = processor_of(config, recording.navigation, {"front": recording.line})
+    obs = recording.observations[180:200]
+    one, _ = processor._screened("front", obs, processor.received, AntennaState())
     ranges = one.ranges()
     point = single_point(ranges, one.anchor_ecef_m)
     index = processor._index["front"]
@@ -164,7 +166,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     ranges, place, raim = fault_free(ranges, index, place, scale, config.model_copy(update={"screens": ()}))
 
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
-        return protect(one, ranges, index.trajectory, place.constrained, raim, scale, settings).level.level_m
+        return protection_levels(one, ranges, index.trajectory, place.constrained, raim, scale, settings).level.level_m
 
     has = np.isfinite(levels(scale, config))
     assert has.any()
@@ -181,7 +183,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
 
 def test_a_geo_that_the_log_does_not_have_is_refused(recording: Recording) -> None:
     with pytest.raises(SettingsError, match="sbas_prn = 120"):
-        EpochProcessor(recording.config(sbas_prn=120), recording.navigation, {"front": recording.line})
+        processor_of(recording.config(sbas_prn=120), recording.navigation, {"front": recording.line})
 
 
 def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording, tmp_path: Path) -> None:
@@ -225,7 +227,7 @@ def test_precise_orbits_are_not_what_sbas_corrects(recording: Recording) -> None
     # Never looked into: the refusal comes before.
     navigation = replace(recording.navigation, precise=object())
     with pytest.raises(SettingsError, match="give --sbas or --sp3"):
-        EpochProcessor(recording.config(), navigation, {"front": recording.line})
+        processor_of(recording.config(), navigation, {"front": recording.line})
 
 
 def test_other_signals_than_l1_ca_are_not_corrected(recording: Recording) -> None:
@@ -249,7 +251,7 @@ def test_a_newer_record_that_calls_a_satellite_unhealthy_wins_over_the_issue_of_
     extra["transmitted"][-1] = recording.observations.time[0]
     extra["toe"][-1] = extra["toe"][-1] + np.timedelta64(16, "s")
     navigation = replace(recording.navigation, kepler=replace(kepler, **extra))
-    processor = EpochProcessor(recording.config(), navigation, {"front": recording.line})
+    processor = processor_of(recording.config(), navigation, {"front": recording.line})
     found = processor.process({"front": recording.observations})[0].antennas["front"]
     column = int(np.flatnonzero(found.satellite == one)[0])
     observed = (found.reason[:, column] & Reason.NOT_OBSERVED) == 0
@@ -259,6 +261,6 @@ def test_a_newer_record_that_calls_a_satellite_unhealthy_wins_over_the_issue_of_
 @pytest.mark.requirement("C2")
 def test_positions_from_code_and_phase_have_no_level(recording: Recording) -> None:
     config = recording.config(carrier="float")
-    processor = EpochProcessor(config, recording.navigation, {"front": recording.line})
+    processor = processor_of(config, recording.navigation, {"front": recording.line})
     assert processor.process({"front": recording.observations[150:170]})[0].antennas["front"].protection is None
     assert any("there is none for positions from code and phase together" in note for note in processor.notes)

@@ -12,9 +12,10 @@ from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.integrity.raim import Outcome, threshold
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.processor import EpochProcessor, Result
+from railfix.pipeline.processor import Result
 from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS, observations_table, positions_table
 from railfix.ranges.cn0_curve import read_cn0_curve
+from railfix.run.processor import processor_of
 from railfix.run.sources import TrackReading, open_line
 from railfix.simulate.demonstration import demo_inputs
 
@@ -36,7 +37,7 @@ TIGHT: dict[str, object] = {
 def result_of(settings: dict[str, object]) -> Result:
     inputs = demo_inputs()
     line = open_line(inputs.track, inputs.vehicle, antennas=("front", "rear"), reading=TrackReading())
-    processor = EpochProcessor(parse_config(settings), read_navigation(inputs.nav), line.trajectories)
+    processor = processor_of(parse_config(settings), read_navigation(inputs.nav), line.trajectories)
     return processor.process({name: read_observations(paths)[PART] for name, paths in inputs.logs.items()})[0]
 
 

@@ -12,7 +12,8 @@ Where to begin
 >>> navigation = railfix.read_navigation(files["nav"])
 >>> track = railfix.read_track(files["track"])
 >>> trajectory = railfix.Trajectory.from_track(track)
->>> result, state = railfix.EpochProcessor(railfix.Config(), navigation, {"front": trajectory}).process({"front": log})
+>>> processor = railfix.EpochProcessor(railfix.Config(), {"front": trajectory}, navigation=navigation)
+>>> result, state = processor.process({"front": log})
 >>> positions = railfix.positions_table(result)
 
 ============================ =========================================================================

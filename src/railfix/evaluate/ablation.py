@@ -20,12 +20,13 @@ from railfix.evaluate.along_track import along_track_error, interpolate_referenc
 from railfix.evaluate.scores import Score, score
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config
-from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
+from railfix.pipeline.processor import AntennaResult, State
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
 from railfix.run.driver import Progress, RunOptions, notes_of, open_inputs
 from railfix.run.inputs import RunInputs
 from railfix.run.output import OutputFolder
+from railfix.run.processor import processor_of
 from railfix.run.record import run_record
 from railfix.run.tally import Tally
 from railfix.track.trajectory import Trajectory
@@ -170,7 +171,7 @@ def ablate_files(
         navigation, line, logs = open_inputs(inputs, options)
         screens, left_out = judging_screens(config, line.trajectories)
         processors = {
-            name: EpochProcessor(
+            name: processor_of(
                 # Nobody asks for a protection level here.
                 config.model_copy(update={"screens": chosen, "protection": "off"}),
                 navigation,

@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
-from railfix.pipeline.corrected_ranges import Prepared
+from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.screens import (
     AntennaPairLimits,
     Screened,
@@ -65,77 +65,78 @@ def spacing_at(front: Trajectory, rear: Trajectory, front_arc_m: Floats) -> Spac
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaPair:
-    """What two antennas have in common, P epochs.
+    """Common epochs of two antennas, P of them.
 
     Attributes
     ----------
-    prepared : mapping of str to Prepared
-        "front" and "rear".
     front_epoch, rear_epoch : ndarray of int, shape (P,)
-        Epochs of each that belong together.
+        Epochs of each antenna that belong together.
     spacing : Spacing
-        At the place that the front antenna sees its satellites from.
+        At the approximate place of the front antenna.
     """
 
-    prepared: Mapping[str, Prepared]
     front_epoch: Indices
     rear_epoch: Indices
     spacing: Spacing
 
 
 def pair_antennas(
-    front: Prepared, rear: Prepared, front_path: Trajectory, rear_path: Trajectory, *, tolerance_s: float
+    front: CorrectedRanges,
+    rear: CorrectedRanges,
+    front_path: Trajectory,
+    rear_path: Trajectory,
+    *,
+    tolerance_s: float,
 ) -> AntennaPair:
-    """Match the epochs of two antennas by their time tags.
+    """Return the epochs of two antennas matched by their time tags.
 
     Parameters
     ----------
-    front, rear : Prepared
+    front, rear : CorrectedRanges
     front_path, rear_path : Trajectory
     tolerance_s : float [s]
         Largest difference of the tags.
-
-    Returns
-    -------
-    AntennaPair
     """
-    one, two = pair_epochs(front.observations.time, rear.observations.time, tolerance_s=tolerance_s)
-    arc, _ = front_path.nearest(front.anchor_ecef_m[one])
-    return AntennaPair(
-        prepared={"front": front, "rear": rear},
-        front_epoch=one,
-        rear_epoch=two,
-        spacing=spacing_at(front_path, rear_path, arc),
-    )
+    at_front, at_rear = pair_epochs(front.time, rear.time, tolerance_s=tolerance_s)
+    arc, _ = front_path.nearest(front.anchor_ecef_m[at_front])
+    return AntennaPair(front_epoch=at_front, rear_epoch=at_rear, spacing=spacing_at(front_path, rear_path, arc))
 
 
-def screen_antenna_pair(pair: AntennaPair, limits: AntennaPairLimits) -> None:
-    """Compare the codes of two antennas; a satellite that does not fit is refused on both.
+def antenna_pair_screened(
+    pair: AntennaPair, ranges: Mapping[str, CorrectedRanges], limits: AntennaPairLimits
+) -> dict[str, CorrectedRanges]:
+    """Return the ranges of two antennas after the comparison of their codes; a misfit is rejected on both.
 
     Parameters
     ----------
     pair : AntennaPair
+    ranges : mapping of str to CorrectedRanges
+        "front" and "rear".
     limits : AntennaPairLimits
     """
-    front, rear = pair.prepared["front"], pair.prepared["rear"]
-    one, two = pair.front_epoch, pair.rear_epoch
+    front, rear = ranges["front"], ranges["rear"]
+    at_front, at_rear = pair.front_epoch, pair.rear_epoch
     ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
     heading, gradient, length = spacing_direction(pair.spacing.front_ecef_m, pair.spacing.rear_ecef_m)
+    here = np.ix_(at_front, ours)
     verdict = antenna_pair_screen(
-        front.corrected_code_m[np.ix_(one, ours)],
-        rear.corrected_code_m[np.ix_(two, theirs)],
-        front.elevation_deg[np.ix_(one, ours)],
-        front.azimuth_deg[np.ix_(one, ours)],
+        front.corrected_code_m[here],
+        rear.corrected_code_m[np.ix_(at_rear, theirs)],
+        front.elevation_deg[here],
+        front.azimuth_deg[here],
         satellite=front.satellite[ours],
         heading_deg=heading,
         gradient_permille=gradient,
         spacing_m=length,
-        tag_difference=rear.observations.time[two] - front.observations.time[one],
-        range_rate_mps=-SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[np.ix_(one, ours)],
+        tag_difference=rear.time[at_rear] - front.time[at_front],
+        range_rate_mps=-SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[here],
         limits=limits,
     )
-    for antenna, epochs, channels in ((front, one, ours), (rear, two, theirs)):
+    screened = dict(ranges)
+    for name, epochs, channels in (("front", at_front, ours), ("rear", at_rear, theirs)):
+        antenna = ranges[name]
         metric = np.full(antenna.reason.shape, np.nan)
         metric[np.ix_(epochs, channels)] = verdict.metric
         reject = on_channels(verdict.reject, antenna.reason.shape, epochs, channels)
-        antenna.screened("antenna_pair", Screened(metric=metric, reject=reject), Reason.ANTENNA_PAIR)
+        screened[name] = antenna.screened("antenna_pair", Screened(metric=metric, reject=reject), Reason.ANTENNA_PAIR)
+    return screened

@@ -1,4 +1,4 @@
-"""What the pipeline does with the carrier phase: smoothed codes, or code and phase together."""
+"""Apply carrier-phase smoothing or float ambiguities."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from railfix.core.arrays import Floats
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import Prepared
+from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.positioning.carrier import (
     ArcState,
     ContinuityState,
@@ -30,13 +30,13 @@ from railfix.positioning.carrier import (
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Phases of satellites lower than this are weighted as if they stood here [deg].
+#: Phases of satellites below this elevation are weighted as if at it [deg].
 LOWEST_WEIGHTED_DEG = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class CarrierState:
-    """What the phases of one antenna leave to the next epochs; None before the first."""
+    """State of the carrier-phase stages of one antenna; None before the first epoch."""
 
     slips: SlipState | None = None
     smoothing: SmoothingState | None = None
@@ -45,22 +45,27 @@ class CarrierState:
     phase: PhaseState | None = None
 
 
-def slips_of(one: Prepared, navigation: Navigation, config: Config, state: CarrierState) -> tuple[Slips, CarrierState]:
-    """Cycle slips of all channels of an antenna's log."""
-    obs = one.observations
+def with_slips(
+    ranges: CorrectedRanges, navigation: Navigation, config: Config, state: CarrierState
+) -> tuple[CorrectedRanges, CarrierState]:
+    """Return the ranges with the cycle slips of all channels of their log."""
+    obs = ranges.observations
     channels = {**glonass_channels(navigation), **obs.header.glonass_channel}
     frequency = carrier_frequency_hz(obs.satellite, obs.signal, channels)
     slips, after = find_slips(obs, state.slips, frequency_hz=frequency, limits=config.slips)
-    return slips, replace(state, slips=after)
+    return replace(ranges, slips=slips), replace(state, slips=after)
 
 
-def smoothed(one: Prepared, slips: Slips, config: Config, state: CarrierState) -> tuple[Prepared, CarrierState]:
-    """The same with codes smoothed by their phases; the weights stay those of raw codes.
+def smoothed(ranges: CorrectedRanges, config: Config, state: CarrierState) -> tuple[CorrectedRanges, CarrierState]:
+    """Return the ranges with their codes smoothed by their phases; the weights stay those of raw codes.
 
-    What multipath and the floor of the noise leave is not averaged as white noise is.
+    Multipath and the error floor are not averaged out as white noise is. The ranges need their slips
+    (`with_slips`); without them nothing is smoothed.
     """
-    obs = one.observations
-    found, after = smooth_codes(
+    obs, slips = ranges.observations, ranges.slips
+    if slips is None:
+        return ranges, state
+    result, after = smooth_codes(
         obs.time,
         obs.satellite,
         obs.signal,
@@ -70,12 +75,12 @@ def smoothed(one: Prepared, slips: Slips, config: Config, state: CarrierState) -
         state.smoothing,
         limits=config.smoothing,
     )
-    corrected = one.corrected_code_m + (found.code_m - obs.code_m)[:, one.columns]
-    return replace(one, corrected_code_m=corrected), replace(state, smoothing=after)
+    corrected = ranges.corrected_code_m + (result.code_m - obs.code_m)[:, ranges.columns]
+    return replace(ranges, corrected_code_m=corrected), replace(state, smoothing=after)
 
 
-def carried(
-    one: Prepared,
+def code_and_phase(
+    corrected: CorrectedRanges,
     slips: Slips,
     ranges: Ranges,
     trajectory: Trajectory,
@@ -83,11 +88,11 @@ def carried(
     config: Config,
     state: CarrierState,
 ) -> tuple[PhasePositions, CarrierState]:
-    """Positions from code and phase, each from its own and earlier epochs (requirement A5; P4).
+    """Return positions from code and phase, each from its own and earlier epochs (requirement A5; P4).
 
     Parameters
     ----------
-    one : Prepared
+    corrected : CorrectedRanges
     slips : Slips
     ranges : Ranges
         Codes that the position was solved with; a phase is used where its code is.
@@ -102,22 +107,27 @@ def carried(
     PhasePositions
     CarrierState
     """
-    time, columns = one.observations.time, one.columns
+    time, columns, satellites = corrected.time, corrected.columns, corrected.satellites
+    satellite, signal = corrected.satellite, corrected.signal
     used = ranges.weight > 0
-    phase = corrected_phase_m(slips.phase_m[:, columns], one.satellites.clock_m, one.ionosphere_m, one.troposphere_m)
+    phase = corrected_phase_m(
+        slips.phase_m[:, columns], corrected.satellites.clock_m, corrected.ionosphere_m, corrected.troposphere_m
+    )
     phase = np.where(used, phase, np.nan)
     jumps, continuity = track_jumps(
-        time, one.satellite, one.signal, phase, one.satellites.position_ecef_m, slips.slip[:, columns],
+        time, satellite, signal, phase, satellites.position_ecef_m, slips.slip[:, columns],
         trajectory, arc_m, state.continuity, limits=config.continuity,
     )  # fmt: skip
     has = np.isfinite(slips.phase_m[:, columns])
-    arcs, numbers = number_arcs(slips.slip[:, columns] | jumps.jump, has, one.satellite, one.signal, state.arcs)
-    sine = np.sin(np.radians(np.maximum(one.elevation_deg, LOWEST_WEIGHTED_DEG)))
+    arcs, numbers = number_arcs(
+        slips.slip[:, columns] | jumps.jump, has, corrected.satellite, corrected.signal, state.arcs
+    )
+    sine = np.sin(np.radians(np.maximum(corrected.elevation_deg, LOWEST_WEIGHTED_DEG)))
     known = np.isfinite(phase)
     phases = Phases(
         phase_m=np.where(known, phase, 0.0),
         weight=np.where(known, (sine / config.phase_sigma_m) ** 2, 0.0),
         arc_id=arcs,
     )
-    found, after = phase_positions(time, ranges, phases, trajectory, arc_m, state.phase, limits=config.phase)
-    return found, replace(state, continuity=continuity, arcs=numbers, phase=after)
+    positions, after = phase_positions(time, ranges, phases, trajectory, arc_m, state.phase, limits=config.phase)
+    return positions, replace(state, continuity=continuity, arcs=numbers, phase=after)

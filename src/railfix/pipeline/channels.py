@@ -1,10 +1,11 @@
-"""The channels of a log against the settings: worked out once for each set of channels that comes along.
+"""Channels of a log that the settings allow, computed once for each set of channels.
 
-A log of a day has few sets of channels, and live epochs come with the same one again and again.
+A log of a day has few sets of channels, and most live epochs have the same one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -55,37 +56,35 @@ class Channels:
 
 
 class ChannelBook:
-    """Channels by what a log calls them.
+    """Channels of observations under some settings, computed once for each set of channels.
 
     Parameters
     ----------
     config : Config
-    navigation : Navigation
-        Tells the frequencies of GLONASS satellites where a log does not.
     """
 
-    def __init__(self, config: Config, navigation: Navigation) -> None:
+    def __init__(self, config: Config) -> None:
         self._config = config
-        self._glonass = glonass_channels(navigation)
         self._known: dict[tuple[object, ...], Channels] = {}
 
-    def of(self, obs: Observations) -> Channels:
-        """Channels of some observations."""
+    def of(self, obs: Observations, navigation: Navigation) -> Channels:
+        """Return the channels of some observations; GLONASS frequencies are those of the log, then of the records."""
+        glonass = {**glonass_channels(navigation), **obs.header.glonass_channel}
         key = (
             obs.satellite.tobytes(),
             obs.signal.tobytes(),
             obs.satellite.dtype.str,
             obs.signal.dtype.str,
-            tuple(obs.header.glonass_channel.items()),
+            tuple(glonass.items()),
         )
-        found = self._known.get(key)
-        if found is None:
+        channels = self._known.get(key)
+        if channels is None:
             while len(self._known) >= _REMEMBERED:
                 self._known.pop(next(iter(self._known)))
-            found = self._known[key] = self._worked_out(obs)
-        return found
+            channels = self._known[key] = self._selected(obs, glonass)
+        return channels
 
-    def _worked_out(self, obs: Observations) -> Channels:
+    def _selected(self, obs: Observations, glonass: Mapping[str, int]) -> Channels:
         systems = self._config.systems
         columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=self._config.signals)
         satellite, signal = obs.satellite[columns], obs.signal[columns]
@@ -93,7 +92,7 @@ class ChannelBook:
         left_out = np.where(np.isin(obs.system, systems), Reason.OTHER_SIGNAL_TAKEN, Reason.SYSTEM_NOT_SELECTED)
         left_out[columns] = Reason.USED
         names, which = np.unique(obs.satellite, return_inverse=True)
-        frequency = carrier_frequency_hz(satellite, signal, {**self._glonass, **obs.header.glonass_channel})
+        frequency = carrier_frequency_hz(satellite, signal, glonass)
         return Channels(
             columns=read_only(columns),
             satellite=read_only(satellite),

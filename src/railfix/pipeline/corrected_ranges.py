@@ -1,43 +1,43 @@
-"""From observations to corrected ranges with the reasons so far: everything before a position is sought."""
+"""Corrected pseudoranges with their sigmas and the reasons for rejection so far: everything before positioning."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
 from railfix.core.reasons import Reason
-from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
 from railfix.pipeline.channels import Channels
 from railfix.pipeline.config import Config
+from railfix.pipeline.received import Received
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import single_point
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import ErrorModel
-from railfix.ranges.sbas import SbasCorrections
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
 from railfix.screens import Screened
 
-#: Standard deviation given to raw ranges when looking for a place to see the satellites from [m].
+#: Standard deviation given to raw ranges for the approximate place of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
 #: A last step of this length leaves 25 m of a range, which turns no satellite by more than 2e-6 rad [m].
 ANCHOR_TOLERANCE_M: Final = 1000.0
-#: Further from the line than this a raw 3-D position is no train on it, however bad the ranges [m].
+#: A raw 3-D position further from the line than this is not that of a train on it, however bad the ranges [m].
 BESIDE_THE_LINE_M: Final = 1e5
-#: Stands for the satellite of a range without weight [m].
+#: Satellite position of ranges without weight: any finite value will do [m].
 SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prepared:
-    """One antenna's chunk before any position: T epochs by the K channels that settings allow.
+class CorrectedRanges:
+    """Corrected pseudoranges of one antenna before positioning: T epochs by the K channels that the settings allow.
 
     Attributes
     ----------
@@ -46,17 +46,17 @@ class Prepared:
     code_m, doppler_hz, cn0_dbhz : ndarray, shape (T, K)
     satellites : SatelliteStates
     anchor_ecef_m : ndarray, shape (T, 3) [m]
-        Where the satellites are seen from.
+        Approximate place of the antenna, from which the directions to the satellites are computed.
     elevation_deg, azimuth_deg : ndarray, shape (T, K)
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
-        Delays taken off the codes; 0 where the model is off, NaN where SBAS has none.
+        Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none.
     corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
     bias_m : ndarray, shape (T, K) [m]
         Largest nominal bias of each range by the error model; 0 without one.
     reason : ndarray of int64, shape (T, K)
-        Written to by `refuse` alone.
-    screens : dict of str to Screened
-        What each screen measured and said.
+        `reasons.Reason` bits so far, 0 = usable.
+    screens : mapping of str to Screened
+        Metric and verdict of each screen so far.
     slips : Slips or None
         Of all channels of the observations, where the carrier phase is used.
     """
@@ -76,12 +76,22 @@ class Prepared:
     sigma_m: Floats
     bias_m: Floats
     reason: Bits
-    screens: dict[str, Screened] = field(default_factory=dict)
+    screens: Mapping[str, Screened] = field(default_factory=dict)
     slips: Slips | None = None
 
     @property
+    def time(self) -> Datetimes:
+        """Time tags of the epochs, shape (T,)."""
+        return self.observations.time
+
+    @property
+    def break_before(self) -> Masks:
+        """Epochs that must not be differenced with the one before, shape (T,)."""
+        return self.observations.break_before
+
+    @property
     def columns(self) -> Indices:
-        """Where the channels stand in the observations, shape (K,)."""
+        """Columns of the channels in the observations, shape (K,)."""
         return self.channels.columns
 
     @property
@@ -109,32 +119,30 @@ class Prepared:
         """Carrier of each channel, shape (K,) [Hz]."""
         return self.channels.frequency_hz
 
-    def refuse(self, mask: Masks, reason: Reason) -> None:
-        """Add a reason to observed channels; nothing ever takes one away."""
-        self.reason[mask & ((self.reason & Reason.NOT_OBSERVED) == 0)] |= reason
+    def rejected(self, mask: Masks, reason: Reason) -> CorrectedRanges:
+        """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
+        hit = mask & ((self.reason & Reason.NOT_OBSERVED) == 0)
+        return replace(self, reason=np.where(hit, self.reason | int(reason), self.reason))
 
-    def screened(self, name: str, verdict: Screened, reason: Reason) -> None:
-        """Keep what a screen said, and act on it."""
-        self.screens[name] = verdict
-        self.refuse(verdict.reject, reason)
+    def screened(self, name: str, verdict: Screened, reason: Reason) -> CorrectedRanges:
+        """Return the ranges with the verdict of a screen, its rejects carrying the reason."""
+        return replace(self.rejected(verdict.reject, reason), screens={**self.screens, name: verdict})
 
     def ranges(self) -> Ranges:
-        """What may be fitted now."""
+        """Return the ranges without a reason against them, ready to be fitted."""
         return usable_ranges(self.satellites, self.corrected_code_m, 1.0 / self.sigma_m**2, self.reason, self.groups)
 
 
-def prepare(
+def correct_ranges(
     obs: Observations,
     channels: Channels,
     config: Config,
-    navigation: Navigation,
+    received: Received,
     index: SearchIndex,
-    klobuchar: Floats | None,
     *,
     error_model: ErrorModel | None = None,
-    sbas: SbasCorrections | None = None,
-) -> Prepared:
-    """Find the satellites of the channels, correct their codes, weigh them.
+) -> CorrectedRanges:
+    """Correct the codes of the channels and compute their sigmas.
 
     Parameters
     ----------
@@ -142,63 +150,63 @@ def prepare(
     channels : Channels
         Of these observations.
     config : Config
-    navigation : Navigation
+    received : Received
+        Navigation records and coefficients; where SBAS is used, its corrections replace the models, and satellites
+        without a valid one are rejected.
     index : SearchIndex
         Of the antenna's trajectory.
-    klobuchar : ndarray, shape (8,), or None
-        Ionospheric coefficients; None leaves the ionosphere uncorrected.
     error_model : ErrorModel, optional
         Gives the weights in place of ``config.noise``.
-    sbas : SbasCorrections, optional
-        Corrects satellites, ionosphere and troposphere in place of the models; what it has no valid
-        correction for is refused.
 
     Returns
     -------
-    Prepared
+    CorrectedRanges
         With the reasons of codes, satellites and corrections; the screens come after.
     """
     columns, satellite, signal, groups = channels.columns, channels.satellite, channels.signal, channels.groups
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
-    reason = _reasons_of_codes(satellite, code)
-    fixes = None if sbas is None else sbas.satellites(obs.time, satellite, navigation)
+    reason, sbas = _reasons_of_codes(satellite, code), received.sbas
+    observed = (reason & Reason.NOT_OBSERVED) == 0
+    fixes = None if sbas is None else sbas.satellites(obs.time, satellite, received.navigation)
     states = satellite_states(
         obs.time,
         satellite,
         signal,
         code,
-        navigation,
+        received.navigation,
         max_age_s=config.max_ephemeris_age_s,
         record=None if fixes is None else fixes.record,
     )
+    lacking = np.zeros(code.shape, dtype=np.int64)
     if fixes is not None:
-        states, refused = corrected_satellites(states, fixes)
-        refused = np.where(signal == SBAS_SIGNAL, refused, int(Reason.SBAS_NOT_COVERED))
-        reason |= np.where(reason & Reason.NOT_OBSERVED, 0, refused)
-    observed = (reason & Reason.NOT_OBSERVED) == 0
-    for mask, bit in (
-        (states.no_record, Reason.NO_EPHEMERIS),
-        (states.too_old, Reason.EPHEMERIS_TOO_OLD),
-        (states.unhealthy, Reason.UNHEALTHY),
+        states, lacking = corrected_satellites(states, fixes)
+        lacking = np.where(signal == SBAS_SIGNAL, lacking, int(Reason.SBAS_NOT_COVERED))
+    for mask, bits in (
+        (observed, lacking),
+        (observed & states.no_record, int(Reason.NO_EPHEMERIS)),
+        (observed & states.too_old, int(Reason.EPHEMERIS_TOO_OLD)),
+        (observed & states.unhealthy, int(Reason.UNHEALTHY)),
     ):
-        reason[observed & mask] |= bit
+        reason = np.where(mask, reason | bits, reason)
     clean = code + states.clock_m - states.group_delay_m
     if fixes is not None:
         clean = clean + np.nan_to_num(fixes.fast_m)
     anchor = _anchor(index, config, usable_ranges(states, clean, _ANCHOR_WEIGHT, reason, groups))
     seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
     if sbas is None or fixes is None:
-        air = modelled_delays(obs.time, seen, frequency, klobuchar=klobuchar, troposphere=config.troposphere)
+        delays = modelled_delays(
+            obs.time, seen, frequency, klobuchar=received.klobuchar, troposphere=config.troposphere
+        )
     else:
-        air = sbas_delays(sbas, fixes, obs.time, seen, frequency)
-        reason |= np.where(reason & Reason.NOT_OBSERVED, 0, air.reason)
-    clean = clean - air.ionosphere_m - air.troposphere_m
+        delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
+        reason = np.where(observed, reason | delays.reason, reason)
+    clean = clean - delays.ionosphere_m - delays.troposphere_m
     local, bias = _local_errors(seen, cn0, index, config, error_model)
     if error_model is not None and error_model.covers == "local" and sbas is None:
         local = np.hypot(local, config.nominal.sigma_m(seen.elevation_deg))
-    sigma = np.hypot(local, air.sigma_m)
-    reason[(reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))] |= Reason.NO_CORRECTION
-    return Prepared(
+    sigma = np.hypot(local, delays.sigma_m)
+    uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))
+    return CorrectedRanges(
         observations=obs,
         channels=channels,
         code_m=code,
@@ -208,19 +216,19 @@ def prepare(
         anchor_ecef_m=anchor,
         elevation_deg=seen.elevation_deg,
         azimuth_deg=seen.azimuth_deg,
-        ionosphere_m=air.ionosphere_m,
-        troposphere_m=air.troposphere_m,
+        ionosphere_m=delays.ionosphere_m,
+        troposphere_m=delays.troposphere_m,
         corrected_code_m=clean,
         sigma_m=sigma,
         bias_m=bias,
-        reason=reason,
+        reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
     )
 
 
 def _local_errors(
     seen: SeenFrom, cn0: Floats, index: SearchIndex, config: Config, model: ErrorModel | None
 ) -> tuple[Floats, Floats]:
-    """Sigma and bias of the ranges by the error model, or by the noise settings: shapes (T, K)."""
+    """Return sigma and bias of the ranges by the error model, or by the noise settings: shapes (T, K) [m]."""
     if model is None:
         return code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), np.zeros(cn0.shape)
     arc, _ = index.trajectory.nearest(seen.receiver_ecef_m)
@@ -233,12 +241,11 @@ _ANCHOR_WEIGHT: Final = np.array(1.0 / ANCHOR_SIGMA_M**2)
 
 
 def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
-    """A place near the antenna to see the satellites from, shape (T, 3): good to some hundred metres.
+    """Return an approximate place of the antenna, good to some hundred metres, shape (T, 3) [m].
 
     The point of the line nearest to a 3-D position from raw ranges of equal weight, started from
     the middle of the line at every epoch so that no epoch depends on another; the 3-D position
-    itself where it is nowhere near the line; where there is none, the point of the line that fits
-    best.
+    itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
     """
     trajectory = index.trajectory
     middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
@@ -257,21 +264,21 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
 
 
 def _reasons_of_codes(satellite: Strings, code: Floats) -> Bits:
-    """Reasons that the codes alone give, shape (T, K)."""
+    """Return the reasons that follow from the codes alone, shape (T, K)."""
     observed = np.isfinite(code)
     plausible = (code > PLAUSIBLE_CODE_M[0]) & (code < PLAUSIBLE_CODE_M[1])
     taken = first_available(satellite, plausible)
-    reason = np.zeros(code.shape, dtype=np.int64)
-    reason[~observed] |= Reason.NOT_OBSERVED
-    reason[observed & ~plausible] |= Reason.IMPLAUSIBLE_CODE
-    reason[plausible & ~taken] |= Reason.OTHER_SIGNAL_TAKEN
-    return reason
+    return np.select(
+        [~observed, ~plausible, ~taken],
+        [int(Reason.NOT_OBSERVED), int(Reason.IMPLAUSIBLE_CODE), int(Reason.OTHER_SIGNAL_TAKEN)],
+        int(Reason.USED),
+    )
 
 
 def usable_ranges(
     states: SatelliteStates, code: Floats, weight: Floats, reason: Bits, groups: tuple[slice, ...]
 ) -> Ranges:
-    """Ranges to be fitted: what has a reason, or no number, gets no weight and harmless numbers."""
+    """Return ranges to be fitted: those with a reason, or without a number, have weight 0 and finite values."""
     used = (reason == 0) & np.isfinite(code) & np.isfinite(weight)
     return Ranges(
         sat_ecef_m=np.where(used[..., None], states.position_ecef_m, SOMEWHERE_ABOVE_M),
@@ -282,5 +289,5 @@ def usable_ranges(
 
 
 def without(ranges: Ranges, dropped: Masks) -> Ranges:
-    """The same ranges, some of them without weight."""
+    """Return the ranges with weight 0 where `dropped`, shape (T, M)."""
     return replace(ranges, weight=np.where(dropped, 0.0, ranges.weight))

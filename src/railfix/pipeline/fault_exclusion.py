@@ -1,107 +1,150 @@
-"""RAIM at work: positions without the satellites that do not agree with the rest."""
+"""Detect and exclude faulty satellites, then solve again."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from railfix.core.arrays import Floats, Indices
-from railfix.integrity.raim import LinearModel, Outcome, constrained_model, detect, exclude, reliability, worst_channel
+from railfix.integrity.raim import (
+    Exclusion,
+    LinearModel,
+    Outcome,
+    constrained_model,
+    detect,
+    exclude,
+    reliability,
+    worst_channel,
+)
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import without
-from railfix.pipeline.results import Raim, patched
+from railfix.pipeline.results import RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
 from railfix.positioning.constrained import Constrained
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.section_search import SearchIndex
+from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.positioning.single_point import single_point
 from railfix.track.trajectory import Trajectory
 
 
 def fault_free(
-    ranges: Ranges, index: SearchIndex, place: Place, scale: Floats, config: Config
-) -> tuple[Ranges, Place, Raim]:
-    """RAIM: where a fault is detected and its satellites are found, the position without them."""
+    ranges: Ranges,
+    index: SearchIndex,
+    place: Place,
+    scale: Floats,
+    config: Config,
+    *,
+    predicted: PredictedPlace | None = None,
+) -> tuple[Ranges, Place, RaimResult]:
+    """Return ranges and positions without the satellites that RAIM excludes, and its verdict on each epoch.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        T epochs by K channels.
+    index : SearchIndex
+    place : Place
+        Positions from these ranges.
+    scale : ndarray, shape (T,)
+        Noise scale of the receiver.
+    config : Config
+        Where "raim" is not among its screens nothing is tested.
+    predicted : PredictedPlace, optional
+    """
     limits, constrained = config.raim, place.constrained
-    found = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
-    raim = Raim(
-        outcome=np.where(found.testable, Outcome.PASSED, Outcome.UNTESTABLE).astype(np.int8),
-        statistic=found.statistic,
-        threshold=found.threshold,
+    test = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
+    on = "raim" in config.screens
+    raim = RaimResult(
+        outcome=np.where(test.testable & on, Outcome.PASSED, Outcome.UNTESTABLE).astype(np.int8),
+        statistic=test.statistic,
+        threshold=test.threshold,
         excluded=np.zeros(ranges.code_m.shape, dtype=bool),
         own_error_m=np.full(ranges.code_m.shape, np.nan),
         protection_level_m=np.full(len(ranges), np.nan),
     )
-    failing = np.flatnonzero(found.detected)
-    if "raim" not in config.screens:
-        raim.outcome[:] = Outcome.UNTESTABLE
-        return ranges, place, raim
+    failing = np.flatnonzero(test.detected & on)
     if not len(failing):
         return ranges, place, raim
     arc, section = constrained.arc_m[failing], constrained.section[failing]
     model = constrained_model(ranges.take(failing), index.trajectory, arc, section=section)
     exclusion = exclude(model, limits=limits, scale=scale[failing])
-    raim.outcome[failing] = exclusion.outcome
-    raim.excluded[failing], raim.own_error_m[failing] = exclusion.excluded, exclusion.own_error_m
-    left = exclusion.outcome == Outcome.UNRESOLVED
-    _from_elsewhere(ranges, index, place, raim, failing[left], model.take(np.flatnonzero(left)), scale, config)
-    again = failing[raim.excluded[failing].any(axis=1)]
-    if len(again):
-        ranges = without(ranges, raim.excluded)
-        part = ranges.take(again)
-        rest = single_point(part, place.point.ecef_m[again], limits=config.single_point)
-        mended = place_on_line(part, index, rest, config)
-        constrained = mended.constrained
-        # Without the fault the best section can be another one: is the rest of one mind there too?
-        once_more = detect(
-            constrained.wsse, constrained.residual_m, redundancy_of(part), limits=limits, scale=scale[again]
-        )
-        raim.outcome[again[once_more.detected]] = Outcome.UNRESOLVED
-        place = Place(
-            point=patched(place.point, again, mended.point),
-            section=patched(place.section, again, mended.section),
-            constrained=patched(place.constrained, again, mended.constrained),
-        )
-    return ranges, place, raim
+    raim = _with_exclusion(raim, failing, exclusion, np.arange(len(failing)))
+    unresolved = np.flatnonzero(exclusion.outcome == Outcome.UNRESOLVED)
+    if len(unresolved):
+        epochs = failing[unresolved]
+        second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config, predicted)
+        raim = _with_exclusion(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
+    changed = failing[raim.excluded[failing].any(axis=1)]
+    if not len(changed):
+        return ranges, place, raim
+    ranges = without(ranges, raim.excluded)
+    part = ranges.take(changed)
+    point = single_point(part, place.point.ecef_m[changed], limits=config.single_point)
+    solved = place_on_line(part, index, point, config, predicted=None if predicted is None else predicted.take(changed))
+    # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
+    recheck = detect(
+        solved.constrained.wsse, solved.constrained.residual_m, redundancy_of(part), limits=limits, scale=scale[changed]
+    )
+    outcome = np.where(recheck.detected, Outcome.UNRESOLVED, raim.outcome[changed])
+    place = Place(
+        point=patched(place.point, changed, solved.point),
+        section=patched(place.section, changed, solved.section),
+        constrained=patched(place.constrained, changed, solved.constrained),
+    )
+    return ranges, place, replace(raim, outcome=_put(raim.outcome, changed, outcome))
 
 
-def _from_elsewhere(
+def _put(array: NDArray[Any], rows: Indices, values: NDArray[Any]) -> NDArray[Any]:
+    """Return a copy of an array with some rows replaced."""
+    copy = array.copy()
+    copy[rows] = values
+    return copy
+
+
+def _with_exclusion(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices) -> RaimResult:
+    """Return the result with some rows of an exclusion of `epochs` put in."""
+    at = epochs[rows]
+    return replace(
+        raim,
+        outcome=_put(raim.outcome, at, exclusion.outcome[rows]),
+        excluded=_put(raim.excluded, at, exclusion.excluded[rows]),
+        own_error_m=_put(raim.own_error_m, at, exclusion.own_error_m[rows]),
+    )
+
+
+def _second_attempt(
     ranges: Ranges,
     index: SearchIndex,
     place: Place,
-    raim: Raim,
-    stuck: Indices,
+    epochs: Indices,
     model: LinearModel,
     scale: Floats,
     config: Config,
-) -> None:
-    """Try unresolved epochs once more from where they are without their worst satellite; written into `raim`.
+    predicted: PredictedPlace | None,
+) -> Exclusion:
+    """Return the exclusion of unresolved epochs, linearised at their position without the worst satellite.
 
-    A large fault on a curve moves the position to a place where the line runs another way, and
-    what is linear there is not where the train is.
+    A large fault on a curve moves the position to a part of the line with another direction, where the
+    linear model does not hold for the true position.
     """
-    if not len(stuck):
-        return
-    worst = worst_channel(model)
-    one = np.zeros((len(stuck), ranges.code_m.shape[1]), dtype=bool)
-    one[np.arange(len(stuck)), worst] = True
-    whole = ranges.take(stuck)
-    part = without(whole, one)
-    point = single_point(part, place.point.ecef_m[stuck], limits=config.single_point)
-    rest = place_on_line(part, index, point, config).constrained
-    there = constrained_model(whole, index.trajectory, rest.arc_m, section=rest.section)
-    exclusion = exclude(there, limits=config.raim, scale=scale[stuck])
-    found = np.flatnonzero(exclusion.excluded.any(axis=1))
-    raim.outcome[stuck[found]] = exclusion.outcome[found]
-    raim.excluded[stuck[found]] = exclusion.excluded[found]
-    raim.own_error_m[stuck[found]] = exclusion.own_error_m[found]
+    worst = np.zeros((len(epochs), ranges.code_m.shape[1]), dtype=bool)
+    worst[np.arange(len(epochs)), worst_channel(model)] = True
+    all_ranges = ranges.take(epochs)
+    part = without(all_ranges, worst)
+    point = single_point(part, place.point.ecef_m[epochs], limits=config.single_point)
+    near = None if predicted is None else predicted.take(epochs)
+    solved = place_on_line(part, index, point, config, predicted=near).constrained
+    there = constrained_model(all_ranges, index.trajectory, solved.arc_m, section=solved.section)
+    return exclude(there, limits=config.raim, scale=scale[epochs])
 
 
-def protected(
-    ranges: Ranges, trajectory: Trajectory, constrained: Constrained, raim: Raim, scale: Floats, config: Config
-) -> Raim:
-    """RAIM with the protection level of what is left, where no fault is left in it."""
+def with_p4_level(
+    raim: RaimResult, ranges: Ranges, trajectory: Trajectory, constrained: Constrained, scale: Floats, config: Config
+) -> RaimResult:
+    """Return the RAIM result with P4's protection level, where no fault is left in the position."""
     model = constrained_model(ranges, trajectory, constrained.arc_m, section=constrained.section)
     level = reliability(model, limits=config.raim, scale=scale).protection_level_m
     faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])

@@ -9,12 +9,11 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.reasons import CHECK_FAILED, Status
-from railfix.integrity.protection import ProtectionLevel, RiskBudget, along_track_level, availability
-from railfix.integrity.protection import Status as LevelStatus
+from railfix.integrity.protection import LevelStatus, ProtectionLevel, RiskBudget, along_track_level, availability
 from railfix.integrity.raim import Outcome, constrained_model
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import Prepared
-from railfix.pipeline.results import Protection, Raim
+from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.results import ProtectionResult, RaimResult
 from railfix.positioning.constrained import Constrained
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
@@ -56,46 +55,46 @@ def risk_of(config: Config) -> RiskBudget:
     return replace(config.risk, satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
 
 
-def protect(
-    one: Prepared,
+def protection_levels(
+    corrected: CorrectedRanges,
     ranges: Ranges,
     trajectory: Trajectory,
     constrained: Constrained,
-    raim: Raim,
+    raim: RaimResult,
     scale: Floats,
     config: Config,
-) -> Protection:
+) -> ProtectionResult:
     """Levels of the positions of a chunk.
 
     Parameters
     ----------
-    one : Prepared
+    corrected : CorrectedRanges
     ranges : Ranges
         What the positions were solved with.
     trajectory : Trajectory
     constrained : Constrained
-    raim : Raim
+    raim : RaimResult
     scale : ndarray, shape (T,)
         The receiver's noise scale; an error model stands for itself and is not scaled.
     config : Config
 
     Returns
     -------
-    Protection
+    ProtectionResult
     """
     faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
     arc = np.where(faulty, np.nan, constrained.arc_m)
     model = constrained_model(ranges, trajectory, arc, section=np.maximum(constrained.section, 0))
     level = along_track_level(
         model,
-        [name[0] for name in one.satellite.tolist()],
+        [name[0] for name in corrected.satellite.tolist()],
         risk=risk_of(config),
         scale=_level_scale(scale, config),
-        bias_m=None if config.error_model is None else one.bias_m,
+        bias_m=None if config.error_model is None else corrected.bias_m,
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    return Protection(level=level, status=status, kind=kind_of(config))
+    return ProtectionResult(level=level, status=status, kind=kind_of(config))
 
 
 def _level_scale(scale: Floats, config: Config) -> Floats | float:
@@ -103,7 +102,7 @@ def _level_scale(scale: Floats, config: Config) -> Floats | float:
     return 1.0 if config.error_model is not None else np.maximum(scale, 1.0)
 
 
-def judged(protection: Protection, status: Codes, has: Masks, config: Config) -> Protection:
+def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:
     """Levels beside the verdicts on the positions.
 
     A level stands for the place that the ranges were linearised at. Where another place explains them as
@@ -111,7 +110,7 @@ def judged(protection: Protection, status: Codes, has: Masks, config: Config) ->
 
     Parameters
     ----------
-    protection : Protection
+    protection : ProtectionResult
     status : ndarray of int8, shape (T,)
         `reasons.Status`.
     has : ndarray of bool, shape (T,)
@@ -127,4 +126,4 @@ def judged(protection: Protection, status: Codes, has: Masks, config: Config) ->
     verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
     doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP])
     verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
-    return Protection(level=level, status=verdict.astype(np.int8), kind=protection.kind)
+    return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind)

@@ -1,4 +1,4 @@
-"""Reasons brought together: of channels that were never looked at, of lone satellites, counted by satellite."""
+"""Combine the rejection reasons of all channels, and count them by satellite."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ import numpy as np
 
 from railfix.core.arrays import Bits, Integers, Masks
 from railfix.core.reasons import Reason
-from railfix.pipeline.corrected_ranges import Prepared
+from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies
 
 
-def whole_reason(one: Prepared) -> Bits:
-    """Reasons of all channels of the observations, those that settings leave out included, shape (T, M)."""
-    not_observed = ~np.isfinite(one.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
-    reason = np.asarray(not_observed | one.channels.left_out)
-    reason[:, one.columns] = one.reason
+def reason_of_all_channels(corrected: CorrectedRanges) -> Bits:
+    """Return the reasons of all channels of the observations, shape (T, M)."""
+    not_observed = ~np.isfinite(corrected.observations.code_m) * np.int64(Reason.NOT_OBSERVED)
+    reason = np.asarray(not_observed | corrected.channels.left_out)
+    reason[:, corrected.columns] = corrected.reason
     return reason
 
 
-def alone_on_their_clocks(one: Prepared, ties: ClockTies) -> Masks:
-    """Satellites that determine their own clock and nothing else, shape (T, K)."""
-    alone = np.zeros(one.reason.shape, dtype=bool)
-    for g, group in enumerate(one.groups):
-        used = one.reason[:, group] == 0
+def alone_on_their_clocks(corrected: CorrectedRanges, ties: ClockTies) -> Masks:
+    """Return the satellites that are the only ones of a clock without a known bias, shape (T, K)."""
+    alone = np.zeros(corrected.reason.shape, dtype=bool)
+    for g, group in enumerate(corrected.groups):
+        used = corrected.reason[:, group] == 0
         lone = (np.count_nonzero(used, axis=1) == 1) & (ties.sigma_m[:, g] >= UNTIED_M)
         alone[:, group] = used & lone[:, None]
     return alone
 
 
-def satellites_refused(member: Integers, reason: Bits) -> Integers:
-    """Satellites with a code of which no signal was used, shape (T,).
+def satellites_rejected(member: Integers, reason: Bits) -> Integers:
+    """Return the number of satellites with a code of which no signal was used, shape (T,).
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""What the pipeline returns: every intermediate result, and the state that one chunk leaves to the next."""
+"""Results of the pipeline with every intermediate value, and the state carried from one chunk to the next."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -14,12 +14,13 @@ from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.pipeline.carrier_phase import CarrierState
+from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import Constrained
 from railfix.positioning.intersystem_bias import OffsetState
 from railfix.positioning.section_search import Section
 from railfix.positioning.single_point import SinglePoint
-from railfix.screens import DopplerState, Screened
+from railfix.screens import Screened
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -28,7 +29,7 @@ Rows = TypeVar("Rows", bound="DataclassInstance")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Raim:
+class RaimResult:
     """Detection and exclusion of T epochs.
 
     Attributes
@@ -39,10 +40,10 @@ class Raim:
         Before any exclusion; in noise variances, or in m^2 with the fixed limit.
     excluded : ndarray of bool, shape (T, K)
     own_error_m : ndarray, shape (T, K) [m]
-        Error of the channels that stand against the rest; NaN elsewhere.
+        Error of the channels named as faulty against all others; NaN elsewhere.
     protection_level_m : ndarray, shape (T,) [m]
-        `raim.reliability` of the ranges left; infinite where a fault of one of them would not show, NaN
-        where there is no position, where a fault is left in it, or where that or the screen is off.
+        `raim.reliability` of the remaining ranges; infinite where a fault of one of them cannot be detected, NaN
+        where there is no position, where a fault is left in it, or where the level or RAIM is off.
     """
 
     outcome: Codes
@@ -54,7 +55,7 @@ class Raim:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Protection:
+class ProtectionResult:
     """Protection levels of T epochs.
 
     Attributes
@@ -62,9 +63,9 @@ class Protection:
     level : ProtectionLevel
         NaN without a position, and where RAIM has left a fault in it. Channels count as `AntennaResult.columns` do.
     status : ndarray of int8, shape (T,)
-        `protection.Status` against `Config.alarm_limit_m`.
+        `protection.LevelStatus` against `Config.alarm_limit_m`.
     kind : str
-        What the levels rest on: "sbas" or "separation" (`protecting.KINDS`).
+        Basis of the levels: "sbas" or "separation" (`protection_levels.KINDS`).
     """
 
     level: ProtectionLevel
@@ -74,38 +75,49 @@ class Protection:
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaState:
-    """What one antenna's epochs leave to the next.
+    """State of one antenna after a chunk.
 
     Attributes
     ----------
     log_variance_sum, log_variance_weight : float
-        Sums behind the noise scale: the receiver's post-fit variance against the weights, averaged
-        as a logarithm so that multipath does not carry it.
+        Sums of the noise scale: the receiver's post-fit variance against the weights, averaged as a logarithm so that
+        multipath has little influence.
     offsets : OffsetState
-        What is known of the offsets between the clocks of the constellations.
-    doppler : DopplerState or None
-        The last epoch that the Doppler screen has seen.
+        Inter-system biases estimated so far.
+    screens : mapping of str to object
+        State of each screen that has one, by its name.
     carrier : CarrierState or None
-        What the carrier phase has left, where it is used.
+        State of the carrier-phase stages, where they are used.
     """
 
     log_variance_sum: float = 0.0
     log_variance_weight: float = 0.0
     offsets: OffsetState = field(default_factory=OffsetState)
-    doppler: DopplerState | None = None
+    screens: Mapping[str, Any] = field(default_factory=dict)
     carrier: CarrierState | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """What a chunk leaves to the next, by antenna."""
+    """State after a chunk: everything that the next one needs.
+
+    Attributes
+    ----------
+    antennas : mapping of str to AntennaState
+    received : Received or None
+        Navigation records and SBAS messages so far; None: those that the processor was made with.
+    fusion : None
+        State of the filter along the track, once there is one.
+    """
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
+    received: Received | None = None
+    fusion: None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(NotebookTable):
-    """All that was found for one antenna, T epochs by M channels (those of the observations given).
+    """Results of one antenna, T epochs by M channels (those of the observations given).
 
     Attributes
     ----------
@@ -119,9 +131,9 @@ class AntennaResult(NotebookTable):
     along_sigma_m : ndarray, shape (T,) [m]
         Standard deviation along the line, the receiver's noise scale and the map error included.
     own_sigma_m : ndarray, shape (T,) [m]
-        What the ranges of the epoch itself vouch for: standard deviation along the line by the larger
-        of the receiver's noise and what these ranges show, widened as Student's t is where few of them
-        are redundant. Also where the position is dropped.
+        Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of
+        the receiver's noise and the noise of these residuals, widened by Student's t where few ranges are
+        redundant. Also given where the position is dropped.
     noise_scale : ndarray, shape (T,)
         Standard deviation of this receiver's ranges against the one the weights assume, as
         estimated from the epochs before.
@@ -151,14 +163,14 @@ class AntennaResult(NotebookTable):
     constrained : Constrained
     phase : PhasePositions or None
         Positions from code and phase, where ``Config.carrier`` is "float"; they are what the coordinates are.
-    raim : Raim
+    raim : RaimResult
         Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
-    protection : Protection or None
+    protection : ProtectionResult or None
         Protection levels along the line; None where they are off.
     clocks : tuple of str
         Letter of each receiver clock of the results above, length G.
     clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
-        What was known before each epoch of that clock against the reference clock.
+        Inter-system bias known before each epoch: that clock less the reference clock.
     """
 
     time: Datetimes
@@ -195,8 +207,8 @@ class AntennaResult(NotebookTable):
     section: Section
     constrained: Constrained
     phase: PhasePositions | None
-    raim: Raim
-    protection: Protection | None
+    raim: RaimResult
+    protection: ProtectionResult | None
     clocks: tuple[str, ...]
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats
@@ -220,22 +232,25 @@ class Result(NotebookTable):
     ----------
     antennas : mapping of str to AntennaResult
     notes : tuple of str
-        What was asked for and what was used in its place, one sentence each.
+        Differences between what was asked for and what was used, one sentence each.
+    fusion : None
+        Positions of the filter along the track, once there is one.
     """
 
     antennas: Mapping[str, AntennaResult]
     notes: tuple[str, ...]
+    fusion: None = None
 
     def __repr__(self) -> str:
         parts = (f"{name} {result.status_text()}" for name, result in self.antennas.items())
         return f"<Result: {'; '.join(parts)}>"
 
 
-def patched(whole: Rows, epochs: Indices, part: Rows) -> Rows:
-    """The same result with some epochs replaced, by index; every field has the epochs on axis 0."""
+def patched(result: Rows, epochs: Indices, part: Rows) -> Rows:
+    """Return a result with some epochs replaced, by index; every field has the epochs on axis 0."""
     values = {}
-    for item in fields(whole):
-        array = np.array(getattr(whole, item.name))
+    for item in fields(result):
+        array = np.array(getattr(result, item.name))
         array[epochs] = getattr(part, item.name)
         values[item.name] = array
-    return replace(whole, **values)
+    return replace(result, **values)

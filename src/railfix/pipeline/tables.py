@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Floats
 from railfix.core.reasons import Reason, Status, reason_text
-from railfix.integrity.protection import Cause
-from railfix.integrity.protection import Status as LevelStatus
+from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
-from railfix.pipeline.processor import AntennaResult, Result
 from railfix.pipeline.protection_levels import KINDS
+from railfix.pipeline.results import AntennaResult, Result
 from railfix.screens import DopplerScreened
 
 if TYPE_CHECKING:

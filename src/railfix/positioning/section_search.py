@@ -54,11 +54,15 @@ class SectionLimits:
         Ranges beyond the unknowns (clocks and distance) below which a section is doubtful: on real
         recordings of two constellations a quarter of the sections were wrong with one redundant
         range, 3 to 4 % with two.
+    predicted_sigmas : float
+        Points further from a predicted place than this many of its sigmas are left out where nearer ones
+        remain (`PredictedPlace`).
     """
 
     ambiguity_risk: float = 1e-3
     separation_m: float = 30.0
     redundancy: int = 2
+    predicted_sigmas: float = 6.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.ambiguity_risk < 1.0:
@@ -70,6 +74,24 @@ class SectionLimits:
     def threshold(self) -> float:
         """Excess of q that noise of unit variance explains."""
         return float(chi2.isf(self.ambiguity_risk, 1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictedPlace:
+    """Place on the trajectory predicted without the ranges, by a filter along the track: T epochs.
+
+    Attributes
+    ----------
+    arc_m, sigma_m : ndarray, shape (T,) [m]
+        NaN where there is no prediction.
+    """
+
+    arc_m: Floats
+    sigma_m: Floats
+
+    def take(self, epochs: Indices) -> PredictedPlace:
+        """Return the predictions of some epochs, by index."""
+        return PredictedPlace(arc_m=self.arc_m[epochs], sigma_m=self.sigma_m[epochs])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +179,14 @@ def _searchable(ranges: Ranges) -> Masks:
     return np.asarray(ranges.n_used > ranges.n_clocks)
 
 
-def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
+def search(
+    ranges: Ranges,
+    index: SearchIndex,
+    point: SinglePoint,
+    *,
+    limits: SectionLimits | None = None,
+    predicted: PredictedPlace | None = None,
+) -> Section:
     """The same point as `exhaustive_search`, without looking at the whole line.
 
     Parameters
@@ -168,6 +197,9 @@ def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: Se
     point : SinglePoint
         3-D position from the same ranges and weights; NaN where there is none.
     limits : SectionLimits, optional
+    predicted : PredictedPlace, optional
+        Of the points that fit as well as noise allows, only those near the predicted place are kept; where none
+        of them is near it, the ranges contradict the prediction and it is not used.
 
     Returns
     -------
@@ -192,7 +224,28 @@ def search(ranges: Ranges, index: SearchIndex, point: SinglePoint, *, limits: Se
         candidates.append(found)
     for found in candidates:
         np.add.at(evaluations, found.epoch, 1)
+    if predicted is not None:
+        candidates = [_near(part, index.trajectory, predicted, limits) for part in candidates]
     return _decide(epochs, candidates, index.trajectory, freedom, limits, evaluations)
+
+
+def _near(
+    candidates: _Candidates, trajectory: Trajectory, predicted: PredictedPlace, limits: SectionLimits
+) -> _Candidates:
+    """Return the candidates near the predicted place, and all candidates of the epochs that have none there."""
+    epoch = candidates.epoch
+    away = np.abs(trajectory.arc_m[candidates.vertex] - predicted.arc_m[epoch])
+    near = away <= limits.predicted_sigmas * predicted.sigma_m[epoch] + trajectory.length_m.max()
+    any_near = np.zeros(len(predicted.arc_m), dtype=bool)
+    any_near[epoch[near]] = True
+    keep = near | ~any_near[epoch]
+    return _Candidates(
+        epoch[keep],
+        candidates.vertex[keep],
+        candidates.q[keep],
+        candidates.half_gradient[keep],
+        candidates.matrix[keep],
+    )
 
 
 def _ball(

@@ -30,6 +30,7 @@ from railfix.run.checks import (
 from railfix.run.chunks import aligned
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.output import OutputFolder
+from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
 from railfix.run.sources import Line, Log, TrackReading, open_line
 from railfix.run.tally import Tally
@@ -142,12 +143,12 @@ def run_files(
     with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
         fingerprints = inputs.fingerprints(pool)
         navigation, line, logs = open_inputs(inputs, options)
-        processor = EpochProcessor(config, navigation, line.trajectories)
+        processor = processor_of(config, navigation, line.trajectories)
         tally = _position(logs, processor, folder, options, progress)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
-        check_sbas_time(processor.sbas, tally)
+        check_sbas_time(processor.received.sbas, tally)
         check_positions(tally)
         sigma, found_levels = along_sigma(folder), levels(folder)
         notes = (*notes_of(line, navigation, tally, logs), *_notes_of_levels(config, tally, found_levels))
@@ -223,7 +224,7 @@ def _position(
         result, state = processor.process(chunk, state)
         tally.took(result, clock.perf_counter() - began)
         tally.add(result)
-        check_same_day(processor.navigation, tally)
+        check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
         table = positions_table(result)
         folder.append_parquet("positions.parquet", table)

@@ -16,9 +16,9 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.range_errors.robust_clock import robust_clock
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import scan_observations
-from railfix.pipeline.carrier_phase import CarrierState, slips_of, smoothed
+from railfix.pipeline.carrier_phase import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.corrected_ranges import prepare
+from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor
 from railfix.positioning.section_search import SearchIndex
 from railfix.track import Track
@@ -94,25 +94,25 @@ def base_station(
     latitude, longitude, height = (float(x) for x in geodetic_from_ecef(position_ecef_m))
     ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)
     index = SearchIndex(Trajectory.from_track(Track.from_ecef(ends)))
-    config, navigation = processor.config, processor.navigation
-    book = ChannelBook(config, navigation)
+    config, received = processor.config, processor.received
+    book = ChannelBook(config)
     state, phases = CarrierState(), False
     times: list[Datetimes] = []
     errors: list[dict[str, Floats]] = []
     for obs in parts:
-        prepared = prepare(obs, book.of(obs), config, navigation, index, processor.klobuchar, sbas=processor.sbas)
-        slips, state = slips_of(prepared, navigation, config, state)
-        prepared, state = smoothed(prepared, slips, config, state)
+        corrected = correct_ranges(obs, book.of(obs, received.navigation), config, received, index)
+        corrected, state = with_slips(corrected, received.navigation, config, state)
+        corrected, state = smoothed(corrected, config, state)
         phases |= bool(np.isfinite(obs.phase_cycles).any())
-        distance, _ = range_with_rotation(prepared.satellites.position_ecef_m, position_ecef_m)
-        residual = np.where(prepared.reason == Reason.USED, prepared.corrected_code_m - distance, np.nan)
-        clock = robust_clock(residual, prepared.sigma_m, prepared.groups).clock_m
+        distance, _ = range_with_rotation(corrected.satellites.position_ecef_m, position_ecef_m)
+        residual = np.where(corrected.reason == Reason.USED, corrected.corrected_code_m - distance, np.nan)
+        clock = robust_clock(residual, corrected.sigma_m, corrected.groups).clock_m
         owner = np.zeros(residual.shape[1], dtype=np.intp)
-        for g, group in enumerate(prepared.groups):
+        for g, group in enumerate(corrected.groups):
             owner[group] = g
         error = residual - clock[:, owner]
         of_satellite: dict[str, Floats] = {}
-        for k, satellite in enumerate(prepared.satellite.tolist()):
+        for k, satellite in enumerate(corrected.satellite.tolist()):
             before = of_satellite.get(satellite)
             of_satellite[satellite] = error[:, k] if before is None else np.where(np.isnan(before), error[:, k], before)
         times.append(obs.time)

@@ -15,11 +15,12 @@ from railfix.core.files import file_sha256
 from railfix.evaluate.range_errors.base_station import BaseStation, base_station_from_files
 from railfix.evaluate.range_errors.gather import GatherLimits, joined, range_errors
 from railfix.io.reference_log import read_reference
-from railfix.pipeline.processor import EpochProcessor, State, conditions_of
+from railfix.pipeline.processor import State, conditions_of
 from railfix.ranges.error_model import ErrorModel, ErrorModelFit, ErrorModelSource, ErrorSamples, fit_bins
 from railfix.run.chunks import aligned
 from railfix.run.driver import open_inputs
 from railfix.run.past import past_run
+from railfix.run.processor import processor_of
 
 #: Called after each chunk with the name of the run and the epochs processed so far.
 OnChunk = Callable[[str, int], None]
@@ -134,7 +135,7 @@ def _run_errors(
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options)
     references = read_reference(source.reference, tuple(past.inputs.logs))
-    processor, state = EpochProcessor(past.config, navigation, line.trajectories), State()
+    processor, state = processor_of(past.config, navigation, line.trajectories), State()
     base: BaseStation | None = None
     if source.base:
         base = base_station_from_files(source.base, processor, position_ecef_m=source.base_position_ecef_m)

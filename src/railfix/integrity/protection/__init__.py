@@ -12,7 +12,7 @@ From the model of `railfix.integrity.raim`, once for noise alone and once with f
 from railfix.integrity.protection.level import Cause, ProtectionLevel, along_track_level
 from railfix.integrity.protection.risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
 from railfix.integrity.protection.sbas import LevelsInSpace, levels_in_space, sbas_level
-from railfix.integrity.protection.status import Status, availability
+from railfix.integrity.protection.status import LevelStatus, availability
 
 __all__ = [
     "K_H_NPA",
@@ -21,10 +21,10 @@ __all__ = [
     "MOST_EXCLUDED",
     "SATELLITE_PRIOR",
     "Cause",
+    "LevelStatus",
     "LevelsInSpace",
     "ProtectionLevel",
     "RiskBudget",
-    "Status",
     "along_track_level",
     "availability",
     "k_factor",

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Codes
 
 
-class Status(IntEnum):
+class LevelStatus(IntEnum):
     """Of an epoch, against an alarm limit."""
 
     #: The level is within the alarm limit.
@@ -22,7 +22,7 @@ class Status(IntEnum):
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """Status of epochs.
+    """LevelStatus of epochs.
 
     Parameters
     ----------
@@ -35,10 +35,10 @@ def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayL
     Returns
     -------
     ndarray of int8, shape (T,)
-        `Status`.
+        `LevelStatus`.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
     level = np.asarray(level_m, dtype=np.float64)
-    status = np.where(level <= alarm_limit_m, Status.AVAILABLE, Status.UNAVAILABLE)
-    return np.where(~np.isnan(level) & ~np.asarray(consistent), Status.ALARM, status).astype(np.int8)
+    status = np.where(level <= alarm_limit_m, LevelStatus.AVAILABLE, LevelStatus.UNAVAILABLE)
+    return np.where(~np.isnan(level) & ~np.asarray(consistent), LevelStatus.ALARM, status).astype(np.int8)

@@ -1,0 +1,142 @@
+"""Samples of the sensors on board, as frozen arrays: inputs beside the observations of the antennas.
+
+Axis 0 is the sample. Times are GPS time, not falling; a value that was not measured is NaN. The columns are those of
+the tables that `railfix simulate` writes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Strings, read_only
+
+
+def _times() -> Datetimes:
+    return np.empty(0, dtype="datetime64[ns]")
+
+
+def _freeze(samples: Any) -> None:
+    """Make every array of a type read-only, and check that all have one row a sample."""
+    for item in fields(samples):
+        value = getattr(samples, item.name)
+        if len(value) != len(samples.time):
+            raise ValueError(f"{item.name} has {len(value)} samples, time has {len(samples.time)}")
+        object.__setattr__(samples, item.name, read_only(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TachometerPulses:
+    """Pulses of a tachometer, N of them.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        Instant of each pulse.
+    pulse : ndarray of int64, shape (N,)
+        Number of the pulse: a gap means lost pulses.
+    direction : ndarray of int64, shape (N,)
+        1 when the vehicle moves forward, -1 backward, 0 where the sensor does not report it.
+    """
+
+    time: Datetimes = field(default_factory=_times)
+    pulse: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    direction: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InertialSamples:
+    """Samples of an inertial unit fixed to the vehicle body, N of them.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+    force_mps2 : ndarray, shape (N, 3) [m/s^2]
+        Specific force forward, right, down; about (0, 0, -9.8) at rest.
+    rate_radps : ndarray, shape (N, 3) [rad/s]
+        Angular rate about forward (roll), right (pitch), down (yaw).
+    """
+
+    time: Datetimes = field(default_factory=_times)
+    force_mps2: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    rate_radps: Floats = field(default_factory=lambda: np.empty((0, 3)))
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadarSpeeds:
+    """Speeds over ground of a Doppler radar, N of them.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+    speed_mps : ndarray, shape (N,) [m/s]
+        Forward positive; NaN without a signal.
+    """
+
+    time: Datetimes = field(default_factory=_times)
+    speed_mps: Floats = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationRanges:
+    """Two-way ranges to radio stations beside the track, N of them.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+    station : ndarray of str, shape (N,)
+        Name of the station on the ground.
+    range_m : ndarray, shape (N,) [m]
+    sigma_m : ndarray, shape (N,) [m]
+        Standard deviation that the device reports; NaN where it reports none.
+    """
+
+    time: Datetimes = field(default_factory=_times)
+    station: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
+    range_m: Floats = field(default_factory=lambda: np.empty(0))
+    sigma_m: Floats = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorSamples:
+    """Samples of all sensors on board received since the chunk before.
+
+    Attributes
+    ----------
+    tachometer : TachometerPulses
+    inertial : InertialSamples
+    radar : RadarSpeeds
+    ranging : StationRanges
+        Each without rows where the sensor is absent or has sent nothing.
+    """
+
+    tachometer: TachometerPulses = field(default_factory=TachometerPulses)
+    inertial: InertialSamples = field(default_factory=InertialSamples)
+    radar: RadarSpeeds = field(default_factory=RadarSpeeds)
+    ranging: StationRanges = field(default_factory=StationRanges)

@@ -1,0 +1,85 @@
+"""Result of one antenna: every intermediate value side by side, coordinates where the status allows them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
+from railfix.pipeline.config import Config
+from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.protection_levels import judged
+from railfix.pipeline.reason_table import reason_of_all_channels, satellites_rejected
+from railfix.pipeline.results import AntennaResult
+from railfix.pipeline.solution import Solution
+from railfix.track.trajectory import Trajectory
+
+
+def with_coordinates(config: Config) -> Masks:
+    """Return which statuses come with coordinates, by the number of the status."""
+    dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
+    return np.array([status in POSITIONED and status not in dropped for status in sorted(Status)])
+
+
+def antenna_result(
+    corrected: CorrectedRanges, trajectory: Trajectory, solution: Solution, config: Config
+) -> AntennaResult:
+    """Return the result of one antenna."""
+    obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
+    has = with_coordinates(config)[solution.status]
+    arc = np.where(has, solution.arc_m, np.nan)
+    ecef = trajectory.at_arc(arc)
+    latitude, longitude, height = geodetic_from_ecef(ecef)
+    nearest, offset = trajectory.nearest(point.ecef_m)
+    reason = reason_of_all_channels(corrected)
+    protection = solution.protection
+
+    def on_all_channels(values: Floats) -> Floats:
+        full = np.full(obs.code_m.shape, np.nan)
+        full[:, corrected.columns] = values
+        return full
+
+    return AntennaResult(
+        time=obs.time,
+        satellite=obs.satellite,
+        signal=obs.signal,
+        status=solution.status,
+        chainage_m=trajectory.chainage_at(arc),
+        kilometrage_m=trajectory.kilometrage_at(arc),
+        arc_m=arc,
+        along_sigma_m=np.where(has, solution.along_sigma_m, np.nan),
+        own_sigma_m=solution.own_sigma_m,
+        noise_scale=solution.noise_scale,
+        ecef_m=ecef,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        n_used=np.count_nonzero(corrected.reason == 0, axis=1),
+        n_rejected=satellites_rejected(corrected.channels.member, reason),
+        conventional_ecef_m=point.ecef_m,
+        conventional_arc_m=nearest,
+        conventional_chainage_m=trajectory.chainage_at(nearest),
+        conventional_offset_m=offset,
+        reason=reason,
+        elevation_deg=on_all_channels(corrected.elevation_deg),
+        azimuth_deg=on_all_channels(corrected.azimuth_deg),
+        cn0_dbhz=obs.cn0_dbhz,
+        sigma_m=on_all_channels(corrected.sigma_m),
+        corrected_code_m=on_all_channels(corrected.corrected_code_m),
+        residual_m=on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
+        satellites=corrected.satellites,
+        columns=corrected.columns,
+        screens=corrected.screens,
+        single_point=point,
+        section=solution.place.section,
+        constrained=constrained,
+        phase=solution.phase,
+        raim=replace(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
+        protection=None if protection is None else judged(protection, solution.status, has, config),
+        clocks=corrected.clocks,
+        clock_offset_m=solution.ties.offset_m,
+        clock_offset_sigma_m=solution.ties.sigma_m,
+    )

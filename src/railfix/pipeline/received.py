@@ -1,0 +1,198 @@
+"""Navigation records and SBAS messages received so far, and the corrections made from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import SettingsError
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.pipeline.config import Config
+from railfix.ranges.sbas import SbasCorrections, SbasMessages, SbasState
+
+Records = TypeVar("Records", KeplerRecords, GlonassRecords)
+
+#: Types of the elements of record tables, by the name of their array type (`railfix.core.arrays`).
+_ELEMENTS: Final[dict[str, Any]] = {
+    "Strings": "<U3",
+    "Datetimes": "datetime64[ns]",
+    "Floats": np.float64,
+    "Integers": np.int64,
+}
+#: Fields that tell two Keplerian records of one satellite apart.
+_KEPLER_KEY: Final = ("satellite", "message", "toe", "toc", "iode", "iodc", "health")
+_GLONASS_KEY: Final = ("satellite", "toe", "health")
+
+
+def _no_records(kind: type[Records]) -> Records:
+    """Return a record table without rows; vectors of GLONASS have shape (0, 3)."""
+    arrays = {
+        item.name: np.empty((0, 3) if "_ecef_" in item.name else 0, dtype=_ELEMENTS[str(item.type)])
+        for item in fields(kind)
+    }
+    return kind(**arrays)
+
+
+def no_navigation() -> Navigation:
+    """Return navigation data without records: what is known before the first message."""
+    return Navigation(kepler=_no_records(KeplerRecords), glonass=_no_records(GlonassRecords))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Received:
+    """Everything received beside the observations, up to the current epoch.
+
+    Attributes
+    ----------
+    navigation : Navigation
+    messages : SbasState or None
+        SBAS messages of the GEO in use; None: SBAS is not used.
+    sbas : SbasCorrections or None
+        Corrections by these messages.
+    klobuchar : ndarray, shape (8,), or None
+        Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS.
+    notes : tuple of str
+        Data that were asked for, and the data used in their place, one sentence each.
+    """
+
+    navigation: Navigation = field(default_factory=no_navigation)
+    messages: SbasState | None = None
+    sbas: SbasCorrections | None = None
+    klobuchar: Floats | None = None
+    notes: tuple[str, ...] = ()
+
+
+def known_from_start(
+    config: Config, *, navigation: Navigation | None = None, messages: SbasMessages | None = None
+) -> Received:
+    """Return what is known before the first epoch: all of it where files are read, nothing where a train runs.
+
+    Parameters
+    ----------
+    config : Config
+    navigation : Navigation, optional
+    messages : SbasMessages, optional
+        Recorded messages, of which the GEO is chosen if the settings ask for the best.
+
+    Raises
+    ------
+    SettingsError
+        SBAS and precise ephemerides together, or no message of the GEO asked for.
+    """
+    received = _with_notes(Received(navigation=navigation or no_navigation()), config)
+    if messages is None:
+        return received
+    try:
+        sbas = SbasCorrections.from_log(messages, prn=config.sbas_prn, limits=config.sbas_limits)
+    except ValueError as error:
+        raise SettingsError(f"sbas_prn = {config.sbas_prn}: {error}") from None
+    state = SbasState(prn=sbas.prn, limits=config.sbas_limits).received(messages)
+    return _with_notes(replace(received, messages=state, sbas=sbas), config)
+
+
+def receive(
+    before: Received,
+    config: Config,
+    time: np.datetime64,
+    *,
+    navigation: Navigation | None = None,
+    messages: SbasMessages | None = None,
+) -> Received:
+    """Return what is known after new navigation records and SBAS messages have arrived.
+
+    Parameters
+    ----------
+    before : Received
+    config : Config
+    time : datetime64[ns]
+        Of the next epoch, NaT where there is none; SBAS messages that neither it nor a later one can use are dropped.
+    navigation : Navigation, optional
+        New records, ionospheric coefficients or precise ephemerides. Records received again are dropped; newer
+        coefficients and precise ephemerides replace the older ones.
+    messages : SbasMessages, optional
+        New messages; without any so far, every satellite is rejected until the corrections are complete.
+
+    Returns
+    -------
+    Received
+        `before` itself where nothing new has arrived.
+
+    Raises
+    ------
+    SettingsError
+        SBAS and precise ephemerides together, or messages while the settings leave the GEO open.
+    """
+    if navigation is None and messages is None:
+        return before
+    after = before if navigation is None else replace(before, navigation=_merged(before.navigation, navigation))
+    if messages is not None:
+        state = before.messages
+        if state is None:
+            if config.sbas_prn == "best":
+                raise SettingsError(
+                    "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN"
+                )
+            state = SbasState(prn=config.sbas_prn, limits=config.sbas_limits)
+        state = state.received(messages)
+        state = state if np.isnat(time) else state.kept_from(time)
+        after = replace(after, messages=state, sbas=state.corrections)
+    return _with_notes(after, config)
+
+
+def _with_notes(received: Received, config: Config) -> Received:
+    """Return the data with the ionospheric coefficients in use and notes on what replaces what was asked for."""
+    if received.sbas is not None and received.navigation.precise is not None:
+        raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
+    klobuchar, notes = _ionosphere(received, config)
+    return replace(
+        received, klobuchar=klobuchar, notes=(*notes, *(() if received.sbas is None else received.sbas.notes))
+    )
+
+
+def _merged(old: Navigation, new: Navigation) -> Navigation:
+    """Return old and new navigation data together."""
+    return Navigation(
+        kepler=_united(old.kepler, new.kepler, _KEPLER_KEY),
+        glonass=_united(old.glonass, new.glonass, _GLONASS_KEY),
+        klobuchar={**old.klobuchar, **new.klobuchar},
+        leap_seconds=old.leap_seconds if new.leap_seconds is None else new.leap_seconds,
+        passed_over={
+            kind: old.passed_over.get(kind, 0) + new.passed_over.get(kind, 0)
+            for kind in {**old.passed_over, **new.passed_over}
+        },
+        notes=tuple(dict.fromkeys((*old.notes, *new.notes))),
+        precise=old.precise if new.precise is None else new.precise,
+        sources=tuple(dict.fromkeys((*old.sources, *new.sources))),
+    )
+
+
+def _united(old: Records, new: Records, key: tuple[str, ...]) -> Records:
+    """Return the rows of two tables, those of the second without the ones that the first has."""
+    known = set(zip(*(getattr(old, name).tolist() for name in key), strict=True))
+    rows = zip(*(getattr(new, name).tolist() for name in key), strict=True)
+    fresh = np.array([row not in known for row in rows], dtype=bool)
+    if not fresh.any():
+        return old
+    return replace(
+        old,
+        **{
+            item.name: np.concatenate([getattr(old, item.name), getattr(new, item.name)[fresh]]) for item in fields(old)
+        },
+    )
+
+
+def _ionosphere(received: Received, config: Config) -> tuple[Floats | None, tuple[str, ...]]:
+    """Return the Klobuchar coefficients in use, and notes where they are not those asked for."""
+    if received.sbas is not None:
+        asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
+        return None, (f"{asked} asked for, those of SBAS used in their place",)
+    if config.ionosphere == "off":
+        return None, ()
+    for letter, name in (("G", "GPS"), ("J", "QZSS"), ("C", "BeiDou")):
+        if letter in received.navigation.klobuchar:
+            note = f"ionosphere: klobuchar asked for, coefficients broadcast by {name} used"
+            return received.navigation.klobuchar[letter], (() if letter == "G" else (note,))
+    return None, ("ionosphere: klobuchar asked for, no coefficients received, delay left uncorrected",)

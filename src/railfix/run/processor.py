@@ -1,0 +1,43 @@
+"""Epoch processor of a run: the settings' files are read here, the processor opens none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from railfix.core.errors import SettingsError
+from railfix.gnss.navigation import Navigation
+from railfix.pipeline.config import Config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.ranges.cn0_curve import read_cn0_curve
+from railfix.ranges.error_model import read_error_model
+from railfix.ranges.sbas import read_sbas
+from railfix.track.trajectory import Trajectory
+
+
+def processor_of(config: Config, navigation: Navigation, trajectories: Mapping[str, Trajectory]) -> EpochProcessor:
+    """Return a processor with all navigation records and the contents of the files that the settings name.
+
+    Parameters
+    ----------
+    config : Config
+    navigation : Navigation
+    trajectories : mapping of str to Trajectory
+        By antenna.
+
+    Raises
+    ------
+    InputFileError
+        A file that the settings name is missing or not what it should be.
+    SettingsError
+        SBAS and precise ephemerides together, or no SBAS message of the GEO asked for.
+    """
+    if config.sbas and navigation.precise is not None:
+        raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
+    return EpochProcessor(
+        config,
+        trajectories,
+        navigation=navigation,
+        messages=read_sbas(list(config.sbas)) if config.sbas else None,
+        error_model=None if config.error_model is None else read_error_model(config.error_model),
+        cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
+    )
