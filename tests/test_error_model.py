@@ -13,11 +13,13 @@ from railfix.core.errors import InputFileError
 from railfix.ranges.error_model import (
     POOLED,
     BinStatistics,
+    Conditions,
     ErrorBins,
     ErrorModel,
     ErrorModelFit,
     ErrorModelSource,
     ErrorSamples,
+    condition_differences,
     fit_bins,
     gaussian_overbound,
     read_error_model,
@@ -136,6 +138,7 @@ def made_model() -> ErrorModel:
         before=fit_bins(samples, np.ones(n, dtype=bool), fit),
         after=fit_bins(samples, samples.used, fit),
         covers="local",
+        conditions=CONDITIONS,
         source=ErrorModelSource(runs=('a "run"',), base="3034", epochs=7, files=(("x.obs", "00ff"),)),
     )
 
@@ -146,7 +149,7 @@ def test_the_file_gives_the_model_back(tmp_path: Path) -> None:
     again = read_error_model(tmp_path / "model.toml")
     assert again.bins == model.bins
     assert again.covers == model.covers
-    assert again.source == model.source
+    assert (again.source, again.conditions) == (model.source, CONDITIONS)
     for part in ("before", "after"):
         for item in fields(BinStatistics):
             np.testing.assert_allclose(
@@ -167,22 +170,70 @@ def test_what_no_bin_knows_is_nan() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("railfix error model 1", "something else", "is no error model"),
-        ('covers = "local"', 'covers = "all"', "covers is 'all'"),
-        ("sectors = 4", "sectors = 3", "must have 75 rows"),
-        ("sectors = 4", 'sectors = "x"', r"\[bins\]"),
-        ("[before]", "[early]", "must have exactly the entries"),
-        ('["count", ', '["number", ', "must have columns"),
-        ("rows = [\n  [", "rows = [\n  [-", "must not be negative"),
-        ("rows = [\n  [", "rows = [\n  [true, ", "must be 7 numbers"),
+        (
+            "railfix error model 2",
+            "something else",
+            "is not an error model: format = 'railfix error model 2' was expected",
+        ),
+        ("railfix error model 2", "railfix error model 1", "of format 'railfix error model 1', .* make it anew"),
+        ('covers = "local"', 'covers = "all"', "entry covers: Input should be 'local' or"),
+        ("sectors = 4", "sectors = 3", "entry before.count: 75 values were expected, one a bin, got 100"),
+        ("sectors = 4", "sectors = 0", "entry bins.sectors: Input should be greater"),
+        ("15.0,", "95.0,", "entry bins.elevation_deg"),
+        ("[before]", "[early]", "unknown entry early; known are after, before"),
+        ("[before]\ncount = [", "[before]\nnumber = [", "unknown entry before.number; known are bias_m"),
+        ("[before]\ncount = [\n    ", "[before]\ncount = [\n    -", "entry before.count.0: Input should be greater"),
+        ("sigma_m = [\n    ", "sigma_m = [\n    -1.0,\n    ", "entry before.sigma_m"),
+        ('codes = "raw"', 'codes = "cooked"', "entry conditions.codes: Input should be 'raw' or 'smoothed'"),
     ],
 )
 def test_a_broken_file_is_refused_with_the_place(tmp_path: Path, old: str, new: str, said: str) -> None:
     path = tmp_path / "model.toml"
     write_error_model(made_model(), path)
-    path.write_text(path.read_text().replace(old, new, 1))
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputFileError, match=said):
         read_error_model(path)
+
+
+def test_a_negative_bound_is_rejected(tmp_path: Path) -> None:
+    model = made_model()
+    bad = replace(model, after=replace(model.after, bound_sigma_m=-model.after.bound_sigma_m))
+    write_error_model(bad, tmp_path / "model.toml")
+    with pytest.raises(InputFileError, match=r"after\.bound_sigma_m: must not be negative, got -"):
+        read_error_model(tmp_path / "model.toml")
+
+
+CONDITIONS = Conditions(
+    systems=("G", "E"),
+    signals={"G": ("1C",), "E": ("1C", "1X")},
+    screens=("elevation", "doppler"),
+    elevation_mask_deg=15.0,
+    codes="raw",
+    ionosphere="klobuchar",
+    troposphere="saastamoinen",
+)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, ()),
+        ({"systems": ("E", "G"), "screens": ("doppler", "elevation")}, ()),
+        ({"systems": ("G",)}, ("systems: model G E, run G",)),
+        ({"signals": {"G": ("1C",), "E": ("1X", "1C")}}, ("signals: model E:1C/1X G:1C, run E:1X/1C G:1C",)),
+        ({"screens": ()}, ("screens: model elevation doppler, run none",)),
+        ({"elevation_mask_deg": 10.0}, ("elevation mask: model 15 deg, run 10 deg",)),
+        ({"codes": "smoothed"}, ("codes: model raw, run smoothed",)),
+        (
+            {"ionosphere": "sbas", "troposphere": "sbas"},
+            ("ionosphere: model klobuchar, run sbas", "troposphere: model saastamoinen, run sbas"),
+        ),
+    ],
+)
+def test_conditions_are_compared_field_by_field(changes: dict[str, object], expected: tuple[str, ...]) -> None:
+    assert condition_differences(CONDITIONS, CONDITIONS.replaced(**changes)) == expected
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -309,12 +309,12 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
 
 def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: Path) -> None:
     model, _ = error_model_from_runs([ModelInputs(run=done_run, reference=demo_files()["truth"])])
-    assert model.source.conditions == conditions_of(past_run(done_run).config)
+    assert model.conditions == conditions_of(past_run(done_run).config)
     write_error_model(model, tmp_path / "m.toml")
     same = processor_of(parse_config({"error_model": str(tmp_path / "m.toml")}), *_nothing())
     assert not any("other conditions" in note for note in same.notes)
     other = processor_of(parse_config({"error_model": str(tmp_path / "m.toml"), "screens": []}), *_nothing())
-    assert any("made under other conditions" in note for note in other.notes)
+    assert any("other conditions than this run's: screens: model elevation" in note for note in other.notes)
 
 
 def _nothing() -> tuple[Navigation, dict[str, Trajectory]]:

@@ -28,7 +28,7 @@ from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.ranges.error_model import ErrorModel
+from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
 from railfix.track.trajectory import Trajectory
@@ -116,11 +116,9 @@ class EpochProcessor:
                 lacking.append(
                     f"screen {name}: asked for, but without a vehicle file the spacing is unknown; not judged"
                 )
-        made = "" if self._error_model is None else self._error_model.source.conditions
-        if made and made != conditions_of(config := self.config):
-            lacking.append(
-                f"error model: made under other conditions ({made}) than this run's ({conditions_of(config)})"
-            )
+        conditions = None if self._error_model is None else self._error_model.conditions
+        if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
+            lacking.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
         if self.config.protection == "on" and self.config.carrier == "float":
             lacking.append("protection level: asked for, but there is none for positions from code and phase together")
         return tuple(lacking)
@@ -273,9 +271,14 @@ class EpochProcessor:
         return new_ranges, new_solutions
 
 
-def conditions_of(config: Config) -> str:
-    """Screens and corrections that the errors of the ranges depend on, in words: what an error model holds for."""
-    screens = ", ".join(config.screens) or "none"
-    corrections = "sbas" if config.sbas else f"ionosphere {config.ionosphere}, troposphere {config.troposphere}"
-    carrier = "codes smoothed" if config.carrier == "smoothed" else "codes as they are"
-    return f"screens {screens}; mask {config.elevation.mask_deg:g} deg; {corrections}; {carrier}"
+def conditions_of(config: Config) -> Conditions:
+    """Settings that the errors of the ranges depend on: the conditions of an error model made from such a run."""
+    return Conditions(
+        systems=config.systems,
+        signals={letter: config.signals.get(letter, ()) for letter in config.systems},
+        screens=config.screens,
+        elevation_mask_deg=config.elevation.mask_deg,
+        codes="smoothed" if config.carrier == "smoothed" else "raw",
+        ionosphere="sbas" if config.sbas else config.ionosphere,
+        troposphere="sbas" if config.sbas else config.troposphere,
+    )

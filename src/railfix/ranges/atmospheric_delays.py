@@ -1,4 +1,4 @@
-"""Delays of the air: where the satellites are seen from, and what the broadcast models say."""
+"""Ionospheric and tropospheric delays, and the directions they depend on."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Where the satellites stand from a place that is good to some hundred metres: T epochs by K channels.
+    """Directions to the satellites from a receiver position good to some hundred metres: T epochs by K channels.
 
     Attributes
     ----------
     receiver_ecef_m : ndarray, shape (T, 3) [m]
     latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
-        The same.
+        Geodetic coordinates of the receiver.
     satellite_ecef_m : ndarray, shape (T, K, 3) [m]
     elevation_deg, azimuth_deg : ndarray, shape (T, K)
     """
@@ -34,7 +34,7 @@ class SeenFrom:
 
     @classmethod
     def of(cls, receiver_ecef_m: Floats, satellite_ecef_m: Floats) -> SeenFrom:
-        """Work out directions and the place on the ellipsoid."""
+        """Directions and geodetic coordinates from Earth-fixed positions."""
         latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
         elevation, azimuth = elevation_azimuth(satellite_ecef_m, receiver_ecef_m)
         return cls(
@@ -50,16 +50,16 @@ class SeenFrom:
 
 @dataclass(frozen=True, kw_only=True)
 class Delays:
-    """Delays of T epochs by K channels, and what is unsure of the corrected codes besides local errors.
+    """Delays of T epochs by K channels, and the standard deviation of the errors that remain after them.
 
     Attributes
     ----------
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
         On the channel's own carrier; 0 where a model is off, NaN where SBAS has none.
     sigma_m : ndarray, shape (T, K) [m]
-        To be added to the local errors; 0 where nothing tells it, NaN where a part of it is unknown.
+        To be added to that of local errors; 0 without SBAS, NaN where a part of it is unknown.
     reason : ndarray of int64, shape (T, K)
-        Why a delay is unknown.
+        Flags of unknown delays (`railfix.core.reasons.Reason`).
     """
 
     ionosphere_m: Floats
@@ -76,7 +76,7 @@ def modelled_delays(
     klobuchar: Floats | None,
     troposphere: str,
 ) -> Delays:
-    """Delays by Klobuchar's and Saastamoinen's models, each where it is on.
+    """Delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off.
 
     Parameters
     ----------
@@ -88,13 +88,16 @@ def modelled_delays(
     troposphere : {"saastamoinen", "off"}
     """
     shape = seen.elevation_deg.shape
-    ionosphere, air = np.zeros((2, *shape))
+    ionosphere, troposphere_m = np.zeros((2, *shape))
     if klobuchar is not None:
         ionosphere = klobuchar_delay_m(
             time, seen.latitude_deg, seen.longitude_deg, seen.elevation_deg, seen.azimuth_deg, klobuchar, frequency_hz
         )
     if troposphere == "saastamoinen":
-        air = saastamoinen_delay_m(seen.latitude_deg, seen.height_m, seen.elevation_deg)
+        troposphere_m = saastamoinen_delay_m(seen.latitude_deg, seen.height_m, seen.elevation_deg)
     return Delays(
-        ionosphere_m=ionosphere, troposphere_m=air, sigma_m=np.zeros(shape), reason=np.zeros(shape, dtype=np.int64)
+        ionosphere_m=ionosphere,
+        troposphere_m=troposphere_m,
+        sigma_m=np.zeros(shape),
+        reason=np.zeros(shape, dtype=np.int64),
     )

@@ -1,7 +1,7 @@
-"""What the positioning does with SBAS: corrected satellites, delays with their sigma, reasons for refusals.
+"""SBAS corrections applied: satellites, delays with their sigma, reasons for rejection.
 
 The sum of the variances is that of DO-229D (J.2.2), without the airborne receiver's: ``sigma_flt^2 +
-sigma_UIRE^2 + sigma_tropo^2``. What multipath and receiver add on a railway comes from elsewhere (P1 2.4).
+sigma_UIRE^2 + sigma_tropo^2``. Multipath and receiver noise on a railway are added by the caller (P1 2.4).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ REASONS: Final = np.array([int(_REASON_OF[state]) for state in sorted(SatelliteS
 
 
 def corrected_satellites(states: SatelliteStates, fixes: SatelliteCorrections) -> tuple[SatelliteStates, Bits]:
-    """Satellites moved and their clocks set by long-term corrections, and the reasons of those without.
+    """Satellites with long-term corrections applied, and the reasons of those without corrections.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ def sbas_delays(
     seen: SeenFrom,
     frequency_hz: Floats,
 ) -> Delays:
-    """Delays of the air by the grid and by DO-229D's troposphere, and the sigma of the corrected codes.
+    """Delays from the SBAS grid and the troposphere of DO-229D, with the sigma of the corrected codes.
 
-    Worked out for the channels that have a correction at any of the epochs; the others are refused anyway.
+    Computed for the channels that have a correction at any of the epochs; the others are rejected.
 
     Parameters
     ----------

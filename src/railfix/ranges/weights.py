@@ -1,20 +1,20 @@
-"""From raw codes to ranges that can be fitted: signal choice, corrections, weights.
+"""Signal choice and standard deviations of corrected pseudoranges.
 
-``P = code + c dt_sv - c TGD - I - T`` (algorithm section of P1 2.2(2): the satellite clock, the
-ionosphere and the troposphere are predictable, the receiver clock is not), and the standard
-deviation that each P is given.
+A corrected pseudorange is ``P = code + c dt_sv - c TGD - I - T`` (P1 2.2(2): satellite clock, ionosphere and
+troposphere are predicted, the receiver clock is estimated).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP
+from railfix.core.settings import Settings
 
 #: A pseudorange lies between these [m]: nearest satellite less a receiver clock 33 ms off, GEO plus the same.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
@@ -22,8 +22,7 @@ PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
-@dataclass(frozen=True, kw_only=True)
-class CodeNoise:
+class CodeNoise(Settings):
     """Standard deviation of a corrected pseudorange from C/N0 and elevation.
 
     ``sigma^2 = floor_sigma_m^2 + (zenith_sigma_m * 10^((cn0_reference - min(C/N0, cn0_cap)) / 20) / sin(el))^2``
@@ -36,22 +35,16 @@ class CodeNoise:
         At the zenith and the reference C/N0. Only ratios matter to the position: what it is on a
         receiver is estimated from the residuals (`pipeline.AntennaState`).
     floor_sigma_m : float
-        What neither C/N0 nor elevation sees: satellite clock and orbit, ionosphere, troposphere left over.
+        Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
     cn0_reference_dbhz, cn0_cap_dbhz : float
-        Above the cap a stronger signal is not a better one.
+        A C/N0 above the cap counts as the cap.
     """
 
     model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"
-    zenith_sigma_m: float = 1.0
-    floor_sigma_m: float = 1.0
+    zenith_sigma_m: float = Field(default=1.0, gt=0)
+    floor_sigma_m: float = Field(default=1.0, ge=0)
     cn0_reference_dbhz: float = 45.0
     cn0_cap_dbhz: float = 50.0
-
-    def __post_init__(self) -> None:
-        if not self.zenith_sigma_m > 0.0:
-            raise ValueError(f"zenith_sigma_m must be positive, got {self.zenith_sigma_m}")
-        if not self.floor_sigma_m >= 0.0:
-            raise ValueError(f"floor_sigma_m must not be negative, got {self.floor_sigma_m}")
 
 
 def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | None = None) -> Floats:
@@ -68,9 +61,8 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 
-@dataclass(frozen=True, kw_only=True)
-class NominalErrors:
-    """Standard deviations of what a local error model does not cover, where no SBAS tells them: assumptions.
+class NominalErrors(Settings):
+    """Assumed standard deviations of the errors that a local error model does not cover, where SBAS gives none.
 
     ``sigma^2 = satellite^2 + (ionosphere F(el))^2 + (troposphere m(el))^2`` with the mappings of DO-229D
     (A.4.4.10.4 and A.4.2.4).
@@ -86,14 +78,9 @@ class NominalErrors:
         Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4: 0.12 m).
     """
 
-    satellite_sigma_m: float = 0.8
-    ionosphere_sigma_m: float = 1.0
-    troposphere_sigma_m: float = 0.12
-
-    def __post_init__(self) -> None:
-        for name in ("satellite_sigma_m", "ionosphere_sigma_m", "troposphere_sigma_m"):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+    satellite_sigma_m: float = Field(default=0.8, ge=0)
+    ionosphere_sigma_m: float = Field(default=1.0, ge=0)
+    troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats) -> Floats:
         """Standard deviation at elevations, any shape [m]; NaN below the horizon."""

@@ -16,7 +16,15 @@ from railfix.evaluate.range_errors.base_station import BaseStation, base_station
 from railfix.evaluate.range_errors.gather import GatherLimits, joined, range_errors
 from railfix.io.reference_log import read_reference
 from railfix.pipeline.processor import State, conditions_of
-from railfix.ranges.error_model import ErrorModel, ErrorModelFit, ErrorModelSource, ErrorSamples, fit_bins
+from railfix.ranges.error_model import (
+    Conditions,
+    ErrorModel,
+    ErrorModelFit,
+    ErrorModelSource,
+    ErrorSamples,
+    condition_differences,
+    fit_bins,
+)
 from railfix.run.chunks import aligned
 from railfix.run.driver import open_inputs
 from railfix.run.past import past_run
@@ -57,7 +65,7 @@ class _RunErrors:
     epochs: int
     files: Mapping[str, str]
     base: str
-    conditions: str
+    conditions: Conditions
 
 
 def error_model_from_runs(
@@ -103,9 +111,12 @@ def error_model_from_runs(
     if not any(len(part.error_m) for part in parts):
         raise MismatchError("no pseudorange error could be computed; do run, reference and station belong together?")
     samples = joined(parts)
-    conditions = sorted({run.conditions for run in runs})
-    if len(conditions) > 1:
-        raise MismatchError(f"the runs have different conditions: {' and '.join(conditions)}; make a model for each")
+    conditions = runs[0].conditions
+    for source, run in zip(inputs[1:], runs[1:], strict=True):
+        if differences := condition_differences(
+            conditions, run.conditions, names=(str(inputs[0].run), str(source.run))
+        ):
+            raise MismatchError(f"the runs have different conditions: {'; '.join(differences)}; make a model for each")
     times = [time for run in runs for time in run.times]
     files = {path: digest for run in runs for path, digest in run.files.items()}
     model = ErrorModel(
@@ -113,10 +124,10 @@ def error_model_from_runs(
         before=fit_bins(samples, np.ones(len(samples.error_m), dtype=np.bool_), fit),
         after=fit_bins(samples, samples.used, fit),
         covers="local" if with_base == {True} else "satellite_and_atmosphere",
+        conditions=conditions,
         source=ErrorModelSource(
             runs=tuple(str(source.run) for source in inputs),
             base=", ".join(dict.fromkeys(run.base for run in runs if run.base)),
-            conditions=conditions[0],
             epochs=sum(run.epochs for run in runs),
             start=str(min(times)),
             end=str(max(times)),

@@ -1,5 +1,6 @@
 """Errors of corrected pseudoranges along a railway, by direction and C/N0: fit, file, use (P1 7)."""
 
+from railfix.ranges.error_model.conditions import Conditions, condition_differences
 from railfix.ranges.error_model.file import read_error_model, write_error_model
 from railfix.ranges.error_model.fit import ErrorModelFit, ErrorSamples, fit_bins
 from railfix.ranges.error_model.marginal import SummaryRow, summary
@@ -9,6 +10,7 @@ from railfix.ranges.error_model.overbound import Overbound, gaussian_overbound
 __all__ = [
     "POOLED",
     "BinStatistics",
+    "Conditions",
     "ErrorBins",
     "ErrorModel",
     "ErrorModelFit",
@@ -16,6 +18,7 @@ __all__ = [
     "ErrorSamples",
     "Overbound",
     "SummaryRow",
+    "condition_differences",
     "fit_bins",
     "gaussian_overbound",
     "read_error_model",

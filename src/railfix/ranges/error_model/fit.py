@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.settings import Settings
 from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins
 from railfix.ranges.error_model.overbound import gaussian_overbound
 
 
-@dataclass(frozen=True, kw_only=True)
-class ErrorModelFit:
-    """How a model is fitted.
+class ErrorModelFit(Settings):
+    """Settings of the fit of an error model.
 
     Attributes
     ----------
@@ -26,13 +27,9 @@ class ErrorModelFit:
         seconds where a train stands.
     """
 
-    bins: ErrorBins = field(default_factory=ErrorBins)
-    least_blocks: int = 30
-    block_s: float = 30.0
-
-    def __post_init__(self) -> None:
-        if self.least_blocks < 1 or not self.block_s > 0.0:
-            raise ValueError("least_blocks must be at least 1 and block_s positive")
+    bins: ErrorBins = Field(default_factory=ErrorBins)
+    least_blocks: int = Field(default=30, ge=1)
+    block_s: float = Field(default=30.0, gt=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +43,7 @@ class ErrorSamples:
     block : ndarray of int, shape (n,)
         Number of the satellite's block of time: samples of one block are not independent.
     used : ndarray of bool, shape (n,)
-        What the screens let through.
+        Samples that passed every screen.
     """
 
     error_m: Floats
@@ -88,16 +85,16 @@ def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStat
     done: dict[tuple[int, int], tuple[float, ...]] = {}
     order = np.argsort(index, kind="stable")
     start = np.concatenate([[0], np.cumsum(count)])
-    for one in range(size):
+    for bin_ in range(size):
         for level, member in enumerate(sets):
-            key = (level, int(member[one]))
-            of_set = np.flatnonzero(member == member[one])
+            key = (level, int(member[bin_]))
+            of_set = np.flatnonzero(member == member[bin_])
             enough = len(np.unique(block[_rows(order, start, of_set)])) >= fit.least_blocks
             if not enough and level < len(sets) - 1:
                 continue
             if key not in done:
                 done[key] = _figures(error[_rows(order, start, of_set)])
-            figures[:, one], pooled[one] = done[key], level
+            figures[:, bin_], pooled[bin_] = done[key], level
             break
     bias, sigma, bound_bias, bound_sigma = (part.reshape(bins.shape) for part in figures)
     return BinStatistics(

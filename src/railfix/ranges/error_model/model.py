@@ -1,4 +1,4 @@
-"""Error model of pseudoranges on a railway: bias, sigma and overbound by where the satellite stands (P1 7).
+"""Error model of pseudoranges on a railway: bias, sigma and overbound by direction and C/N0 (P1 7).
 
 The bins are elevation, azimuth relative to the car body and C/N0. P1 names elevation and azimuth; C/N0
 is the strongest predictor of multipath on recordings, so it can be a third axis.
@@ -7,22 +7,22 @@ is the strongest predictor of multipath on recordings, so it can be a third axis
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, field_validator
 
 from railfix.core.arrays import Floats, Integers
+from railfix.core.settings import Settings
+from railfix.ranges.error_model.conditions import Conditions
 
-#: Errors that a model can contain.
-COVERS: Final = ("local", "satellite_and_atmosphere")
-#: What a bin was filled from.
+#: Sets of samples that the figures of a bin may come from.
 POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ErrorBins:
-    """Where a bin begins and ends.
+class ErrorBins(Settings):
+    """Edges of the bins.
 
     Attributes
     ----------
@@ -35,19 +35,16 @@ class ErrorBins:
         without C/N0 go into the lowest.
     """
 
-    elevation_deg: tuple[float, ...] = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)
-    sectors: int = 4
+    elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = (0.0, 15.0, 30.0, 45.0, 60.0, 90.0)
+    sectors: int = Field(default=4, ge=1)
     cn0_dbhz: tuple[float, ...] = (0.0, 30.0, 35.0, 40.0, 45.0, 60.0)
 
-    def __post_init__(self) -> None:
-        for name in ("elevation_deg", "cn0_dbhz"):
-            edges = getattr(self, name)
-            if len(edges) < 2 or not (np.diff(edges) > 0).all():
-                raise ValueError(f"{name} needs at least two rising edges, got {edges}")
-        if self.elevation_deg[0] < 0.0 or self.elevation_deg[-1] > 90.0:
-            raise ValueError(f"elevation_deg must lie within 0 to 90, got {self.elevation_deg}")
-        if self.sectors < 1:
-            raise ValueError(f"sectors must be at least 1, got {self.sectors}")
+    @field_validator("elevation_deg", "cn0_dbhz")
+    @classmethod
+    def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if len(value) < 2 or not (np.diff(value) > 0).all():
+            raise ValueError("at least two rising edges are needed")
+        return value
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -104,17 +101,14 @@ class BinStatistics:
     pooled: Integers
 
 
-@dataclass(frozen=True, kw_only=True)
-class ErrorModelSource:
-    """What a model was made from, for its file.
+class ErrorModelSource(Settings):
+    """Runs that a model was made from, for its file.
 
     Attributes
     ----------
     runs : tuple of str
     base : str
         Marker of the reference station.
-    conditions : str
-        Screens and corrections under which it holds (`pipeline.conditions_of`).
     epochs : int
     start, end, railfix_version : str
     files : tuple of (str, str)
@@ -123,8 +117,7 @@ class ErrorModelSource:
 
     runs: tuple[str, ...] = ()
     base: str = ""
-    conditions: str = ""
-    epochs: int = 0
+    epochs: int = Field(default=0, ge=0)
     start: str = ""
     end: str = ""
     railfix_version: str = ""
@@ -144,6 +137,8 @@ class ErrorModel:
     covers : {"local", "satellite_and_atmosphere"}
         "local": multipath and receiver noise alone (a reference station took the rest away).
         "satellite_and_atmosphere": these, too, as they were on those days.
+    conditions : Conditions or None
+        Settings under which it holds; None: unknown, compared with nothing.
     source : ErrorModelSource
     """
 
@@ -151,6 +146,7 @@ class ErrorModel:
     before: BinStatistics
     after: BinStatistics
     covers: Literal["local", "satellite_and_atmosphere"]
+    conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
 
     def at(
