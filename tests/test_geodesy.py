@@ -42,7 +42,8 @@ def test_there_and_back(latitude: float, longitude: float, height: float) -> Non
     ecef = ecef_from_geodetic(latitude, longitude, height)
     again = ecef_from_geodetic(*geodetic_from_ecef(ecef))
     np.testing.assert_allclose(again, ecef, atol=1e-6)
-    assert geodetic_from_ecef(ecef)[2] == pytest.approx(height, abs=1e-6)
+    # PROJ divides by the cosine of the latitude: near a pole its height has lost a micrometre
+    assert geodetic_from_ecef(ecef)[2] == pytest.approx(height, abs=1e-5)
 
 
 def test_shapes_and_absent_points() -> None:

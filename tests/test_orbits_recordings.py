@@ -15,7 +15,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import satellite_states
 from railfix.gnss.orbits.kepler import Orbits, kepler_state
-from railfix.gnss.orbits.selection import validity_s
+from railfix.gnss.orbits.record_selection import validity_s
 from railfix.io.rinex import read_navigation
 
 FILES = (

@@ -13,7 +13,7 @@ from orbits_made import HOUR, TOE, kepler, navigation
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states
-from railfix.gnss.orbits.selection import make_lookup
+from railfix.gnss.orbits.record_selection import make_lookup
 from railfix.gnss.orbits.signal_health import group_delay_s, unhealthy
 
 CODE = 23_000_000.0

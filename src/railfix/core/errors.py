@@ -1,7 +1,7 @@
 """The errors that railfix raises, and the exit code of the command line for each.
 
-Every error is one sentence that names the file (and line or field), what was expected and what
-to do. Array functions raise `ValueError` when their contract is violated.
+Every message is one sentence: the file (and line or field), what was expected, and what to do.
+Array functions raise `ValueError` when their contract is violated.
 
 ==== =====================================================================
 code meaning
@@ -11,7 +11,7 @@ code meaning
 2    the command line was misused (unknown option, missing argument)
 3    an input file is missing, unreadable, or not what it should be
 4    a setting is misspelt, out of range, or contradicts another
-5    the inputs are readable but do not belong together (other day, other place)
+5    the inputs are readable but do not match each other (other day, other place)
 6    the track map was checked and has errors
 7    the run ended without a single position
 8    the output cannot be written
@@ -25,7 +25,7 @@ from typing import ClassVar
 
 
 class RailfixError(Exception):
-    """Base of every error that a user of railfix can cause and mend.
+    """Base of all errors that a user can correct: input files, settings, outputs.
 
     Attributes
     ----------
@@ -44,9 +44,9 @@ class InputFileError(RailfixError):
     path : str or path-like
         The file.
     message : str
-        What is wrong, what was expected, what to do; no trailing full stop.
+        What is wrong, what was expected, what to do; without a full stop at the end.
     line : int, optional
-        1-based line number where it was found.
+        1-based line number of the fault.
     """
 
     exit_code = 3
@@ -66,7 +66,7 @@ class SettingsError(RailfixError):
 
 
 class MismatchError(RailfixError):
-    """Inputs that are each readable but do not belong together."""
+    """Inputs are readable but do not match each other (another day, another place)."""
 
     exit_code = 5
 

@@ -1,7 +1,7 @@
-"""Files as they come from receivers and archives: plain, gzip, compress (.Z), Hatanaka inside any.
+"""Files from receivers and archives: plain, gzip, compress (.Z), each also Hatanaka-compressed.
 
-What a file is, is told by its first bytes and never by its name. Memory stays bounded whatever
-the size of the file:
+The first bytes of a file decide how it is read, never its name. Memory is bounded whatever the size
+of the file:
 
 =============== ==================================================================================
 plain, gzip     streamed block by block
@@ -41,7 +41,7 @@ BrokenLines = Literal["stop", "count"]
 
 _GZIP: Final = b"\x1f\x8b"
 _COMPRESS: Final = b"\x1f\x9d"
-#: First bytes of archives that are not read, and what to call them.
+#: First bytes of archives that are not read, and their names in messages.
 _ARCHIVES: Final = {
     b"PK\x03\x04": "a zip archive",
     b"BZh": "a bzip2 archive",
@@ -54,7 +54,7 @@ _COPY_BYTES: Final = 1 << 20
 
 
 class ByteStream(io.BufferedIOBase):
-    """Decompressed bytes of one file, to be read once, front to back.
+    """Stream of the decompressed bytes of one file.
 
     A context manager. `read` raises `InputFileError` where the compressed data end early or are
     damaged.
@@ -73,7 +73,7 @@ class ByteStream(io.BufferedIOBase):
 
     @property
     def share(self) -> float:
-        """Part of the bytes on disk that has been read, 0 to 1."""
+        """Fraction of the bytes on disk that has been read, 0 to 1."""
         number = self._disk.fileno()
         return os.lseek(number, 0, os.SEEK_CUR) / max(os.fstat(number).st_size, 1)
 
@@ -100,7 +100,7 @@ class ByteStream(io.BufferedIOBase):
 
 
 class _HatanakaStream(ByteStream):
-    """Output of the Hatanaka decoder; its verdict is read where its output ends."""
+    """Output of the Hatanaka decoder; its exit code is checked at the end of the output."""
 
     def __init__(
         self, path: FilePath, process: subprocess.Popen[bytes], log: IO[bytes], held: ExitStack, *, disk: IO[bytes]
@@ -116,10 +116,10 @@ class _HatanakaStream(ByteStream):
         if at_end and not self._done:
             self._done = True
             if self._process.wait() != 0:
-                raise InputFileError(self.path, self._complaint())
+                raise InputFileError(self.path, self._error_text())
         return block
 
-    def _complaint(self) -> str:
+    def _error_text(self) -> str:
         self._log.seek(0)
         text = self._log.read().decode("ascii", "replace")
         what = re.search(r"(?:ERROR|WARNING)[^:]*:?\s*([^\n]+)", text)
@@ -153,7 +153,7 @@ def open_stream(path: FilePath) -> ByteStream:
         source = held.enter_context(closing(_open_plain(path)))
         head = source.read(_HEAD_BYTES)
         source.seek(0)
-        _refuse_archive(path, head)
+        _reject_archive(path, head)
         if head.startswith(_GZIP):
             source = held.enter_context(closing(cast("IO[bytes]", gzip.GzipFile(fileobj=source, mode="rb"))))
             with ByteStream(path, source, ExitStack()) as unpacked:
@@ -163,14 +163,14 @@ def open_stream(path: FilePath) -> ByteStream:
             source = _unpack_compress(path, source, held)
             head = source.read(_HEAD_BYTES)
             source.seek(0)
-        _refuse_content(path, head)
+        _reject_content(path, head)
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
         return ByteStream(path, source, held.pop_all())
 
 
 def read_bytes(path: FilePath) -> bytes:
-    """The whole decompressed content of a file; for small files (navigation, SP3).
+    """Read the decompressed content of a file; for small files (navigation, SP3).
 
     Raises
     ------
@@ -182,7 +182,7 @@ def read_bytes(path: FilePath) -> bytes:
 
 
 def read_text(path: FilePath) -> str:
-    """The whole decompressed content of a small UTF-8 file, without a byte order mark.
+    """Read the decompressed content of a small UTF-8 file, without a byte order mark.
 
     Raises
     ------
@@ -198,7 +198,7 @@ def read_text(path: FilePath) -> str:
 
 
 def ending(path: FilePath) -> str:
-    """Ending of a file's name in lower case, that of a packed file without ``.gz`` or ``.Z``.
+    """Return the ending of a file name in lower case, ignoring ``.gz`` and ``.Z``.
 
     >>> ending("Line.GeoJSON.gz")
     '.geojson'
@@ -208,7 +208,7 @@ def ending(path: FilePath) -> str:
 
 
 def file_sha256(path: FilePath) -> str:
-    """SHA-256 of a file as it is on disk, as hexadecimal digits.
+    """Compute the SHA-256 of a file on disk, as hexadecimal digits.
 
     Raises
     ------
@@ -223,7 +223,7 @@ def file_sha256(path: FilePath) -> str:
 
 
 def fingerprint(kind: str, path: FilePath) -> dict[str, Any]:
-    """What a file is, its path, size [bytes] and SHA-256, as plain values for JSON.
+    """Describe an input file by kind, path, size [bytes] and SHA-256, as plain values for JSON.
 
     Raises
     ------
@@ -235,19 +235,19 @@ def fingerprint(kind: str, path: FilePath) -> dict[str, Any]:
 
 
 def toml_string(text: str) -> str:
-    """A text as TOML writes it: a JSON string, but for the control character that only TOML escapes."""
+    """Quote a text for TOML: as a JSON string, with the control character that only TOML escapes."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
-    """Write a text file under a temporary name, then rename it: it appears whole or not at all.
+    """Write a text file under a temporary name, then rename it: a failed write leaves no file.
 
     Parameters
     ----------
     path : path
     text : str
     what : str
-        What it is, for the message.
+        Kind of file, for the message.
 
     Raises
     ------
@@ -266,7 +266,7 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
 
 
 def read_text_lines(path: FilePath) -> list[str]:
-    """The whole decompressed content of a small file as lines without their ends (LF or CR LF).
+    """Read the lines of a small, possibly compressed file, without line ends (LF or CR LF).
 
     Bytes outside ASCII (names in comments) are read as Latin-1, so that columns stay columns.
 
@@ -293,13 +293,13 @@ def _open_plain(path: FilePath) -> IO[bytes]:
         raise InputFileError(path, f"cannot be opened ({error.strerror or error})") from error
 
 
-def _refuse_archive(path: FilePath, head: bytes) -> None:
+def _reject_archive(path: FilePath, head: bytes) -> None:
     for magic, name in _ARCHIVES.items():
         if head.startswith(magic):
             raise InputFileError(path, f"is {name}; unpack it first (.gz and .Z are read as they are)")
 
 
-def _refuse_content(path: FilePath, head: bytes) -> None:
+def _reject_content(path: FilePath, head: bytes) -> None:
     if not head.strip():
         raise InputFileError(path, "is empty")
     if b"\0" in head:
@@ -321,7 +321,7 @@ def _unpack_compress(path: FilePath, source: IO[bytes], held: ExitStack) -> IO[b
 
 
 def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> ByteStream:
-    """Start the decoder on an open source; the caller's `held` is taken over."""
+    """Start the decoder on an open source and take over the resources in `held`."""
     if isinstance(source, gzip.GzipFile):
         spool = _temporary(held)
         with ByteStream(path, source, ExitStack()) as unpacked:

@@ -22,7 +22,7 @@ def _to_geodetic() -> Transformer:
 
 
 def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Latitude, longitude and ellipsoidal height of ECEF points.
+    """Convert ECEF to latitude, longitude and ellipsoidal height.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def geodetic_from_ecef(ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> Floats:
-    """ECEF points of geodetic coordinates on WGS 84.
+    """Convert geodetic coordinates on WGS 84 to ECEF.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
 
 
 def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
-    """Unit vectors east, north, up in ECEF.
+    """Compute the unit vectors east, north, up in ECEF.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
 
 
 def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Elevation and azimuth of satellites from receivers.
+    """Compute elevation and azimuth of satellites at receivers.
 
     Parameters
     ----------
@@ -112,12 +112,12 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
 
 
 def range_with_rotation(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Range that a signal travels while the Earth turns, and the line of sight.
+    """Compute the geometric range with the Sagnac correction, and the line of sight.
 
     The satellite is given in the Earth-fixed frame of its transmit time. To first order in the
     angle turned during the flight (6e-6 rad), rotating it into the frame of reception adds
-    ``omega / c * (s_x r_y - s_y r_x)`` to the distance (Sagnac; IS-GPS-200, 20.3.3.4.3.4); what
-    is left out is below 0.2 mm.
+    ``omega / c * (s_x r_y - s_y r_x)`` to the distance (Sagnac; IS-GPS-200, 20.3.3.4.3.4); the
+    neglected terms are below 0.2 mm.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def range_with_rotation(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tu
     range_m : ndarray, shape (...)
     line_of_sight : ndarray, shape (..., 3)
         Unit vector from receiver to satellite `u`, such that d(range)/d(receiver) = -u (the
-        Sagnac term's own gradient, 6e-6, is left out).
+        gradient of the Sagnac term, 6e-6, is neglected).
     """
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Why an observation was not used, and what became of an epoch.
+"""Rejection reasons of observations and solution status of epochs.
 
-A reason is a bit; an observation carries all that applied, 0 means that it was used. A status is
-one word an epoch and antenna, decided once, from numbers.
+Each reason is one bit; an observation carries the bits of all reasons that apply, 0 means that it was
+used. Each epoch of an antenna has exactly one status.
 """
 
 from __future__ import annotations
@@ -16,89 +16,89 @@ from railfix.core.arrays import Integers, Strings
 
 
 class Reason(IntFlag):
-    """Why an observation (epoch, channel) was not used. 0 = used."""
+    """Reasons for rejecting an observation (epoch, channel); 0 = used."""
 
     USED = 0
     #: No pseudorange at this epoch.
     NOT_OBSERVED = 1 << 0
-    #: The pseudorange cannot be one (not between 10 000 and 100 000 km).
+    #: Implausible pseudorange: outside 10 000 to 100 000 km.
     IMPLAUSIBLE_CODE = 1 << 1
-    #: The constellation was not asked for.
+    #: The constellation is not selected.
     SYSTEM_NOT_SELECTED = 1 << 2
-    #: Another signal of the same satellite was taken.
+    #: Another signal of the same satellite was selected.
     OTHER_SIGNAL_TAKEN = 1 << 3
-    #: No navigation record of the satellite at all.
+    #: The navigation data have no record of the satellite.
     NO_EPHEMERIS = 1 << 4
-    #: There are records, but none valid at this time.
+    #: No record of the satellite is valid at this time.
     EPHEMERIS_TOO_OLD = 1 << 5
-    #: The newest valid record says unhealthy.
+    #: The newest valid record flags the satellite or signal as unhealthy.
     UNHEALTHY = 1 << 6
     #: Below the elevation mask.
     ELEVATION_MASK = 1 << 7
-    #: The only usable satellite of its clock: it determines that clock and nothing else.
+    #: The only usable satellite of its clock group: it determines that clock and contributes nothing to the position.
     ALONE_ON_ITS_CLOCK = 1 << 8
-    #: A correction of its signal is unknown: its group delay is not broadcast, or it stands at the horizon.
+    #: A correction is unknown: the group delay of the signal is not broadcast, or the satellite is at the horizon.
     NO_CORRECTION = 1 << 9
-    #: SBAS: its mask does not have the satellite.
+    #: SBAS: the satellite is not in the PRN mask.
     SBAS_NOT_COVERED = 1 << 10
-    #: SBAS: a fast or long-term correction, its degradation, or the issue of data that it is for is missing.
+    #: SBAS: the fast or long-term correction, its degradation, or the record with its issue of data is missing.
     SBAS_NO_CORRECTION = 1 << 11
-    #: SBAS: the corrections are too old.
+    #: SBAS: the corrections have timed out.
     SBAS_TIMED_OUT = 1 << 12
-    #: SBAS: do not use, not monitored, too uncertain, or the GEO itself says that it must not be used.
+    #: SBAS: do not use, not monitored, UDRE too large, or the GEO sends "do not use" (message type 0).
     SBAS_DO_NOT_USE = 1 << 13
-    #: SBAS: the ionosphere where the signal passes is not known.
+    #: SBAS: no ionospheric delay at the pierce point.
     SBAS_NO_IONOSPHERE = 1 << 14
-    #: Weaker than the absolute floor of C/N0.
+    #: C/N0 below the absolute limit.
     CN0_FLOOR = 1 << 15
-    #: Weaker than an open sky gives at its elevation.
+    #: C/N0 below the open-sky curve at this elevation.
     CN0_CURVE = 1 << 16
-    #: The code changed otherwise than its Doppler says.
+    #: The change of the pseudorange disagrees with the Doppler.
     DOPPLER = 1 << 17
-    #: The codes of the two antennas differ otherwise than their spacing says.
+    #: The pseudorange difference between the two antennas disagrees with their spacing.
     ANTENNA_PAIR = 1 << 18
-    #: Excluded by RAIM: its own error against all others is over the limit.
+    #: Excluded by RAIM: its estimated range error exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
 
 
 class Status(IntEnum):
-    """What became of one epoch of one antenna."""
+    """Solution status of one epoch of one antenna."""
 
     #: A position along the line.
     OK = 0
-    #: A position, but another place on the line explains the ranges as well.
+    #: A position, but another place on the line fits the ranges equally well.
     AMBIGUOUS = 1
-    #: A position, clamped to an end of the map or too far from what the ranges say.
+    #: A position, but at an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2
-    #: No position: fewer usable satellites than asked for.
+    #: No position: fewer usable satellites than `Config.min_satellites`.
     TOO_FEW_SATELLITES = 3
-    #: No position: the satellites stand across the track and do not tell where along it.
+    #: No position: the satellite geometry does not determine the position along the track.
     UNOBSERVABLE = 4
-    #: No position: the iteration did not settle.
+    #: No position: the iteration did not converge.
     NO_CONVERGENCE = 5
     #: No position: this antenna has no observation at this epoch.
     NO_OBSERVATION = 6
-    #: A position, but the ranges contradict each other and no exclusion mends it.
+    #: A position, but the ranges are inconsistent and no exclusion restores consistency.
     INCONSISTENT = 7
-    #: A position, but the two antennas' positions are not as far apart as the antennas.
+    #: A position, but the distance between the two antennas' positions disagrees with the antenna spacing.
     ANTENNAS_DISAGREE = 8
-    #: A position, but what its own ranges can vouch for is too wide (`Config.largest_sigma_m`).
+    #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9
 
     @property
     def text(self) -> str:
-        """The word written to files: ``too_few_satellites``."""
+        """Name as written to files: ``too_few_satellites``."""
         return self.name.lower()
 
 
-#: Positions that a check has failed: with coordinates or without, as `Config.failed_checks` says.
+#: Statuses of positions that failed a check; `Config.failed_checks` keeps or drops their coordinates.
 CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN)
 #: Statuses that come with coordinates (those of `CHECK_FAILED` unless they are dropped).
 POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, *CHECK_FAILED)
 
 
 def reason_text(reason: int) -> str:
-    """Names of the bits of one reason, joined by ``+``; ``used`` for 0.
+    """Join the names of the bits of one reason by ``+``; ``used`` for 0.
 
     >>> reason_text(Reason.UNHEALTHY | Reason.ELEVATION_MASK)
     'unhealthy+elevation_mask'
@@ -109,12 +109,12 @@ def reason_text(reason: int) -> str:
 
 
 def reason_texts(reasons: ArrayLike) -> Strings:
-    """`reason_text` of every element of an array."""
+    """Apply `reason_text` to every element of an array."""
     values, inverse = np.unique(np.asarray(reasons), return_inverse=True)
     return np.array([reason_text(int(v)) for v in values])[inverse.reshape(np.shape(reasons))]
 
 
 def first_reason(reasons: ArrayLike) -> Integers:
-    """The lowest set bit of each reason: the first stage that refused the observation."""
+    """Return the lowest set bit of each reason: the first stage that rejected the observation."""
     value = np.asarray(reasons, dtype=np.int64)
     return value & -value

@@ -20,7 +20,7 @@ from railfix.core.spelling import misspelt
 
 
 class Settings(BaseModel):
-    """Base of all settings: frozen, unknown names rejected, validated when made."""
+    """Base of all settings: frozen, validated on construction, unknown names rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -40,7 +40,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
-    """Settings from plain values.
+    """Validate plain values as settings.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
     Raises
     ------
     SettingsError
-        Names the source, the setting, what was expected and what was given.
+        A value is invalid; the message names the source, the setting, what was expected and what was given.
     """
     try:
         return model.model_validate(dict(values))
@@ -73,7 +73,7 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
-    """Names of the settings of the group at a location of a nested model."""
+    """Return the names of the settings of the group at a location of a nested model."""
     kind: Any = model
     for part in location:
         if get_origin(kind) is dict:
@@ -86,13 +86,13 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[s
 
 
 def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
-    """Values of a TOML file.
+    """Read the values of a TOML file.
 
     Parameters
     ----------
     path : path
     what : str
-        What the file should be, with its article ("a vehicle file").
+        Kind of file expected, with its article ("a vehicle file").
 
     Raises
     ------
@@ -112,7 +112,7 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
 
 
 def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:
-    """Settings from a TOML file.
+    """Read settings from a TOML file.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings
 
 
 def write_toml(path: FilePath, values: Mapping[str, Any], *, what: str = "file", comment: str = "") -> None:
-    """Write values as TOML, whole or not at all, below an optional comment.
+    """Write values as TOML below an optional comment; a failed write leaves no file.
 
     Raises
     ------

@@ -38,7 +38,7 @@ _LEAP_UTC: Final = np.array(
 
 
 def seconds(delta: ArrayLike) -> Floats:
-    """Time differences as seconds.
+    """Convert time differences to seconds.
 
     Parameters
     ----------
@@ -51,24 +51,24 @@ def seconds(delta: ArrayLike) -> Floats:
         NaN where `delta` is NaT.
     """
     ns = np.asarray(delta, dtype="timedelta64[ns]")
-    whole = ns.astype(np.int64)
-    result = (whole // _NS).astype(np.float64) + (whole % _NS) / _NS
+    count = ns.astype(np.int64)
+    result = (count // _NS).astype(np.float64) + (count % _NS) / _NS
     return np.where(np.isnat(ns), np.nan, result)
 
 
 def timedelta(seconds_s: ArrayLike) -> NDArray[np.timedelta64]:
-    """Seconds as ``timedelta64[ns]``, rounded to the nanosecond; NaN becomes NaT."""
+    """Convert seconds to ``timedelta64[ns]``, rounded to the nanosecond; NaN becomes NaT."""
     value = np.asarray(seconds_s, dtype=np.float64)
     finite = np.isfinite(value)
     filled = np.where(finite, value, 0.0)
-    whole = np.floor(filled)
-    ns = whole.astype(np.int64) * _NS + np.rint((filled - whole) * _NS).astype(np.int64)
+    full_s = np.floor(filled)
+    ns = full_s.astype(np.int64) * _NS + np.rint((filled - full_s) * _NS).astype(np.int64)
     result = ns.astype("timedelta64[ns]")
     return np.where(finite, result, np.timedelta64("NaT", "ns"))
 
 
 def from_week(week: ArrayLike, seconds_of_week: ArrayLike) -> Datetimes:
-    """GPS week and seconds of week as GPS time.
+    """Convert GPS week and seconds of week to GPS time.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def from_week(week: ArrayLike, seconds_of_week: ArrayLike) -> Datetimes:
 
 
 def to_week(time: ArrayLike) -> tuple[Integers, Floats]:
-    """GPS time as full week number and seconds of week [s]."""
+    """Convert GPS time to the full week number and seconds of week [s]."""
     ns = (np.asarray(time, dtype="datetime64[ns]") - GPS_EPOCH).astype(np.int64)
     week = ns // (SECONDS_PER_WEEK * _NS)
     rest = ns - week * (SECONDS_PER_WEEK * _NS)
@@ -94,26 +94,26 @@ def to_week(time: ArrayLike) -> tuple[Integers, Floats]:
 
 
 def bdt_to_gpst(time: ArrayLike) -> Datetimes:
-    """BeiDou time as GPS time: GPST = BDT + 14 s."""
+    """Convert BeiDou time to GPS time: GPST = BDT + 14 s."""
     shift = timedelta(-BDT_MINUS_GPST_S)
     return np.asarray(np.asarray(time, dtype="datetime64[ns]") + shift, dtype="datetime64[ns]")
 
 
 def gpst_minus_utc(utc: ArrayLike) -> Integers:
-    """Leap seconds GPST - UTC [s] in force at UTC instants."""
+    """Look up the leap seconds GPST - UTC [s] in force at UTC instants."""
     at = np.asarray(utc, dtype="datetime64[ns]")
     return np.asarray(np.searchsorted(_LEAP_UTC, at, side="right") - 1, dtype=np.int64)
 
 
 def utc_to_gpst(utc: ArrayLike) -> Datetimes:
-    """UTC as GPS time, by the table of leap seconds."""
+    """Convert UTC to GPS time by the table of leap seconds."""
     at = np.asarray(utc, dtype="datetime64[ns]")
     leap = gpst_minus_utc(at).astype("timedelta64[s]")
     return np.asarray(at + leap, dtype="datetime64[ns]")
 
 
 def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
-    """GPS time with the given seconds of week that lies nearest to another time.
+    """Resolve the week of seconds of week: the GPS time nearest to another time.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def nearest_week(seconds_of_week: ArrayLike, near: ArrayLike) -> Datetimes:
     Returns
     -------
     ndarray of datetime64[ns]
-        Never further than half a week from `near`, whatever week a file claims.
+        At most half a week from `near`; week numbers written in files are not used.
     """
     week, sow = to_week(near)
     shift = np.rint((sow - np.asarray(seconds_of_week, dtype=np.float64)) / SECONDS_PER_WEEK)

@@ -1,4 +1,4 @@
-"""Broadcast and precise ephemerides as frozen arrays: what the orbit stage reads.
+"""Broadcast and precise ephemerides as read-only arrays.
 
 One row of a record table is one navigation message of one satellite. All times are GPS time.
 Units are those of the interface documents (SI, radians). Absent is NaN (NaT for times).
@@ -18,7 +18,7 @@ from railfix.core.display import NotebookTable, plural, time_span_text
 
 
 def _records_text(satellite: Strings, toe: Datetimes) -> str:
-    """Records, satellites, constellations and span of time, for `repr`."""
+    """Summarize records by number, satellites, constellations and time span, for `repr`."""
     satellites = np.unique(satellite)
     systems = "".join(np.unique(satellites.astype("<U1")).tolist())
     text = f"{plural(satellite, 'record')} of {plural(satellites, 'satellite')}"
@@ -46,7 +46,7 @@ class KeplerRecords(NotebookTable):
     toc, toe : ndarray of datetime64[ns], shape (n,)
         Clock and ephemeris reference times, GPS time. The week is resolved from toc.
     transmitted : ndarray of datetime64[ns], shape (n,)
-        Transmission time of the message; NaT when the file does not say (or says the 0.9999e9 of RINEX).
+        Transmission time of the message; NaT where the file has none (or the 0.9999e9 of RINEX).
     af0_s, af1, af2 : ndarray, shape (n,)
         Clock polynomial [s, s/s, s/s^2].
     sqrt_a, eccentricity, m0, delta_n, omega0, i0, omega, omega_dot, i_dot : ndarray, shape (n,)
@@ -197,7 +197,7 @@ class PreciseEphemeris(NotebookTable):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Navigation(NotebookTable):
-    """All that navigation files say. Compared and hashed by identity, so that what is prepared from it can be kept.
+    """Content of navigation files. Compared and hashed by identity, so that derived tables can be cached.
 
     Attributes
     ----------
@@ -205,13 +205,13 @@ class Navigation(NotebookTable):
     glonass : GlonassRecords
     klobuchar : mapping of str to ndarray, shape (8,)
         Klobuchar alpha 0-3 and beta 0-3 by constellation letter ("G", "C", "J"), as received.
-        All-zero coefficients mean "not received" and are left out here; `notes` says so.
+        All-zero coefficients mean "not received": they are left out, and `notes` records it.
     leap_seconds : int or None
-        GPST - UTC [s] as the header says.
+        GPST - UTC [s] from the header.
     passed_over : mapping of str to int
-        Records that were read over, counted by what they are ("S", "I", "G CNAV", "duplicate").
+        Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").
     notes : tuple of str
-        One sentence each: what a reader should know (no ionosphere, week resolved from the clock time).
+        Remarks for the user (no ionosphere, week resolved from the clock time).
     precise : PreciseEphemeris or None
         When given, used in place of the broadcast orbits and clocks.
     sources : tuple of str
@@ -237,7 +237,7 @@ class Navigation(NotebookTable):
 
 @lru_cache(maxsize=8)
 def glonass_channels(navigation: Navigation) -> dict[str, int]:
-    """Frequency channel of each GLONASS satellite, as its records say.
+    """Return the frequency channel of each GLONASS satellite from its records.
 
     For logs whose header lacks GLONASS SLOT / FRQ #: the form of `ObservationHeader.glonass_channel`.
     """

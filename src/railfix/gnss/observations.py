@@ -1,4 +1,4 @@
-"""Observations of one receiver as frozen arrays: what every stage reads.
+"""Observations of one receiver as read-only arrays.
 
 Axis 0 is time (epochs), axis 1 is the *channel*: one satellite on one signal. A satellite tracked
 on three signals has three channels, so nothing is padded for signals that a constellation does
@@ -17,13 +17,13 @@ import numpy as np
 from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.display import NotebookTable, plural, time_span_text
 
-#: Sentences about single faults that are kept; the rest is only counted.
+#: Largest number of messages about single faults; further faults are only counted.
 MAX_PROBLEMS: Final = 50
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationHeader:
-    """What the header of an observation log says.
+    """Header of an observation log.
 
     Attributes
     ----------
@@ -42,9 +42,9 @@ class ObservationHeader:
         Frequency channel of GLONASS satellites ("R05" -> 1).
     leap_seconds : int or None
     signals : mapping of str to tuple of str
-        Signals announced per constellation, RINEX 3 codes without the type letter ("1C", "2W").
+        Signals declared for each constellation, RINEX 3 codes without the type letter ("1C", "2W").
     receiver_clock_applied : bool
-        RCV CLOCK OFFS APPL: tags, codes and phases are already corrected for the receiver's clock.
+        RCV CLOCK OFFS APPL: time tags, codes and phases are already corrected for the receiver clock.
     """
 
     version: float = float("nan")
@@ -67,7 +67,7 @@ class Observations(NotebookTable):
     Attributes
     ----------
     time : ndarray of datetime64[ns], shape (T,)
-        Time tag of the receiver in GPS time, exactly as tagged (never rounded), rising.
+        Receiver time tags in GPS time, not rounded, strictly rising.
     satellite : ndarray of str, shape (M,)
         Satellite of each channel, "G01", "J02".
     signal : ndarray of str, shape (M,)
@@ -83,17 +83,17 @@ class Observations(NotebookTable):
     loss_of_lock : ndarray of uint8, shape (T, M)
         RINEX loss-of-lock indicator of the phase, 0 where blank or absent.
     break_before : ndarray of bool, shape (T,)
-        True where nothing may be differenced across the step into this epoch: power failure
-        (epoch flag 1), a new site or moving antenna (2, 3), start of another file with a gap.
+        True where epochs must not be differenced with the one before: power failure (epoch flag
+        1), new site or moving antenna (2, 3), start of another file after a gap.
     header : ObservationHeader
     problems : tuple of str
-        What was broken in the file and passed over, a sentence each (file, line, what); at most
-        `MAX_PROBLEMS`, then one more that says how many more there were. A slice of epochs has none.
+        Messages about faults that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then one
+        with the number of the others. A slice of epochs has none.
     problem_count : int
-        How many problems there were.
+        Number of faults.
     passed_over : mapping of str to int
-        What was read over, counted by what it is: broken epochs and satellite lines, duplicate
-        epochs, external events, satellites of constellations unknown or not asked for.
+        Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs,
+        external events, satellites of unknown or unselected constellations.
     """
 
     time: Datetimes
@@ -141,7 +141,7 @@ class Observations(NotebookTable):
         return self.satellite.astype("<U1")
 
     def __getitem__(self, epochs: slice) -> Observations:
-        """A run of epochs (a view); the channels stay."""
+        """Select a range of epochs (a view) with all channels."""
         return Observations(
             time=self.time[epochs],
             satellite=self.satellite,
@@ -157,7 +157,7 @@ class Observations(NotebookTable):
 
 
 def concatenate(parts: Sequence[Observations]) -> Observations:
-    """Parts of one log as a whole; channels are united, absent ones filled with NaN.
+    """Join consecutive parts of one log; channels absent in a part are filled with NaN.
 
     Parameters
     ----------
@@ -218,15 +218,15 @@ def _joined_problems(parts: Sequence[Observations]) -> tuple[str, ...]:
     )
 
 
-def capped_problems(sentences: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """The first `MAX_PROBLEMS` sentences, and one that says how many more of `count` there were."""
-    kept = tuple(islice(sentences, MAX_PROBLEMS))
+def capped_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
+    """Return the first `MAX_PROBLEMS` messages, and one with the number of the others of `count`."""
+    kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept
 
 
 def _joined_counts(parts: Sequence[Observations]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for part in parts:
-        for what, number in part.passed_over.items():
-            counts[what] = counts.get(what, 0) + number
+        for kind, number in part.passed_over.items():
+            counts[kind] = counts.get(kind, 0) + number
     return counts

@@ -13,12 +13,12 @@ from railfix.gnss.navigation import GlonassRecords
 
 #: Step of the integration [s]; the ICD's statement of accuracy is for 60 s.
 STEP_S: Final = 60.0
-#: Rows integrated at once: what stays in the cache.
+#: Rows integrated at once, so that the arrays stay in the cache.
 _BLOCK: Final = 8192
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
-    """Acceleration in the Earth-fixed frame: central force, J2, rotation, Moon and Sun.
+    """Compute the acceleration in the Earth-fixed frame: central force, J2, rotation, Moon and Sun.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floa
 
 
 def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: Floats) -> tuple[Floats, Floats]:
-    """One step of fourth order, forward or backward; arrays of shape (3, n), steps of shape (n,)."""
+    """Integrate one fourth-order step, forward or backward; arrays of shape (3, n), steps of shape (n,)."""
     h = step_s
     a1 = acceleration(position, velocity, luni_solar)
     v1 = velocity + 0.5 * h * a1
@@ -58,13 +58,13 @@ def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: 
 
 
 @dataclass(frozen=True)
-class Integrated:
-    """States of all records at whole steps from their reference times, integrated once.
+class GlonassStates:
+    """States of all records at multiples of the step from their reference times.
 
     Attributes
     ----------
     position, velocity : ndarray, shape (3, records, 2 steps + 1) [m, m/s]
-        The reference time in the middle.
+        The reference time is the middle column.
     luni_solar : ndarray, shape (3, records) [m/s^2]
     """
 
@@ -73,8 +73,8 @@ class Integrated:
     luni_solar: Floats
 
     @classmethod
-    def from_records(cls, records: GlonassRecords, reach_s: float) -> Integrated:
-        """Integrate all records over `reach_s` to both sides and one step more."""
+    def from_records(cls, records: GlonassRecords, reach_s: float) -> GlonassStates:
+        """Integrate all records over `reach_s` in both directions and one step beyond."""
         steps = int(np.ceil(reach_s / STEP_S)) + 1
         luni_solar = np.ascontiguousarray(records.acceleration_ecef_mps2.T)
         position = np.empty((3, len(records), 2 * steps + 1))
@@ -87,14 +87,14 @@ class Integrated:
         return cls(position, velocity, luni_solar)
 
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
-        """State a time after the reference time: from the whole step before it, outward.
+        """Compute states at times since the reference time, from the last multiple of the step.
 
         Parameters
         ----------
         row : ndarray of int, shape (n,)
-            Of the records.
+            Row of the records.
         since_toe_s : ndarray, shape (n,) [s]
-            Within the reach.
+            Within `reach_s`.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Positions, velocities and clocks of Keplerian broadcast records, any number at once."""
+"""Positions, velocities and relativistic clock corrections of Keplerian broadcast records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.core.constants import (
 )
 from railfix.gnss.navigation import KeplerRecords
 
-#: x, y, z as arrays of their own.
+#: x, y, z as separate arrays.
 Components = tuple[Floats, Floats, Floats]
 
 #: Inclination of the frame in which BeiDou GEO records are given [rad] (BDS-SIS-ICD-B1I 3.0, 5.2.4.12).
@@ -36,7 +36,7 @@ ROTATION: Final[Mapping[str, float]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Orbits:
-    """Elements of orbits and what follows from them alone, one row an orbit.
+    """Orbit elements and time-independent quantities, one row per orbit.
 
     Attributes
     ----------
@@ -47,10 +47,10 @@ class Orbits:
     node : ndarray, shape (n,) [rad]
         Longitude of the ascending node at toe.
     node_rate : ndarray, shape (n,) [rad/s]
-    tilted_turn : ndarray, shape (n,) [rad/s]
-        BeiDou GEO: turn of the Earth out of the tilted frame of toe; 0 elsewhere.
+    tilted_rate : ndarray, shape (n,) [rad/s]
+        BeiDou GEO: rotation rate of the Earth-fixed frame against the tilted frame of toe; 0 elsewhere.
     relativity : ndarray, shape (n,) [s]
-        F e sqrt(A), to be multiplied by sin E.
+        F e sqrt(A), the factor of sin E.
     eccentricity, m0, i_dot, cuc, cus, crc, crs, cic, cis : ndarray, shape (n,)
         As `navigation.KeplerRecords`.
     """
@@ -67,7 +67,7 @@ class Orbits:
     i_dot: Floats
     node: Floats
     node_rate: Floats
-    tilted_turn: Floats
+    tilted_rate: Floats
     cuc: Floats
     cus: Floats
     crc: Floats
@@ -78,7 +78,7 @@ class Orbits:
 
     @classmethod
     def from_records(cls, records: KeplerRecords) -> Orbits:
-        """Orbits of all records, in their order."""
+        """Compute the orbits of all records, in their order."""
         system = records.satellite.astype("<U1").tolist()
         gm = np.array([GM.get(s, np.nan) for s in system], dtype=np.float64)
         rotation = np.array([ROTATION.get(s, np.nan) for s in system], dtype=np.float64)
@@ -93,15 +93,15 @@ class Orbits:
             cos_i0=np.cos(records.i0),
             sin_i0=np.sin(records.i0),
             node=records.omega0 - rotation * records.toe_sow_s,
-            # GEO records: the node in the inertial frame of toe; the Earth's turn follows at the end.
+            # GEO records: node in the inertial frame of toe; the Earth's rotation is applied at the end.
             node_rate=records.omega_dot - np.where(geo, 0.0, rotation),
-            tilted_turn=np.where(geo, rotation, 0.0),
+            tilted_rate=np.where(geo, rotation, 0.0),
             relativity=-2.0 * np.sqrt(gm) / SPEED_OF_LIGHT**2 * records.eccentricity * records.sqrt_a,
             **{name: getattr(records, name) for name in _AS_BROADCAST},
         )
 
     def take(self, rows: Integers) -> Orbits:
-        """The orbits of some rows, in their order."""
+        """Select rows."""
         return Orbits(**{item.name: getattr(self, item.name)[rows] for item in fields(Orbits)})
 
 
@@ -109,18 +109,19 @@ _AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "cuc", "cus", "crc", "crs
 
 
 def is_beidou_geo(satellite: str) -> bool:
-    """Whether a satellite's records are given in the tilted frame: C01 to C05, C59 to C63 (B1I ICD 3.0, table 4-1).
+    """Return whether a satellite is a BeiDou GEO: C01 to C05, C59 to C63 (B1I ICD 3.0, table 4-1).
 
-    The number decides and not the name of the message, which converters are known to mix up.
+    Records of GEO satellites refer to a tilted frame. The satellite number decides, not the message
+    name, which converters are known to confuse.
     """
     return satellite[:1] == "C" and (int(satellite[1:]) <= 5 or int(satellite[1:]) >= 59)
 
 
 def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Floats, Floats, Floats]:
-    """Kepler's equation M = E - e sin E.
+    """Solve Kepler's equation M = E - e sin E.
 
-    Newton's method three times, a fixed number so that no result depends on its neighbours; it has
-    converged to the last digit for e < 0.2 (the largest of any of these satellites is 0.17).
+    Three Newton steps, a fixed number so that no result depends on other elements of the array;
+    converged to the last digit for e < 0.2 (the largest of these satellites is 0.17).
 
     Returns
     -------
@@ -134,12 +135,12 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
         anomaly = anomaly + step
         sine, cosine = np.sin(anomaly), np.cos(anomaly)
     step = (mean_anomaly - anomaly + eccentricity * sine) / (1.0 - eccentricity * cosine)
-    sine, cosine = _turned(sine, cosine, step)
+    sine, cosine = _rotated(sine, cosine, step)
     return anomaly + step, sine, cosine
 
 
-def _turned(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Sine and cosine after a small further angle: exact to rounding below 1e-3 rad."""
+def _rotated(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
+    """Compute sine and cosine after adding a small angle: exact to rounding below 1e-3 rad."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
     small_cosine = 1.0 - square * (0.5 - square / 24.0)
@@ -147,19 +148,19 @@ def _turned(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats
 
 
 def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
-    """State of satellites a time after their records' toe (IS-GPS-200, table 20-IV).
+    """Compute satellite states at times since toe (IS-GPS-200, table 20-IV).
 
     Parameters
     ----------
     orbits : Orbits
-        n rows, or one for all instants. The corrections of latitude and inclination are small
-        angles (their fields end at 1.3e-4 rad).
+        n rows, or one for all times. The harmonic corrections of latitude and inclination are
+        treated as small angles (their broadcast range ends at 1.3e-4 rad).
     since_toe_s : ndarray, shape (n,) [s]
 
     Returns
     -------
     position_m, velocity_mps : tuple of three ndarray, shape (n,)
-        Earth-fixed at that very time.
+        In the Earth-fixed frame of that time.
     relativity_s : ndarray, shape (n,) [s]
         F e sqrt(A) sin E, the same as -2 r.v / c^2.
     """
@@ -170,8 +171,8 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
     sin_p = sin_v * el.cos_omega + cos_v * el.sin_omega
     cos_p = cos_v * el.cos_omega - sin_v * el.sin_omega
     sin_2p, cos_2p = 2.0 * sin_p * cos_p, cos_p * cos_p - sin_p * sin_p
-    sin_u, cos_u = _turned(sin_p, cos_p, el.cus * sin_2p + el.cuc * cos_2p)
-    sin_i, cos_i = _turned(el.sin_i0, el.cos_i0, el.i_dot * t + el.cis * sin_2p + el.cic * cos_2p)
+    sin_u, cos_u = _rotated(sin_p, cos_p, el.cus * sin_2p + el.cuc * cos_2p)
+    sin_i, cos_i = _rotated(el.sin_i0, el.cos_i0, el.i_dot * t + el.cis * sin_2p + el.cic * cos_2p)
     r = el.a * shrink + el.crs * sin_2p + el.crc * cos_2p
 
     e_rate = el.motion / shrink
@@ -193,26 +194,26 @@ def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Compo
         x_rate * sin_n + across_rate * cos_n + px * el.node_rate,
         y_rate * sin_i + across * i_rate,
     )
-    if el.tilted_turn.any():
-        position, velocity = _out_of_tilted_frame(position, velocity, el.tilted_turn, t)
+    if el.tilted_rate.any():
+        position, velocity = _out_of_tilted_frame(position, velocity, el.tilted_rate, t)
     return position, velocity, el.relativity * sin_e
 
 
 def _out_of_tilted_frame(
-    position: Components, velocity: Components, turn: Floats, since_toe_s: Floats
+    position: Components, velocity: Components, rate: Floats, since_toe_s: Floats
 ) -> tuple[Components, Components]:
-    """BeiDou GEO: R_z(omega t) R_x(-5 deg) (BDS-SIS-ICD-B1I 3.0, 5.2.4.12); rows that do not turn stay."""
+    """BeiDou GEO: R_z(omega t) R_x(-5 deg) (BDS-SIS-ICD-B1I 3.0, 5.2.4.12); rows of rate 0 are unchanged."""
     cos_x, sin_x = np.cos(_GEO_TILT), np.sin(_GEO_TILT)
-    angle = turn * since_toe_s
+    angle = rate * since_toe_s
     cos_z, sin_z = np.cos(angle), np.sin(angle)
 
-    def turned(v: Components) -> Components:
+    def rotated(v: Components) -> Components:
         y, z = cos_x * v[1] + sin_x * v[2], cos_x * v[2] - sin_x * v[1]
         return cos_z * v[0] + sin_z * y, cos_z * y - sin_z * v[0], z
 
-    place, speed = turned(position), turned(velocity)
-    speed = (speed[0] + turn * place[1], speed[1] - turn * place[0], speed[2])
-    tilted = turn != 0.0
+    place, speed = rotated(position), rotated(velocity)
+    speed = (speed[0] + rate * place[1], speed[1] - rate * place[0], speed[2])
+    tilted = rate != 0.0
     x, y, z = (np.where(tilted, new, old) for new, old in zip(place, position, strict=True))
     vx, vy, vz = (np.where(tilted, new, old) for new, old in zip(speed, velocity, strict=True))
     return (x, y, z), (vx, vy, vz)

@@ -1,4 +1,4 @@
-"""Satellites from a precise ephemeris: polynomials through its positions, straight lines through its clocks."""
+"""Satellite states from a precise ephemeris: polynomial interpolation of positions, linear of clocks."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from railfix.core.timescale import seconds
 from railfix.gnss.navigation import PreciseEphemeris
 
 #: Points of the interpolation polynomial (order 12). With positions every 15 minutes it is within 3 mm on the two
-#: Galileo satellites in elliptic orbits, where the custom of 11 points is 17 mm off near perigee, and within a
+#: Galileo satellites in elliptic orbits, where the usual 11 points err by 17 mm near perigee, and within a
 #: micrometre elsewhere; in the first and last interval of a file up to 0.7 m on these two (0.05 mm elsewhere).
 POINTS: Final = 13
-#: No state between two epochs further apart than this many times the usual interval: the file has a gap there.
+#: Epochs further apart than this many times the usual interval are a gap, within which there is no state.
 _GAP: Final = 1.5
-#: States computed at once: what stays in the cache.
+#: Number of states computed at once, so that the arrays stay in the cache.
 _BLOCK: Final = 4096
 
 
 def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats) -> Floats:
-    """Clocks at ``time + offset`` as the file has them, straight between its epochs, shape (n,) [s]."""
+    """Interpolate the clocks of the file linearly at ``time + offset``, shape (n,) [s]."""
     left = np.clip(np.searchsorted(ephemeris.time, time, side="right") - 1, 0, len(ephemeris.time) - 2)
     step = seconds(ephemeris.time[left + 1] - ephemeris.time[left])
     part = (seconds(time - ephemeris.time[left]) + offset_s) / step
@@ -33,7 +33,7 @@ def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetime
 def precise_state(
     ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """States of satellites at ``time + offset``.
+    """Compute the states of satellites at ``time + offset``.
 
     Parameters
     ----------
@@ -44,14 +44,14 @@ def precise_state(
     time : ndarray of datetime64[ns], shape (n,)
         Within the file's first and last epoch.
     offset_s : ndarray, shape (n,) [s]
-        A fraction of a second (the travel of the signal).
+        A fraction of a second (minus the travel time of the signal).
 
     Returns
     -------
     position_ecef_m, velocity_ecef_mps : ndarray, shape (3, n)
         NaN where a node is missing or the time lies outside the file or in a gap of it.
     clock_s : ndarray, shape (n,) [s]
-        As given, plus the relativistic -2 r.v / c^2 that SP3 clocks leave out.
+        Of the file, plus the relativistic -2 r.v / c^2 that SP3 clocks do not contain.
     """
     if len(ephemeris.time) < POINTS:
         raise ValueError(f"a precise ephemeris needs at least {POINTS} epochs, got {len(ephemeris.time)}")
@@ -77,18 +77,18 @@ def _state(
     windows, which = np.unique(begin, return_inverse=True)
     index = windows + np.arange(POINTS)[:, None]
     since = seconds(nodes[index] - nodes[windows])
-    # Nodes turned into the frame that the Earth has at the first of them: it does not turn, the orbit is smooth there.
+    # Rotate the nodes into the Earth-fixed frame of the first node, an inertial frame, in which the orbit is smooth.
     place = np.moveaxis(ephemeris.position_ecef_m[index], -1, 0)
-    turned = np.stack(_turned(EARTH_ROTATION_RATE * since[..., None], place))
+    rotated = np.stack(_rotated(EARTH_ROTATION_RATE * since[..., None], place))
     own = seconds(time - nodes[begin]) + offset_s
-    weight, slope = _lagrange_at_zero(since[:, which] - own, _gaps(since)[:, which])
-    chosen = turned[:, :, which, column]
-    position = np.stack(_turned(-EARTH_ROTATION_RATE * own, _sum(weight * chosen)))
-    velocity = np.stack(_turned(-EARTH_ROTATION_RATE * own, _sum(slope * chosen)))
+    weight, slope = _lagrange_at_zero(since[:, which] - own, _node_products(since)[:, which])
+    chosen = rotated[:, :, which, column]
+    position = np.stack(_rotated(-EARTH_ROTATION_RATE * own, _sum(weight * chosen)))
+    velocity = np.stack(_rotated(-EARTH_ROTATION_RATE * own, _sum(slope * chosen)))
     velocity[0] += EARTH_ROTATION_RATE * position[1]
     velocity[1] -= EARTH_ROTATION_RATE * position[0]
 
-    # r.v is the same with the Earth-fixed velocity: their difference stands across r.
+    # r.v is the same with the Earth-fixed velocity: the difference of the velocities is perpendicular to r.
     relativity = -2.0 * _sum_axis0(position * velocity) / SPEED_OF_LIGHT**2
     clock = precise_clock_s(ephemeris, column, time, offset_s) + relativity
     left = np.clip(right - 1, 0, len(nodes) - 2)
@@ -99,7 +99,7 @@ def _state(
 
 
 def _sum(terms: Floats) -> Floats:
-    """Sum over the nodes (axis 1) in a fixed order."""
+    """Sum over the nodes (axis 1) in a fixed order, for reproducible rounding."""
     total = terms[:, 0].copy()
     for i in range(1, terms.shape[1]):
         total += terms[:, i]
@@ -110,28 +110,28 @@ def _sum_axis0(terms: Floats) -> Floats:
     return np.asarray(terms[0] + terms[1] + terms[2])
 
 
-def _turned(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
-    """Vectors, components first, turned about the Earth's axis."""
+def _rotated(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]:
+    """Rotate vectors, components first, about the Earth's axis."""
     cos, sin = np.cos(angle), np.sin(angle)
     return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 
 
-def _gaps(since_s: Floats) -> Floats:
-    """Products of the differences of each node to the others of its window, shape (P, windows)."""
+def _node_products(since_s: Floats) -> Floats:
+    """Compute the products of the differences of each node to the others of its window, shape (P, windows)."""
     difference = since_s[:, None] - since_s[None]
     difference[np.arange(POINTS), np.arange(POINTS)] = 1.0
     return np.asarray(difference.prod(axis=1))
 
 
-def _lagrange_at_zero(nodes: Floats, gaps: Floats) -> tuple[Floats, Floats]:
-    """Weights of the value and of the slope at 0 of the polynomial through nodes, shape (P, n).
+def _lagrange_at_zero(nodes: Floats, node_products: Floats) -> tuple[Floats, Floats]:
+    """Compute the Lagrange weights of value and slope at 0 of the polynomial through nodes, shape (P, n).
 
     Products of ``-node`` over all nodes but one, and their derivatives, from the products before
     and after that one, over the products of the differences.
     """
     points = len(nodes)
-    one, none = np.ones(nodes.shape[1]), np.zeros(nodes.shape[1])
-    before, after = [(one, none)], [(one, none)]
+    start = (np.ones(nodes.shape[1]), np.zeros(nodes.shape[1]))
+    before, after = [start], [start]
     for i in range(points - 1):
         value, rate = before[-1]
         before.append((-nodes[i] * value, value - nodes[i] * rate))
@@ -141,5 +141,5 @@ def _lagrange_at_zero(nodes: Floats, gaps: Floats) -> tuple[Floats, Floats]:
     weight, slope = np.empty(nodes.shape), np.empty(nodes.shape)
     for i in range(points):
         (p, p_rate), (q, q_rate) = before[i], after[points - 1 - i]
-        weight[i], slope[i] = p * q / gaps[i], (p_rate * q + p * q_rate) / gaps[i]
+        weight[i], slope[i] = p * q / node_products[i], (p_rate * q + p * q_rate) / node_products[i]
     return weight, slope

@@ -1,4 +1,4 @@
-"""What Keplerian records say about one signal: whether it is healthy, and its group delay."""
+"""Health and group delay of a signal from Keplerian records."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.gnss.navigation import KeplerRecords
 #: Galileo: data validity and signal health by band, E1-B, E5a, E5b (RINEX 3.05, table A8; OS SIS ICD 5.1.9.3).
 GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
 #: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
-#: from the most significant one. 1 (no L1C/B) is what satellites with L1C/A broadcast since 2022.
+#: from the most significant one. 1 (no L1C/B) is broadcast by satellites with L1C/A since 2022.
 QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
@@ -24,7 +24,7 @@ _ANY: Final = -1
 
 
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
-    """Records that call a signal unhealthy, shape (n,).
+    """Flag the records in which a signal is unhealthy, shape (n,).
 
     GPS: any of the six bits. QZSS and Galileo: the bits of the signal; Galileo also where no
     accuracy is predicted (SISA "NAPA", written as -1; OS SDD 1.3, 2.3.1.4 calls that marginal).
@@ -41,16 +41,16 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
 def group_delay_s(
     records: KeplerRecords, signal: str, *, clock: Literal["broadcast", "ionosphere_free"] = "broadcast"
 ) -> Floats:
-    """Group delay of a signal against the satellite clock, shape (n,) [s].
+    """Compute the group delay of a signal relative to the satellite clock, shape (n,) [s].
 
     ======== =====================================================================================
     GPS,     TGD on L1, scaled by (f1/f)^2 elsewhere (IS-GPS-200, 20.3.3.3.3.2). L5 and the civil
-    QZSS     L2 signals would need inter-signal corrections that LNAV does not hold: some decimetres.
-    Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 takes
-             the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1: it
-             is taken as equal to E5a/E1 there. NaN on E6, whose delay is not broadcast.
+    QZSS     L2 signals would need inter-signal corrections that LNAV does not contain: some decimetres.
+    Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 uses
+             the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1:
+             BGD E5a/E1 is used in its place. NaN on E6, whose delay is not broadcast.
     BeiDou   The clock is that of B3I (B1I ICD 3.0, 5.2.4.10): TGD1 on B1I, TGD2 on B2I, 0 on B3I;
-             NaN on signals whose delay D1 and D2 do not hold (B1C, B2a, B2b).
+             NaN on signals whose delay D1 and D2 do not contain (B1C, B2a, B2b).
     ======== =====================================================================================
 
     Parameters
@@ -59,7 +59,7 @@ def group_delay_s(
     signal : str
         RINEX 3 code without its type letter: "1C".
     clock : {"broadcast", "ionosphere_free"}
-        Of the record itself, or of SP3 files: the ionosphere-free pair L1/L2 of GPS and QZSS (the
+        Clock of the record, or of SP3 files, which refers to the ionosphere-free pair L1/L2 of GPS and QZSS (the
         same as broadcast), E1/E5a of Galileo, B1I/B3I of BeiDou.
     """
     delay = np.full(len(records), np.nan)

@@ -15,48 +15,48 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits.kepler import kepler_state
 from railfix.gnss.orbits.precise import precise_clock_s, precise_state
-from railfix.gnss.orbits.table import Plan, Table, table_of
+from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords, prepared_records
 
 #: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
-#: arithmetic on every element, arranged so that live epochs and whole logs are both fast.
+#: arithmetic on every element, arranged so that single live epochs and complete logs are both fast.
 _SHORT: Final = 96
-#: Epochs of a channel computed at once: what stays in the cache.
+#: Epochs of a channel computed at once, so that the arrays stay in the cache.
 _BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
 class SatelliteStates:
-    """Satellites as the receiver's codes saw them, T epochs by M channels.
+    """Satellite states at the times of transmission, T epochs by M channels.
 
     NaN where a channel has no code, no record, or only records out of their validity.
 
     Attributes
     ----------
     position_ecef_m : ndarray, shape (T, M, 3) [m]
-        In the Earth-fixed frame of the instant of transmission, not turned to reception
-        (`geodesy.range_with_rotation` does that).
+        In the Earth-fixed frame of the time of transmission, not rotated to that of reception
+        (`railfix.core.geodesy.range_with_rotation` does that).
     velocity_ecef_mps : ndarray, shape (T, M, 3) [m/s]
         In the same frame: the derivative of `position_ecef_m`.
     clock_m : ndarray, shape (T, M) [m]
-        c times the satellite clock, relativity included, group delay not.
+        c times the satellite clock with the relativistic correction, without group delay.
     group_delay_m : ndarray, shape (T, M) [m]
         Of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on
-        signals whose delay is not broadcast (`signal_health.group_delay_s` says which).
+        signals whose delay is not broadcast (see `signal_health.group_delay_s`).
     age_s : ndarray, shape (T, M) [s]
-        Epoch less the record's reference time, signed; 0 for a precise ephemeris.
+        Epoch minus the reference time of the record; 0 for a precise ephemeris.
     accuracy_m : ndarray, shape (T, M) [m]
         As broadcast; NaN for GLONASS and for a precise ephemeris.
     record : ndarray of int, shape (T, M)
-        Row of the record table of the constellation, -1 where there is none. The record is named
-        also where it is too old, and where the channel has no code.
+        Row of the record table of the constellation, -1 where there is none. Set also where the
+        record is too old or the channel has no code.
     no_record : ndarray of bool, shape (T, M)
-        There is no record of the satellite at all.
+        The satellite has no record.
     too_old : ndarray of bool, shape (T, M)
-        There are records, but none valid at the epoch (judged where there is a code).
+        The satellite has records, but none is valid at the epoch (set only where there is a code).
     unhealthy : ndarray of bool, shape (T, M)
-        The record used calls the signal unhealthy.
+        The record used flags the signal as unhealthy.
     future_record : ndarray of bool, shape (T, M)
-        The record used was transmitted after the epoch: right after the fact, not live.
+        The record used was transmitted after the epoch: usable in post-processing, not live.
     """
 
     position_ecef_m: Floats
@@ -86,13 +86,13 @@ def satellite_states(
     max_age_s: float | None = None,
     record: Integers | None = None,
 ) -> SatelliteStates:
-    """Satellites at the instants of transmission ``time - code / c - dt_sv``.
+    """Compute satellite states at the times of transmission ``time - code / c - dt_sv``.
 
-    The receiver clock is in the time tag and in the code alike, so the instant needs no estimate
-    of it. No result depends on the other epochs or channels of the call, to the last bit.
+    The receiver clock affects time tag and code equally, so the time of transmission needs no
+    estimate of it. No result depends on the other epochs or channels of the call, to the last bit.
 
-    Galileo channels on E5a take F/NAV records, all others I/NAV; where no such record is valid at
-    an epoch and one of the other message is, that one with its clock and group delay.
+    Galileo channels on E5a use F/NAV records, all others I/NAV; where no such record is valid at an
+    epoch, a valid record of the other message with its clock and group delay.
 
     Parameters
     ----------
@@ -102,15 +102,15 @@ def satellite_states(
     code_m : ndarray, shape (T, M) [m]
         NaN where not observed.
     navigation : Navigation
-        With `precise` set, positions and clocks come from there, and a satellite that it does not
-        have has no record; health and group delays come from the nearest broadcast record of
-        whatever age, and a satellite without any has no record either.
+        With `precise` set, positions and clocks come from the precise ephemeris, and a satellite
+        absent from it has no record; health and group delays come from the nearest broadcast
+        record of any age, and a satellite without a broadcast record has no record either.
     max_age_s : float, optional
         Tighter limit on the distance from toe than the records' own validity [s].
     record : ndarray of int, shape (T, M), optional
-        Rows of `navigation.kepler` to take instead of choosing, -1 to choose as ever: corrections
-        hold for one issue of data (`issues.issue_records`). A satellite that the record chosen as ever
-        calls unhealthy is unhealthy all the same. GLONASS is not concerned.
+        Rows of `navigation.kepler` to use, -1 for the usual selection: corrections refer to one issue
+        of data (`issue_records`). A satellite is unhealthy also where the record of the usual
+        selection flags it. Ignored for GLONASS.
 
     Returns
     -------
@@ -126,22 +126,22 @@ def satellite_states(
         raise ValueError(f"code_m has shape {code_m.shape}, expected {expected}; signal has {len(signal)} channels")
     if record is not None and record.shape != code_m.shape:
         raise ValueError(f"record has shape {record.shape}, expected {code_m.shape}")
-    table = table_of(navigation)
-    plan = table.plan(satellite, signal)
-    found = _Found.empty(code_m.shape)
+    table = prepared_records(navigation)
+    plan = table.channels(satellite, signal)
+    states = _Arrays.empty(code_m.shape)
     observed = np.isfinite(code_m)
     if len(plan.kepler) and len(navigation.kepler):
-        _fill_kepler(table, plan, time, code_m, observed, max_age_s, found, record)
+        _fill_kepler(table, plan, time, code_m, observed, max_age_s, states, record)
     if len(plan.glonass) and len(navigation.glonass):
-        _fill_glonass(table, plan, time, code_m, observed, max_age_s, found)
+        _fill_glonass(table, plan, time, code_m, observed, max_age_s, states)
     if navigation.precise is not None:
-        _fill_precise(navigation, satellite, time, code_m, observed, found)
-    return SatelliteStates(**vars(found))
+        _fill_precise(navigation, satellite, time, code_m, observed, states)
+    return SatelliteStates(**vars(states))
 
 
 @dataclass
-class _Found:
-    """The arrays of `SatelliteStates` while they are filled in."""
+class _Arrays:
+    """Writable arrays of `SatelliteStates` during the computation."""
 
     position_ecef_m: Floats
     velocity_ecef_mps: Floats
@@ -156,7 +156,7 @@ class _Found:
     future_record: Masks
 
     @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> _Found:
+    def empty(cls, shape: tuple[int, ...]) -> _Arrays:
         position, velocity = np.full((2, *shape, 3), np.nan)
         clock, delay, age, accuracy = np.full((4, *shape), np.nan)
         no_record, too_old, unhealthy, future = np.zeros((4, *shape), dtype=bool)
@@ -172,13 +172,13 @@ def _limit(validity: NDArray[np.timedelta64], max_age_s: float | None) -> NDArra
 
 
 def _fill_kepler(
-    table: Table,
-    plan: Plan,
+    table: PreparedRecords,
+    plan: ChannelRecords,
     time: Datetimes,
     code_m: Floats,
     observed: Masks,
     max_age_s: float | None,
-    found: _Found,
+    states: _Arrays,
     record: Integers | None,
 ) -> None:
     """Fill in the channels of GPS, QZSS, Galileo and BeiDou."""
@@ -186,43 +186,43 @@ def _fill_kepler(
     rows, valid, future = table.lookup.find(plan.preferred, time, limit)
     if plan.any_other:
         others, other_valid, other_future = table.lookup.find(plan.other, time, limit)
-        # What was on the air goes before what is right after the fact.
+        # A record transmitted before the epoch takes precedence over one transmitted later.
         better = other_valid & (~valid | (future & ~other_future))
         rows, future, valid = np.where(better, others, rows), np.where(better, other_future, future), valid | better
     channels, newest = plan.kepler, rows
     if record is not None:
-        asked = record[:, channels].T
-        given = asked >= 0
-        valid = np.where(given, np.abs(time - table.lookup.toe[asked]) <= limit[asked], valid)
-        future = np.where(given, table.lookup.available[asked] > time, future)
-        rows = np.where(given, asked, rows)
-    found.record[:, channels] = rows.T
-    found.no_record[:, channels] = (rows < 0).T
+        selected = record[:, channels].T
+        given = selected >= 0
+        valid = np.where(given, np.abs(time - table.lookup.toe[selected]) <= limit[selected], valid)
+        future = np.where(given, table.lookup.available[selected] > time, future)
+        rows = np.where(given, selected, rows)
+    states.record[:, channels] = rows.T
+    states.no_record[:, channels] = (rows < 0).T
     seen = observed[:, channels].T & (rows >= 0)
     precise = table.navigation.precise is not None
     usable = seen if precise else seen & valid
-    found.too_old[:, channels] = (seen & ~usable).T
-    found.future_record[:, channels] = (usable & future).T
+    states.too_old[:, channels] = (seen & ~usable).T
+    states.future_record[:, channels] = (usable & future).T
     for k, t, row in _groups(rows, usable):
-        _kepler_group(table, plan, k, t, row, time, code_m, found)
+        _kepler_group(table, plan, k, t, row, time, code_m, states)
     if record is not None:
-        # An older record that calls the satellite healthy does not win, whatever a correction is made for.
-        sick = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
-        found.unhealthy[:, channels] |= sick.T
+        # The newest record decides on health, also where a correction refers to an older one.
+        newest_unhealthy = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
+        states.unhealthy[:, channels] |= newest_unhealthy.T
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
-    """Elements to compute together: channels, epochs (to index with) and their records' rows.
+    """Yield the elements to compute together: channels, epochs (as indices) and record rows.
 
-    All together in a short chunk; else the run of one channel on one record, cut into blocks.
+    All elements of a short chunk; else the consecutive epochs of one channel on one record, in blocks.
     """
     if rows.shape[1] < _SHORT:
         k, t = np.nonzero(usable)
         if len(k):
             yield k, t, rows[k, t]
         return
-    for channel, (row, wanted) in enumerate(zip(rows, usable, strict=True)):
-        at = np.flatnonzero(wanted)
+    for channel, (row, used) in enumerate(zip(rows, usable, strict=True)):
+        at = np.flatnonzero(used)
         if not len(at):
             continue
         of_at = row[at]
@@ -233,7 +233,14 @@ def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]
 
 
 def _kepler_group(
-    table: Table, plan: Plan, k: Any, t: Any, row: Integers, time: Datetimes, code_m: Floats, found: _Found
+    table: PreparedRecords,
+    plan: ChannelRecords,
+    k: Any,
+    t: Any,
+    row: Integers,
+    time: Datetimes,
+    code_m: Floats,
+    states: _Arrays,
 ) -> None:
     m, kepler = plan.kepler[k], table.navigation.kepler
     age = seconds(time[t] - kepler.toe[row])
@@ -242,12 +249,12 @@ def _kepler_group(
     since_toe = since_toe - _polynomial(clock, since_toe + ahead)
     position, velocity, relativity = kepler_state(table.orbits.take(row), since_toe)
     for i in range(3):
-        found.position_ecef_m[t, m, i], found.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
-    found.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
-    found.age_s[t, m], found.accuracy_m[t, m] = age, kepler.accuracy_m[row]
+        states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
+    states.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
+    states.age_s[t, m], states.accuracy_m[t, m] = age, kepler.accuracy_m[row]
     signal = plan.signal[k]
-    found.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
-    found.unhealthy[t, m] = plan.unhealthy[signal, row]
+    states.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
+    states.unhealthy[t, m] = plan.unhealthy[signal, row]
 
 
 def _polynomial(clock: Floats, since_toc_s: Floats) -> Floats:
@@ -255,19 +262,25 @@ def _polynomial(clock: Floats, since_toc_s: Floats) -> Floats:
 
 
 def _fill_glonass(
-    table: Table, plan: Plan, time: Datetimes, code_m: Floats, observed: Masks, max_age_s: float | None, found: _Found
+    table: PreparedRecords,
+    plan: ChannelRecords,
+    time: Datetimes,
+    code_m: Floats,
+    observed: Masks,
+    max_age_s: float | None,
+    states: _Arrays,
 ) -> None:
-    """Fill in the channels of GLONASS; its code biases between channels are left as they are."""
+    """Fill in the channels of GLONASS; code biases between frequency channels are not corrected."""
     records = table.navigation.glonass
     rows, valid, future = table.glonass_lookup.find(
         plan.glonass_number, time, _limit(table.glonass_validity, max_age_s)
     )
     channels = plan.glonass
-    found.record[:, channels] = rows.T
-    found.no_record[:, channels] = (rows < 0).T
+    states.record[:, channels] = rows.T
+    states.no_record[:, channels] = (rows < 0).T
     seen = observed[:, channels].T & (rows >= 0)
     if table.navigation.precise is None:
-        found.too_old[:, channels] = (seen & ~valid).T
+        states.too_old[:, channels] = (seen & ~valid).T
     k, t = np.nonzero(seen & valid)
     m, row = channels[k], rows[k, t]
     age = seconds(time[t] - records.toe[row])
@@ -276,12 +289,12 @@ def _fill_glonass(
     since = since - (bias + rate * since)
     position, velocity = table.integrated.state(row, since)
     for i in range(3):
-        found.position_ecef_m[t, m, i], found.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
-    found.clock_m[t, m] = SPEED_OF_LIGHT * (bias + rate * since)
-    found.group_delay_m[t, m] = 0.0
-    found.age_s[t, m] = age
-    found.future_record[t, m] = future[k, t]
-    found.unhealthy[t, m] = records.health[row] != 0
+        states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
+    states.clock_m[t, m] = SPEED_OF_LIGHT * (bias + rate * since)
+    states.group_delay_m[t, m] = 0.0
+    states.age_s[t, m] = age
+    states.future_record[t, m] = future[k, t]
+    states.unhealthy[t, m] = records.health[row] != 0
 
 
 def _fill_precise(
@@ -290,29 +303,29 @@ def _fill_precise(
     time: Datetimes,
     code_m: Floats,
     observed: Masks,
-    found: _Found,
+    states: _Arrays,
 ) -> None:
-    """Put positions and clocks of the precise ephemeris in place of the broadcast ones."""
+    """Replace broadcast positions and clocks by those of the precise ephemeris."""
     precise = navigation.precise
     if precise is None:
         raise ValueError("no precise ephemeris is given")
     known = {str(s): i for i, s in enumerate(precise.satellite)}
     column = np.array([known.get(s, -1) for s in satellite.tolist()], dtype=np.intp)
     glonass = np.char.startswith(satellite, "R")
-    found.group_delay_m[:, glonass] = 0.0
-    absent = (column < 0) | (found.no_record.all(axis=0) & ~glonass)
+    states.group_delay_m[:, glonass] = 0.0
+    absent = (column < 0) | (states.no_record.all(axis=0) & ~glonass)
     m, t = np.nonzero(observed.T & ~absent[:, None])
     travel = -code_m[t, m] / SPEED_OF_LIGHT
-    # As with broadcast clocks, the instant is found without the relativistic part (below 0.4 microseconds).
+    # As with broadcast clocks, the time of transmission is computed without the relativistic part (below 0.4 us).
     clock = precise_clock_s(precise, column[m], time[t], travel)
     position, velocity, clock = precise_state(precise, column[m], time[t], travel - np.nan_to_num(clock))
     missing = np.isnan(position[0]) | np.isnan(clock)
-    for values in (found.position_ecef_m, found.velocity_ecef_mps, found.clock_m, found.age_s, found.accuracy_m):
+    for values in (states.position_ecef_m, states.velocity_ecef_mps, states.clock_m, states.age_s, states.accuracy_m):
         values[...] = np.nan
     for i in range(3):
-        found.position_ecef_m[t, m, i] = np.where(missing, np.nan, position[i])
-        found.velocity_ecef_mps[t, m, i] = np.where(missing, np.nan, velocity[i])
-    found.clock_m[t, m] = np.where(missing, np.nan, SPEED_OF_LIGHT * clock)
-    found.age_s[t, m] = np.where(missing, np.nan, 0.0)
-    found.no_record[...] = absent
-    found.no_record[t, m] = missing
+        states.position_ecef_m[t, m, i] = np.where(missing, np.nan, position[i])
+        states.velocity_ecef_mps[t, m, i] = np.where(missing, np.nan, velocity[i])
+    states.clock_m[t, m] = np.where(missing, np.nan, SPEED_OF_LIGHT * clock)
+    states.age_s[t, m] = np.where(missing, np.nan, 0.0)
+    states.no_record[...] = absent
+    states.no_record[t, m] = missing

@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Integers, Masks, Strings
+from railfix.io.rinex.fault_log import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import Epochs
 from railfix.io.rinex.observations_fields import FIELD_WIDTH, Fields, Words, gather, parse
 from railfix.io.rinex.observations_lines import Lines
-from railfix.io.rinex.observations_log import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
 from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, Column
 
 _BLANK: Final = ord(" ")

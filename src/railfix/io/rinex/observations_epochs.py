@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from railfix.core.arrays import Integers, Masks
+from railfix.io.rinex.fault_log import EPOCHS, FaultLog
 from railfix.io.rinex.observations_lines import EpochLines, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
-from railfix.io.rinex.observations_log import EPOCHS, FaultLog
 
 #: An epoch never has more lines than its three-digit count tells, so this many are no epoch.
 _MAX_LINES = 1100 * 6

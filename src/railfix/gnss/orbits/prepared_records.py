@@ -1,4 +1,4 @@
-"""What is prepared once for a `Navigation`, so that an epoch costs only its own arithmetic."""
+"""Lookups and orbit elements of a `Navigation`, computed once and cached."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from numpy.typing import NDArray
 from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.glonass import Integrated
+from railfix.gnss.orbits.glonass import GlonassStates
 from railfix.gnss.orbits.kepler import Orbits
-from railfix.gnss.orbits.selection import VALIDITY_S, make_lookup, validity_s
+from railfix.gnss.orbits.record_selection import VALIDITY_S, make_lookup, validity_s
 from railfix.gnss.orbits.signal_health import group_delay_s, unhealthy
 
-#: Channel sets remembered per navigation.
-_PLANS: Final = 64
+#: Number of channel sets cached per navigation.
+_CACHED_SETS: Final = 64
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A set of channels against the record tables.
+class ChannelRecords:
+    """Record rows, group delays and health of a set of channels.
 
     Attributes
     ----------
     kepler, glonass : ndarray of int, shape (K,), (R,)
         Channels of the constellations with Keplerian records, and of GLONASS.
     preferred, other : ndarray of int, shape (K,)
-        Numbers in the lookup: Galileo's message that carries the channel's clock, and the other
-        one; elsewhere the satellite, and -1.
+        Numbers in the lookup: for Galileo the message with the clock of the channel's signal, and
+        the other message; for other constellations the satellite, and -1.
     any_other : bool
     signal : ndarray of int, shape (K,)
         Row of `group_delay_s` and `unhealthy`.
@@ -52,7 +52,7 @@ class Plan:
     glonass_number: Integers
 
 
-class Table:
+class PreparedRecords:
     """Lookups, orbits and clocks of all records of one `Navigation`."""
 
     def __init__(self, navigation: Navigation) -> None:
@@ -69,24 +69,24 @@ class Table:
         validity = np.full(len(glonass), VALIDITY_S["R"])
         self.glonass_validity = timedelta(validity)
         self.glonass_lookup = make_lookup(glonass.satellite, glonass.toe, glonass.transmitted, validity)
-        self._plans: dict[tuple[bytes, ...], Plan] = {}
+        self._cache: dict[tuple[bytes, ...], ChannelRecords] = {}
 
     @cached_property
-    def integrated(self) -> Integrated:
-        """GLONASS states at whole steps."""
-        return Integrated.from_records(self.navigation.glonass, VALIDITY_S["R"])
+    def integrated(self) -> GlonassStates:
+        """GLONASS states at multiples of the integration step."""
+        return GlonassStates.from_records(self.navigation.glonass, VALIDITY_S["R"])
 
-    def plan(self, satellite: Strings, signal: Strings) -> Plan:
-        """The plan of a set of channels, made once."""
+    def channels(self, satellite: Strings, signal: Strings) -> ChannelRecords:
+        """Return the records of a set of channels, from the cache where possible."""
         key = (satellite.tobytes(), signal.tobytes(), str(satellite.dtype).encode(), str(signal.dtype).encode())
-        found = self._plans.get(key)
-        if found is None:
-            while len(self._plans) >= _PLANS:
-                self._plans.pop(next(iter(self._plans)))
-            found = self._plans[key] = self._make_plan(satellite.tolist(), signal.tolist())
-        return found
+        channels = self._cache.get(key)
+        if channels is None:
+            while len(self._cache) >= _CACHED_SETS:
+                self._cache.pop(next(iter(self._cache)))
+            channels = self._cache[key] = self._channel_records(satellite.tolist(), signal.tolist())
+        return channels
 
-    def _make_plan(self, satellite: list[str], signal: list[str]) -> Plan:
+    def _channel_records(self, satellite: list[str], signal: list[str]) -> ChannelRecords:
         kepler = np.array([i for i, s in enumerate(satellite) if s[:1] in ("G", "J", "E", "C")], dtype=np.intp)
         glonass = np.array([i for i, s in enumerate(satellite) if s[:1] == "R"], dtype=np.intp)
         names = [(satellite[i], signal[i]) for i in kepler]
@@ -95,13 +95,13 @@ class Table:
         first, second = zip(*(_labels(name, code) for name, code in names), strict=True) if names else ((), ())
         pairs = [(number.get(a, -1), number.get(b, -1)) for a, b in zip(first, second, strict=True)]
         preferred, other = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        # A satellite with only the other message has that one first.
+        # A satellite that has only the other message uses it as the preferred one.
         preferred, other = np.where(preferred < 0, other, preferred), np.where(preferred < 0, -1, other)
         clock: Literal["broadcast", "ionosphere_free"] = (
             "ionosphere_free" if self.navigation.precise is not None else "broadcast"
         )
         records = self.navigation.kepler
-        return Plan(
+        return ChannelRecords(
             kepler=kepler,
             glonass=glonass,
             preferred=preferred,
@@ -121,7 +121,7 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Names in the lookup, the preferred one first: F/NAV holds the clock of E1 and E5a, I/NAV of E1 and E5b."""
+    """Return the names in the lookup, preferred first: F/NAV has the clock of E1 and E5a, I/NAV of E1 and E5b."""
     if satellite[0] != "E":
         return satellite, ""
     messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
@@ -129,6 +129,6 @@ def _labels(satellite: str, signal: str) -> tuple[str, str]:
 
 
 @lru_cache(maxsize=8)
-def table_of(navigation: Navigation) -> Table:
-    """The table of a `Navigation`, made once."""
-    return Table(navigation)
+def prepared_records(navigation: Navigation) -> PreparedRecords:
+    """Prepare the records of a `Navigation`, once for each object."""
+    return PreparedRecords(navigation)

@@ -1,12 +1,12 @@
-"""Which record a satellite has at an epoch.
+"""Selection of the navigation record of a satellite at an epoch.
 
-Among records the newest one transmitted before the epoch is taken. Where a file does not tell
-when a record was transmitted, it serves from half-way since the record before it. Where the
-newest is out of its validity (expired while an older one lasts, or sent long before it begins),
-or where every record was transmitted after the epoch (a file that begins later than the log), the
-one whose reference time lies nearest is taken if it is valid, and flagged if it was not on the
-air yet. Health is decided on the record taken: an older one that calls the satellite healthy does
-not win.
+The newest record transmitted before the epoch is selected. A record without a transmission time
+counts as transmitted half-way between the reference times of the record before it and its own. Where
+the newest record is outside its validity (expired while an older one is still valid, or transmitted
+long before its validity begins), or where all records were transmitted after the epoch (a file that
+begins later than the log), the record with the nearest reference time is selected if it is valid,
+and flagged if it had not been transmitted yet. Health is that of the selected record: an older
+healthy record does not override it.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import KeplerRecords
 
-#: Longest distance of an epoch from toe [s]: GPS and QZSS half the fit interval that the record
-#: states and never less than this (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour);
+#: Longest distance of an epoch from toe [s]: GPS and QZSS half the broadcast fit interval and
+#: never less than this (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour);
 #: Galileo 4 h (Galileo OS SDD 1.3, 2.4.2: no data older than that are broadcast). BeiDou (renewed
-#: every hour) and GLONASS (renewed every 30 min) state none: the limits are those of RTKLIB 2.4.3
+#: every hour) and GLONASS (renewed every 30 min) broadcast none: the limits are those of RTKLIB 2.4.3
 #: (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: A record sent earlier than this before its validity begins has a wrong transmission time [s].
+#: A record transmitted earlier than this before its validity begins has a wrong transmission time [s].
 _EARLY_S: Final = 3600.0
-#: Longest time that a lookup tells apart [ms]: 34 years, so that records of another year do no harm.
+#: Time span that a lookup key can hold [ms]: 34 years, so that records of another year are kept apart.
 _SPAN: Final = np.int64(2**40)
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 
 @dataclass(frozen=True)
 class Lookup:
-    """Records of all satellites in two sorted lists, each answered by a single search.
+    """Records of all satellites in two sorted lists, each searched by bisection.
 
     Attributes
     ----------
     number : mapping of str to int
         Number of a satellite (or of its message: "E01 INAV") in the lists.
     first : ndarray of int, shape (satellites,)
-        Where a satellite's records begin in both lists.
+        First record of each satellite in both lists.
     sent_key, sent_record : ndarray of int64, shape (n,)
-        Satellite and time of availability [ms since `origin`] as one rising number, and the row of
-        the record table.
+        Satellite and time of availability [ms since `origin`] as one ascending number, and the row
+        of the record table.
     toe_key, toe_record : ndarray of int64, shape (n,)
-        The same by reference time: from half-way since the one before.
+        The same by reference time: from half-way between the reference time before and its own.
     origin : datetime64[ns]
     toe, available : ndarray of datetime64[ns], shape (n,)
-        Reference time, and time since when it serves, by row of the record table.
+        Reference time, and time from which the record is available, by row of the record table.
     """
 
     number: Mapping[str, int]
@@ -67,12 +67,12 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Record of each satellite at each epoch.
+        """Select the record of each satellite at each epoch.
 
         Parameters
         ----------
         number : ndarray of int, shape (M,)
-            Of `number`; -1 for a satellite that is not there.
+            Values of `number`; -1 for a satellite without records.
         time : ndarray of datetime64[ns], shape (T,)
         limit : ndarray of timedelta64, shape (n,)
             Longest distance of an epoch from toe, by row of the record table.
@@ -80,7 +80,7 @@ class Lookup:
         Returns
         -------
         record : ndarray of int, shape (M, T)
-            Row of the record table; -1 where the satellite has none at all.
+            Row of the record table; -1 where the satellite has no record.
         valid : ndarray of bool, shape (M, T)
             The epoch lies within the limit of the record.
         future : ndarray of bool, shape (M, T)
@@ -90,19 +90,19 @@ class Lookup:
         if not len(self.sent_key):
             return np.full(shape, -1, dtype=np.int64), np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
         base = np.maximum(number, 0)
-        wanted = base[:, None] * _SPAN + np.clip((time - self.origin) // _MILLISECOND, 0, _SPAN - 1)
-        found = np.searchsorted(self.sent_key, wanted, side="right") - 1
-        future = found < self.first[base][:, None]
-        record = self.sent_record[np.maximum(found, 0)]
+        key = base[:, None] * _SPAN + np.clip((time - self.origin) // _MILLISECOND, 0, _SPAN - 1)
+        position = np.searchsorted(self.sent_key, key, side="right") - 1
+        future = position < self.first[base][:, None]
+        record = self.sent_record[np.maximum(position, 0)]
         valid = (np.abs(time - self.toe[record]) <= limit[record]) & ~future
         if not valid.all():
             m, t = np.nonzero(~valid)
-            nearest = self.toe_record[np.searchsorted(self.toe_key, wanted[m, t], side="right") - 1]
-            lasting = np.abs(time[t] - self.toe[nearest]) <= limit[nearest]
-            taken = lasting | future[m, t]
-            record[m, t] = np.where(taken, nearest, record[m, t])
-            valid[m, t] = lasting
-            future[m, t] = taken & (self.available[nearest] > time[t])
+            nearest = self.toe_record[np.searchsorted(self.toe_key, key[m, t], side="right") - 1]
+            nearest_valid = np.abs(time[t] - self.toe[nearest]) <= limit[nearest]
+            replaced = nearest_valid | future[m, t]
+            record[m, t] = np.where(replaced, nearest, record[m, t])
+            valid[m, t] = nearest_valid
+            future[m, t] = replaced & (self.available[nearest] > time[t])
         absent = number < 0
         if absent.any():
             record[absent], valid[absent], future[absent] = -1, False, False
@@ -158,6 +158,6 @@ def make_lookup(
 
 
 def validity_s(records: KeplerRecords) -> Floats:
-    """Longest distance of an epoch from toe for each record, shape (n,) [s]."""
+    """Compute the longest distance of an epoch from toe for each record, shape (n,) [s]."""
     base = np.array([VALIDITY_S[s[0]] for s in records.satellite.tolist()], dtype=np.float64)
     return np.fmax(base, records.fit_interval_h * 1800.0)

@@ -1,4 +1,4 @@
-"""Which record of a satellite carries an issue of data: what a correction made for that issue needs."""
+"""Selection of navigation records by issue of data, for corrections that refer to one issue."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Integers, Strings
 from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.selection import validity_s
+from railfix.gnss.orbits.record_selection import validity_s
 
-#: Issues of data told apart: 8 bits in the records of GPS and QZSS, and in corrections.
+#: Number of different issues of data: 8 bits in the records of GPS and QZSS, and in corrections.
 _ISSUES: Final = 256
-#: Longest time that is told apart [ms]: 278 years.
+#: Time span that a lookup key can hold [ms]: 278 years.
 _SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 _MS: Final = np.timedelta64(1, "ms")
 
 
 class _Issues:
-    """Records of GPS and QZSS by satellite and issue, each from half-way since the one before it."""
+    """Records of GPS and QZSS by satellite and issue, each from half-way between the toe before and its own."""
 
     def __init__(self, navigation: Navigation) -> None:
         kepler = navigation.kepler
@@ -48,7 +48,7 @@ def _issues_of(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Rows of `navigation.kepler` with wanted issues of data.
+    """Find the rows of `navigation.kepler` with given issues of data.
 
     Parameters
     ----------
@@ -62,17 +62,17 @@ def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, i
     -------
     ndarray of int, shape (T, M)
         The record of that issue whose reference time is nearest, if the epoch lies in its
-        validity; -1 elsewhere, and for satellites other than GPS and QZSS. Whether the record was
-        on the air at the epoch is not asked: `SatelliteStates.future_record` tells.
+        validity; -1 elsewhere, and for satellites other than GPS and QZSS. The record may
+        have been transmitted after the epoch: see `SatelliteStates.future_record`.
     """
     table = _issues_of(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)
-    wanted = np.where((issue >= 0) & (number >= 0), number * _ISSUES + issue, -1)
+    series = np.where((issue >= 0) & (number >= 0), number * _ISSUES + issue, -1)
     if not len(table.key):
-        return np.full(wanted.shape, -1, dtype=np.int64)
-    key = wanted * _SPAN + np.clip((time - _ORIGIN) // _MS, 0, _SPAN - 1)[:, None]
+        return np.full(series.shape, -1, dtype=np.int64)
+    key = series * _SPAN + np.clip((time - _ORIGIN) // _MS, 0, _SPAN - 1)[:, None]
     at = np.maximum(np.searchsorted(table.key, key, side="right") - 1, 0)
     record = table.row[at]
-    found = (wanted >= 0) & (table.series[at] == wanted)
-    found &= np.abs(time[:, None] - table.toe[record]) <= table.limit[record]
-    return np.where(found, record, -1)
+    usable = (series >= 0) & (table.series[at] == series)
+    usable &= np.abs(time[:, None] - table.toe[record]) <= table.limit[record]
+    return np.where(usable, record, -1)
