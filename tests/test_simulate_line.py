@@ -27,9 +27,11 @@ from railfix.simulate import (
     antenna_truth,
     build_alignment,
     build_motion,
+    run_curve,
     shuttle,
 )
-from railfix.simulate.motion import Sway
+from railfix.simulate.body_motion import BodyMotion
+from railfix.simulate.kinematics import limit_jerk
 from railfix.simulate.run import vehicle_table
 from railfix.track import read_track, write_track_csv
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -384,7 +386,7 @@ def test_a_run_the_other_way_is_its_mirror_and_ends_standing() -> None:
 
 def test_the_body_sways_with_its_sigma_and_not_at_rest() -> None:
     scenario = Scenario(vehicle=VehicleSettings(sway_sigma_deg=0.5, sway_period_s=1.5))
-    sway = Sway.of(scenario)
+    sway = BodyMotion(scenario, build_motion(LINE, scenario))
     time = np.arange(0.0, 600.0, 0.1)
     roll = sway.roll_rad(time, np.full(time.shape, 30.0))
     assert np.degrees(roll.std()) == pytest.approx(0.5, rel=0.15)
@@ -399,3 +401,62 @@ def test_the_body_sways_with_its_sigma_and_not_at_rest() -> None:
     )
     rear = antenna_truth(LINE, scenario.vehicle, scenario.vehicle.rear, middle, roll)
     assert np.linalg.norm(swaying.ecef_m - rear.ecef_m, axis=1) == pytest.approx(18.2, abs=1e-6)
+
+
+def test_pitch_follows_the_acceleration_and_moves_the_antennas() -> None:
+    """Once the oscillation has decayed, the pitch under a constant acceleration is the gain times it."""
+    vehicle = VehicleSettings(pitch_deg_per_mps2=0.6, pitch_period_s=0.8)
+    scenario = Scenario(
+        vehicle=vehicle, run=RunSettings(first_stand_s=5.0, acceleration_mps2=0.5, deceleration_mps2=1.0)
+    )
+    body = BodyMotion(scenario, motion := build_motion(LINE, scenario))
+    time = np.arange(0.0, 120.0, 0.02)
+    chainage, speed = motion.at(time)
+    pitch = body.pitch_rad(time, speed)
+    assert pitch is not None
+    acceleration = motion.acceleration_at(time)
+    settled = np.array([np.ptp(acceleration[max(k - 200, 0) : k + 1]) == 0.0 for k in range(len(time))])
+    assert len(set(acceleration[settled])) >= 3
+    assert np.degrees(pitch[settled]) == pytest.approx(0.6 * acceleration[settled], abs=0.6 * 2e-3)
+    assert np.degrees(pitch).max() > 0.6 * 0.5 * 1.2, "it overshoots"
+    level, pitched = (antenna_truth(LINE, vehicle, vehicle.front, chainage, 0.0, p) for p in (None, pitch))
+    moved = np.linalg.norm(pitched.ecef_m - level.ecef_m, axis=1)
+    assert moved == pytest.approx(2.0 * np.abs(np.sin(pitch / 2.0)) * np.hypot(9.1, 3.95), abs=1e-4)
+    # The front rises by the lever arm, the antenna moves back by its height.
+    up = geodetic_from_ecef(pitched.ecef_m)[2] - geodetic_from_ecef(level.ecef_m)[2]
+    assert up == pytest.approx(9.1 * np.sin(pitch), abs=2e-3)
+    assert pitched.chainage_m - level.chainage_m == pytest.approx(-3.95 * np.sin(pitch), abs=2e-3)
+
+
+def test_random_pitch_has_its_sigma_and_none_at_rest() -> None:
+    scenario = Scenario(vehicle=VehicleSettings(pitch_sigma_deg=0.2, pitch_period_s=0.9))
+    body = BodyMotion(scenario, build_motion(LINE, scenario))
+    time = np.arange(0.0, 900.0, 0.1)
+    pitch = body.pitch_rad(time, np.full(time.shape, 25.0))
+    assert pitch is not None
+    assert np.degrees(pitch.std()) == pytest.approx(0.2, rel=0.15)
+    standing = body.pitch_rad(time, np.zeros(time.shape))
+    assert standing is not None
+    assert (standing == 0.0).all()
+    assert BodyMotion(Scenario(), build_motion(LINE, Scenario())).pitch_rad(time, time) is None
+
+
+@pytest.mark.parametrize("jerk", [0.1, 0.4, 2.0])
+def test_the_jerk_stays_within_its_limit_and_the_stops_where_they_are(jerk: float) -> None:
+    settings = RunSettings(stations=(Station(at_m=30.0), Station(at_m=400.0), Station(at_m=720.0)), stand_s=25.0)
+    plain = run_curve(LINE, settings, 100.0, contact_m=1.137)
+    smooth = limit_jerk(plain, jerk)
+    assert np.abs(smooth.jerk_mps3).max() == pytest.approx(jerk, rel=1e-6), "as fast as the limit allows"
+    time = np.arange(0.0, 400.0, 0.01)
+    chainage, speed = smooth.at(time)
+    # Independent: third differences of the chainage; it and its derivatives are continuous.
+    third = np.diff(chainage[::10], 3) / 0.1**3
+    assert np.abs(third).max() < jerk * 1.01 + 1e-3
+    assert np.abs(np.diff(speed)).max() < 0.8 * 0.01 * 1.001, "never faster than the plain motion's acceleration"
+    assert np.diff(chainage) == pytest.approx((speed[1:] + speed[:-1]) / 2.0 * 0.01, abs=1e-6)
+    assert np.diff(speed) == pytest.approx(
+        (smooth.acceleration_at(time)[1:] + smooth.acceleration_at(time)[:-1]) / 2.0 * 0.01, abs=jerk * 1e-4
+    )
+    assert np.abs(speed).max() <= np.abs(plain.at(time)[1]).max() + 1e-9
+    standing = chainage[speed == 0.0]
+    assert set(np.round(standing, 6)) == {30.0, 400.0, 720.0}

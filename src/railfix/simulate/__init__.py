@@ -14,6 +14,7 @@ from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.demo_data import DEMO_FILES, demo_files, demo_folder
 from railfix.simulate.disturbance import Disturbance, Disturbances, Geometry
 from railfix.simulate.errors import ErrorSettings
+from railfix.simulate.kinematics import Motion
 from railfix.simulate.line_settings import (
     Element,
     GeneratedLine,
@@ -23,7 +24,7 @@ from railfix.simulate.line_settings import (
     MapError,
     Terrain,
 )
-from railfix.simulate.motion import Motion, build_motion, run_curve, shuttle
+from railfix.simulate.motion import build_motion, run_curve, shuttle
 from railfix.simulate.run import section_table, truth_table, write_run
 from railfix.simulate.scenario import (
     ANTENNAS,

@@ -27,7 +27,7 @@ class AntennaTruth:
     ----------
     ecef_m : ndarray, shape (n, 3) [m]
     chainage_m : ndarray, shape (n,) [m]
-        Centreline point in the plane through the antenna perpendicular to the body's long axis.
+        Centreline point in the plane through the antenna perpendicular to the line between the bogie centres.
     forward : ndarray, shape (n, 3)
         Unit vector of the body's long axis.
     """
@@ -43,6 +43,7 @@ def antenna_truth(
     offset_m: tuple[float, float, float],
     middle_m: Floats,
     sway_rad: Floats | float = 0.0,
+    pitch_rad: Floats | None = None,
 ) -> AntennaTruth:
     """True position of an antenna.
 
@@ -56,6 +57,9 @@ def antenna_truth(
         Chainage midway between the bogies' chainages.
     sway_rad : ndarray, shape (n,), or float [rad]
         Lean to the right beyond that of the cant.
+    pitch_rad : ndarray, shape (n,) [rad], optional
+        Pitch beyond that of the gradient, about the point between the bogies at the rail tops; positive where
+        the front rises.
 
     Returns
     -------
@@ -64,9 +68,9 @@ def antenna_truth(
     middle = np.asarray(middle_m, dtype=np.float64)
     half = np.full(middle.shape, vehicle.bogie_distance_m / 2.0)
     for _ in range(5):
-        chord = line.at(middle + half) - line.at(middle - half)
-        length = np.linalg.norm(chord, axis=-1)
-        rate = np.einsum("ni,ni->n", chord, line.tangent_at(middle + half) + line.tangent_at(middle - half)) / length
+        between = line.at(middle + half) - line.at(middle - half)
+        length = np.linalg.norm(between, axis=-1)
+        rate = np.einsum("ni,ni->n", between, line.tangent_at(middle + half) + line.tangent_at(middle - half)) / length
         half = half - (length - vehicle.bogie_distance_m) / rate
     rear, front = line.at(middle - half), line.at(middle + half)
     forward = front - rear
@@ -80,12 +84,16 @@ def antenna_truth(
     lean = 0.5 * (np.arcsin(line.lean_at(middle - half) / contact) + np.arcsin(line.lean_at(middle + half) / contact))
     lean = lean + sway_rad
     along, across, up = offset_m
+    chord = forward
+    if pitch_rad is not None:
+        cosine, sine = np.cos(pitch_rad)[:, None], np.sin(pitch_rad)[:, None]
+        forward, upright = cosine * forward + sine * upright, cosine * upright - sine * forward
     arm = across * np.cross(forward, upright) + up * upright
     # A lean to the right turns the body about its forward axis.
     turned = np.cos(lean)[:, None] * arm + np.sin(lean)[:, None] * np.cross(forward, arm)
     place = origin + along * forward + turned
     abeam = middle + along
     for _ in range(5):
-        ahead = np.einsum("ni,ni->n", line.at(abeam) - place, forward)
-        abeam = abeam - ahead / np.einsum("ni,ni->n", line.tangent_at(abeam), forward)
+        ahead = np.einsum("ni,ni->n", line.at(abeam) - place, chord)
+        abeam = abeam - ahead / np.einsum("ni,ni->n", line.tangent_at(abeam), chord)
     return AntennaTruth(ecef_m=place, chainage_m=abeam, forward=forward)

@@ -6,16 +6,14 @@ stopping at stations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Floats
 from railfix.simulate.alignment import Alignment
-from railfix.simulate.random_functions import RandomFunction
+from railfix.simulate.kinematics import Motion, limit_jerk
 from railfix.simulate.scenario import RunSettings, Scenario, Station
 
 #: Spacing of the places at which a run curve looks at the limits [m].
@@ -23,40 +21,6 @@ _STEP_M: Final = 2.0
 _GRAVITY: Final = 9.806_65
 #: Contact points of the wheels lie further apart than the gauge [m].
 _RAIL_HEAD_M: Final = 0.070
-#: Speed from which on the body sways fully [m/s].
-_FULL_SWAY_MPS: Final = 20.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """Pieces of constant acceleration; the last one continues.
-
-    Attributes
-    ----------
-    time_s : ndarray, shape (P,) [s]
-        Start of each piece, rising from 0.
-    chainage_m, speed_mps, acceleration_mps2 : ndarray, shape (P,)
-        At the start of the piece; signs are those of rising chainage.
-    """
-
-    time_s: Floats
-    chainage_m: Floats
-    speed_mps: Floats
-    acceleration_mps2: Floats
-
-    def at(self, time_s: ArrayLike) -> tuple[Floats, Floats]:
-        """Chainage [m] and speed [m/s] at times; before 0 the train stands."""
-        time = np.asarray(time_s, dtype=np.float64)
-        piece = np.maximum(np.searchsorted(self.time_s, time, side="right") - 1, 0)
-        since = np.maximum(time - self.time_s[piece], 0.0)
-        speed = self.speed_mps[piece] + self.acceleration_mps2[piece] * since
-        return self.chainage_m[piece] + (self.speed_mps[piece] + speed) / 2.0 * since, speed
-
-    def acceleration_at(self, time_s: ArrayLike) -> Floats:
-        """Acceleration along the line [m/s^2] at times; before 0 none."""
-        time = np.asarray(time_s, dtype=np.float64)
-        piece = np.searchsorted(self.time_s, time, side="right") - 1
-        return np.where(piece < 0, 0.0, self.acceleration_mps2[np.maximum(piece, 0)])
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
@@ -85,35 +49,10 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
     usual = RunSettings()
     plain = ("stations", "limits", "cant_deficiency_m", "direction", "at_end")
     if all(getattr(settings, name) == getattr(usual, name) for name in plain):
-        return shuttle(margin, line.length_m - margin, lasting, settings)
-    return run_curve(line, settings, lasting, contact_m=scenario.vehicle.gauge_m + _RAIL_HEAD_M)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sway:
-    """Roll of the body about its forward axis, beyond that of the cant.
-
-    Attributes
-    ----------
-    function : RandomFunction
-    """
-
-    function: RandomFunction
-
-    @classmethod
-    def of(cls, scenario: Scenario) -> Sway:
-        """Sway of a scenario's vehicle; its seed decides."""
-        vehicle = scenario.vehicle
-        rng = np.random.default_rng([scenario.seed, 13])
-        return cls(
-            function=RandomFunction.periodic(
-                rng, sigma=float(np.radians(vehicle.sway_sigma_deg)), period=vehicle.sway_period_s
-            )
-        )
-
-    def roll_rad(self, time_s: Floats, speed_mps: Floats) -> Floats:
-        """Lean to the right [rad] at times and speeds; none while the train stands."""
-        return self.function.at(time_s) * np.minimum(np.abs(speed_mps) / _FULL_SWAY_MPS, 1.0)
+        motion = shuttle(margin, line.length_m - margin, lasting, settings)
+    else:
+        motion = run_curve(line, settings, lasting, contact_m=scenario.vehicle.gauge_m + _RAIL_HEAD_M)
+    return motion if settings.jerk_mps3 is None else limit_jerk(motion, settings.jerk_mps3)
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:

@@ -87,6 +87,8 @@ class RunSettings(ScenarioSettings):
     limits : tuple of SpeedLimit
     cant_deficiency_m : float or None
         Curves are run at the speed whose equilibrium cant is the curve's cant and this; None: curves do not limit.
+    jerk_mps3 : float or None
+        Largest jerk; None: accelerations begin and end at once.
     direction : {"rising", "falling"}
         Of the first leg. The vehicle's front points to rising chainage either way.
     at_end : {"return", "stand"}
@@ -102,6 +104,7 @@ class RunSettings(ScenarioSettings):
     stations: tuple[Station, ...] = ()
     limits: tuple[SpeedLimit, ...] = ()
     cant_deficiency_m: Positive | None = None
+    jerk_mps3: Positive | None = None
     direction: Literal["rising", "falling"] = "rising"
     at_end: Literal["return", "stand"] = "return"
 
@@ -129,6 +132,11 @@ class VehicleSettings(ScenarioSettings):
     sway_sigma_deg, sway_period_s : float
         Roll of the body about its forward axis at 20 m/s and more, in proportion to the speed below that.
         Not in the vehicle's file, as it is unknown in practice.
+    pitch_sigma_deg, pitch_period_s : float
+        Random pitch of the body on its suspension at 20 m/s and more, in proportion to the speed below that.
+    pitch_deg_per_mps2 : float
+        Pitch under a constant acceleration, positive where the front rises when the train accelerates toward
+        rising chainage; it follows the acceleration as a damped oscillator of `pitch_period_s`.
     """
 
     name: str = "made test car"
@@ -138,6 +146,9 @@ class VehicleSettings(ScenarioSettings):
     rear: Three = (-9.1, 0.25, 3.95)
     sway_sigma_deg: NotNegative = 0.0
     sway_period_s: Positive = 1.5
+    pitch_sigma_deg: NotNegative = 0.0
+    pitch_period_s: Positive = 1.0
+    pitch_deg_per_mps2: Finite = 0.0
 
 
 class SkySettings(ScenarioSettings):

@@ -17,6 +17,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
+from railfix.simulate.body_motion import BodyMotion
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ, CN0_SECOND_DB
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
@@ -24,7 +25,8 @@ from railfix.simulate.disturbance import Disturbances, Geometry
 from railfix.simulate.environment import Environment
 from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import ClockWalk
-from railfix.simulate.motion import Motion, Sway, build_motion
+from railfix.simulate.kinematics import Motion
+from railfix.simulate.motion import build_motion
 from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
 from railfix.simulate.satellites import SatelliteTable, links
 from railfix.simulate.scenario import ANTENNAS, Scenario
@@ -85,8 +87,8 @@ class Simulation:
     line : Alignment
     motion : Motion
         Of the vehicle's middle.
-    sway : Sway
-        Of the vehicle's body.
+    body : BodyMotion
+        Roll and pitch of the vehicle's body.
     environment : Environment
         Structures along the line.
     disturbances : tuple of Disturbances
@@ -98,7 +100,7 @@ class Simulation:
         self.scenario = scenario
         self.line: Alignment = build_alignment(scenario.line)
         self.motion: Motion = build_motion(self.line, scenario)
-        self.sway: Sway = Sway.of(scenario)
+        self.body: BodyMotion = BodyMotion(scenario, self.motion)
         self.environment = Environment(scenario.environment, line_length_m=self.line.length_m, seed=scenario.place_seed)
         place = () if scenario.environment.empty else (self.environment,)
         self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
@@ -193,8 +195,8 @@ class Simulation:
     def body_truth(self, offset_m: tuple[float, float, float], seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
         """True position of a point of the body at seconds after the start, and the speed."""
         middle, speed = self.motion.at(seconds_s)
-        roll = self.sway.roll_rad(seconds_s, speed)
-        return antenna_truth(self.line, self.scenario.vehicle, offset_m, middle, roll), speed
+        roll, pitch = self.body.roll_rad(seconds_s, speed), self.body.pitch_rad(seconds_s, speed)
+        return antenna_truth(self.line, self.scenario.vehicle, offset_m, middle, roll, pitch), speed
 
     @cached_property
     def channels(self) -> tuple[tuple[str, str], ...]:

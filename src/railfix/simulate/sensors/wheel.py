@@ -12,7 +12,7 @@ from railfix.core.arrays import Floats
 from railfix.simulate.sensors.settings import DrawnSlips, SlipInterval, TachometerSettings
 
 if TYPE_CHECKING:
-    from railfix.simulate.motion import Motion
+    from railfix.simulate.kinematics import Motion
     from railfix.simulate.signals import Simulation
 
 
