@@ -19,6 +19,7 @@ FLOORS: Final[tuple[tuple[str, ...], ...]] = (
     ("ranges",),
     ("positioning", "motion"),
     ("screens", "integrity"),
+    ("tracking",),
     ("pipeline",),
     ("run",),
     ("simulate", "reference"),

@@ -1,0 +1,16 @@
+"""One filter along the track: codes, Dopplers, carrier phases and sensors, hypotheses over branches.
+
+Plain functions over arrays: `track` takes epochs and the state left by earlier ones and returns places along the
+trajectory and the new state.
+"""
+
+from __future__ import annotations
+
+from railfix.tracking.epochs import GnssEpochs, SensorEpochs
+from railfix.tracking.filter import track
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.line import Line
+from railfix.tracking.result import Tracked, TrackStatus
+from railfix.tracking.state import TrackState
+
+__all__ = ["GnssEpochs", "Line", "SensorEpochs", "TrackState", "TrackStatus", "Tracked", "TrackingLimits", "track"]

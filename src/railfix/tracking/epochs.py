@@ -1,0 +1,93 @@
+"""Measurements of the filter: arrays of T epochs by K channels, and of T epochs for sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+
+
+@dataclass(frozen=True, kw_only=True)
+class GnssEpochs:
+    """Corrected GNSS measurements of one antenna; NaN where there is none or it must not be used.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    satellite : ndarray of str, shape (K,)
+    clock : ndarray of str, shape (K,)
+        Letter of the receiver clock of each channel's codes.
+    sat_ecef_m, sat_velocity_mps : ndarray, shape (T, K, 3)
+        Satellites at transmission.
+    code_m, code_sigma_m : ndarray, shape (T, K) [m]
+        Corrected pseudorange and its standard deviation, the receiver's noise scale included.
+    phase_m : ndarray, shape (T, K) [m]
+        Corrected carrier phase.
+    phase_joined : ndarray of bool, shape (T, K)
+        Whether the phase continues that of the epoch before without a cycle slip.
+    rate_mps : ndarray, shape (T, K) [m/s]
+        Range rate by the Doppler with the satellite clock and the troposphere's change taken off.
+    cn0_dbhz : ndarray, shape (T, K)
+    """
+
+    time: Datetimes
+    satellite: Strings
+    clock: Strings
+    sat_ecef_m: Floats
+    sat_velocity_mps: Floats
+    code_m: Floats
+    code_sigma_m: Floats
+    phase_m: Floats
+    phase_joined: Masks
+    rate_mps: Floats
+    cn0_dbhz: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorEpochs:
+    """Sensor measurements at the same epochs, by name of the source, shape (T,) each; NaN where there is none.
+
+    Attributes
+    ----------
+    wheel_m, wheel_sigma_m : mapping of str to ndarray [m]
+        Signed way since the epoch before.
+    speed_mps, speed_sigma_mps : mapping of str to ndarray [m/s]
+        Speed along the track, + toward rising chainage.
+    force_mps2, force_sigma_mps2 : ndarray or None [m/s2]
+        Mean specific force along rising chainage since the epoch before, gravity included.
+    place_m, place_sigma_m : mapping of str to ndarray [m]
+        Arc length.
+    """
+
+    wheel_m: Mapping[str, Floats] = field(default_factory=dict)
+    wheel_sigma_m: Mapping[str, Floats] = field(default_factory=dict)
+    speed_mps: Mapping[str, Floats] = field(default_factory=dict)
+    speed_sigma_mps: Mapping[str, Floats] = field(default_factory=dict)
+    force_mps2: Floats | None = None
+    force_sigma_mps2: Floats | None = None
+    place_m: Mapping[str, Floats] = field(default_factory=dict)
+    place_sigma_m: Mapping[str, Floats] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Previous:
+    """The last epoch that had observations: what a change of the carrier phase is taken from.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+    satellite : ndarray of str, shape (K,)
+    sat_ecef_m : ndarray, shape (K, 3) [m]
+    phase_m : ndarray, shape (K,) [m]
+    """
+
+    time: np.datetime64
+    satellite: Strings
+    sat_ecef_m: Floats
+    phase_m: Floats

@@ -1,0 +1,175 @@
+"""Hypotheses over places of the line: where they begin, how they are joined and dropped."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+from railfix.core.geodesy import range_with_rotation
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.line import Line
+from railfix.tracking.predict import CODE_CLOCK_SIGMA_M
+from railfix.tracking.rows import Channels
+from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Unknown
+
+#: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between [m].
+_SPACING_M: Final = 15.0
+#: Places whose logarithm of likelihood is this far below the best are not begun with.
+_WORSE: Final = 12.0
+#: Standard deviation of an unknown speed: no train is faster than twice this [m/s].
+_ANY_SPEED_MPS: Final = 50.0
+_ANY_DRIFT_MPS: Final = 1e3
+#: Priors of the sensors: a wheel worn or entered wrongly by 2 %, an accelerometer's offset and mounting, a radar's
+#: angle.
+WHEEL_PRIOR: Final = 0.02
+FORCE_PRIOR_MPS2: Final = 0.1
+RADAR_PRIOR: Final = 0.02
+#: What a new hypothesis takes over from a lost track: its error has gone into everything else.
+_KEPT: Final = np.array([Unknown.WHEEL, Unknown.FORCE_OFFSET, Unknown.RADAR])
+
+
+def places(channels: Channels, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
+    """Places along the line that the codes of an epoch are consistent with.
+
+    Returns
+    -------
+    arc_m : ndarray, shape (C,) [m]
+        Local maxima of the likelihood with Student's t errors, the best first; empty without redundant codes.
+    sigma_m : ndarray, shape (C,) [m]
+        Half of the stretch that is about as likely, at least `start_sigma_m`.
+    """
+    has = np.isfinite(channels.code_m) & np.isfinite(channels.code_sigma_m)
+    groups = [has & (channels.offset == g) for g in range(len(CLOCKS))]
+    groups = [group for group in groups if group.sum() > 1]
+    if sum(int(group.sum()) - 1 for group in groups) < 1:
+        return np.empty(0), np.empty(0)
+    keep = _thinned(line)
+    arc, points = line.arc_m[keep], line.ecef_m[keep]
+    likelihood = np.zeros(len(arc))
+    degrees = limits.degrees_of_freedom
+    for group in groups:
+        distance, _ = range_with_rotation(channels.sat_ecef_m[group], points[:, None, :])
+        residual = channels.code_m[group] - distance
+        variance = (1.0 + limits.code_white_share**2) * channels.code_sigma_m[group] ** 2
+        clock = np.median(residual, axis=1, keepdims=True)
+        for _ in range(limits.passes):
+            weight = (degrees + 1.0) / (degrees + (residual - clock) ** 2 / variance) / variance
+            clock = (weight * residual).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
+        likelihood -= 0.5 * (degrees + 1.0) * np.log1p((residual - clock) ** 2 / (degrees * variance)).sum(axis=1)
+    order = np.argsort(-likelihood, kind="stable")
+    order = order[likelihood[order] > likelihood[order[0]] - _WORSE]
+    chosen: list[int] = []
+    for candidate in order.tolist():
+        if all(abs(arc[candidate] - arc[other]) > limits.start_separation_m for other in chosen):
+            chosen.append(candidate)
+        if len(chosen) == limits.most_hypotheses:
+            break
+    sigma = np.full(len(chosen), limits.start_sigma_m)
+    return arc[chosen], sigma
+
+
+def _thinned(line: Line) -> Indices:
+    """Vertices about `_SPACING_M` apart."""
+    marks = np.arange(line.arc_m[0], line.arc_m[-1] + _SPACING_M, _SPACING_M)
+    return np.unique(np.minimum(np.searchsorted(line.arc_m, marks), len(line.arc_m) - 1))
+
+
+def begin(
+    arc_m: Floats,
+    sigma_m: Floats,
+    satellites: int,
+    line: Line,
+    limits: TrackingLimits,
+    *,
+    known: tuple[Floats, Floats] | None = None,
+) -> tuple[Floats, Floats]:
+    """Mean and covariance of new hypotheses at places, shapes (H, N) and (H, N, N).
+
+    Parameters
+    ----------
+    arc_m, sigma_m : ndarray, shape (H,) [m]
+    satellites : int
+        Errors of satellites in the state.
+    line : Line
+    limits : TrackingLimits
+    known : tuple of ndarray, shapes (N,) and (N, N), optional
+        Mean and covariance of a lost track: what it knew of the sensors is kept, clocks and satellites begin anew.
+    """
+    width = SATELLITES + satellites
+    mean = np.zeros((len(arc_m), width))
+    mean[:, Unknown.PLACE] = mean[:, Unknown.BEFORE] = arc_m
+    variance = np.ones((len(arc_m), width))
+    variance[:, Unknown.PLACE] = variance[:, Unknown.BEFORE] = sigma_m**2
+    variance[:, Unknown.SPEED] = _ANY_SPEED_MPS**2
+    variance[:, Unknown.ACCELERATION] = limits.acceleration_mps2**2
+    variance[:, Unknown.DRIFT] = _ANY_DRIFT_MPS**2
+    variance[:, Unknown.MAP_RIGHT] = line.sigma_plan_m**2
+    variance[:, Unknown.MAP_UP] = line.sigma_height_m**2
+    variance[:, Unknown.CODE_PLACE] = limits.slow_code_m**2
+    variance[:, Unknown.DOPPLER_SPEED] = limits.doppler_error_mps**2
+    variance[:, Unknown.WHEEL] = WHEEL_PRIOR**2
+    variance[:, Unknown.FORCE_OFFSET] = FORCE_PRIOR_MPS2**2
+    variance[:, Unknown.RADAR] = RADAR_PRIOR**2
+    variance[:, OFFSETS:SATELLITES] = limits.offset_prior_m**2
+    covariance = np.zeros((len(arc_m), width, width))
+    diagonal = np.arange(width)
+    covariance[:, diagonal, diagonal] = variance
+    covariance[:, Unknown.CODE_CLOCK, Unknown.CODE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    covariance[:, Unknown.PHASE_CLOCK, Unknown.PHASE_CLOCK] = CODE_CLOCK_SIGMA_M**2
+    if known is not None:
+        mean[:, _KEPT] = known[0][_KEPT]
+        covariance[:, _KEPT[:, None], _KEPT] = known[1][_KEPT[:, None], _KEPT]
+    return mean, covariance
+
+
+def split(
+    mean: Floats, covariance: Floats, log_probability: float, arc_m: Floats, sigma_m: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Narrower hypotheses within a wide one, about places; probabilities by its density there.
+
+    Parameters
+    ----------
+    mean, covariance : ndarray, shapes (N,), (N, N)
+        The wide hypothesis.
+    log_probability : float
+    arc_m, sigma_m : ndarray, shape (C,) [m]
+    """
+    place = Unknown.PLACE
+    wide = covariance[place, place]
+    gain = covariance[:, place] / wide
+    means = mean + gain * (arc_m - mean[place])[:, None]
+    narrower = covariance - np.outer(gain, gain) * wide
+    covariances = narrower + np.outer(gain, gain) * (sigma_m**2)[:, None, None]
+    log_weight = -0.5 * (arc_m - mean[place]) ** 2 / wide + np.log(sigma_m)
+    return means, covariances, log_probability + log_weight - np.logaddexp.reduce(log_weight)
+
+
+def surviving(
+    mean: Floats, covariance: Floats, log_probability: Floats, origin_m: Floats, limits: TrackingLimits
+) -> tuple[Indices, Floats]:
+    """Hypotheses to go on with, the most probable first, and their probabilities.
+
+    Those that have come to the same place count as one. Improbable ones are dropped once all have travelled far
+    enough for their motion to have told them apart.
+    """
+    order = np.argsort(-log_probability, kind="stable")
+    place = mean[:, Unknown.PLACE]
+    sigma = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE])
+    kept: list[int] = []
+    joined = log_probability.copy()
+    for one in order.tolist():
+        twin = next((k for k in kept if abs(place[one] - place[k]) < max(2.0, sigma[one] + sigma[k])), None)
+        if twin is None:
+            kept.append(one)
+        else:
+            joined[twin] = np.logaddexp(joined[twin], joined[one])
+    chosen = np.array(kept[: limits.most_hypotheses], dtype=np.intp)
+    probability = joined[chosen] - np.logaddexp.reduce(joined[chosen])
+    travelled = np.abs(place[chosen] - origin_m[chosen])
+    if travelled[0] >= limits.decided_travel_m:
+        alive = probability > np.log(limits.least_probability)
+        chosen, probability = chosen[alive], probability[alive]
+        probability = probability - np.logaddexp.reduce(probability)
+    return chosen, probability

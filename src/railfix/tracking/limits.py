@@ -1,0 +1,103 @@
+"""Settings of the filter along the track, each with the reason of its default."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+
+
+class TrackingLimits(Settings):
+    """Noise of the motion and of the measurements, and when branches are kept or sought.
+
+    Attributes
+    ----------
+    acceleration_mps2, acceleration_s : float
+        Standard deviation and correlation time of the acceleration along the track (R. A. Singer, 1970). Trains
+        brake and accelerate with up to 1.3 m/s2 and hold it for some seconds; cars with more, for shorter.
+    degrees_of_freedom : float
+        Of Student's t that measurement errors follow: 4 is the least integer with a finite kurtosis bound of the
+        score, and what urban code errors look like.
+    passes : int
+        Rounds of reweighting an epoch.
+    code_correlation_s, code_correlation_m : float
+        Time and travel over which the multipath of a satellite's code changes: a reflector of a street or a
+        station is passed within about 100 m; at rest the fringe of one 10 m away lasts about a minute.
+    code_white_share : float
+        White part of a code's error, over its standard deviation; per second, not per epoch.
+    slow_code_m, slow_code_s : float
+        Displacement along the line by errors of orbits and ionosphere, about 1 m a satellite, and how long it lasts:
+        averaging over epochs does not take it away.
+    doppler_floor_mps, doppler_zenith_mps : float
+        ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler.
+    doppler_error_mps, doppler_error_share, doppler_correlation_s : float
+        Time-correlated error of the speed by Dopplers: its least size, its share of the speed (a reflected signal is
+        shifted by up to the speed, at rest not at all) and its correlation time.
+    phase_floor_m, phase_zenith_m : float
+        The same of the change of a carrier phase over an epoch.
+    clock_walk_mps : float
+        Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency,
+        what quartz oscillators without an oven show when shaken.
+    offset_walk_m : float
+        Change of the offset between the codes of two constellations in the square root of a second.
+    offset_prior_m : float
+        Standard deviation of such an offset before anything is known beside the first epoch's median.
+    map_roughness_m, map_correlation_m : float
+        Local error of the map across the track and in height, and the length over which it changes: with it the
+        change of the carrier phase cannot claim more than the shape of the line is known to.
+    map_scale_m : float
+        Error of a length along the map [m per square root of m].
+    map_absolute_m : float
+        Length over which the absolute error of the map changes (sigmas are those of the trajectory).
+    decided_travel_m : float
+        Hypotheses are dropped only after this much travel: before, motion has not told branches apart.
+    least_probability : float
+        Hypotheses below it are dropped.
+    most_hypotheses : int
+    start_sigma_m : float
+        Standard deviation of a hypothesis about its place when it begins.
+    start_separation_m : float
+        Two places of the first epoch this close are one.
+    gap_s : float
+        Time without measurements after which places are sought again beside the predicted one.
+    lost_motion_weight, lost_motion_s, lost_code_weight, lost_code_s : float
+        The track is lost when the mean weight of Dopplers and phases, or of codes, stays below these for so long
+        (1 is the weight of an error of one standard deviation).
+    expired_sigma_m : float
+        Standard deviation from which on a predicted place is no position.
+    """
+
+    acceleration_mps2: float = Field(default=1.0, gt=0)
+    acceleration_s: float = Field(default=2.0, gt=0)
+    degrees_of_freedom: float = Field(default=4.0, gt=2)
+    passes: int = Field(default=4, ge=1)
+    code_correlation_s: float = Field(default=60.0, gt=0)
+    code_correlation_m: float = Field(default=100.0, gt=0)
+    code_white_share: float = Field(default=0.5, gt=0)
+    slow_code_m: float = Field(default=0.7, ge=1e-6)
+    slow_code_s: float = Field(default=600.0, gt=0)
+    doppler_floor_mps: float = Field(default=0.03, gt=0)
+    doppler_zenith_mps: float = Field(default=0.05, gt=0)
+    doppler_error_mps: float = Field(default=0.01, gt=0)
+    doppler_error_share: float = Field(default=0.02, ge=0)
+    doppler_correlation_s: float = Field(default=10.0, gt=0)
+    phase_floor_m: float = Field(default=0.01, gt=0)
+    phase_zenith_m: float = Field(default=0.01, gt=0)
+    clock_walk_mps: float = Field(default=0.5, gt=0)
+    offset_walk_m: float = Field(default=0.02, gt=0)
+    offset_prior_m: float = Field(default=30.0, gt=0)
+    map_roughness_m: float = Field(default=0.3, gt=0)
+    map_correlation_m: float = Field(default=50.0, gt=0)
+    map_scale_m: float = Field(default=0.03, gt=0)
+    map_absolute_m: float = Field(default=500.0, gt=0)
+    decided_travel_m: float = Field(default=60.0, ge=0)
+    least_probability: float = Field(default=1e-4, gt=0, lt=0.5)
+    most_hypotheses: int = Field(default=8, ge=1)
+    start_sigma_m: float = Field(default=30.0, gt=0)
+    start_separation_m: float = Field(default=60.0, gt=0)
+    gap_s: float = Field(default=5.0, gt=0)
+    lost_motion_weight: float = Field(default=0.45, ge=0)
+    lost_motion_s: float = Field(default=6.0, gt=0)
+    lost_code_weight: float = Field(default=0.5, ge=0)
+    lost_code_s: float = Field(default=12.0, gt=0)
+    expired_sigma_m: float = Field(default=200.0, gt=0)

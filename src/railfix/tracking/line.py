@@ -1,0 +1,80 @@
+"""The trajectory as the filter sees it: points, smooth tangents and axes at arc lengths, beyond its ends too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Floats
+from railfix.track.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """Vertices of a trajectory with their axes.
+
+    Attributes
+    ----------
+    arc_m : ndarray, shape (V,) [m]
+    ecef_m : ndarray, shape (V, 3) [m]
+    axes : ndarray, shape (V, 3, 3)
+        Rows: tangent (mean of the two segments), to the right, up.
+    segment : ndarray, shape (V - 1, 3)
+        Unit vector of each segment.
+    gradient : ndarray, shape (V - 1,)
+        Climb over horizontal length of each segment.
+    sigma_plan_m, sigma_height_m : float [m]
+    """
+
+    arc_m: Floats
+    ecef_m: Floats
+    axes: Floats
+    segment: Floats
+    gradient: Floats
+    sigma_plan_m: float
+    sigma_height_m: float
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Line:
+        """Axes at the vertices of a trajectory."""
+        segment = np.asarray(trajectory.tangent)
+        tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
+        tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+        up = np.concatenate([trajectory.up[:1], trajectory.up])
+        right = np.cross(tangent, up)
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        return cls(
+            arc_m=np.asarray(trajectory.arc_m),
+            ecef_m=np.asarray(trajectory.ecef_m),
+            axes=np.stack([tangent, right, np.cross(right, tangent)], axis=1),
+            segment=segment,
+            gradient=np.asarray(trajectory.gradient_permille) / 1e3,
+            sigma_plan_m=trajectory.sigma_plan_m,
+            sigma_height_m=trajectory.sigma_height_m,
+        )
+
+    def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
+        """Points and axes at arc lengths, straight on beyond the ends.
+
+        Parameters
+        ----------
+        arc_m : ndarray, shape (H,) [m]
+
+        Returns
+        -------
+        ecef_m : ndarray, shape (H, 3) [m]
+        axes : ndarray, shape (H, 3, 3)
+            Rows: tangent, right, up; interpolated between vertices.
+        """
+        index = np.clip(np.searchsorted(self.arc_m, arc_m, side="right") - 1, 0, len(self.segment) - 1)
+        along = arc_m - self.arc_m[index]
+        share = np.clip(along / (self.arc_m[index + 1] - self.arc_m[index]), 0.0, 1.0)[:, None, None]
+        axes = (1.0 - share) * self.axes[index] + share * self.axes[index + 1]
+        axes = axes / np.sqrt((axes * axes).sum(axis=-1, keepdims=True))
+        return self.ecef_m[index] + along[:, None] * self.segment[index], axes
+
+    def gradient_at(self, arc_m: Floats) -> Floats:
+        """Climb over horizontal length, between the middles of segments, shape (H,)."""
+        middle = 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
+        return np.interp(arc_m, middle, self.gradient)

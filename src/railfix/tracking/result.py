@@ -1,0 +1,145 @@
+"""What the filter returns: places, speeds and what measured them, epoch by epoch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.robust import mean_weight
+from railfix.tracking.rows import Kind, Rows
+from railfix.tracking.state import TrackState, Unknown
+
+#: A hypothesis this probable is the only one that counts.
+DECIDED: Final = 0.99
+
+
+class TrackStatus(IntEnum):
+    """What the filter says of an epoch."""
+
+    #: One place, from measurements of this epoch.
+    TRACKING = 0
+    #: Several places are possible; the most probable one is given.
+    SEVERAL_BRANCHES = 1
+    #: No measurement of this epoch: the predicted place.
+    COASTING = 2
+    #: Measurements contradict the track: places are sought again.
+    LOST = 3
+    #: No place: predicted too far.
+    EXPIRED = 4
+    #: No place yet: no epoch so far had redundant codes.
+    NOT_STARTED = 5
+
+    @property
+    def text(self) -> str:
+        """The word written to files: ``several_branches``."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracked:
+    """Places of T epochs; NaN where there is none.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    status : ndarray of int8, shape (T,)
+        `TrackStatus`.
+    arc_m, sigma_m : ndarray, shape (T,) [m]
+        Of the most probable hypothesis.
+    speed_mps, speed_sigma_mps, acceleration_mps2 : ndarray, shape (T,)
+    probability : ndarray, shape (T,)
+        Of the hypothesis given.
+    hypotheses : ndarray of int, shape (T,)
+    code_weight, motion_weight : ndarray, shape (T,)
+        Mean weights of codes, and of Dopplers and phases.
+    wheel_scale, force_offset_mps2, radar_scale : ndarray, shape (T,)
+    used : ndarray of int, shape (T, len(Kind))
+        Measurements of each kind with a weight of more than a half.
+    innovation : ndarray, shape (T, 3, K)
+        Before the update, of codes, phases and Dopplers.
+    weight : ndarray, shape (T, 3, K)
+    """
+
+    time: Datetimes
+    status: Codes
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats
+    speed_sigma_mps: Floats
+    acceleration_mps2: Floats
+    probability: Floats
+    hypotheses: Integers
+    code_weight: Floats
+    motion_weight: Floats
+    wheel_scale: Floats
+    force_offset_mps2: Floats
+    radar_scale: Floats
+    used: Integers
+    innovation: Floats
+    weight: Floats
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @classmethod
+    def empty(cls, time: Datetimes, channels: int) -> Tracked:
+        """Nothing known at T epochs, to be filled in."""
+        size = len(time)
+        names = (
+            "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
+            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale",
+        )  # fmt: skip
+        return cls(
+            time=time,
+            status=np.full(size, TrackStatus.NOT_STARTED, dtype=np.int8),
+            hypotheses=np.zeros(size, dtype=np.int64),
+            used=np.zeros((size, len(Kind)), dtype=np.int64),
+            innovation=np.full((size, 3, channels), np.nan),
+            weight=np.full((size, 3, channels), np.nan),
+            **{name: np.full(size, np.nan) for name in names},
+        )
+
+
+def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weight: Floats) -> None:
+    """Innovations and weights of the best hypothesis."""
+    for kind in Kind:
+        mask = rows.kind == kind
+        result.used[epoch, kind] = np.count_nonzero(weight[mask] > 0.5)
+        if kind <= Kind.DOPPLER:
+            result.innovation[epoch, kind, rows.column[mask]] = innovation[mask]
+            result.weight[epoch, kind, rows.column[mask]] = weight[mask]
+    result.code_weight[epoch] = mean_weight(rows, weight, (Kind.CODE,))
+    result.motion_weight[epoch] = mean_weight(rows, weight, (Kind.PHASE, Kind.DOPPLER))
+
+
+def write_place(
+    result: Tracked, epoch: int, state: TrackState, *, measured: bool, lost: bool, limits: TrackingLimits
+) -> None:
+    """Place, speed and status of the most probable hypothesis."""
+    mean, covariance = state.mean[0], state.covariance[0]
+    sigma = float(np.sqrt(covariance[Unknown.PLACE, Unknown.PLACE]))
+    probability = float(np.exp(state.log_probability[0]))
+    result.hypotheses[epoch] = state.hypotheses
+    result.probability[epoch] = probability
+    if sigma > limits.expired_sigma_m:
+        result.status[epoch] = TrackStatus.EXPIRED
+        return
+    result.arc_m[epoch], result.sigma_m[epoch] = mean[Unknown.PLACE], sigma
+    result.speed_mps[epoch] = mean[Unknown.SPEED]
+    result.speed_sigma_mps[epoch] = np.sqrt(covariance[Unknown.SPEED, Unknown.SPEED])
+    result.acceleration_mps2[epoch] = mean[Unknown.ACCELERATION]
+    result.wheel_scale[epoch] = mean[Unknown.WHEEL]
+    result.force_offset_mps2[epoch] = mean[Unknown.FORCE_OFFSET]
+    result.radar_scale[epoch] = mean[Unknown.RADAR]
+    if lost:
+        status = TrackStatus.LOST
+    elif not measured:
+        status = TrackStatus.COASTING
+    else:
+        status = TrackStatus.TRACKING if probability >= DECIDED else TrackStatus.SEVERAL_BRANCHES
+    result.status[epoch] = status

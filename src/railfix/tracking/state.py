@@ -1,0 +1,121 @@
+"""State of the filter: hypotheses side by side, each a Gaussian over the same unknowns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks, Strings
+from railfix.tracking.epochs import Previous
+
+#: Letters of the receiver clocks of codes, in the order of their offsets in the state.
+CLOCKS: Final = ("G", "E", "C", "R", "I")
+
+
+class Unknown(IntEnum):
+    """Place of each unknown in the state; offsets of the clocks and satellites' errors come after."""
+
+    #: Arc length, speed, acceleration along the trajectory [m, m/s, m/s2].
+    PLACE = 0
+    SPEED = 1
+    ACCELERATION = 2
+    #: Arc length at the epoch before [m].
+    BEFORE = 3
+    #: Change of the clock of the carrier phases since the epoch before [m].
+    PHASE_CLOCK = 4
+    #: Drift of that clock [m/s].
+    DRIFT = 5
+    #: Error of the map to the right and up [m].
+    MAP_RIGHT = 6
+    MAP_UP = 7
+    #: Clock of the codes at this epoch [m].
+    CODE_CLOCK = 8
+    #: Error of the map's displacement since the epoch before: right, up, along [m].
+    STEP_RIGHT = 9
+    STEP_UP = 10
+    STEP_ALONG = 11
+    #: Share that the wheel's way is too short by.
+    WHEEL = 12
+    #: Offset of the accelerometer [m/s2].
+    FORCE_OFFSET = 13
+    #: Share that the radar's speed is too low by.
+    RADAR = 14
+    #: Time-correlated error of the speed by Dopplers [m/s].
+    DOPPLER_SPEED = 15
+    #: Displacement along the line by errors of the codes that last minutes (orbits, ionosphere) [m].
+    CODE_PLACE = 16
+
+
+#: First offset of the clocks.
+OFFSETS: Final = len(Unknown)
+#: First error of a satellite.
+SATELLITES: Final = OFFSETS + len(CLOCKS)
+#: Unknowns that begin anew at every epoch.
+FRESH: Final = (Unknown.CODE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.STEP_ALONG)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackState:
+    """What one epoch leaves to the next: H hypotheses of N unknowns.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Of the last epoch; NaT before the first.
+    mean : ndarray, shape (H, N)
+    covariance : ndarray, shape (H, N, N)
+    log_probability : ndarray, shape (H,)
+    origin_m : ndarray, shape (H,) [m]
+        Arc length at which each hypothesis began.
+    satellite : ndarray of str, shape (N - SATELLITES,)
+        Satellites whose errors are in the state.
+    seen : ndarray of datetime64[ns], shape (N - SATELLITES,)
+        When each was last measured.
+    offset_known : ndarray of bool, shape (len(CLOCKS),)
+        Clocks that have had an observation.
+    previous : Previous or None
+    measured : datetime64[ns]
+        Last epoch with measurements that the filter used.
+    weak_motion_s, weak_code_s : float [s]
+        How long the mean weights have been low.
+    log_scale : ndarray, shape (2,)
+        Logarithm of the variance of Dopplers and of phases against that of the limits.
+    """
+
+    time: np.datetime64
+    mean: Floats
+    covariance: Floats
+    log_probability: Floats
+    origin_m: Floats
+    satellite: Strings
+    seen: np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]
+    offset_known: Masks
+    previous: Previous | None
+    measured: np.datetime64
+    weak_motion_s: float = 0.0
+    weak_code_s: float = 0.0
+    log_scale: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def hypotheses(self) -> int:
+        """Number of hypotheses."""
+        return len(self.log_probability)
+
+    @classmethod
+    def empty(cls) -> TrackState:
+        """State before the first epoch."""
+        return cls(
+            time=np.datetime64("NaT", "ns"),
+            mean=np.empty((0, SATELLITES)),
+            covariance=np.empty((0, SATELLITES, SATELLITES)),
+            log_probability=np.empty(0),
+            origin_m=np.empty(0),
+            satellite=np.empty(0, dtype="<U3"),
+            seen=np.empty(0, dtype="datetime64[ns]"),
+            offset_known=np.zeros(len(CLOCKS), dtype=np.bool_),
+            previous=None,
+            measured=np.datetime64("NaT", "ns"),
+        )

@@ -1,0 +1,189 @@
+"""The filter along the track on epochs with known truth, against second formulas and by cutting."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackStatus, track
+from railfix.tracking.predict import singer_step
+from railfix.tracking.robust import robust_update
+from railfix.tracking.rows import Rows
+from railfix.tracking.state import TrackState
+from tracking_cases import Ride, bent_line, part, ride, wheel, without_epochs
+
+
+def _in_parts(ride: Ride, cuts: list[int]) -> tuple[list[Tracked], TrackState | None]:
+    results, state = [], None
+    for begin, end in zip([0, *cuts], [*cuts, len(ride.epochs)], strict=True):
+        result, state = track(part(ride.epochs, slice(begin, end)), ride.line, state)
+        results.append(result)
+    return results, state
+
+
+@pytest.mark.requirement("E5")
+def test_noise_free_epochs_give_the_place_and_speed() -> None:
+    case = ride()
+    result, _ = track(case.epochs, case.line)
+    settled = slice(20, None)
+    assert np.abs(result.arc_m - case.arc_m)[settled].max() < 0.05
+    assert np.abs(result.speed_mps - case.speed_mps)[settled].max() < 0.05
+    assert (result.status[settled] == TrackStatus.TRACKING).all()
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("cuts", [[1], [7, 60], list(range(1, 90))])
+def test_any_cutting_gives_the_same_numbers(cuts: list[int]) -> None:
+    case = ride(90, noise=1.0)
+    whole, last = track(case.epochs, case.line)
+    parts, state = _in_parts(case, cuts)
+    for name in ("arc_m", "sigma_m", "speed_mps", "probability", "status", "innovation", "weight"):
+        joined = np.concatenate([getattr(one, name) for one in parts])
+        np.testing.assert_array_equal(joined, getattr(whole, name), err_msg=name)
+    assert state is not None
+    np.testing.assert_array_equal(state.mean, last.mean)
+
+
+@pytest.mark.requirement("E5")
+def test_no_epoch_depends_on_a_later_one() -> None:
+    case = ride(60, noise=1.0)
+    code = case.epochs.code_m.copy()
+    code[40:] += 100.0
+    changed, _ = track(replace(case.epochs, code_m=code), case.line)
+    whole, _ = track(case.epochs, case.line)
+    np.testing.assert_array_equal(changed.arc_m[:40], whole.arc_m[:40])
+
+
+@pytest.mark.requirement("E5")
+def test_a_satellite_with_a_wrong_code_loses_its_weight() -> None:
+    case = ride(noise=1.0)
+    code = case.epochs.code_m.copy()
+    code[50:80, [1, 4, 7]] += np.array([60.0, -45.0, 80.0])
+    result, _ = track(replace(case.epochs, code_m=code), case.line)
+    assert np.abs(result.arc_m - case.arc_m)[20:].max() < 3.0
+    assert result.weight[50:80, 0][:, [1, 4, 7]].max() < 0.2
+    assert np.median(result.weight[50:80, 0][:, [0, 2, 3]]) > 0.7
+
+
+@pytest.mark.requirement("E5")
+def test_errors_stay_within_their_sigmas() -> None:
+    ratio = []
+    for seed in range(8):
+        case = ride(100, noise=1.0, seed=seed)
+        result, _ = track(case.epochs, case.line)
+        ratio.append(((result.arc_m - case.arc_m) / result.sigma_m)[20:])
+    assert np.sqrt(np.mean(np.concatenate(ratio) ** 2)) < 1.5
+
+
+@pytest.mark.requirement("E5")
+def test_a_gap_is_coasted_and_left_again() -> None:
+    case = ride(120, noise=1.0)
+    gap = np.zeros(120, dtype=bool)
+    gap[60:80] = True
+    result, _ = track(without_epochs(case.epochs, gap), case.line)
+    assert (result.status[60:80] == TrackStatus.COASTING).all()
+    assert (np.diff(result.sigma_m[59:80]) > 0).all()
+    assert (np.abs(result.arc_m - case.arc_m) < 4.0 * result.sigma_m)[20:].all()
+    assert np.abs(result.arc_m - case.arc_m)[90:].max() < 3.0
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.requirement("E2")
+def test_a_wheel_carries_through_a_gap_and_its_diameter_is_learnt() -> None:
+    case = ride(150, trajectory=bent_line(4000.0), noise=0.3)
+    gap = np.zeros(150, dtype=bool)
+    gap[110:140] = True
+    result, _ = track(without_epochs(case.epochs, gap), case.line, sensors=wheel(case, scale=0.02))
+    assert result.wheel_scale[109] == pytest.approx(0.02, abs=0.004)
+    moved = case.arc_m[139] - case.arc_m[109]
+    assert abs(result.arc_m[139] - case.arc_m[139]) < 2.0 + 0.003 * moved
+    assert (result.status[110:140] == TrackStatus.TRACKING).all()
+
+
+@pytest.mark.requirement("E5")
+def test_a_clock_step_of_a_millisecond_moves_nothing() -> None:
+    case = ride(80)
+    step = 299_792.458 * (np.arange(80) >= 50)[:, None]
+    moved = replace(case.epochs, code_m=case.epochs.code_m + step, phase_m=case.epochs.phase_m + step)
+    result, _ = track(moved, case.line)
+    assert np.abs(result.arc_m - case.arc_m)[20:].max() < 0.1
+
+
+@pytest.mark.requirement("E5")
+def test_a_place_put_wrong_is_lost_and_sought_again() -> None:
+    case = ride(120, noise=1.0)
+    _, state = track(part(case.epochs, slice(0, 50)), case.line)
+    mean = state.mean.copy()
+    mean[:, 0] += 800.0
+    later, _ = track(part(case.epochs, slice(50, 120)), case.line, replace(state, mean=mean))
+    assert TrackStatus.LOST in later.status
+    assert np.abs(later.arc_m[-20:] - case.arc_m[-20:]).max() < 3.0
+
+
+def _linear_rows(random: np.random.Generator, hypotheses: int, rows: int, width: int) -> tuple[Rows, np.ndarray]:
+    design = random.normal(size=(hypotheses, rows, width))
+    made = Rows(
+        design=design,
+        value=random.normal(size=(hypotheses, rows)),
+        variance=random.uniform(0.5, 2.0, rows),
+        kind=np.zeros(rows, dtype=np.int64),
+        column=np.arange(rows),
+    )
+    root = random.normal(size=(hypotheses, width, width))
+    return made, root @ np.swapaxes(root, 1, 2) + np.eye(width)
+
+
+@pytest.mark.requirement("E5")
+def test_with_normal_errors_the_update_is_kalmans_and_its_evidence_the_density() -> None:
+    rows, covariance = _linear_rows(np.random.default_rng(3), 2, 7, 4)
+    update = robust_update(rows, covariance, np.ones((2, 7)), degrees=1e9, passes=3)
+    density = []
+    for k in range(2):
+        innovation = rows.design[k] @ covariance[k] @ rows.design[k].T + np.diag(rows.variance)
+        gain = covariance[k] @ rows.design[k].T @ np.linalg.inv(innovation)
+        np.testing.assert_allclose(update.change[k], gain @ rows.value[k], rtol=1e-6, atol=1e-9)
+        kalman = covariance[k] - gain @ rows.design[k] @ covariance[k]
+        np.testing.assert_allclose(update.covariance[k], kalman, rtol=1e-6, atol=1e-9)
+        density.append(multivariate_normal.logpdf(rows.value[k], cov=innovation))
+    assert update.log_evidence[0] - update.log_evidence[1] == pytest.approx(density[0] - density[1], abs=1e-5)
+
+
+@pytest.mark.requirement("E5")
+def test_the_noise_of_the_motion_is_that_of_many_short_steps() -> None:
+    whole_step, whole_noise = singer_step(3.0, 1.0, 2.0)
+    step, noise = singer_step(0.01, 1.0, 2.0)
+    total, product = np.zeros((3, 3)), np.eye(3)
+    for _ in range(300):
+        total = step @ total @ step.T + noise
+        product = step @ product
+    np.testing.assert_allclose(product, whole_step, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(total, whole_noise, rtol=2e-2)
+
+
+@pytest.mark.requirement("E5")
+def test_inputs_are_left_as_they_are() -> None:
+    case = ride(30, noise=1.0)
+    for array in vars(case.epochs).values():
+        array.setflags(write=False)
+    _, state = track(part(case.epochs, slice(0, 15)), case.line)
+    for array in (state.mean, state.covariance, state.log_probability):
+        array.setflags(write=False)
+    track(part(case.epochs, slice(15, 30)), case.line, state)
+
+
+def _looped(trajectory_length: float) -> tuple[GnssEpochs, np.ndarray, Line]:
+    """A ride on a line that comes back beside itself 12 m away: two branches for every code."""
+    case = ride(100, trajectory=bent_line(trajectory_length, turn_deg=190.0), noise=1.0, code_sigma_m=8.0)
+    return case.epochs, case.arc_m, case.line
+
+
+@pytest.mark.requirement("E5")
+def test_probabilities_sum_to_one_and_motion_decides() -> None:
+    epochs, arc, line = _looped(1500.0)
+    result, state = track(epochs, line, limits=TrackingLimits())
+    assert np.exp(state.log_probability).sum() == pytest.approx(1.0)
+    assert np.nanmax(result.probability) <= 1.0 + 1e-12
+    assert np.abs(result.arc_m - arc)[-20:].max() < 8.0
