@@ -38,7 +38,7 @@ from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, fit
 from railfix.ranges.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model
 from railfix.run.driver import open_inputs
-from railfix.run.past import past_run
+from railfix.run.folder import read_record
 from railfix.run.processor import processor_of
 from railfix.track.trajectory import Trajectory
 
@@ -212,7 +212,7 @@ def truth_of(folder: Path, name: str) -> Path:
 
 
 def recording_of(folder: Path, name: str) -> Recording:
-    past = past_run(folder / name)
+    past = read_record(folder / name)
     navigation, line, logs = open_inputs(past.inputs, past.options)
     (antenna,) = logs
     reference = read_reference(truth_of(folder, name), (antenna,))[antenna]

@@ -75,7 +75,6 @@ def test_version() -> None:
         (["run"], "--front"),
         (["run", "--front"], "--front"),
         (["ran"], "ran"),
-        (["run", "--chunk", "0"], "--chunk"),
         (["run", "--chunk", "many"], "--chunk"),
         (["run", "--start", "yesterday"], "--start"),
         (["run", "--reference", "roof"], "--reference"),

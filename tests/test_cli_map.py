@@ -7,17 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
-from railfix.cli import Commands
-from railfix.cli.map import map_app
+from railfix.cli import app
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track, read_track, write_track_csv
 
 runner = CliRunner()
-app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
-app.add_typer(map_app, name="map")
 
 
 def call(*arguments: object) -> tuple[int, str]:
@@ -80,7 +76,7 @@ def test_the_limit_of_the_mid_chord_deviation_is_an_option(tmp_path: Path) -> No
         (["check", "line.csv", "--geoid", "japan"], 4, "ellipsoidal already"),
         (["check", "line.csv", "--mid-chord", "0"], 4, "must be positive"),
         (["check", "line.csv", "--crs", "EPSG:0"], 4, "unknown"),
-        (["check", "line.csv", "--out", "line.csv"], 8, "cannot be made"),
+        (["check", "line.csv", "--out", "line.csv"], 8, "does not exist"),
         (["check", "line.csv", "far.csv"], 3, "the gap is"),
         (["check"], 2, "Missing argument"),
         (["check", "line.csv", "--wrong"], 2, "No such option"),

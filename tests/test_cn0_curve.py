@@ -8,14 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from conftest import ROOT
-from railfix.cli import Commands
-from railfix.cli.cn0_curve import cn0_curve as command
+from railfix.cli import app
 from railfix.core.errors import InputFileError, MismatchError, OutputError, SettingsError
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.rinex import read_navigation, read_observations
@@ -38,9 +36,6 @@ from railfix.screens import cn0_screen
 
 pytestmark = pytest.mark.requirement("B1")
 
-app = typer.Typer(cls=Commands, pretty_exceptions_enable=False)
-app.callback()(lambda: None)
-app.command("cn0-curve")(command)
 runner = CliRunner()
 
 DEMO = ROOT / "data" / "demo"

@@ -527,8 +527,12 @@ def test_the_command_writes_every_table(tmp_path: Path):
         (["--reference", "{reference}", "--label", "a", "--label", "b"], 4, "--label is given 2 times"),
         (["--reference", "{late}"], 5, "no time in common"),
         (["--reference", "{reference}", "--speed-classes", "20,x"], 4, "--speed-classes"),
-        (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "speed_edges_kmh"),
-        (["--reference", "{reference}", "--section-length", "0"], 4, "section_m"),
+        (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "--speed-classes: positive numbers that rise"),
+        (
+            ["--reference", "{reference}", "--section-length", "0"],
+            4,
+            "--section-length: Input should be greater",
+        ),
         (["--reference", "{reference}", "--sections", "absent.csv"], 3, "absent.csv"),
         (["--reference", "{reference}", "--method", "trajectory"], 3, "names no track"),
         (["--reference", "auto"], 3, "names no log of the front antenna"),
@@ -554,7 +558,7 @@ def test_errors_of_the_command(tmp_path: Path, change: list[str], code: int, tol
     ("spoil", "told"),
     [
         (lambda run: (run / "run.json").unlink(), r"run\.json: there is no such file"),
-        (lambda run: (run / "run.json").write_text("{"), r"run\.json: cannot be read as JSON"),
+        (lambda run: (run / "run.json").write_text("{"), r"run\.json: is not valid JSON"),
         (lambda run: (run / "positions.parquet").unlink(), "holds neither positions.parquet nor positions.csv"),
         (lambda run: (run / "positions.parquet").write_bytes(b"PAR1"), "cannot be read as a table"),
         (

@@ -29,7 +29,7 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor, conditions_of
 from railfix.ranges.error_model import ErrorModelFit, read_error_model, write_error_model
-from railfix.run import RunOptions, past_run, run_files
+from railfix.run import RunOptions, read_record, run_files
 from railfix.run.driver import open_inputs
 from railfix.run.processor import processor_of
 from railfix.simulate import Scenario, Simulation, demo_files
@@ -185,31 +185,32 @@ def done_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def test_a_past_run_knows_how_it_was_done(done_run: Path) -> None:
-    past = past_run(done_run)
+def test_a_read_record_knows_how_it_was_done(done_run: Path) -> None:
+    past = read_record(done_run)
     assert past.config.min_satellites == 4
     assert past.inputs == demo_inputs()
     assert past.options == RunOptions()
     past.check_inputs()
 
 
-def test_a_past_run_whose_input_has_changed_is_refused(done_run: Path, tmp_path: Path) -> None:
+def test_a_read_record_whose_input_has_changed_is_refused(done_run: Path, tmp_path: Path) -> None:
     record = json.loads((done_run / "run.json").read_text())
     record["inputs"][0]["sha256"] = "0" * 64
     (tmp_path / "run.json").write_text(json.dumps(record))
     with pytest.raises(MismatchError, match="has changed since the run"):
-        past_run(tmp_path).check_inputs()
+        read_record(tmp_path).check_inputs()
 
 
 @pytest.mark.parametrize(
-    ("content", "said"), [("{", "is no JSON"), ("{}", "lacks inputs, options, settings_used"), ("[]", "everything")]
+    ("content", "said"),
+    [("{", "is not valid JSON"), ("{}", "has no table settings_used"), ("[]", "expected a JSON object")],
 )
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "run.json").write_text(content)
     with pytest.raises(InputFileError, match=said):
-        past_run(tmp_path)
-    with pytest.raises(InputFileError, match="name a folder that railfix run wrote"):
-        past_run(tmp_path / "nothing")
+        _ = read_record(tmp_path).config
+    with pytest.raises(InputFileError, match="expected the folder that railfix run wrote"):
+        read_record(tmp_path / "nothing")
 
 
 def test_the_command_writes_a_model_and_says_what_it_lacks(done_run: Path, tmp_path: Path) -> None:
@@ -262,8 +263,8 @@ def test_a_run_of_another_version_is_refused(done_run: Path, tmp_path: Path) -> 
     record = json.loads((done_run / "run.json").read_text())
     record["options"]["novelty"] = 1
     (tmp_path / "run.json").write_text(json.dumps(record))
-    with pytest.raises(InputFileError, match="other options than this version writes"):
-        past_run(tmp_path)
+    with pytest.raises(InputFileError, match=r"not written by this version .*unknown setting novelty"):
+        _ = read_record(tmp_path).options
 
 
 def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
@@ -309,7 +310,7 @@ def test_the_station_is_corrected_as_the_train_is(recordings: Path) -> None:
 
 def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: Path) -> None:
     model, _ = error_model_from_runs([ModelInputs(run=done_run, reference=demo_files()["truth"])])
-    assert model.conditions == conditions_of(past_run(done_run).config)
+    assert model.conditions == conditions_of(read_record(done_run).config)
     write_error_model(model, tmp_path / "m.toml")
     same = processor_of(parse_config({"error_model": str(tmp_path / "m.toml")}), *_nothing())
     assert not any("other conditions" in note for note in same.notes)

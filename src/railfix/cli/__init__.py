@@ -1,46 +1,40 @@
 """The command line: the program ``railfix`` and its commands.
 
-The commands import what they need when they run, so that ``railfix --help`` answers at once.
+Each command is imported when it is called, so that ``railfix --help`` answers at once.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 import typer
-from typer.core import TyperGroup
 
 from railfix import __version__
-from railfix.cli.ablate import ablate as ablate_command
-from railfix.cli.cn0_curve import cn0_curve as cn0_curve_command
-from railfix.cli.demo import demo as demo_command
-from railfix.cli.error_model import error_model as error_model_command
-from railfix.cli.evaluate import evaluate as evaluate_command
-from railfix.cli.map import map_app
-from railfix.cli.plot_screens import plot_screens as plot_screens_command
-from railfix.cli.reference import reference as reference_command
-from railfix.cli.report import report as report_command
-from railfix.cli.run import run as run_command
-from railfix.cli.simulate import simulate as simulate_command
-from railfix.core.errors import RailfixError
+from railfix.cli.command import LazyCommands, run_program
 
 
-class Commands(TyperGroup):
-    """A group whose commands end with one sentence and the exit code of the error's class."""
+class _Program(LazyCommands):
+    """The commands of railfix."""
 
-    def invoke(self, ctx: Any) -> Any:
-        """Run the command; an error that the user can mend is told in one sentence."""
-        try:
-            return super().invoke(ctx)
-        except RailfixError as error:
-            sentence = " ".join(str(error).split())
-            typer.echo(f"railfix: error: {sentence}", err=True)
-            raise typer.Exit(error.exit_code) from None
+    summaries: ClassVar[Mapping[str, str]] = {
+        "run": "Position receiver logs along the line.",
+        "demo": "Position the demonstration log and compare it with its ground truth.",
+        "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
+        "evaluate": "Compute errors of runs against references.",
+        "reference": "Build a reference trajectory from fixed positions, gaps bridged.",
+        "cn0-curve": "Fit the mean C/N0 over elevation of an antenna and receiver.",
+        "error-model": "Model the pseudorange errors of a line from runs with references.",
+        "plot-screens": "Plot each screen's metric against its limit.",
+        "simulate": "Simulate runs with ground truth.",
+        "report": "Write an HTML report on runs.",
+        "map": "Check a track map, or make one from positions.",
+    }
 
 
 app = typer.Typer(
     name="railfix",
-    cls=Commands,
+    cls=_Program,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -70,9 +64,9 @@ def railfix(
 ) -> None:
     """Positions of a train along its line, from satellite receiver logs and a 3-D track map.
 
-    A train runs on a known line, so its antenna lies on a known curve in space and its place is one
+    A train runs on a known line, so its antenna lies on a known curve and its position is one
     number along it. railfix reads RINEX logs, navigation files and a track map, and writes that
-    number for every epoch, with its standard deviation and the reason for everything it refused.
+    number for every epoch, with its standard deviation and the reason for every rejected observation.
 
     To begin: `railfix demo`, then `railfix run --help`.
 
@@ -88,23 +82,14 @@ def railfix(
     - 7: the run ended without a single position
     - 8: the output cannot be written
 
-    An error is one sentence on the standard error output; it leaves no results behind.
+    128 and the number of a signal: the program was ended by that signal (143 SIGTERM, 141 the reader of its
+    output ended first).
+
+    An error is one sentence on the standard error output; it leaves no results behind. Files that exist are
+    replaced only with `--overwrite`, and an input is never replaced.
     """
-
-
-app.command("run")(run_command)
-app.command("demo")(demo_command)
-app.command("ablate")(ablate_command)
-app.command("evaluate")(evaluate_command)
-app.command("reference")(reference_command)
-app.command("cn0-curve")(cn0_curve_command)
-app.command("error-model")(error_model_command)
-app.command("plot-screens")(plot_screens_command)
-app.command("simulate")(simulate_command)
-app.command("report")(report_command)
-app.add_typer(map_app)
 
 
 def main() -> None:
     """Entry point of the program ``railfix``."""
-    app()
+    run_program(app)

@@ -1,82 +1,28 @@
-"""``railfix ablate``: what each screen buys and costs."""
+"""``railfix ablate``: compare choices of screens on one log."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
 
-from railfix.cli.options import (
-    INPUTS,
-    CrsOption,
-    DatumOption,
-    EndOption,
-    FrontOption,
-    GeoidOption,
-    LenientOption,
-    NavOption,
-    OutOption,
-    OverwriteOption,
-    RearOption,
-    Sp3Option,
-    StartOption,
-    TrackOption,
-    VehicleOption,
-)
-from railfix.cli.settings import (
-    Choices,
-    ConfigOption,
-    CurveOption,
-    PresetOption,
-    ScreensOption,
-    SettingOption,
-    WithoutOption,
-    settings_of,
-)
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from railfix.evaluate import Score
-    from railfix.evaluate.ablation import Ablation, Effect
-
-#: Columns of text that the table needs.
-_WIDTH = 110
+from railfix.cli.console import console_of_tables, progress_bar, show_files, show_notes
+from railfix.cli.options import OutOption, Without, from_models
+from railfix.cli.settings import Choices, settings_of
+from railfix.evaluate import Score
+from railfix.evaluate.ablation import Ablation, Effect, ablate_files
+from railfix.run import RunInputs, RunOptions
 
 
+@from_models
 def ablate(
+    inputs: RunInputs,
+    choices: Choices,
+    options: Annotated[RunOptions, Without("observations", "chunk_epochs", "reference")],
     *,
-    front: FrontOption,
-    nav: NavOption,
-    track: TrackOption,
     out: OutOption,
-    rear: RearOption = None,
-    sp3: Sp3Option = None,
-    vehicle: VehicleOption = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            "--truth",
-            metavar="POSITIONS",
-            rich_help_panel=INPUTS,
-            help="Where the antenna really was: CSV with named columns (antenna says whose, where there are two) or "
-            "RTKLIB .pos; of quality 1 where it tells one.",
-        ),
-    ] = None,
-    config: ConfigOption = None,
-    preset: PresetOption = None,
-    setting: SettingOption = None,
-    screens: ScreensOption = None,
-    without: WithoutOption = None,
-    cn0_curve: CurveOption = None,
-    crs: CrsOption = None,
-    height_datum: DatumOption = None,
-    geoid: GeoidOption = None,
-    start: StartOption = None,
-    end: EndOption = None,
-    lenient: LenientOption = False,
-    overwrite: OverwriteOption = False,
 ) -> None:
     r"""What each screen buys and costs on a log: all screens, none, each alone, all but each.
 
@@ -97,36 +43,8 @@ def ablate(
     4 a setting is wrong; 5 the inputs do not belong together; 7 not one position; 8 DIR cannot be
     written; 1 a defect of railfix.
     """
-    from railfix.cli.console import progress_bar
-    from railfix.evaluate.ablation import ablate_files
-    from railfix.run import RunInputs, RunOptions, TrackReading
-
-    chosen = Choices(
-        config=config,
-        preset=preset,
-        setting=tuple(setting or ()),
-        screens=screens,
-        without=tuple(without or ()),
-        cn0_curve=cn0_curve,
-    )
-    settings, asked = settings_of(chosen)
-    inputs = RunInputs(
-        front=tuple(front),
-        rear=tuple(rear or ()),
-        nav=tuple(nav),
-        sp3=tuple(sp3 or ()),
-        track=tuple(track),
-        vehicle=vehicle,
-        config=config,
-        truth=truth,
-    )
-    options = RunOptions(
-        broken_lines="count" if lenient else "stop",
-        overwrite="replace" if overwrite else "refuse",
-        start=start,
-        end=end,
-        track=TrackReading(crs=crs, height_datum=height_datum, geoid=geoid),
-    )
+    settings, asked = settings_of(choices)
+    inputs = inputs.replaced(config=choices.config)
     with progress_bar() as progress:
         ablation = ablate_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
     show_ablation(ablation)
@@ -134,24 +52,16 @@ def ablate(
 
 def show_ablation(ablation: Ablation) -> None:
     """One table an antenna, the notes, and where the results are."""
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    console.width = max(console.width, _WIDTH)
+    console = console_of_tables()
     for antenna in dict.fromkeys(effect.antenna for effect in ablation.effects):
         effects = [effect for effect in ablation.effects if effect.antenna == antenna]
         console.print(f"{antenna}: {effects[0].epochs:,} epochs", markup=False)
         _show(console, effects)
-    for note in ablation.notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for path in ablation.files.values():
-        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    show_notes(console, ablation.notes)
+    show_files(console, ablation.files.values())
 
 
 def _show(console: Console, effects: list[Effect]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     scored = effects[0].coordinates is not None
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     table.add_column("screens", no_wrap=True)

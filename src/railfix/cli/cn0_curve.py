@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.table import Table
 
-from railfix.core.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from railfix.core.arrays import Floats
-    from railfix.ranges.cn0_curve import Cn0Curve
+from railfix.cli.console import console_of_tables, show_files, show_notes
+from railfix.cli.options import LenientOption, OverwriteOption
+from railfix.core.arrays import Floats
+from railfix.core.errors import SettingsError
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, cn0_curve_from_log, write_cn0_curve
+from railfix.run.output import check_output_file
 
 
 def cn0_curve(
@@ -32,35 +35,32 @@ def cn0_curve(
         str | None,
         typer.Option(
             metavar="LAT,LON,HEIGHT",
-            help="Where the antenna stood, in degrees and metres, to some kilometres; else what the header says.",
+            help="Position of the antenna, in degrees and metres, within some kilometres; from the header without it.",
         ),
     ] = None,
     bin_deg: Annotated[float, typer.Option("--bin", metavar="DEG", help="Width of the bins of elevation.")] = 5.0,
-    lenient: Annotated[
-        bool, typer.Option("--lenient", help="Count broken lines of the files and go on, instead of stopping.")
-    ] = False,
+    lenient: LenientOption = False,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Fit the mean C/N0 over elevation of one antenna and receiver.
 
-    Let the antenna stand under open sky for about a day, with the receiver that the train will have:
-    the curve belongs to the two together. It is fitted for each constellation and signal, and the file
-    says what it was made from. Positioning then refuses signals that are 10 dB-Hz below the mean at their
-    elevation; without a curve there is only the floor that is the same for all.
+    Record about a day under open sky with the antenna and the receiver of the train: the curve belongs to the
+    two together. It is fitted for each constellation and signal, and the file names its inputs. Positioning then
+    rejects signals that are 10 dB-Hz below the mean at their elevation; without a curve only a fixed floor applies.
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 
     Exit codes as `railfix --help` says; 5 where the position or the navigation files do not fit the log.
     """
-    from railfix.ranges.cn0_curve import CurveFit, cn0_curve_from_log, write_cn0_curve
-
     try:
         fit = CurveFit(bin_deg=bin_deg)
     except ValueError as error:
         raise SettingsError(f"--bin: {error}") from None
     place = None if position is None else place_of(position, "--position")
-    for path in (out, plot):
-        if path is not None and not path.parent.is_dir():
-            raise OutputError(f"{path}: the folder {path.parent} does not exist")
+    outputs = [path for path in (out, plot) if path is not None]
+    for path in outputs:
+        others = [other for other in outputs if other is not path]
+        check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=[*observations, *nav, *others])
     made = cn0_curve_from_log(
         observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"
     )
@@ -70,15 +70,11 @@ def cn0_curve(
         draw_cn0_curve(plot, made.curve, made.samples)
     write_cn0_curve(made.curve, out)
     _print_curve(made.curve, made.notes)
-    for path in (out, plot):
-        if path is not None:
-            typer.echo(f"wrote {path}")
+    show_files(console_of_tables(), outputs)
 
 
 def place_of(text: str, option: str) -> Floats:
-    """A place given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
-    from railfix.core.geodesy import ecef_from_geodetic
-
+    """Return a position given as LAT,LON,HEIGHT on the command line, ECEF, shape (3,) [m]."""
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
     except ValueError:
@@ -89,12 +85,7 @@ def place_of(text: str, option: str) -> Floats:
 
 
 def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from railfix.ranges.cn0_curve import KINDS
-
-    console, source = Console(highlight=False), curve.source
+    console, source = console_of_tables(), curve.source
     console.print(
         f"antenna {source.antenna or 'not named'}, receiver {source.receiver or 'not named'}; "
         f"{source.epochs:,} epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz over elevation",
@@ -114,8 +105,7 @@ def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
             f"{float(mean.spread_db.mean()):.1f}",
         )
     console.print(table)
-    for note in notes:
-        console.print(f"note: {note}", markup=False)
+    show_notes(console, notes)
 
 
 def _number(value: float) -> str:

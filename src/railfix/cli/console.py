@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -17,6 +18,30 @@ if TYPE_CHECKING:
     from railfix.run import RunSummary
     from railfix.run.driver import Progress as ProgressCall
     from railfix.run.tally import AntennaTally
+
+
+#: Width of tables where the output is no terminal, so that no cell is cut or folded.
+_FILE_WIDTH: Final = 500
+
+
+def console_of_tables() -> Console:
+    """Return the standard output for tables, wide enough for whole rows in a log file."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = max(console.width, _FILE_WIDTH)
+    return console
+
+
+def show_notes(console: Console, notes: Iterable[str]) -> None:
+    """Print notes, one per line."""
+    for note in notes:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def show_files(console: Console, paths: Iterable[Path]) -> None:
+    """Print the files that were written."""
+    for path in paths:
+        console.print(f"wrote {path}", markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -48,15 +73,13 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
 
 def show_summary(summary: RunSummary) -> None:
     """Epochs, positions, statuses, the budget of reasons, and where the results are."""
-    console = Console(highlight=False)
+    console = console_of_tables()
     names = list(summary.tally.antennas)
     console.print(_positions(summary, names))
     console.print("Pseudoranges, by the first reason that refused them, and by it alone")
     console.print(_reasons(summary, names))
-    for note in summary.notes:
-        console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for path in summary.files.values():
-        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    show_notes(console, summary.notes)
+    show_files(console, summary.files.values())
     rate = summary.tally.epochs / summary.wall_s
     console.print(f"{summary.tally.epochs:,} epochs in {summary.wall_s:.2f} s ({rate:,.0f} epochs/s, reading included)")
 

@@ -1,31 +1,36 @@
-"""``railfix demo``: the main job on the log that comes with railfix, against its truth."""
+"""``railfix demo``: position the demonstration log and compare it with its ground truth."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from railfix.evaluate import Evaluation
+from railfix.cli.console import console_of_tables, progress_bar, show_summary
+from railfix.cli.options import OverwriteOption
+from railfix.evaluate import Evaluation
+from railfix.report import read_runs, write_page
+from railfix.run import RunOptions, run_files
+from railfix.simulate.demonstration import demo_inputs, demo_truth
 
 
 def demo(
     *,
     out: Annotated[
         Path,
-        typer.Option("--out", metavar="DIR", help="Folder for the results; those of an earlier demo are replaced."),
+        typer.Option("--out", metavar="DIR", help="Folder for the results; made where absent."),
     ] = Path("railfix-demo"),
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """Run the main job on the log that comes with railfix, and compare it with the truth.
+    """Position the demonstration log and compare the positions with their ground truth.
 
-    The log is made up: a train with two antennas on a test line with curves and cant; the README beside
-    the log tells what it holds. railfix positions it as `railfix run` does, and sets the positions
-    on the map, and the conventional ones (3-D single point, moved to the nearest point), against the
-    truth as `railfix report` does.
+    The log is simulated: a train with two antennas on a test line with curves and cant; the README beside
+    the log describes it. It is positioned as by `railfix run`; the positions on the map, and the conventional
+    ones (3-D single point, moved to the nearest point of the line), are compared with the ground truth as by
+    `railfix report`.
 
     Into DIR come `positions.csv`, `positions.parquet`, `observations.parquet`, `run.json` and
     `report.html`, the page to open in a browser.
@@ -36,31 +41,25 @@ def demo(
 
     Exit codes: 0 done; 8 DIR cannot be written; 1 a defect of railfix.
     """
-    from railfix.cli.console import progress_bar, show_summary
-    from railfix.report import read_runs, write_page
-    from railfix.run import RunOptions, run_files
-    from railfix.simulate.demonstration import demo_inputs, demo_truth
-
     inputs = demo_inputs()
     with progress_bar() as progress:
-        options = RunOptions(observations="write", overwrite="replace", chunk_epochs=200)
+        options = RunOptions(observations="write", overwrite="replace" if overwrite else "refuse", chunk_epochs=200)
         summary = run_files(inputs, out=out, options=options, progress=progress)
     show_summary(summary)
     runs, evaluation = read_runs([out], [demo_truth()])
-    page = write_page(runs, evaluation, out / "report.html", title="railfix demo: a made-up run against its truth")
+    page = write_page(
+        runs, evaluation, out / "report.html", title="railfix demo: a simulated run against its ground truth"
+    )
     if evaluation is not None:
         show_errors(evaluation)
-    typer.echo(f"the log, its track map, vehicle and truth: {inputs.front[0].parent}")
+    typer.echo(f"the log, its track map, vehicle and ground truth: {inputs.front[0].parent}")
     typer.echo(f"the report, to open in a browser: {page}")
 
 
 def show_errors(evaluation: Evaluation) -> None:
-    """Errors along the line on the map, of those that no check has failed, and of the conventional position."""
-    from rich.console import Console as Terminal
-    from rich.table import Table
-
-    console: Console = Terminal(highlight=False)
-    console.print("Error along the line against the truth in metres, + toward its end")
+    """Print errors along the line: on the map, of those that passed every check, and of the conventional position."""
+    console = console_of_tables()
+    console.print("Error along the line against the ground truth in metres, + toward its end")
     table = Table()
     for head in ("antenna", "position", "rate", "mean", "std", "p50", "p95", "largest"):
         table.add_column(head, justify="left" if head in ("antenna", "position") else "right")
@@ -77,7 +76,7 @@ def show_errors(evaluation: Evaluation) -> None:
 
 
 def show_levels(evaluation: Evaluation, console: Console) -> None:
-    """The protection level of each antenna: how wide, how often it serves, how often an error is over it."""
+    """Print the protection level of each antenna: median, availability, and errors above it."""
     for kind, found in evaluation.integrity.items():
         rows = found.stanford.filter(grouping="all", levels_of="usable", own_limit=True)
         for row in rows.filter(rows["antenna"] != "all").iter_rows(named=True):

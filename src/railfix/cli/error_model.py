@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
 import typer
+from rich.table import Table
 
-from railfix.core.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from railfix.ranges.error_model import ErrorModel
+from railfix.cli.cn0_curve import place_of
+from railfix.cli.console import console_of_tables
+from railfix.cli.options import OverwriteOption
+from railfix.core.errors import SettingsError
+from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
+from railfix.ranges.error_model import ErrorBins, ErrorModel, ErrorModelFit, summary, write_error_model
+from railfix.run.output import check_output_file
 
 
 def error_model(
@@ -18,7 +23,7 @@ def error_model(
     *,
     reference: Annotated[
         list[Path],
-        typer.Option("--reference", metavar="FILE", help="Where the antennas were, one for each RUN in their order."),
+        typer.Option("--reference", metavar="FILE", help="Reference positions, one file for each RUN in order."),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="MODEL.toml", help="Error model to write.")],
     base: Annotated[
@@ -31,7 +36,7 @@ def error_model(
     ] = None,
     base_position: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON,HEIGHT", help="Place of the station; else what its header says."),
+        typer.Option(metavar="LAT,LON,HEIGHT", help="Position of the station; from its header without it."),
     ] = None,
     elevations: Annotated[
         str, typer.Option(metavar="DEG,...", help="Edges of the bins of elevation.")
@@ -44,34 +49,31 @@ def error_model(
     ] = "0,30,35,40,45,60",
     least_blocks: Annotated[
         int,
-        typer.Option(metavar="N", help="Passes of a satellite (30 s blocks) below which wider bins stand for a bin."),
+        typer.Option(
+            metavar="N", help="Passes of a satellite (30 s blocks) below which a bin takes the values of a wider one."
+        ),
     ] = 30,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Model the errors of corrected pseudoranges: multipath of the line and receiver noise.
 
-    Each RUN is positioned once more with its own settings. The error of a pseudorange is what is left of it
-    after the distance to the reference and the receiver clock are taken away, and with `--base` also what a
-    nearby reference station sees of the same satellite. Without `--base` errors of orbits, clocks and
-    atmosphere stay in, as they were on those days: the model is then wider, and holds for such days.
+    Each RUN is positioned once more with its own settings. The error of a pseudorange is its residual after the
+    distance from the reference and the receiver clock are subtracted, and with `--base` also the residual of a
+    nearby reference station to the same satellite. Without `--base` the model includes the orbit, clock and
+    atmospheric errors of those days: it is wider, and valid for such days.
 
     The file has bias, standard deviation and a Gaussian overbound for every bin of elevation, azimuth from the
-    car's front and C/N0, before the screens and after. `railfix run --set error_model=MODEL.toml` weighs
-    the ranges by it and derives the protection level from it.
+    car's front and C/N0, before the screens and after. `railfix run --error-model MODEL.toml` weights
+    the ranges and derives the protection level by it.
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
     Exit codes as `railfix --help` says; 5 where run, reference and station do not belong together.
     """
-    import numpy as np
-
-    from railfix.cli.cn0_curve import place_of
-    from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
-    from railfix.ranges.error_model import ErrorBins, ErrorModelFit, write_error_model
-
     if len(reference) != len(runs):
         raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")
-    if not out.parent.is_dir():
-        raise OutputError(f"{out}: the folder {out.parent} does not exist")
+    in_runs = [path for run in runs if run.is_dir() for path in run.iterdir()]
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[*reference, *(base or ()), *in_runs])
     try:
         bins = ErrorBins(elevation_deg=_edges(elevations), sectors=sectors, cn0_dbhz=_edges(cn0))
         fit = ErrorModelFit(bins=bins, least_blocks=least_blocks)
@@ -93,12 +95,7 @@ def _edges(text: str) -> tuple[float, ...]:
 
 
 def _print_model(model: ErrorModel, samples: int) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from railfix.ranges.error_model import summary
-
-    console = Console(highlight=False)
+    console = console_of_tables()
     base = model.source.base or "none: errors of satellites and atmosphere are in the model"
     console.print(
         f"{samples:,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres",

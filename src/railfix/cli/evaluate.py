@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from railfix.cli.options import CHOICES, INPUTS, CrsOption, DatumOption, GeoidOption, OverwriteOption
+from railfix.cli.evaluate_tables import show_evaluation
+from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.core.errors import SettingsError
+from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
+from railfix.evaluate.run_folder import POSITIONS_TABLE, tables_of
+from railfix.run.inputs import INPUTS
+from railfix.run.output import OutputFolder
 
-if TYPE_CHECKING:
-    from railfix.evaluate import RunAndReference
 
-
+@from_models
 def evaluate(
     *,
     runs: Annotated[list[Path], typer.Argument(metavar="RUN", help="Folder that `railfix run` wrote.")],
@@ -22,7 +27,7 @@ def evaluate(
             "--reference",
             metavar="FILE",
             rich_help_panel=INPUTS,
-            help="Reference trajectory (reference.csv, truth.csv, .gz, RTKLIB), once for each run in order; "
+            help="Reference positions (reference.csv, truth.csv, .gz, RTKLIB), once for each run in order; "
             "`auto`: truth.csv or reference.csv beside the log of each run.",
         ),
     ],
@@ -51,69 +56,25 @@ def evaluate(
     sections: Annotated[
         Path | None,
         typer.Option(
+            "--sections",
             metavar="CSV",
             rich_help_panel=INPUTS,
-            help="Environment by chainage (from_m,to_m,environment), where the reference does not tell it.",
+            help="Environment by chainage (from_m,to_m,environment), where the reference has none.",
         ),
     ] = None,
-    track: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="TRACK", rich_help_panel=INPUTS, help="Track in place of the one that run.json names."),
-    ] = None,
-    vehicle: Annotated[
-        Path | None,
-        typer.Option(metavar="TOML", rich_help_panel=INPUTS, help="Vehicle in place of the one that run.json names."),
-    ] = None,
-    crs: CrsOption = None,
-    height_datum: DatumOption = None,
-    geoid: GeoidOption = None,
+    files: Annotated[TrackFiles, Without("reference")],
     label: Annotated[
         list[str] | None,
         typer.Option(
+            "--label",
             metavar="TEXT",
-            rich_help_panel=CHOICES,
-            help="Name of the configuration of each run, once for each in order; made from the settings by default.",
+            rich_help_panel="Choices",
+            help="Name of the configuration of each run, once for each in order; from the settings by default.",
         ),
     ] = None,
-    method: Annotated[
-        Literal["auto", "chainage", "trajectory"],
-        typer.Option(
-            rich_help_panel=CHOICES,
-            help="Errors as differences of chainage, or along the trajectory from the reference's place.",
-        ),
-    ] = "auto",
-    reference_sigma: Annotated[
-        float,
-        typer.Option(
-            metavar="M", rich_help_panel=CHOICES, help="Epochs whose reference is worse are left out of the errors."
-        ),
-    ] = 0.5,
-    reference_gap: Annotated[
-        float, typer.Option(metavar="S", rich_help_panel=CHOICES, help="Longest step of the reference that is bridged.")
-    ] = 2.5,
-    section_length: Annotated[
-        float, typer.Option(metavar="M", rich_help_panel=CHOICES, help="Length of the sections of the line.")
-    ] = 1000.0,
-    speed_classes: Annotated[
-        str, typer.Option(metavar="KMH,...", rich_help_panel=CHOICES, help="Where one class of speed ends.")
-    ] = "20,60,100",
-    standing: Annotated[
-        float, typer.Option(metavar="M/S", rich_help_panel=CHOICES, help="Below this speed the train stands.")
-    ] = 0.3,
-    alarm_limit: Annotated[
-        list[float] | None,
-        typer.Option(
-            metavar="M",
-            rich_help_panel=CHOICES,
-            help="What a protection level must stay within to be available, beside each run's own limit; may be "
-            "repeated. 10, 20 and 40 by default.",
-        ),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option(metavar="N", rich_help_panel=CHOICES, help="Start of the random numbers of the confidence.")
-    ] = 0,
+    options: EvaluationOptions,
     beside_p1: Annotated[
-        bool, typer.Option("--beside-p1", rich_help_panel=CHOICES, help="Also show what the source paper found.")
+        bool, typer.Option("--beside-p1", rich_help_panel="Choices", help="Also show the results of the source paper.")
     ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -140,41 +101,25 @@ def evaluate(
     4 a setting is wrong; 5 run, reference and line do not belong together; 8 DIR cannot be written;
     1 a defect of railfix.
     """
-    from railfix.cli.evaluate_tables import show_evaluation
-    from railfix.core.settings import validated
-    from railfix.evaluate import EvaluationOptions, TrackFiles, evaluate_runs, write_evaluation
-    from railfix.run.output import OutputFolder
-
-    values = {
-        "method": method,
-        "reference_sigma_m": reference_sigma,
-        "reference_gap_s": reference_gap,
-        "standing_mps": standing,
-        "section_m": section_length,
-        "speed_edges_kmh": _numbers("--speed-classes", speed_classes),
-        "seed": seed,
-    }
-    if alarm_limit:
-        values["alarm_limits_m"] = tuple(alarm_limit)
-    options = validated(EvaluationOptions, values, source="railfix evaluate")
-    files = TrackFiles(track=tuple(track or ()), vehicle=vehicle, crs=crs, height_datum=height_datum, geoid=geoid)
-    chosen = _with_tables(_paired(runs, reference, label), table, conventional)
-
+    pairs = [
+        replace(pair, table=name, conventional=conventional)
+        for pair in _paired(runs, reference, label)
+        for name in table or tables_of(pair.run) or [POSITIONS_TABLE]
+    ]
+    written: dict[str, Path] = {}
     if out is None:
-        evaluation = evaluate_runs(chosen, sections=sections, files=files, options=options)
-        written: dict[str, Path] = {}
+        evaluation = evaluate_runs(pairs, sections=sections, files=files, options=options)
     else:
-        with OutputFolder(out, overwrite="replace" if overwrite else "refuse") as folder:
-            evaluation = evaluate_runs(chosen, sections=sections, files=files, options=options)
+        given = [pair.reference for pair in pairs if isinstance(pair.reference, Path)]
+        inputs = [*given, *files.track, *(path for path in (sections, files.vehicle) if path is not None)]
+        with OutputFolder(out, overwrite="replace" if overwrite else "refuse", inputs=inputs) as folder:
+            evaluation = evaluate_runs(pairs, sections=sections, files=files, options=options)
             written = write_evaluation(evaluation, folder)
     show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")
 
 
 def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> list[RunAndReference]:
     """Each run with its reference and label."""
-    from railfix.core.errors import SettingsError
-    from railfix.evaluate import RunAndReference
-
     references: list[str] = reference * len(runs) if reference == ["auto"] else reference
     for name, given in (("--reference", references), ("--label", label)):
         if given is not None and len(given) != len(runs):
@@ -184,28 +129,3 @@ def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> 
         RunAndReference(run=run, reference=None if file == "auto" else Path(file), configuration=name)
         for run, file, name in zip(runs, references, labels, strict=True)
     ]
-
-
-def _with_tables(
-    runs: list[RunAndReference], tables: list[str] | None, conventional: Path | None
-) -> list[RunAndReference]:
-    """Each run once per table of positions."""
-    from dataclasses import replace
-
-    from railfix.evaluate.run_folder import POSITIONS_TABLE, tables_of
-
-    return [
-        replace(item, table=name, conventional=conventional)
-        for item in runs
-        for name in tables or tables_of(item.run) or [POSITIONS_TABLE]
-    ]
-
-
-def _numbers(option: str, text: str) -> tuple[float, ...]:
-    """Numbers between commas."""
-    from railfix.core.errors import SettingsError
-
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise SettingsError(f"{option} is {text!r}; numbers between commas were expected, such as 20,60,100") from None

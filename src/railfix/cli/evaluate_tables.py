@@ -11,14 +11,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from railfix.cli.console import console_of_tables, show_files, show_notes
 from railfix.cli.evaluate_levels import show_integrity
 from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
-#: Width that the tables need, beside the names of runs and configurations.
-_WIDTH: Final = 150
 _NAMES: Final = {
     "constrained": "on the map",
     "constrained_ok": "  of status ok",
@@ -39,9 +38,7 @@ _MOST_SECTIONS: Final = 20
 
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: Literal["nothing", "p1"]) -> None:
     """Figures of each run, then by groups, then where the files are."""
-    console = Console(highlight=False)
-    names = evaluation.figures.select(pl.col("configuration", "group").str.len_chars().max()).row(0)
-    console.width = max(console.width, _WIDTH + sum(names))
+    console = console_of_tables()
     for run in evaluation.runs:
         console.print(f"{run.name}: {run.configuration}; line {run.line}", markup=False, soft_wrap=True)
         for antenna, method in run.method.items():
@@ -51,8 +48,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
                 markup=False,
                 soft_wrap=True,
             )
-        for note in run.notes:
-            console.print(f"  note: {note}", markup=False, soft_wrap=True)
+        show_notes(console, run.notes)
     console.print("\nErrors along the line in metres, + toward its end")
     several = len(evaluation.runs) > 1
     whole = evaluation.figures.filter(pl.col("grouping") == "all")
@@ -85,8 +81,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
             console.print(f"  the first {_MOST_SECTIONS}; all are in tables.csv (--out)")
     if beside == "p1":
         _show_p1(console)
-    for path in files.values():
-        console.print(f"wrote {path}", markup=False, soft_wrap=True)
+    show_files(console, files.values())
 
 
 def _table(*heads: str, text: int) -> Table:

@@ -3,29 +3,46 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
 import typer
+from rich.table import Table
 
+from railfix.cli.command import Command, Commands
+from railfix.cli.console import console_of_tables, show_notes
+from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
+from railfix.io.position_log import read_positions
+from railfix.run.options import TrackReading
+from railfix.run.output import check_output_file
+from railfix.track import (
+    MapLimits,
+    Thinned,
+    Track,
+    TrackQuality,
+    check_track,
+    from_position_log,
+    read_track,
+    write_track_csv,
+)
 
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from railfix.track import Thinned, Track, TrackQuality
-
-map_app = typer.Typer(
+app = typer.Typer(
+    cls=Commands,
+    add_completion=False,
+    pretty_exceptions_enable=False,
     name="map",
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Track maps: check one before trusting positions on it, or make one from good positions.",
+    help="Check a track map before positions on it are used, or make one from positions.",
 )
 
 #: Findings printed before the rest is only counted.
 _SHOWN = 40
 
 
-@map_app.command("check")
+@app.command("check", cls=Command)
+@from_models
 def check(
     tracks: Annotated[
         list[Path],
@@ -37,31 +54,18 @@ def check(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
     ] = None,
-    crs: Annotated[
-        str | None,
-        typer.Option(metavar="CRS", help="CRS of the coordinates where the file does not say, e.g. `EPSG:6677`."),
-    ] = None,
-    height_datum: Annotated[
-        str | None,
-        typer.Option(metavar="DATUM", help="`ellipsoidal` or `orthometric`, where the file does not say."),
-    ] = None,
-    geoid: Annotated[
-        str | None,
-        typer.Option(
-            metavar="GEOID",
-            help="Geoid of orthometric heights: `japan` (JPGEO2024), `gsigeo2011`, a pyproj grid or vertical CRS.",
-        ),
-    ] = None,
+    reading: Annotated[TrackReading, Without("reference")],
     max_gap: Annotated[
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
     mid_chord: Annotated[
         float, typer.Option(metavar="M", help="Largest deviation of a chord from the arc at its middle.")
     ] = 0.30,
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """Check a track map and print what is wrong with it.
+    """Check a track map and print its faults.
 
-    Looked at: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
+    Checked: spacing and duplicates of points, mid-chord deviation from the arc (from `radius_m`
     where given, else from the circle through neighbouring points), kinks, jumps and reversals of the
     kilometrage, gradients and height spikes, cant, and curve attributes against the points.
 
@@ -73,19 +77,24 @@ def check(
     3 a file is not a track map; 4 an option is wrong; 8 the picture cannot be written; 1 a defect of
     railfix.
     """
-    from railfix.track import MapLimits, check_track, read_track
-
     if not mid_chord > 0.0 or not max_gap > 0.0:
         raise SettingsError("--mid-chord and --max-gap must be positive")
+    picture = None if out is None else out / "map_check.png"
+    if picture is not None and picture.parent.exists():
+        check_output_file(picture, overwrite="replace" if overwrite else "refuse", inputs=tracks)
     track = read_track(
-        list(tracks), crs=crs, height_datum=height_datum, geoid=geoid, max_gap_m=max_gap, duplicates="keep"
+        list(tracks),
+        crs=reading.crs,
+        height_datum=reading.height_datum,
+        geoid=reading.geoid,
+        max_gap_m=max_gap,
+        duplicates="keep",
     )
     quality = check_track(track, limits=MapLimits(mid_chord_m=mid_chord))
-    picture = None
-    if out is not None:
+    if picture is not None:
         from railfix.report.plots.track import plot_track_quality
 
-        picture = _folder(out) / "map_check.png"
+        _make_folder(picture.parent)
         plot_track_quality(quality, picture)
     _print_quality(quality, picture)
     if quality.errors:
@@ -94,7 +103,7 @@ def check(
         )
 
 
-@map_app.command("from-positions")
+@app.command("from-positions", cls=Command)
 def from_positions_command(
     positions: Annotated[
         Path,
@@ -107,7 +116,7 @@ def from_positions_command(
         str | None,
         typer.Option(
             metavar="Q,Q...",
-            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); 1 where the log tells quality.",
+            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); by default 1 where the log has them.",
         ),
     ] = None,
     max_sigma: Annotated[
@@ -122,25 +131,24 @@ def from_positions_command(
         ),
     ] = None,
     name: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the track; else that of the file.")] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """Make a track map from good positions of one run, where no map exists.
+    """Make a track map from the positions of one run.
 
-    Positions of lesser quality and those at which the antenna stands are left out, the rest is thinned
-    to the spacing; bends between two points are kept within 0.30 m. The map is the path of that
-    antenna: use it without a vehicle file. A run over several laps gives several laps.
+    Positions of other quality and those at standstill are left out, the rest is thinned to the spacing; deviations
+    between two points stay within 0.30 m. The map is the path of that antenna: use it without a vehicle file.
+    A run over several laps gives several laps.
 
     Example:
 
         railfix map from-positions rtk.pos --out line.csv --quality 1
 
-    Exit codes: 0 done; 2 the command line was misused; 3 the file is no log of positions, or its
-    positions make no line; 4 an option is wrong; 8 the map cannot be written; 1 a defect of railfix.
+    Exit codes: 0 done; 2 the command line was misused; 3 the file is not a position log, or its
+    positions form no line; 4 an option is wrong; 8 the map cannot be written; 1 a defect of railfix.
     """
-    from railfix.io.position_log import read_positions
-    from railfix.track import from_position_log, write_track_csv
-
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[positions])
     log = read_positions(positions, columns=_columns(column or []))
     track, thinned = from_position_log(
         log,
@@ -149,18 +157,15 @@ def from_positions_command(
         max_sigma_m=max_sigma,
         name=name or positions.stem,
     )
-    if not out.parent.is_dir():
-        raise OutputError(f"{out}: the folder {out.parent} does not exist")
     write_track_csv(track, out)
     _print_thinned(track, thinned, len(log), out)
 
 
-def _folder(path: Path) -> Path:
+def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: the folder cannot be made ({error.strerror})") from None
-    return path
 
 
 def _columns(pairs: list[str]) -> dict[str, str]:
@@ -182,16 +187,8 @@ def _qualities(text: str | None) -> list[int] | None:
         raise SettingsError(f"--quality {text!r}: expected whole numbers with commas, for example 1,2") from None
 
 
-def _console() -> Console:
-    from rich.console import Console
-
-    return Console(highlight=False)
-
-
 def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
-    from rich.table import Table
-
-    console, track, geometry = _console(), quality.track, quality.geometry
+    console, track, geometry = console_of_tables(), quality.track, quality.geometry
     spacing = geometry.spacing_m
     console.print(
         f"{track.name}: {len(track)} points, {track.chainage_m[-1]:,.1f} m, {len(track.sections)} section(s); "
@@ -199,15 +196,12 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
         + (f" + geoid {track.provenance.geoid}" if track.provenance.geoid else ""),
         markup=False,
     )
-    import numpy as np
-
     console.print(
         f"spacing {spacing.min():.2f} / {np.median(spacing):.2f} / {spacing.max():.2f} m (least, median, largest); "
         f"mid-chord deviation up to {np.nanmax(np.abs(geometry.mid_chord_m)):.3f} m",
         markup=False,
     )
-    for note in track.provenance.notes:
-        console.print(f"note: {note}", markup=False)
+    show_notes(console, track.provenance.notes)
     if quality.findings:
         table = Table("severity", "kind", "points", "kilometrage", "finding", show_edge=False)
         for finding in quality.findings[:_SHOWN]:
@@ -224,7 +218,7 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
 
 
 def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None:
-    console = _console()
+    console = console_of_tables()
     console.print(f"{rows} positions, {len(track)} points kept, {track.chainage_m[-1]:,.1f} m")
     for reason, count in thinned.dropped.items():
         if count:

@@ -7,29 +7,35 @@ from typing import Annotated
 
 import typer
 
+from railfix.cli.options import OverwriteOption
+from railfix.report.plots.run_screens import draw_run_screens
+from railfix.run.output import OutputFolder
+
 
 def plot_screens(
     run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `railfix run --observations` wrote.")],
     *,
-    out: Annotated[Path, typer.Option("--out", metavar="PICS", help="Folder for the pictures; it is made.")],
+    out: Annotated[Path, typer.Option("--out", metavar="PICS", help="Folder for the pictures; made where absent.")],
+    overwrite: OverwriteOption = False,
 ) -> None:
-    """Draw each screen's metric against its limit, over time and over chainage.
+    """Plot each screen's metric against its limit, over time and over chainage.
 
-    One PNG a screen and antenna: `front_doppler.png`, `rear_antenna_pair.png`, `front_raim.png`, ...;
-    screens that were off or had nothing to judge get none. What was refused is drawn in another
-    colour, and its share stands in the title. Pictures of the same names are replaced.
+    One PNG per screen and antenna: `front_doppler.png`, `rear_antenna_pair.png`, `front_raim.png`, ...;
+    none for screens that were off or inactive. Rejected observations have another colour, and their share is
+    in the title.
 
     Example:
 
         railfix plot-screens results --out results/screens
 
-    Exit codes: 0 done; 2 the command line was misused; 3 DIR is not that of a run with observations;
+    Exit codes: 0 done; 2 the command line was misused; 3 DIR is not the folder of a run with observations;
     8 the pictures cannot be written; 1 a defect of railfix.
     """
-    from railfix.report.plots.run_screens import draw_run_screens
-
-    drawn = draw_run_screens(run, out)
-    for path in drawn:
+    with OutputFolder(out, overwrite="replace" if overwrite else "refuse") as folder:
+        for picture in draw_run_screens(run, folder.staging):
+            folder.staged(picture.name)
+        drawn = folder.commit()
+    for path in drawn.values():
         typer.echo(f"wrote {path}")
     if not drawn:
-        typer.echo("no screen was on that had anything to judge")
+        typer.echo("no screen of this run was active")

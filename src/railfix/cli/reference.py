@@ -1,107 +1,28 @@
-"""``railfix reference``: where the antennas really were."""
+"""``railfix reference``: reference trajectory of the antennas."""
 
 from __future__ import annotations
 
-from datetime import datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from railfix.cli.options import (
-    CHOICES,
-    INPUTS,
-    CrsOption,
-    DatumOption,
-    GeoidOption,
-    LenientOption,
-    OutOption,
-    OverwriteOption,
-    RearOption,
-    TrackOption,
-    VehicleOption,
+from railfix.cli.options import OutOption, Without, from_models
+from railfix.reference import (
+    ReferenceInputs,
+    ReferenceOptions,
+    ReferenceSettings,
+    ReferenceSummary,
+    reference_files,
 )
 
-if TYPE_CHECKING:
-    from railfix.reference import ReferenceSummary
 
-_LIMITS = "Limits"
-
-
-def _positions(option: str, whose: str) -> Any:
-    return typer.Option(
-        option,
-        metavar="FILE",
-        rich_help_panel=INPUTS,
-        help=f"Positions of the {whose} antenna: RTKLIB .pos, NMEA (.nmea) or CSV with named columns.",
-    )
-
-
-def _table(option: str, text: str) -> Any:
-    return typer.Option(option, metavar="CSV", rich_help_panel=INPUTS, help=text)
-
-
-def _limit(option: str, text: str) -> Any:
-    return typer.Option(option, rich_help_panel=_LIMITS, help=text)
-
-
+@from_models
 def reference(
+    inputs: ReferenceInputs,
+    settings: ReferenceSettings,
+    options: Annotated[ReferenceOptions, Without("reference")],
     *,
-    track: TrackOption,
     out: OutOption,
-    rtk: Annotated[Path | None, _positions("--rtk", "front (or only)")] = None,
-    rtk_rear: Annotated[Path | None, _positions("--rtk-rear", "rear")] = None,
-    vehicle: VehicleOption = None,
-    front: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--front",
-            metavar="OBS",
-            rich_help_panel=INPUTS,
-            help="RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.",
-        ),
-    ] = None,
-    rear: RearOption = None,
-    nav: Annotated[
-        list[Path] | None,
-        typer.Option("--nav", metavar="FILE", rich_help_panel=INPUTS, help="RINEX navigation file, for the same."),
-    ] = None,
-    pulses: Annotated[
-        Path | None,
-        _table(
-            "--pulses", "Tachometer: time_gpst and count, or distance_m, or one row a pulse; direction where known."
-        ),
-    ] = None,
-    acceleration: Annotated[
-        Path | None,
-        _table(
-            "--acceleration", "time_gpst and specific_force_mps2 (as an accelerometer measures) or acceleration_mps2."
-        ),
-    ] = None,
-    wheel_circumference: Annotated[
-        float | None,
-        _limit("--wheel-circumference", "Of the wheel with the tachometer [m]; from the fixes without it."),
-    ] = None,
-    pulses_per_turn: Annotated[float, _limit("--pulses-per-turn", "Pulses a turn of that wheel.")] = 1.0,
-    ratio: Annotated[float, _limit("--ratio", "Least ratio of the ambiguities' test, where the log tells it.")] = 3.0,
-    spacing: Annotated[float, _limit("--spacing", "Distance of the two antennas against the body's [m].")] = 0.05,
-    lateral: Annotated[float, _limit("--lateral", "Distance beside the antenna's path [m].")] = 1.0,
-    height: Annotated[float, _limit("--height", "Distance above or below it [m].")] = 2.0,
-    max_gap: Annotated[float, _limit("--max-gap", "Longest gap between good fixes that is bridged [s].")] = 60.0,
-    max_sigma: Annotated[
-        float, _limit("--max-sigma", "Largest standard deviation of a bridged instant that is kept [m].")
-    ] = 1.0,
-    date: Annotated[
-        datetime | None,
-        typer.Option(
-            metavar="DATE", formats=["%Y-%m-%d"], rich_help_panel=CHOICES, help="UTC date of an NMEA log without RMC."
-        ),
-    ] = None,
-    crs: CrsOption = None,
-    height_datum: DatumOption = None,
-    geoid: GeoidOption = None,
-    lenient: LenientOption = False,
-    overwrite: OverwriteOption = False,
 ) -> None:
     r"""Where the antennas really were: fixed positions on the track, the gaps between them bridged.
 
@@ -126,48 +47,8 @@ def reference(
     4 a setting is wrong; 5 the inputs do not belong together; 7 fewer than two good fixes; 8 DIR cannot be
     written; 1 a defect of railfix.
     """
-    import numpy as np
-
-    from railfix.core.errors import SettingsError
-    from railfix.reference import ReferenceInputs, ReferenceOptions, ReferenceSettings, reference_files
-    from railfix.run import TrackReading
-
-    if not pulses_per_turn > 0.0:
-        raise SettingsError(f"--pulses-per-turn is {pulses_per_turn:g}; a positive number was expected")
-    limits = {
-        "pulse_m": None if wheel_circumference is None else wheel_circumference / pulses_per_turn,
-        "ratio": ratio,
-        "spacing_m": spacing,
-        "lateral_m": lateral,
-        "height_m": height,
-        "max_gap_s": max_gap,
-        "max_sigma_m": max_sigma,
-    }
-    usual = ReferenceSettings()
-    asked = {name: value for name, value in limits.items() if value != getattr(usual, name)}
-    summary = reference_files(
-        ReferenceInputs(
-            rtk=rtk,
-            rtk_rear=rtk_rear,
-            track=tuple(track),
-            vehicle=vehicle,
-            front=tuple(front or ()),
-            rear=tuple(rear or ()),
-            nav=tuple(nav or ()),
-            pulses=pulses,
-            acceleration=acceleration,
-        ),
-        ReferenceSettings(**asked),  # type: ignore[arg-type]
-        out=out,
-        options=ReferenceOptions(
-            broken_lines="count" if lenient else "stop",
-            overwrite="replace" if overwrite else "refuse",
-            track=TrackReading(crs=crs, height_datum=height_datum, geoid=geoid),
-            date=None if date is None else np.datetime64(date, "D"),
-        ),
-        asked=asked,
-    )
-    show_reference(summary)
+    asked = settings.model_dump(mode="json", exclude_unset=True)
+    show_reference(reference_files(inputs, settings, out=out, options=options, asked=asked))
 
 
 def show_reference(summary: ReferenceSummary) -> None:

@@ -7,20 +7,25 @@ from typing import Annotated
 
 import typer
 
+from railfix.cli.options import OverwriteOption
+from railfix.report import write_report
+from railfix.run.output import check_output_file
+
 
 def report(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders that `railfix run` wrote.")],
     *,
-    out: Annotated[Path, typer.Option("--out", metavar="HTML", help="The page; one of that name is replaced.")],
+    out: Annotated[Path, typer.Option("--out", metavar="HTML", help="HTML file to write.")],
     reference: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="REF",
-            help="Where the antennas really were: a reference file, a simulator's truth, a log of good positions. "
+            help="Reference positions: of railfix reference, ground truth of a simulation, a log of good positions. "
             "One for all runs, or repeated, one for each run in order.",
         ),
     ] = None,
     title: Annotated[str, typer.Option(metavar="TEXT", help="Heading of the page.")] = "",
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Make one page of one or several runs, to open in a browser.
 
@@ -40,7 +45,7 @@ def report(
     4 the number of references fits neither one nor each run; 5 a reference is of another time;
     8 the page cannot be written; 1 a defect of railfix.
     """
-    from railfix.report import write_report
-
+    in_runs = [path for run in runs if run.is_dir() for path in run.iterdir() if path.suffix != ".html"]
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[*(reference or ()), *in_runs])
     page = write_report(runs, out, references=tuple(reference or ()), title=title)
     typer.echo(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -2,89 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-import typer
-
-from railfix.cli.options import (
-    CHOICES,
-    CrsOption,
-    DatumOption,
-    EndOption,
-    FrontOption,
-    GeoidOption,
-    LenientOption,
-    NavOption,
-    OutOption,
-    OverwriteOption,
-    RearOption,
-    Sp3Option,
-    StartOption,
-    TrackOption,
-    VehicleOption,
-)
-from railfix.cli.settings import (
-    Choices,
-    ConfigOption,
-    CurveOption,
-    ErrorModelOption,
-    PresetOption,
-    SbasOption,
-    ScreensOption,
-    SettingOption,
-    WithoutOption,
-    settings_of,
-)
+from railfix.cli.console import progress_bar, show_summary
+from railfix.cli.options import OutOption, Without, from_models
+from railfix.cli.settings import Choices, settings_of
+from railfix.run import RunInputs, RunOptions, run_files
 
 
+@from_models
 def run(
-    *,
-    front: FrontOption,
-    nav: NavOption,
-    track: TrackOption,
-    out: OutOption,
-    rear: RearOption = None,
-    sp3: Sp3Option = None,
-    sbas: SbasOption = None,
-    vehicle: VehicleOption = None,
-    config: ConfigOption = None,
-    preset: PresetOption = None,
-    setting: SettingOption = None,
-    screens: ScreensOption = None,
-    without: WithoutOption = None,
-    cn0_curve: CurveOption = None,
-    error_model: ErrorModelOption = None,
-    crs: CrsOption = None,
-    height_datum: DatumOption = None,
-    geoid: GeoidOption = None,
-    reference: Annotated[
-        Literal["antenna", "centre", "front_bogie", "rear_bogie"],
-        typer.Option(
-            rich_help_panel=CHOICES,
-            help="The point of the vehicle whose chainage is given; for each antenna its own place by default.",
-        ),
-    ] = "antenna",
-    start: StartOption = None,
-    end: EndOption = None,
-    observations: Annotated[
-        bool,
-        typer.Option(
-            "--observations",
-            rich_help_panel=CHOICES,
-            help="Also write observations.parquet: one row an epoch, satellite and signal, with its reason.",
-        ),
-    ] = False,
-    lenient: LenientOption = False,
-    overwrite: OverwriteOption = False,
-    chunk: Annotated[
-        int,
-        typer.Option(
-            metavar="EPOCHS",
-            min=1,
-            rich_help_panel=CHOICES,
-            help="Epochs in memory at a time; the results do not depend on it.",
-        ),
-    ] = 3000,
+    inputs: Annotated[RunInputs, Without("truth")], choices: Choices, options: RunOptions, *, out: OutOption
 ) -> None:
     r"""Positions along the line from receiver logs, navigation files and a track map.
 
@@ -109,39 +37,8 @@ def run(
     4 a setting is wrong; 5 the inputs do not belong together; 7 not one position; 8 DIR cannot be
     written; 1 a defect of railfix.
     """
-    from railfix.cli.console import progress_bar, show_summary
-    from railfix.run import RunInputs, RunOptions, TrackReading, run_files
-
-    settings, asked = settings_of(
-        Choices(
-            config=config,
-            preset=preset,
-            setting=tuple(setting or ()),
-            screens=screens,
-            without=tuple(without or ()),
-            cn0_curve=cn0_curve,
-            error_model=error_model,
-            sbas=tuple(sbas or ()),
-        )
-    )
-    inputs = RunInputs(
-        front=tuple(front),
-        rear=tuple(rear or ()),
-        nav=tuple(nav),
-        sp3=tuple(sp3 or ()),
-        track=tuple(track),
-        vehicle=vehicle,
-        config=config,
-    )
-    options = RunOptions(
-        observations="write" if observations else "skip",
-        broken_lines="count" if lenient else "stop",
-        overwrite="replace" if overwrite else "refuse",
-        chunk_epochs=chunk,
-        start=start,
-        end=end,
-        track=TrackReading(crs=crs, height_datum=height_datum, geoid=geoid, reference=reference),
-    )
+    settings, asked = settings_of(choices)
+    inputs = inputs.replaced(config=choices.config)
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)
     show_summary(summary)

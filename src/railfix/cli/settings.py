@@ -2,122 +2,78 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import Any
 
 from railfix.core.errors import SettingsError
-
-if TYPE_CHECKING:
-    from railfix.pipeline.config import Config
-
-_PANEL = "Choices"
-
-PresetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--preset",
-        metavar="NAME",
-        rich_help_panel=_PANEL,
-        help="Settings that all others stand over: default; strict, certainty before rate; p1, the limits of the "
-        "paper that the screens are from, for geodetic receivers at 10 Hz.",
-    ),
-]
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="TOML", rich_help_panel=_PANEL, help="Settings; defaults where not given."),
-]
-SettingOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="KEY=VALUE",
-        rich_help_panel=_PANEL,
-        help="One setting, over the file's: --set elevation.mask_deg=15; may be repeated.",
-    ),
-]
-ScreensOption = Annotated[
-    str | None,
-    typer.Option(
-        "--screens",
-        metavar="NAME,NAME",
-        rich_help_panel=_PANEL,
-        help="The screens that are on, of elevation, cn0, doppler, antenna_pair, raim, antenna_spacing; or none.",
-    ),
-]
-WithoutOption = Annotated[
-    list[str] | None,
-    typer.Option("--without", metavar="NAME", rich_help_panel=_PANEL, help="Switch one screen off; may be repeated."),
-]
-CurveOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--cn0-curve",
-        metavar="TOML",
-        rich_help_panel=_PANEL,
-        help="Mean C/N0 over elevation of antenna and receiver, made by railfix cn0-curve.",
-    ),
-]
-SbasOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--sbas",
-        metavar="FILE",
-        rich_help_panel="Inputs",
-        help="Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B); its corrections take the place of the models, and "
-        "satellites without a valid one are refused.",
-    ),
-]
-ErrorModelOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--error-model",
-        metavar="TOML",
-        rich_help_panel=_PANEL,
-        help="Errors of the pseudoranges on this line, made by railfix error-model, for weights and protection level.",
-    ),
-]
+from railfix.core.settings import Settings, option, read_toml
+from railfix.pipeline.config import PRESETS, SCREENS, Config, parse_config
+from railfix.run.inputs import INPUTS
 
 
-@dataclass(frozen=True, kw_only=True)
-class Choices:
-    """What the command line says about the settings, in the order in which one stands over the other.
+class Choices(Settings):
+    """Settings of a run as the command line gives them; later fields override earlier ones.
 
     Attributes
     ----------
     config : Path or None
     preset : str or None
-        Over the one that the file names.
-    setting : sequence of str
+        Overrides the preset of the file.
+    setting : tuple of str
         KEY=VALUE.
     screens : str or None
         Names with commas, or "none".
-    without : sequence of str
+    without : tuple of str
         Screens to switch off.
     cn0_curve, error_model : Path or None
-    sbas : sequence of Path
+    sbas : tuple of Path
     """
 
-    config: Path | None = None
-    preset: str | None = None
-    setting: tuple[str, ...] = ()
-    screens: str | None = None
-    without: tuple[str, ...] = ()
-    cn0_curve: Path | None = None
-    error_model: Path | None = None
-    sbas: tuple[Path, ...] = ()
+    preset: str | None = option(
+        "Base preset; other settings override it: default; strict, fewer positions of higher integrity; p1, the "
+        "limits of the paper that the screens are from, for geodetic receivers at 10 Hz.",
+        None,
+        metavar="NAME",
+    )
+    config: Path | None = option("Settings file; defaults where it is silent.", None, metavar="TOML")
+    setting: tuple[str, ...] = option(
+        "One setting, overriding the file's: --set elevation.mask_deg=15; may be repeated.",
+        (),
+        name="--set",
+        metavar="KEY=VALUE",
+    )
+    screens: str | None = option(
+        "Screens that are on, of elevation, cn0, doppler, antenna_pair, raim, antenna_spacing; or none.",
+        None,
+        metavar="NAME,NAME",
+    )
+    without: tuple[str, ...] = option("Switch one screen off; may be repeated.", (), metavar="NAME")
+    cn0_curve: Path | None = option(
+        "Mean C/N0 over elevation of antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"
+    )
+    error_model: Path | None = option(
+        "Pseudorange errors of this line for weights and protection level, from railfix error-model.",
+        None,
+        metavar="TOML",
+    )
+    sbas: tuple[Path, ...] = option(
+        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B); its corrections replace the models, and satellites "
+        "without a valid one are rejected.",
+        (),
+        metavar="FILE",
+        panel=INPUTS,
+    )
 
 
 def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Settings of a file with those of the command line on top.
+    """Return the settings of the file, overridden by those of the command line.
 
     Returns
     -------
     Config
     dict
-        The settings that were asked for, as opposed to defaults.
+        The settings that were given, as opposed to defaults.
 
     Raises
     ------
@@ -126,9 +82,6 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
     InputFileError
         The file cannot be read.
     """
-    from railfix.core.settings import read_toml
-    from railfix.pipeline.config import parse_config
-
     values: dict[str, Any] = {}
     source = "command line"
     if choices.config is not None:
@@ -136,7 +89,10 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         parse_config(values, source=str(choices.config))
     if choices.preset is not None:
         values["preset"] = _preset(choices.preset)
+    check_set_once(choices.setting)
     for text in choices.setting:
+        if choices.preset is not None and text.partition("=")[0].strip() == "preset":
+            raise SettingsError(f"the preset is given twice (--preset {choices.preset} and --set {text}); give it once")
         set_value(values, text)
         source = "--set"
     if choices.screens is not None:
@@ -154,8 +110,6 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
 
 
 def _preset(name: str) -> str:
-    from railfix.pipeline.config import PRESETS
-
     if name not in PRESETS:
         raise SettingsError(f"--preset {name}: unknown preset; known are {', '.join(PRESETS)}")
     return name
@@ -163,8 +117,6 @@ def _preset(name: str) -> str:
 
 def _screens(option: str, text: str) -> list[str]:
     """Names of screens, with commas between them."""
-    from railfix.pipeline.config import SCREENS
-
     names = [name.strip() for name in text.split(",")]
     for name in names:
         if name not in SCREENS:
@@ -174,10 +126,20 @@ def _screens(option: str, text: str) -> list[str]:
     return names
 
 
+def check_set_once(settings: tuple[str, ...]) -> None:
+    """Raise where one setting is given twice.
+
+    Raises
+    ------
+    SettingsError
+    """
+    keys = [text.partition("=")[0].strip() for text in settings]
+    if repeated := [key for key in keys if keys.count(key) > 1]:
+        raise SettingsError(f"--set {repeated[0]} is given {keys.count(repeated[0])} times; give it once")
+
+
 def set_value(values: dict[str, Any], text: str) -> None:
     """Put one KEY=VALUE into nested settings; the value is TOML, or a bare word."""
-    import tomllib
-
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise SettingsError(f"--set {text}: expected KEY=VALUE, for example elevation.mask_deg=15")

@@ -1,18 +1,21 @@
-"""``railfix simulate``: simulated runs with ground truth, as files."""
+"""``railfix simulate``: simulated runs as files, with ground truth."""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from railfix.core.errors import OutputError, SettingsError
-
-if TYPE_CHECKING:
-    from railfix.simulate.scenario import Scenario
-    from railfix.simulate.scenario_file import Recipe
+from railfix.cli.console import progress_bar
+from railfix.cli.options import OverwriteOption
+from railfix.cli.settings import check_set_once, set_value
+from railfix.core.errors import SettingsError
+from railfix.run.output import Overwrite, check_folder
+from railfix.simulate.run import write_run
+from railfix.simulate.scenario import Scenario
+from railfix.simulate.scenario_file import Recipe, load_recipe, shipped_scenarios
 
 _PANEL = "Choices"
 
@@ -29,11 +32,11 @@ def simulate(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option("--seconds", metavar="S", rich_help_panel=_PANEL, help="Duration, over the scenario's."),
+        typer.Option("--seconds", metavar="S", rich_help_panel=_PANEL, help="Duration, overriding the scenario's."),
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option("--seed", rich_help_panel=_PANEL, help="Seed, over the scenario's."),
+        typer.Option("--seed", rich_help_panel=_PANEL, help="Seed, overriding the scenario's."),
     ] = None,
     setting: Annotated[
         list[str] | None,
@@ -41,7 +44,7 @@ def simulate(
             "--set",
             metavar="KEY=VALUE",
             rich_help_panel=_PANEL,
-            help="One setting, over the scenario's: --set receiver.code_sigma_m=0; may be repeated.",
+            help="One setting, overriding the scenario's: --set receiver.code_sigma_m=0; may be repeated.",
         ),
     ] = None,
     only: Annotated[
@@ -50,20 +53,19 @@ def simulate(
             "--only",
             metavar="RUN",
             rich_help_panel=_PANEL,
-            help="Of a recipe this run alone, by its number from 1 or its name; may be repeated.",
+            help="Only this run of a recipe, by its number from 1 or its name; may be repeated.",
         ),
     ] = None,
     plain: Annotated[bool, typer.Option("--plain", rich_help_panel=_PANEL, help="Nothing packed: .rnx, .csv.")] = False,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", rich_help_panel=_PANEL, help="Replace files that are already in DIR.")
-    ] = False,
+    overwrite: OverwriteOption = False,
     list_shipped: Annotated[bool, typer.Option("--list", help="Name the shipped scenarios and end.")] = False,
 ) -> None:
-    """Make up runs of a train: logs of two antennas, navigation, track map, vehicle, sensors, and the truth.
+    """Simulate runs of a train: logs of two antennas, navigation, track map, vehicle, sensors, and ground truth.
 
-    SCENARIO says what: the line (elements, a generated one, or a track file), how the train runs, its
-    sky (made, or a navigation file), receivers, errors, what stands along the line, sensors on board.
-    A recipe lists many runs and makes each into its own folder. The same scenario gives the same files.
+    SCENARIO defines the line (elements, a generated one, or a track file), the motion of the train, the
+    satellites (a simulated constellation, or a navigation file), receivers, errors, obstacles along the line and
+    sensors on board. A recipe lists many runs, each written to its own folder. The same scenario gives the same
+    files.
 
     Example:
 
@@ -73,8 +75,6 @@ def simulate(
     should be; 4 a setting is wrong; 5 the navigation file does not serve the scenario's time; 8 DIR
     cannot be written, or has files in it; 1 a defect of railfix.
     """
-    from railfix.simulate.scenario_file import load_recipe, shipped_scenarios
-
     if list_shipped:
         for name in shipped_scenarios():
             recipe = load_recipe(name)
@@ -85,15 +85,21 @@ def simulate(
         raise typer.BadParameter("give a SCENARIO and --out DIR, or --list")
     recipe = load_recipe(scenario)
     numbers = _chosen(recipe, only or [])
+    replacing: Overwrite = "replace" if overwrite else "refuse"
     folders = {number: out / recipe.names[number] for number in numbers}
-    if not overwrite:
-        for folder in folders.values():
-            if folder.is_dir() and any(folder.iterdir()):
-                raise OutputError(f"{folder}: the folder is not empty; name another one, or give --overwrite")
+    for folder in folders.values():
+        check_folder(folder, overwrite=replacing)
     changes = _changes(setting or [], seconds, seed)
     scenarios = {number: recipe.scenario(number, changes=changes) for number in numbers}
     options = [*_said("--seconds", seconds), *_said("--seed", seed), *(w for s in setting or [] for w in ("--set", s))]
-    _make(recipe, ["railfix", "simulate", scenario, "--out", str(out), *options], scenarios, folders, plain=plain)
+    _make(
+        recipe,
+        ["railfix", "simulate", scenario, "--out", str(out), *options],
+        scenarios,
+        folders,
+        plain=plain,
+        overwrite=replacing,
+    )
 
 
 def _make(
@@ -103,10 +109,8 @@ def _make(
     folders: dict[int, Path],
     *,
     plain: bool,
+    overwrite: Overwrite,
 ) -> None:
-    from railfix.cli.console import progress_bar
-    from railfix.simulate.run import write_run
-
     done = 0
     files: dict[str, Path] = {}
     with progress_bar("simulation") as show:
@@ -125,6 +129,7 @@ def _make(
                 folders[number],
                 packing="plain" if plain else "packed",
                 command=shlex.join([*command, *run, *packed]),
+                overwrite=overwrite,
                 progress=progress,
             )
     if len(scenarios) == 1:
@@ -157,8 +162,7 @@ def _chosen(recipe: Recipe, only: list[str]) -> list[int]:
 
 
 def _changes(setting: list[str], seconds: float | None, seed: int | None) -> dict[str, Any]:
-    from railfix.cli.settings import set_value
-
+    check_set_once(tuple(setting))
     changes: dict[str, Any] = {}
     for text in setting:
         set_value(changes, text)

@@ -208,7 +208,7 @@ def ending(path: FilePath) -> str:
 
 
 def file_sha256(path: FilePath) -> str:
-    """Compute the SHA-256 of a file on disk, as hexadecimal digits.
+    """Return the SHA-256 of a file as hexadecimal digits.
 
     Raises
     ------
@@ -219,11 +219,11 @@ def file_sha256(path: FilePath) -> str:
         with Path(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror}); check the name") from error
+        raise InputFileError(path, f"cannot be read ({error.strerror}); check the name") from None
 
 
-def fingerprint(kind: str, path: FilePath) -> dict[str, Any]:
-    """Describe an input file by kind, path, size [bytes] and SHA-256, as plain values for JSON.
+def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[str, Any]:
+    """Return kind, path (or the `name` to record), size and SHA-256 of a file, as plain values for JSON.
 
     Raises
     ------
@@ -231,7 +231,36 @@ def fingerprint(kind: str, path: FilePath) -> dict[str, Any]:
         The file cannot be read.
     """
     digest = file_sha256(path)
-    return {"input": kind, "path": str(path), "bytes": Path(path).stat().st_size, "sha256": digest}
+    return {"input": kind, "path": name or str(path), "bytes": Path(path).stat().st_size, "sha256": digest}
+
+
+def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Parameters
+    ----------
+    path : path
+    what : str
+        What the file should be, with its article ("the record of a run").
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, not UTF-8, not JSON, nested too deeply, or holds no object.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputFileError(path, f"cannot be read as {what} ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise InputFileError(path, f"is not a text file; {what} is JSON in UTF-8") from None
+    except RecursionError:
+        raise InputFileError(path, f"is nested too deeply; expected {what}") from None
+    except json.JSONDecodeError as error:
+        raise InputFileError(path, f"is not valid JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise InputFileError(path, f"is not {what}; expected a JSON object")
+    return content
 
 
 def toml_string(text: str) -> str:

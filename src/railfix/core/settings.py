@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, get_args, get_origin
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, write_whole
@@ -37,6 +37,35 @@ class Settings(BaseModel):
 
 
 Model = TypeVar("Model", bound=BaseModel)
+
+
+def option(
+    text: str,
+    default: Any = ...,
+    *,
+    name: str | None = None,
+    metavar: str | None = None,
+    panel: str = "Choices",
+    **limits: Any,
+) -> Any:
+    """Return a field of a `Settings` model that is an option of the command line as well.
+
+    Parameters
+    ----------
+    text : str
+        Help text.
+    default : optional
+        Required unless given.
+    name : str, optional
+        The option; ``--field-name`` unless given. A field with two words (`Literal`) and a default becomes a
+        switch where it has a name: without it the default, with it the other word.
+    metavar, panel : str, optional
+        Placeholder of the value, heading of the help text.
+    **limits
+        Of `pydantic.Field`: `gt`, `ge`, ...
+    """
+    extra: Any = {"option": name, "metavar": metavar, "panel": panel}
+    return Field(default, description=text, json_schema_extra=extra, **limits)
 
 
 def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:

@@ -23,8 +23,9 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.processor import AntennaResult, State
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
-from railfix.run.driver import Progress, RunOptions, notes_of, open_inputs
+from railfix.run.driver import Progress, notes_of, open_inputs
 from railfix.run.inputs import RunInputs
+from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import run_record
@@ -165,8 +166,11 @@ def ablate_files(
     config, options = config or Config(), options or RunOptions()
     inputs = inputs.with_settings(config)
     inputs.check()
-    with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
-        fingerprints = inputs.fingerprints(pool)
+    with (
+        OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
+        ThreadPoolExecutor(max_workers=1) as pool,
+    ):
+        entries = inputs.entries(pool, out)
         truth = None if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs))
         navigation, line, logs = open_inputs(inputs, options)
         screens, left_out = judging_screens(config, line.trajectories)
@@ -204,11 +208,11 @@ def ablate_files(
         notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs))
         wall = clock.perf_counter() - began
         record = run_record(
-            files=[entry.result() for entry in fingerprints],
+            files=[entry.result() for entry in entries],
             command=sys.argv,
             asked=asked or {},
             used=config.model_copy(update={"screens": screens}).as_dict(),
-            options=options.as_dict(),
+            options=options.model_dump(mode="json"),
             line=line.facts,
             navigation=navigation,
             tally=tallies[ALL],

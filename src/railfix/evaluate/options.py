@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, Field
 
-from railfix.core.settings import Settings
+from railfix.core.settings import Settings, option
 from railfix.evaluate.bracket import LARGEST_GAP_S
 
 Method = Literal["chainage", "trajectory"]
@@ -68,16 +68,31 @@ class EvaluationOptions(Settings):
         Probability of the confidence limits, between 0 and 1.
     """
 
-    method: Literal["auto", "chainage", "trajectory"] = "auto"
-    reference_sigma_m: Positive = 0.5
-    reference_gap_s: Positive = LARGEST_GAP_S
-    standing_mps: Positive = 0.3
-    section_m: Positive = 1000.0
-    speed_edges_kmh: RisingEdges = (20.0, 60.0, 100.0)
+    method: Literal["auto", "chainage", "trajectory"] = option(
+        "Errors as differences of chainage, or along the trajectory from the reference position.", "auto"
+    )
+    reference_sigma_m: Positive = option(
+        "Largest standard deviation of a reference position that is used.", 0.5, name="--reference-sigma", metavar="M"
+    )
+    reference_gap_s: Positive = option(
+        "Longest gap of the reference that is interpolated over.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
+    )
+    standing_mps: Positive = option(
+        "The train is at standstill below this speed.", 0.3, name="--standing", metavar="M/S"
+    )
+    section_m: Positive = option("Length of the sections of the line.", 1000.0, name="--section-length", metavar="M")
+    speed_edges_kmh: RisingEdges = option(
+        "Limits between the speed classes.", (20.0, 60.0, 100.0), name="--speed-classes", metavar="KMH,..."
+    )
     satellite_edges: RisingCounts = (4, 5, 6, 7, 8, 10, 12, 15, 20)
     over_m: RisingEdges = (5.0, 10.0, 20.0, 50.0)
-    alarm_limits_m: tuple[Positive, ...] = (10.0, 20.0, 40.0)
+    alarm_limits_m: tuple[Positive, ...] = option(
+        "Alarm limits that protection levels are compared with, besides the run's own.",
+        (10.0, 20.0, 40.0),
+        name="--alarm-limit",
+        metavar="M,...",
+    )
     block_s: Positive = 60.0
     replicates: int = Field(default=1000, ge=1)
-    seed: int = Field(default=0, ge=0)
+    seed: int = option("Seed of the random numbers of the confidence limits.", 0, metavar="N", ge=0)
     confidence: float = Field(default=0.95, gt=0.0, lt=1.0)

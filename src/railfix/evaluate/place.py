@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError, RailfixError
+from railfix.core.settings import Settings, option
 from railfix.evaluate.along_track import along_track_error, straight_distance
 from railfix.evaluate.options import Method
 from railfix.evaluate.run_folder import RunFolder
+from railfix.run.inputs import INPUTS
+from railfix.run.options import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
@@ -29,24 +33,25 @@ _WITHIN_VEHICLE_M: Final = 45.0
 _ROUNDING_M: Final = 1e-3
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrackFiles:
-    """Files that stand in for those that ``run.json`` names, and how to read the track.
+class TrackFiles(Settings):
+    """Track and vehicle in place of those that ``run.json`` names, and how to read the track.
 
     Attributes
     ----------
     track : tuple of Path
         Empty: those of the run.
     vehicle : Path or None
-    crs, height_datum, geoid : str or None
-        See `railfix.track.read_track`.
+    reading : TrackReading
+        Its `reference` is not used: the run's own is.
     """
 
-    track: tuple[Path, ...] = ()
-    vehicle: Path | None = None
-    crs: str | None = None
-    height_datum: str | None = None
-    geoid: str | None = None
+    track: tuple[Path, ...] = option(
+        "Track in place of the one that run.json names.", (), metavar="TRACK", panel=INPUTS
+    )
+    vehicle: Path | None = option(
+        "Vehicle in place of the one that run.json names.", None, metavar="TOML", panel=INPUTS
+    )
+    reading: TrackReading = Field(default_factory=TrackReading)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,7 +228,7 @@ def find_trajectory(
 
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
     """Ways to read the track: as told; else as the file says, then as the run's record says."""
-    told = (files.crs, files.height_datum, files.geoid)
+    told = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
     if any(told):
         return [told]
     facts = run.track_facts

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.pipeline.protection_levels import KINDS
+from railfix.run.folder import RunRecord, read_record
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
@@ -35,27 +35,22 @@ _ENDINGS: Final = (".parquet", ".csv")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunFolder:
+class RunFolder(RunRecord):
     """Results of a run, with one of its tables of positions.
 
     Attributes
     ----------
-    path : Path
     positions_path : Path
         The Parquet file of the table, or its CSV file where that is absent.
     positions : polars.DataFrame
         One row per epoch and antenna, see `railfix.pipeline.tables.POSITION_COLUMNS`; ``observed`` tells whether the
         antenna has observations.
-    record : mapping
-        ``run.json``.
     table : str
         Name of the table: "positions" for the single-epoch positions.
     """
 
-    path: Path
     positions_path: Path
     positions: pl.DataFrame
-    record: Mapping[str, Any]
     table: str = POSITIONS_TABLE
 
     @property
@@ -82,7 +77,7 @@ class RunFolder:
     def settings(self) -> dict[str, Any]:
         """Settings in force and kinds of input, by dotted name."""
         flat = flattened(self.record.get("settings_used") or {})
-        kinds = {str(entry["input"]) for entry in self.record.get("inputs", ())}
+        kinds = {str(entry["input"]) for entry in self.entries}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
 
     @property
@@ -146,22 +141,6 @@ class RunFolder:
     def _line(self) -> Mapping[str, Any]:
         return self.record.get("line") or {}
 
-    def inputs(self, kind: str) -> list[Mapping[str, Any]]:
-        """Entries of ``run.json`` on one kind of input, in order."""
-        return [entry for entry in self.record.get("inputs", ()) if entry["input"] == kind]
-
-    def located(self, kind: str) -> list[Path]:
-        """Present paths of the files of one kind of input; as recorded where they are not found.
-
-        A relative path may refer to another working folder: it is searched for from the present one, from
-        the folder of the run, and from its parent.
-        """
-        return [self._locate(Path(entry["path"])) for entry in self.inputs(kind)]
-
-    def _locate(self, path: Path) -> Path:
-        places = [path] if path.is_absolute() else [path, self.path / path, self.path.parent / path]
-        return next((place for place in places if place.is_file()), path)
-
 
 def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested settings by dotted name; lists as text."""
@@ -200,10 +179,7 @@ def read_run(path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | N
     MismatchError
         `conventional` is a run on another log.
     """
-    if not path.is_dir():
-        problem = "is a file" if path.exists() else "there is no such folder"
-        raise InputFileError(path, f"{problem}, expected the folder that railfix run wrote; name that")
-    record = _record(path / "run.json") if (path / "run.json").is_file() else None
+    record = read_record(path).record
     file, rows = _read_table(path, table, (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED)
     if table == POSITIONS_TABLE:
         rows = rows.with_columns(observed=pl.col("status") != Status.NO_OBSERVATION.text)
@@ -212,7 +188,6 @@ def read_run(path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | N
         added = [name for name in (*SINGLE_EPOCH, "observed") if name not in rows.columns]
         rows = rows.join(single.select(*_KEYS, *added), on=_KEYS, how="left", maintain_order="left")
         rows = rows.with_columns(pl.col("observed").fill_null(value=False))
-    record = _record(path / "run.json") if record is None else record
     if conventional is not None:
         other = read_run(conventional)
         _check_same_log(path, record, conventional, other.record)
@@ -266,18 +241,6 @@ def _table(file: Path) -> pl.DataFrame:
         raise InputFileError(file, f"is not a table of positions ({str(error).splitlines()[0]})") from error
 
 
-def _record(file: Path) -> Mapping[str, Any]:
-    try:
-        record = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputFileError(file, "there is no such file; railfix run writes it beside the positions") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise InputFileError(file, f"cannot be read as JSON ({error}); run railfix run again") from error
-    if not isinstance(record, dict):
-        raise InputFileError(file, "is not the record of a run; expected an object")
-    return record
-
-
-def floats(table: pl.DataFrame, name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+def floats(table: pl.DataFrame, name: str) -> Floats:
     """A column as numbers, null as NaN."""
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()

@@ -198,12 +198,12 @@ class _Builder:
         joined = self._joined(speeds)
         if joined is not None and len(joined.time) > 1:
             found = self._closings(fixes, *joined.way(fixes.time[good]))
-            settings = replace(settings, doppler_bias_mps=lasting_error_mps(found, settings))
+            settings = settings.replaced(doppler_bias_mps=lasting_error_mps(found, settings))
             told["doppler"] = {"lasting_error_mps": settings.doppler_bias_mps, "lasting_error_from": _told_by(found)}
         if wheel is not None:
             way = wheel.distance_m(fixes.time[good], self._hint(fixes.time[good], joined, fixes))
             found = self._closings(fixes, way, np.full(len(way), 0.0), reading_m=wheel.reading_sigma_m)
-            settings = replace(settings, slip_m=slip_m(found, settings))
+            settings = settings.replaced(slip_m=slip_m(found, settings))
             told["pulses"] = {"slip_m": settings.slip_m, "slip_from": _told_by(found)}
         return settings, told
 

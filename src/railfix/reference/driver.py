@@ -6,6 +6,7 @@ import platform
 import sys
 import time as clock
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +15,6 @@ import numpy as np
 
 from railfix import __version__
 from railfix.core.errors import InputFileError
-from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import concatenate
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
@@ -94,7 +94,11 @@ def reference_files(
     began = clock.perf_counter()
     settings, options = settings or ReferenceSettings(), options or ReferenceOptions()
     inputs.check()
-    with OutputFolder(out, overwrite=options.overwrite) as folder:
+    with (
+        OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
+        ThreadPoolExecutor(max_workers=1) as pool,
+    ):
+        entries = inputs.entries(pool, out)
         wanted: tuple[Antenna, ...] = ("front", "rear")
         antennas = tuple(name for name in wanted if name in inputs.positions or name in inputs.logs)
         line = open_line(inputs.track, inputs.vehicle, antennas=antennas, reading=options.track)
@@ -109,23 +113,24 @@ def reference_files(
         record = {
             "versions": {"railfix": __version__, "python": platform.python_version()},
             "command": list(sys.argv),
-            "inputs": inputs.fingerprints(),
+            "inputs": [entry.result() for entry in entries],
             "settings_asked": dict(asked or {}),
-            "settings_used": settings.as_dict(),
+            "settings_used": settings.model_dump(mode="json"),
             "line": line.facts,
             "notes": notes,
             "antennas": {name: antenna_record(part) for name, part in built.items()},
             "wall_s": round(clock.perf_counter() - began, 3),
         }
         folder.write_json("reference.json", record)
-        files = folder.commit({})
+        files = folder.commit()
     return ReferenceSummary(built=built, notes=tuple(notes), files=files)
 
 
 def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
     """All files but those of the line."""
+    day = None if options.date is None else np.datetime64(options.date, "D")
     logs: dict[str, PositionLog] = {
-        name: read_any_positions(path, broken_lines=options.broken_lines, date=options.date)
+        name: read_any_positions(path, broken_lines=options.broken_lines, date=day)
         for name, path in inputs.positions.items()
     }
     notes = [note for log in logs.values() for note in log.notes]
@@ -137,8 +142,19 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
         navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
         for name, paths in inputs.logs.items():
             log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines)
-            dopplers[name] = _dopplers(log, navigation)
+            found = dopplers_of_log(
+                concatenate(list(log.parts())), navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS
+            )
             notes += log.problems
+            if np.isfinite(found.rate_mps).any():
+                dopplers[name] = found
+                continue
+            problem = "has no Doppler of a satellite with an orbit"
+            if inputs.pulses is None and inputs.acceleration is None:
+                raise InputFileError(
+                    paths[0], f"{problem}; give a log with D observations and its navigation file, or another sensor"
+                )
+            notes.append(f"{paths[0]}: {problem}, no speed is taken from it")
     vehicle = line.vehicle
     distance, facing = float("nan"), 1
     if vehicle is not None:
@@ -158,17 +174,6 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
         distance_m=distance,
     )
     return data, notes
-
-
-def _dopplers(log: Log, navigation: Navigation) -> Dopplers:
-    obs = concatenate(list(log.parts()))
-    found = dopplers_of_log(obs, navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS)
-    if not np.isfinite(found.rate_mps).any():
-        raise InputFileError(
-            log.paths[0],
-            "there is no Doppler with a satellite's orbit; a log with D observations and its navigation were expected",
-        )
-    return found
 
 
 def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:

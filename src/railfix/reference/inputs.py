@@ -1,23 +1,30 @@
-"""Files that a reference is made of, and choices that do not touch it."""
+"""Input files of a reference, and options that do not change it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import datetime as dt
 from pathlib import Path
-from typing import Any, Literal
 
-import numpy as np
+from pydantic import Field
 
-from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import fingerprint
-from railfix.run.inputs import Antenna
-from railfix.run.sources import TrackReading
+from railfix.core.errors import SettingsError
+from railfix.core.files import BrokenLines
+from railfix.core.settings import Settings, option
+from railfix.run.inputs import (
+    Antenna,
+    InputFiles,
+    check_given_once,
+    input_option,
+    logs_by_antenna,
+    track_option,
+    vehicle_option,
+)
+from railfix.run.options import TrackReading
+from railfix.run.output import Overwrite
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReferenceInputs:
-    """Files of a reference.
+class ReferenceInputs(InputFiles):
+    """Input files of a reference.
 
     Attributes
     ----------
@@ -30,38 +37,41 @@ class ReferenceInputs:
     pulses, acceleration : Path or None
     """
 
-    track: tuple[Path, ...]
-    rtk: Path | None = None
-    rtk_rear: Path | None = None
-    vehicle: Path | None = None
-    front: tuple[Path, ...] = ()
-    rear: tuple[Path, ...] = ()
-    nav: tuple[Path, ...] = ()
-    pulses: Path | None = None
-    acceleration: Path | None = None
+    rtk: Path | None = input_option(
+        "Positions of the front (or only) antenna: RTKLIB .pos, NMEA (.nmea) or CSV with named columns.", None
+    )
+    rtk_rear: Path | None = input_option("The same of the rear antenna.", None)
+    track: tuple[Path, ...] = track_option()
+    vehicle: Path | None = vehicle_option()
+    front: tuple[Path, ...] = input_option(
+        "RINEX observation file of the front antenna, for Doppler speeds; repeat it for several.", (), metavar="OBS"
+    )
+    rear: tuple[Path, ...] = input_option("The same of the rear antenna.", (), metavar="OBS")
+    nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; repeat it for several.", ())
+    pulses: Path | None = input_option(
+        "Tachometer: time_gpst with count, distance_m, or one row per pulse; direction if known.",
+        None,
+        metavar="CSV",
+    )
+    acceleration: Path | None = input_option(
+        "Acceleration: time_gpst with specific_force_mps2 (as an accelerometer measures) or acceleration_mps2.",
+        None,
+        metavar="CSV",
+    )
 
     @property
     def positions(self) -> dict[Antenna, Path]:
-        """Logs of positions by antenna."""
+        """Position logs by antenna."""
         both: dict[Antenna, Path | None] = {"front": self.rtk, "rear": self.rtk_rear}
         return {name: path for name, path in both.items() if path is not None}
 
     @property
     def logs(self) -> dict[Antenna, tuple[Path, ...]]:
         """Observation files by antenna."""
-        both: dict[Antenna, tuple[Path, ...]] = {"front": self.front, "rear": self.rear}
-        return {name: paths for name, paths in both.items() if paths}
-
-    def named(self) -> Iterator[tuple[str, Path]]:
-        """Each file with the option that names it."""
-        for name in ("rtk", "rtk_rear", "track", "vehicle", "front", "rear", "nav", "pulses", "acceleration"):
-            value = getattr(self, name)
-            for path in value if isinstance(value, tuple) else (value,):
-                if path is not None:
-                    yield name.replace("_", "-"), path
+        return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Look at what is asked for before anything is read.
+        """Check the input files before anything is read.
 
         Raises
         ------
@@ -76,31 +86,28 @@ class ReferenceInputs:
             raise SettingsError("Doppler speeds need both observations (--front, --rear) and navigation (--nav)")
         if self.vehicle is None and len(set(self.positions) | set(self.logs)) > 1:
             raise SettingsError("front and rear antennas are told apart by the vehicle; name its file with --vehicle")
-        for name, path in self.named():
-            if not path.is_file():
-                raise InputFileError(path, f"there is no such file; check what --{name} names")
-        if self.rtk is not None and self.rtk_rear is not None and self.rtk.resolve() == self.rtk_rear.resolve():
-            raise InputFileError(self.rtk, "is given as the positions of both antennas; give each its own")
-
-    def fingerprints(self) -> list[dict[str, Any]]:
-        """Name, path, size and hash of every file, as plain values."""
-        return [fingerprint(name, path) for name, path in self.named()]
+        self.check_files()
+        options = {"front": "--rtk", "rear": "--rtk-rear"}
+        check_given_once((options[name], path) for name, path in self.positions.items())
+        check_given_once((f"--{name}", path) for name, paths in self.logs.items() for path in paths)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReferenceOptions:
-    """Choices that do not touch the reference.
+class ReferenceOptions(Settings):
+    """Options that do not change the reference.
 
     Attributes
     ----------
     broken_lines : {"stop", "count"}
+        What to do with lines that cannot be read.
     overwrite : {"refuse", "replace"}
     track : TrackReading
-    date : datetime64 or None
-        UTC date of NMEA logs that do not tell it.
+    date : date or None
+        UTC date of NMEA logs that have none.
     """
 
-    broken_lines: Literal["stop", "count"] = "stop"
-    overwrite: Literal["refuse", "replace"] = "refuse"
-    track: TrackReading = field(default_factory=TrackReading)
-    date: np.datetime64 | None = None
+    date: dt.date | None = option("UTC date of an NMEA log without RMC sentences.", None, metavar="DATE")
+    broken_lines: BrokenLines = option(
+        "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
+    )
+    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    track: TrackReading = Field(default_factory=TrackReading)

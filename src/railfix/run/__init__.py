@@ -1,16 +1,16 @@
-"""The batch: logs, navigation and a track map in, tables of positions out."""
+"""Position logs and write the results: files in, tables of positions out, and the results read back."""
 
-from railfix.run.driver import RunOptions, RunSummary, run_files
+from railfix.run.driver import RunSummary, run_files
+from railfix.run.folder import RunRecord, read_record
 from railfix.run.inputs import RunInputs
-from railfix.run.past import PastRun, past_run
-from railfix.run.sources import TrackReading
+from railfix.run.options import RunOptions, TrackReading
 
 __all__ = [
-    "PastRun",
     "RunInputs",
     "RunOptions",
+    "RunRecord",
     "RunSummary",
     "TrackReading",
-    "past_run",
+    "read_record",
     "run_files",
 ]

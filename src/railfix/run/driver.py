@@ -6,12 +6,10 @@ import sys
 import time as clock
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
-from datetime import datetime
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
-from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex import read_navigation
 from railfix.io.sp3 import read_sp3
@@ -29,10 +27,11 @@ from railfix.run.checks import (
 )
 from railfix.run.chunks import aligned
 from railfix.run.inputs import Antenna, RunInputs
+from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
-from railfix.run.sources import Line, Log, TrackReading, open_line
+from railfix.run.sources import Line, Log, open_line
 from railfix.run.tally import Tally
 
 
@@ -41,42 +40,6 @@ class Progress(Protocol):
 
     def __call__(self, *, epochs: int, fraction: float) -> None:
         """Epochs done so far, and the part of the logs that has been read, 0 to 1."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """Choices of a run that do not touch the positions.
-
-    Attributes
-    ----------
-    observations : {"skip", "write"}
-        Whether ``observations.parquet`` is written.
-    broken_lines : {"stop", "count"}
-        What to do with lines of the logs that cannot be read.
-    overwrite : {"refuse", "replace"}
-    chunk_epochs : int
-        Epochs in memory at a time.
-    start, end : datetime or None
-        First epoch, and the time before which the last one lies, GPS time.
-    track : TrackReading
-    """
-
-    observations: Literal["skip", "write"] = "skip"
-    broken_lines: Literal["stop", "count"] = "stop"
-    overwrite: Literal["refuse", "replace"] = "refuse"
-    chunk_epochs: int = 3000
-    start: datetime | None = None
-    end: datetime | None = None
-    track: TrackReading = field(default_factory=TrackReading)
-
-    def __post_init__(self) -> None:
-        if self.start is not None and self.end is not None and self.start >= self.end:
-            raise SettingsError(f"--start {self.start} is not before --end {self.end}; give an earlier start")
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        plain = asdict(self)
-        return plain | {name: None if plain[name] is None else plain[name].isoformat() for name in ("start", "end")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,8 +103,11 @@ def run_files(
     config, options = config or Config(), options or RunOptions()
     inputs = inputs.with_settings(config)
     inputs.check()
-    with ThreadPoolExecutor(max_workers=1) as pool, OutputFolder(out, overwrite=options.overwrite) as folder:
-        fingerprints = inputs.fingerprints(pool)
+    with (
+        OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
+        ThreadPoolExecutor(max_workers=1) as pool,
+    ):
+        entries = inputs.entries(pool, out)
         navigation, line, logs = open_inputs(inputs, options)
         processor = processor_of(config, navigation, line.trajectories)
         tally = _position(logs, processor, folder, options, progress)
@@ -154,11 +120,11 @@ def run_files(
         notes = (*notes_of(line, navigation, tally, logs), *_notes_of_levels(config, tally, found_levels))
         wall = clock.perf_counter() - began
         record = run_record(
-            files=[entry.result() for entry in fingerprints],
+            files=[entry.result() for entry in entries],
             command=sys.argv,
             asked=asked or {},
             used=config.as_dict(),
-            options=options.as_dict(),
+            options=options.model_dump(mode="json"),
             line=line.facts,
             navigation=navigation,
             tally=tally,

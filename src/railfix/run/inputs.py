@@ -1,23 +1,80 @@
-"""What a run reads: named, checked and hashed."""
+"""Input files of a run: named, checked and hashed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 from railfix.core.errors import InputFileError
 from railfix.core.files import fingerprint
+from railfix.core.settings import Settings, option
 from railfix.pipeline.config import Config
 
 Antenna = Literal["front", "rear"]
+#: Heading of the options that name input files.
+INPUTS = "Inputs"
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunInputs:
-    """The files of a run.
+def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any:
+    """Return a field that is an option for one or several input files."""
+    return option(text, default, metavar=metavar, panel=INPUTS)
+
+
+def track_option() -> Any:
+    """Return the field for the files of the track."""
+    text = "Track map, CSV or GeoJSON; several are joined to a route in the order given."
+    return input_option(text, metavar="TRACK")
+
+
+def vehicle_option() -> Any:
+    """Return the field for the vehicle file."""
+    text = (
+        "Vehicle: bogie distance, gauge, positions of the antennas. Without it the track is taken as the antenna's "
+        "own path."
+    )
+    return input_option(text, None, metavar="TOML")
+
+
+class InputFiles(Settings):
+    """Input files of a command, each field a path, several paths, or None."""
+
+    def named(self) -> Iterator[tuple[str, Path]]:
+        """Each file with the name of its field."""
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            for path in value if isinstance(value, tuple) else (value,):
+                if path is not None:
+                    yield name, path
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files."""
+        return tuple(path for _, path in self.named())
+
+    def check_files(self) -> None:
+        """Check that every file is there and can be opened.
+
+        Raises
+        ------
+        InputFileError
+            A file is missing, a folder, or cannot be opened.
+        """
+        for name, path in self.named():
+            _check_file(f"--{name.replace('_', '-')}", path)
+
+    def entries(self, pool: Executor, folder: Path) -> Entries:
+        """Hash every file beside other work; the paths are recorded as `recorded_path` has them."""
+        return [pool.submit(fingerprint, kind, path, name=recorded_path(path, folder)) for kind, path in self.named()]
+
+
+Entries = Sequence[Future[dict[str, Any]]]
+
+
+class RunInputs(InputFiles):
+    """Input files of a run.
 
     Attributes
     ----------
@@ -27,77 +84,105 @@ class RunInputs:
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
         Track map, joined to a route in this order.
-    vehicle, config, truth : Path or None
-        The truth is asked for by `ablate` alone.
+    vehicle : Path or None
+    truth : Path or None
+        Reference positions, for `ablate` alone.
+    config : Path or None
     cn0_curve, error_model : Path or None
     sbas : tuple of Path
         Named by the settings (`with_settings`).
     """
 
-    front: tuple[Path, ...]
-    nav: tuple[Path, ...]
-    track: tuple[Path, ...]
-    rear: tuple[Path, ...] = ()
-    sp3: tuple[Path, ...] = ()
-    vehicle: Path | None = None
+    front: tuple[Path, ...] = input_option(
+        "RINEX observation file of the front (or only) antenna; repeat it for a log in several files.", metavar="OBS"
+    )
+    nav: tuple[Path, ...] = input_option("RINEX navigation file; repeat it for several.")
+    track: tuple[Path, ...] = track_option()
+    rear: tuple[Path, ...] = input_option(
+        "Observation file of the rear antenna, where there is one.", (), metavar="OBS"
+    )
+    sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
+    vehicle: Path | None = vehicle_option()
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None
     sbas: tuple[Path, ...] = ()
-    truth: Path | None = None
+    truth: Path | None = input_option(
+        "Reference positions: CSV with named columns (`antenna` where there are two) or RTKLIB .pos; only those of "
+        "quality 1 where the file has qualities.",
+        None,
+        metavar="POSITIONS",
+    )
 
-    def with_settings(self, config: Config) -> RunInputs:
-        """The same with the files that settings name."""
-        return replace(self, cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=config.sbas)
-
-    def named(self) -> Iterator[tuple[str, Path]]:
-        """Each file with the name of what it is."""
-        for item in fields(self):
-            value = getattr(self, item.name)
-            for path in value if isinstance(value, tuple) else (value,):
-                if path is not None:
-                    yield item.name, path
+    def with_settings(self, config: Config) -> Self:
+        """Return the same with the files that settings name."""
+        return self.replaced(cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=config.sbas)
 
     @property
     def logs(self) -> dict[Antenna, tuple[Path, ...]]:
         """Observation files by antenna."""
-        both: dict[Antenna, tuple[Path, ...]] = {"front": self.front, "rear": self.rear}
-        return {name: paths for name, paths in both.items() if paths}
+        return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Look at every file before the work begins.
+        """Check every file before the work begins.
 
         Raises
         ------
         InputFileError
             A file is missing, a folder, or cannot be opened; or the same log is given twice.
         """
-        for name, path in self.named():
-            _check_file(name, path)
-        seen: dict[Path, tuple[str, Path]] = {}
-        for name, paths in self.logs.items():
-            for path in paths:
-                whole = path.resolve()
-                if whole in seen:
-                    option, first = seen[whole]
-                    raise InputFileError(
-                        path, f"is given twice (--{option} {first} and --{name} {path}); give each log once"
-                    )
-                seen[whole] = (name, path)
+        self.check_files()
+        check_given_once((f"--{name}", path) for name, paths in self.logs.items() for path in paths)
 
-    def fingerprints(self, pool: Executor) -> list[Future[dict[str, Any]]]:
-        """Name, path, size and SHA-256 of every file, computed while the run goes on."""
-        return [pool.submit(fingerprint, name, path) for name, path in self.named()]
+
+def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Antenna, tuple[Path, ...]]:
+    """Return the observation files of those antennas that have any."""
+    both: dict[Antenna, tuple[Path, ...]] = {"front": front, "rear": rear}
+    return {name: paths for name, paths in both.items() if paths}
+
+
+def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
+    """Raise where the same file is given twice, by whichever options and names.
+
+    Raises
+    ------
+    InputFileError
+    """
+    seen: dict[Path, tuple[str, Path]] = {}
+    for name, path in files:
+        resolved = path.resolve()
+        if resolved in seen:
+            option_name, first = seen[resolved]
+            raise InputFileError(path, f"is given twice ({option_name} {first} and {name} {path}); give each log once")
+        seen[resolved] = (name, path)
+
+
+def recorded_path(path: Path, folder: Path) -> str:
+    """Return the path of an input for the record in a results folder.
+
+    Relative paths are recorded relative to the results folder, so that it can be moved together with its
+    inputs; absolute ones stay.
+    """
+    if path.is_absolute():
+        return str(path)
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
+def located(entry: Mapping[str, Any], folder: Path) -> Path:
+    """Return where a recorded input is now: relative paths count from the results folder."""
+    path = folder / str(entry["path"])
+    plain = Path(os.path.normpath(path))
+    return plain if plain.exists() or not path.exists() else path
 
 
 def _check_file(name: str, path: Path) -> None:
     try:
         if path.is_dir():
-            raise InputFileError(path, f"is a folder, --{name} expects a file; name the file in it")
+            raise InputFileError(path, f"is a folder, {name} expects a file; name the file in it")
         if not path.is_file():
-            what = "is no regular file" if path.exists() else "there is no such file"
-            raise InputFileError(path, f"{what}; check what --{name} names")
+            problem = "is not a regular file" if path.exists() else "there is no such file"
+            raise InputFileError(path, f"{problem}; check what {name} names")
         with path.open("rb") as file:
             file.read(1)
     except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror}); check what --{name} names") from error
+        raise InputFileError(path, f"cannot be read ({error.strerror}); check what {name} names") from error

@@ -1,32 +1,34 @@
-"""The folder a run writes to: everything under temporary names, in place only when the run is done."""
+"""Outputs of all commands: written under temporary names, moved in place when complete, never over an input."""
 
 from __future__ import annotations
 
 import json
 import math
-import shutil
-import tempfile
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Self
+from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
 from railfix.core.errors import OutputError
+from railfix.run.lock import READY, clean_up, make_staging, move_in_place
 
 if TYPE_CHECKING:
     import polars as pl
 
+#: What becomes of files that are already there.
+Overwrite = Literal["refuse", "replace"]
 #: How times are written to CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
-CSV_TIME = "%Y-%m-%dT%H:%M:%S%.9f"
+CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
 
 
 class OutputFolder:
-    """A folder that gets all files of a run at once, or none.
+    """A folder that receives all files of a command at once, or none.
 
-    Used as a context manager. Inside it, tables are appended piece by piece under a temporary
-    folder; `commit` moves them in place. Leaving without `commit` (an error) removes what was
-    written, and the folder itself where it had not been there before.
+    Used as a context manager. Inside it, files are written to a hidden staging folder; `commit` moves them in
+    place. Leaving without `commit` (an error) removes what was written, and the folder itself where it had not
+    been there before. What a killed process left behind is cleaned up by the next `OutputFolder` there.
 
     Parameters
     ----------
@@ -35,29 +37,30 @@ class OutputFolder:
     overwrite : {"refuse", "replace"}
         What to do with a folder that has files in it already: "replace" replaces files of the
         same names at the end and leaves others alone.
+    inputs : sequence of Path
+        Files that are read: they are never overwritten.
 
     Raises
     ------
     OutputError
-        The folder cannot be made or written, or is not empty.
+        The folder cannot be made or written, is not empty, is being written by another process, or a file
+        would overwrite an input.
     """
 
-    def __init__(self, path: Path, *, overwrite: str = "refuse") -> None:
+    def __init__(self, path: Path, *, overwrite: Overwrite = "refuse", inputs: Sequence[Path] = ()) -> None:
         if overwrite not in ("refuse", "replace"):
             raise ValueError(f"overwrite is {overwrite!r}, expected 'refuse' or 'replace'")
         self.path = path
+        self._inputs = tuple(inputs)
         self._made: list[Path] = []
         self._csv: dict[str, IO[bytes]] = {}
         self._pieces: dict[str, list[Path]] = {}
-        self._staged: list[Path] = []
+        self._staged: list[str] = []
         with _writing(path):
-            if path.exists() and not path.is_dir():
-                raise OutputError(f"{path}: is a file, expected a folder for the results; name another folder")
-            if overwrite == "refuse" and path.is_dir() and any(path.iterdir()):
-                raise OutputError(f"{path}: the folder is not empty; name another one, or give --overwrite")
+            check_folder(path, overwrite=overwrite)
             self._make()
             try:
-                self._staging = Path(tempfile.mkdtemp(prefix=".railfix-", dir=path))
+                self._staging = make_staging(path)
             except OSError:
                 self._unmake()
                 raise
@@ -85,72 +88,146 @@ class OutputFolder:
     ) -> None:
         for handle in self._csv.values():
             handle.close()
-        shutil.rmtree(self._staging, ignore_errors=True)
+        self._staging.remove()
         if kind is not None:
             self._unmake()
+
+    @property
+    def staging(self) -> Path:
+        """The temporary folder; `staged` registers the files in it that are results."""
+        return self._staging.path
+
+    def staged(self, name: str) -> Path:
+        """Return the temporary path at which to write one file; `commit` moves it in place.
+
+        Raises
+        ------
+        OutputError
+            The file would overwrite an input, or a folder of that name is there.
+        """
+        target = self.path / name
+        check_not_input(target, self._inputs)
+        if target.is_dir():
+            raise OutputError(f"{target}: is a folder, expected a file to replace; remove it")
+        if name not in self._staged:
+            self._staged.append(name)
+        return self._staging.path / name
 
     def append_csv(self, name: str, table: pl.DataFrame) -> None:
         """Append rows to a CSV file; the header is written once."""
         with _writing(self.path / name):
             first = name not in self._csv
             if first:
-                self._csv[name] = (self._staging / name).open("wb")
+                self._csv[name] = self.staged(name).open("wb")
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
         """Append rows to a Parquet file, kept as pieces until `commit`."""
         with _writing(self.path / name):
             pieces = self._pieces.setdefault(name, [])
-            piece = self._staging / f"{name}.{len(pieces):06d}"
+            piece = self.staged(name).with_name(f"{name}.{len(pieces):06d}")
             table.write_parquet(piece, compression="lz4", statistics=False)
             pieces.append(piece)
 
     def scan(self, name: str) -> pl.LazyFrame:
-        """What was appended so far to a Parquet file."""
+        """Return what was appended so far to a Parquet file."""
         import polars as pl
 
         return pl.scan_parquet(self._pieces[name])
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write one JSON file."""
+        """Write one JSON file; NaN and infinities, which JSON lacks, are written as words."""
         with _writing(self.path / name):
             text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
-            (self._staging / name).write_text(text + "\n", encoding="utf-8")
-        self._staged.append(self._staging / name)
+            self.staged(name).write_text(text + "\n", encoding="utf-8")
 
-    def commit(self, metadata: Mapping[str, str]) -> dict[str, Path]:
+    def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
         """Join the pieces and move every file in place.
 
         Parameters
         ----------
-        metadata : mapping of str to str
+        metadata : mapping of str to str, optional
             Written into the footer of each Parquet file.
 
         Returns
         -------
         dict of str to Path
-            Where each file stands.
+            Where each file stands, by its name.
         """
-        files: dict[str, Path] = {}
+        staging = self._staging.path
         with _writing(self.path):
-            for name, handle in self._csv.items():
+            for handle in self._csv.values():
                 handle.close()
-                self._staged.append(self._staging / name)
             for name in self._pieces:
-                whole = self._staging / name
-                self.scan(name).sink_parquet(whole, metadata=dict(metadata))
-                self._staged.append(whole)
-            for source in self._staged:
-                if (target := self.path / source.name).is_dir():
-                    raise OutputError(f"{target}: is a folder, expected a file to replace; remove it")
-            for source in sorted(self._staged):
-                files[source.name] = source.replace(self.path / source.name)
-        return files
+                self.scan(name).sink_parquet(staging / name, metadata=dict(metadata or {}))
+            ready = staging / f"{READY}.part"
+            ready.mkdir()
+            for name in self._staged:
+                self.staged(name).replace(ready / name)
+            # From this rename on, a killed process has finished: the next one moves the files in place.
+            return move_in_place(ready.replace(staging / READY), self.path)
+
+
+def check_folder(path: Path, *, overwrite: Overwrite) -> None:
+    """Clean up a results folder after killed processes, and raise where it must not be written.
+
+    Raises
+    ------
+    OutputError
+        It is a file, is being written by another process, or has files in it that must not be replaced.
+    """
+    with _writing(path):
+        if path.exists() and not path.is_dir():
+            raise OutputError(f"{path}: is a file, expected a folder for the results; name another folder")
+        if path.is_dir():
+            clean_up(path)
+        if overwrite == "refuse" and path.is_dir() and any(path.iterdir()):
+            raise OutputError(f"{path}: the folder is not empty; name another one, or give --overwrite")
+
+
+def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
+    """Raise where a file to be written is an input, under whichever name.
+
+    Raises
+    ------
+    OutputError
+    """
+    for path in inputs:
+        if target.resolve() == path.resolve() or (target.exists() and path.exists() and target.samefile(path)):
+            raise OutputError(f"{target}: is an input, which is never overwritten; name another output")
+
+
+def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
+    """Raise where a single file cannot or must not be written.
+
+    Parameters
+    ----------
+    target : Path
+    overwrite : {"refuse", "replace"}
+        What to do with a file that is already there.
+    inputs : sequence of Path
+        Files that are read: they are never overwritten.
+
+    Raises
+    ------
+    OutputError
+        The folder does not exist or cannot be written, the file is there already, or is an input.
+    """
+    with _writing(target):
+        check_not_input(target, inputs)
+        if not target.parent.is_dir():
+            raise OutputError(f"{target}: the folder {target.parent} does not exist; make it, or name another")
+        if target.is_dir():
+            raise OutputError(f"{target}: is a folder, expected the name of a file to write")
+        if target.exists() and overwrite == "refuse":
+            raise OutputError(f"{target}: the file exists already; name another one, or give --overwrite")
+        if not os.access(target.parent, os.W_OK):
+            raise OutputError(f"{target}: the folder {target.parent} cannot be written; name another")
 
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Turn what the system says about a file into one sentence."""
+    """Turn errors of the system about a file into one sentence."""
     from polars.exceptions import PolarsError
 
     try:
@@ -163,7 +240,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def _finite(value: Any) -> Any:
-    """The same plain values with NaN and infinities, which JSON has not, as words."""
+    """Return the same plain values with NaN and infinities as words."""
     if isinstance(value, Mapping):
         return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -7,35 +7,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from railfix.core.errors import SettingsError
+from railfix.core.files import BrokenLines
 from railfix.gnss.observations import Observations
 from railfix.io.rinex import scan_observations
 from railfix.run.inputs import Antenna
+from railfix.run.options import TrackReading
 from railfix.track import Track, read_track
 from railfix.track.trajectory import Trajectory
-from railfix.track.vehicle import Reference, Vehicle, antenna_trajectory, read_vehicle
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrackReading:
-    """How to read the track, and which point's chainage to give.
-
-    Attributes
-    ----------
-    crs, height_datum, geoid : str or None
-        Where the track's own file does not say; see `railfix.track.read_track`.
-    reference : str
-        The point of the vehicle whose chainage is given; see `railfix.track.vehicle.antenna_trajectory`.
-    """
-
-    crs: str | None = None
-    height_datum: str | None = None
-    geoid: str | None = None
-    reference: Reference = "antenna"
+from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +112,7 @@ class Log:
 
     paths: tuple[Path, ...]
     chunk_epochs: int
-    broken_lines: Literal["stop", "count"] = "stop"
+    broken_lines: BrokenLines = "stop"
     start: datetime | None = None
     end: datetime | None = None
     share: float = 0.0

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import gzip
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
@@ -19,6 +17,7 @@ from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.io.rinex.write import write_navigation, write_observations
+from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
 from railfix.simulate.run_readme import run_readme
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
 from railfix.simulate.scenario_file import scenario_table
@@ -28,7 +27,6 @@ from railfix.track import write_track_csv
 
 #: Decimals of metres, metres a second and metres a second squared in the truth.
 TRUTH_DECIMALS: Final = 4
-_TIME_FORMAT: Final = "%Y-%m-%dT%H:%M:%S%.9f"
 _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",)
 
 
@@ -89,9 +87,10 @@ def write_run(
     *,
     packing: Literal["packed", "plain"] = "packed",
     command: str = "",
+    overwrite: Overwrite = "refuse",
     progress: Callable[[str, int], None] | None = None,
 ) -> dict[str, Path]:
-    """Simulate a run and write its files; those of the same names are replaced, all together at the end.
+    """Simulate a run and write its files, all together at the end.
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
@@ -114,6 +113,8 @@ def write_run(
         Plain: nothing is compressed, and sensors are CSV.
     command : str
         The command that made it, for the README.
+    overwrite : {"refuse", "replace"}
+        What to do with a folder that has files in it already.
     progress : callable, optional
         Called with the antenna and the number of epochs written since the last call.
 
@@ -130,39 +131,30 @@ def write_run(
     InputFileError, MismatchError, SettingsError
         A track or navigation file that the scenario names does not serve.
     """
-    out = Path(folder)
     simulation = Simulation(scenario)
     tables = sensor_tables(simulation)
-    before = out.exists()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=".railfix-", dir=out))
-    except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be made ({error.strerror or error})") from error
-    try:
-        staged = _write_files(simulation, tables, staging, packing, command, progress)
-        return {name: _in_place(path, out) for name, path in staged.items()}
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if not before and not any(out.iterdir()):
-            out.rmdir()
+    with OutputFolder(Path(folder), overwrite=overwrite) as out:
+        staged = _write_files(simulation, tables, out, packing, command, progress)
+        written = out.commit()
+    return {name: written[path.name] for name, path in staged.items()}
 
 
 def _write_files(
     simulation: Simulation,
     tables: dict[str, pl.DataFrame],
-    out: Path,
+    out: OutputFolder,
     packing: Literal["packed", "plain"],
     command: str,
     progress: Callable[[str, int], None] | None,
 ) -> dict[str, Path]:
     scenario = simulation.scenario
     observation, packed = ("crx.gz", ".gz") if packing == "packed" else ("rnx", "")
-    files = {name: out / f"{name}.{observation}" for name in ANTENNAS}
-    files |= {"nav": out / f"nav.rnx{packed}", "track": out / "track.csv", "vehicle": out / "vehicle.toml"}
-    files |= {"truth": out / f"truth.csv{packed}", "sections": out / "sections.csv"}
-    files |= {name: out / f"{name}.{'parquet' if packed else 'csv'}" for name in tables}
-    files |= {"scenario": out / "scenario.toml", "readme": out / "README.md"}
+    names = {name: f"{name}.{observation}" for name in ANTENNAS}
+    names |= {"nav": f"nav.rnx{packed}", "track": "track.csv", "vehicle": "vehicle.toml"}
+    names |= {"truth": f"truth.csv{packed}", "sections": "sections.csv"}
+    names |= {name: f"{name}.{'parquet' if packed else 'csv'}" for name in tables}
+    names |= {"scenario": "scenario.toml", "readme": "README.md"}
+    files = {key: out.staged(name) for key, name in names.items()}
     for antenna in ANTENNAS:
 
         def watched(antenna: str = antenna) -> Iterator[Observations]:
@@ -187,7 +179,7 @@ def _write_files(
 
 def _csv(table: pl.DataFrame, decimals: int | None) -> bytes:
     text = BytesIO()
-    table.write_csv(text, float_precision=decimals, datetime_format=_TIME_FORMAT)
+    table.write_csv(text, float_precision=decimals, datetime_format=CSV_TIME)
     return text.getvalue()
 
 
@@ -195,13 +187,6 @@ def _parquet(table: pl.DataFrame) -> bytes:
     content = BytesIO()
     table.write_parquet(content)
     return content.getvalue()
-
-
-def _in_place(path: Path, out: Path) -> Path:
-    try:
-        return path.replace(out / path.name)
-    except OSError as error:
-        raise OutputError(f"{out / path.name}: the file cannot be written ({error.strerror or error})") from error
 
 
 def vehicle_table(vehicle: VehicleSettings) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from railfix.ranges.error_model import (
 )
 from railfix.run.chunks import aligned
 from railfix.run.driver import open_inputs
-from railfix.run.past import past_run
+from railfix.run.folder import read_record
 from railfix.run.processor import processor_of
 
 #: Called after each chunk with the name of the run and the epochs processed so far.
@@ -142,7 +142,7 @@ def _run_errors(
     source: ModelInputs, number: int, fit: ErrorModelFit, limits: GatherLimits, progress: OnChunk | None
 ) -> _RunErrors:
     """Range errors of one run, chunk by chunk."""
-    past = past_run(source.run)
+    past = read_record(source.run)
     past.check_inputs()
     navigation, line, logs = open_inputs(past.inputs, past.options)
     references = read_reference(source.reference, tuple(past.inputs.logs))

@@ -1,0 +1,177 @@
+"""Commands that are loaded when they are called, and end with one sentence and a documented exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+from collections import Counter
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib import import_module
+from itertools import pairwise
+from typing import Any, ClassVar, Final, NoReturn
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from railfix.core.errors import InputFileError, OutputError, RailfixError
+
+#: Words that are given to switches by mistake.
+_YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
+#: A signal ends the program with this exit code plus its number, as in a shell.
+SIGNALLED: Final = 128
+#: What the system reports of a standard output that cannot take any more.
+_FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
+
+
+class Command(TyperCommand):
+    """A command that reports options given twice and switches given a value."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments, after these checks."""
+        options = {name: param for param in self.params for name in getattr(param, "opts", ())}
+        given: Counter[str] = Counter()
+        words = iter(args[: args.index("--")] if "--" in args else args)
+        for word in words:
+            name, equals, _ = word.partition("=")
+            param = options.get(name)
+            if param is None or not name.startswith("-"):
+                continue
+            if getattr(param, "is_flag", False):
+                self._check_switch(ctx, name, args)
+                continue
+            given[name] += 1
+            if given[name] > 1 and not param.multiple:
+                ctx.fail(f"{name} is given twice; give it once")
+            if not equals:
+                next(words, None)
+        return super().parse_args(ctx, args)
+
+    @staticmethod
+    def _check_switch(ctx: Any, name: str, args: list[str]) -> None:
+        for before, after in pairwise(args):
+            if before == name and after.lower() in _YES_NO:
+                ctx.fail(f"{name} is a switch and takes no value; leave {after} out")
+
+
+class Commands(TyperGroup):
+    """A group whose commands end with one sentence and the exit code of the error's class."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; an error that the user can mend is reported in one sentence."""
+        try:
+            _check_surroundings()
+            return super().invoke(ctx)
+        except RailfixError as error:
+            _end(error)
+        except BrokenPipeError:
+            _discard_output()
+            raise typer.Exit(SIGNALLED + signal.SIGPIPE) from None
+        except OSError as error:
+            if error.filename is not None or error.errno not in _FULL:
+                raise
+            _discard_output()
+            _end(OutputError(f"the standard output cannot be written ({error.strerror}); free space, or redirect it"))
+        except RecursionError as error:
+            if "pydantic" in repr(error):
+                raise
+            _end(InputFileError("an input file", "is nested too deeply to be read; simplify it"))
+
+
+class LazyCommands(Commands):
+    """The commands of the program, each imported from its module when it is called.
+
+    Attributes
+    ----------
+    summaries : mapping of str to str
+        What each command does, by its name, for the list of commands.
+    """
+
+    summaries: ClassVar[Mapping[str, str]] = {}
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands."""
+        return [*super().list_commands(ctx), *self.summaries]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command for the list of commands: name and summary alone."""
+        if cmd_name in self.summaries:
+            return Command(cmd_name, help=self.summaries[cmd_name])
+        return super().get_command(ctx, cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that is called, imported."""
+        name, command, rest = super().resolve_command(ctx, args)
+        return name, loaded(str(name)) if name in self.summaries else command, rest
+
+
+def loaded(name: str) -> Any:
+    """Return a command, imported from its module in `railfix.cli`."""
+    word = name.replace("-", "_")
+    module = import_module(f"railfix.cli.{word}")
+    app = getattr(module, "app", None)
+    if app is None:
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="markdown")
+        app.command(name, cls=Command)(getattr(module, word))
+    command = typer.main.get_command(app)
+    command.name = name
+    return command
+
+
+def run_program(app: typer.Typer) -> NoReturn:
+    """Run the program: signals that end it clean up first, and a reader that stops reading is no error."""
+    for name in ("SIGTERM", "SIGHUP"):
+        if number := getattr(signal, name, None):
+            signal.signal(number, _raise_exit)
+    sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    try:
+        app(standalone_mode=True)
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _discard_output()
+        code = code or SIGNALLED + signal.SIGPIPE
+    except OSError as error:
+        _discard_output()
+        typer.echo(f"railfix: error: the standard output cannot be written ({error.strerror})", err=True)
+        code = code or OutputError.exit_code
+    sys.exit(code)
+
+
+def _raise_exit(number: int, _frame: object) -> NoReturn:
+    """End by way of an exception, so that what is half done is removed."""
+    signal.signal(number, signal.SIG_IGN)
+    raise SystemExit(SIGNALLED + number)
+
+
+def _end(error: RailfixError) -> NoReturn:
+    sentence = " ".join(str(error).split())
+    typer.echo(f"railfix: error: {sentence}", err=True)
+    raise typer.Exit(error.exit_code) from None
+
+
+def _check_surroundings() -> None:
+    """Raise where no command could work: no working directory, or names that are not text."""
+    try:
+        os.getcwd()  # noqa: PTH109
+    except OSError:
+        raise InputFileError(".", "the working directory does not exist any more; change to one that does") from None
+    for word in sys.argv[1:]:
+        try:
+            word.encode("utf-8")
+        except UnicodeEncodeError:
+            shown = word.encode("utf-8", "backslashreplace").decode()
+            raise InputFileError(shown, "the name is not UTF-8; rename the file, or make a link to it") from None
+
+
+def _discard_output() -> None:
+    """Send the rest of the standard output nowhere, so that nothing fails when the program ends."""
+    with suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        os.close(null)

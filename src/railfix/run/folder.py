@@ -1,0 +1,148 @@
+"""Record of a run (``run.json``) read back, with its inputs where they are now."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import file_sha256, read_json_object
+from railfix.core.settings import Model, validated
+from railfix.pipeline.config import Config, parse_config
+from railfix.run.inputs import RunInputs, located
+from railfix.run.options import RunOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """Record of a run: ``run.json`` in the folder that `run_files` wrote.
+
+    Attributes
+    ----------
+    path : Path
+        The folder.
+    record : mapping
+        ``run.json``.
+    """
+
+    path: Path
+    record: Mapping[str, Any]
+
+    def part(self, name: str) -> dict[str, Any]:
+        """Return a table of the record.
+
+        Raises
+        ------
+        InputFileError
+            It is missing or not a table.
+        """
+        found = self.record.get(name)
+        if not isinstance(found, dict):
+            raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
+        return found
+
+    @cached_property
+    def config(self) -> Config:
+        """Settings that were used, with the files they name where these are now.
+
+        Raises
+        ------
+        InputFileError, SettingsError
+            The record lacks them, or they are not settings of this version.
+        """
+        config = parse_config(self.part("settings_used"), source=str(self.path / "run.json"))
+        files = {name: self.located(name) for name in ("cn0_curve", "error_model", "sbas")}
+        changes = {name: tuple(paths) if name == "sbas" else paths[0] for name, paths in files.items() if paths}
+        return config.replaced(**changes) if changes else config
+
+    @cached_property
+    def inputs(self) -> RunInputs:
+        """Input files, where they are now."""
+        entries = [str(entry["input"]) for entry in self.entries]
+        one = ("vehicle", "config", "cn0_curve", "error_model", "truth")
+        values = {
+            name: self.located(name)[0] if name in one else tuple(self.located(name)) for name in dict.fromkeys(entries)
+        }
+        return self._validated(RunInputs, values)
+
+    @cached_property
+    def options(self) -> RunOptions:
+        """Options that were used."""
+        return self._validated(RunOptions, self.part("options"))
+
+    def _validated(self, model: type[Model], values: Mapping[str, Any]) -> Model:
+        try:
+            return validated(model, values, source="")
+        except SettingsError as error:
+            path = self.path / "run.json"
+            raise InputFileError(path, f"was not written by this version ({error}); repeat the run") from None
+
+    def check_inputs(self) -> None:
+        """Check that the input files are there and unchanged.
+
+        Raises
+        ------
+        InputFileError
+            One is missing.
+        MismatchError
+            One has changed since the run.
+        """
+        self.inputs.check()
+        for entry in self.entries:
+            path = located(entry, self.path)
+            if file_sha256(path) != entry["sha256"]:
+                raise MismatchError(
+                    f"{path}: has changed since the run in {self.path} read it as --{entry['input']}; repeat the run"
+                )
+
+    def located(self, kind: str) -> list[Path]:
+        """Return where the files of one kind of input are now, in order; see `railfix.run.inputs.located`."""
+        return [located(entry, self.path) for entry in self.entries if entry["input"] == kind]
+
+    @property
+    def entries(self) -> list[Mapping[str, Any]]:
+        """Input files with kind, path and SHA-256.
+
+        Raises
+        ------
+        InputFileError
+            The record has no such list.
+        """
+        entries = self.record.get("inputs", [])
+        complete = isinstance(entries, list) and all(
+            isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
+        )
+        if not complete:
+            raise InputFileError(
+                self.path / "run.json", "has inputs that are no list of input, path and sha256; repeat the run"
+            )
+        return list(entries)
+
+
+def read_record(folder: Path) -> RunRecord:
+    """Read the record of a run.
+
+    Parameters
+    ----------
+    folder : Path
+        That `railfix run` wrote.
+
+    Returns
+    -------
+    RunRecord
+
+    Raises
+    ------
+    InputFileError
+        There is no record, or it is not one.
+    """
+    if not folder.is_dir():
+        problem = "is a file" if folder.exists() else "there is no such folder"
+        raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; name that")
+    path = folder / "run.json"
+    if not path.is_file():
+        raise InputFileError(path, "there is no such file; railfix run writes it beside the positions")
+    return RunRecord(path=folder, record=read_json_object(path, what="the record of a run"))

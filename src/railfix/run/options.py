@@ -1,0 +1,74 @@
+"""Options of a run that do not change the positions."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from railfix.core.files import BrokenLines
+from railfix.core.settings import Settings, option
+from railfix.run.output import Overwrite
+from railfix.track.vehicle import Reference
+
+
+class TrackReading(Settings):
+    """How to read the track, and which point of the vehicle the chainage is that of.
+
+    Attributes
+    ----------
+    crs, height_datum, geoid : str or None
+        Where the track's own file does not say; see `railfix.track.read_track`.
+    reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
+        See `railfix.track.vehicle.antenna_trajectory`.
+    """
+
+    crs: str | None = option("CRS of the track where its file does not name one.", None, metavar="EPSG")
+    height_datum: str | None = option("Heights of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
+    geoid: str | None = option(
+        "Geoid of orthometric heights: japan (JPGEO2024), gsigeo2011, or a grid or CRS known to PROJ.",
+        None,
+        metavar="MODEL",
+    )
+    reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
+
+
+class RunOptions(Settings):
+    """Options of a run that do not change the positions.
+
+    Attributes
+    ----------
+    observations : {"skip", "write"}
+        Whether ``observations.parquet`` is written.
+    broken_lines : {"stop", "count"}
+        What to do with lines of the logs that cannot be read.
+    overwrite : {"refuse", "replace"}
+    chunk_epochs : int
+        Epochs in memory at a time.
+    start, end : datetime or None
+        First epoch, and the time before which the last one lies, GPS time.
+    track : TrackReading
+    """
+
+    start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
+    end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
+    observations: Literal["skip", "write"] = option(
+        "Also write observations.parquet: one row per epoch, satellite and signal, with its reason.",
+        "skip",
+        name="--observations",
+    )
+    broken_lines: BrokenLines = option(
+        "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
+    )
+    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    chunk_epochs: int = option(
+        "Epochs in memory at a time; the results do not depend on it.", 3000, name="--chunk", metavar="EPOCHS", ge=1
+    )
+    track: TrackReading = Field(default_factory=TrackReading)
+
+    @model_validator(mode="after")
+    def _start_before_end(self) -> Self:
+        if self.start is not None and self.end is not None and self.start >= self.end:
+            raise ValueError(f"--start {self.start} is not before --end {self.end}; give an earlier start")
+        return self
