@@ -527,7 +527,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
         (["--reference", "{reference}", "--label", "a", "--label", "b"], 4, "--label is given 2 times"),
         (["--reference", "{late}"], 5, "no time in common"),
         (["--reference", "{reference}", "--speed-classes", "20,x"], 4, "--speed-classes"),
-        (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "--speed-classes: positive numbers that rise"),
+        (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "--speed-classes: rising numbers expected"),
         (
             ["--reference", "{reference}", "--section-length", "0"],
             4,

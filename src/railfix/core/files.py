@@ -249,11 +249,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
         The file is missing, unreadable, not UTF-8, not JSON, nested too deeply, or holds no object.
     """
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read as {what} ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise InputFileError(path, f"is not a text file; {what} is JSON in UTF-8") from None
+        content = json.loads(read_text(path))
     except RecursionError:
         raise InputFileError(path, f"is nested too deeply; expected {what}") from None
     except json.JSONDecodeError as error:
