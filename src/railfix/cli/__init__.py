@@ -77,7 +77,7 @@ def railfix(
     - 2: the command line was misused (unknown option, missing argument)
     - 3: an input file is missing, unreadable, or not what it should be
     - 4: a setting is misspelt, out of range, or contradicts another
-    - 5: the inputs are readable but do not belong together (other day, other place)
+    - 5: the inputs are readable but do not match each other (other day, other place)
     - 6: the track map was checked and has errors
     - 7: the run ended without a single position
     - 8: the output cannot be written
