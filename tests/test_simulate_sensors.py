@@ -17,8 +17,10 @@ from railfix.simulate import RunSettings, Scenario, Simulation
 from railfix.simulate.sensors import (
     DrawnSlips,
     Dropout,
+    GroundUnit,
     InertialSettings,
     RadarSettings,
+    RangingSettings,
     SensorSettings,
     SlipInterval,
     TachometerSettings,
@@ -62,12 +64,13 @@ def inertial(settings: InertialSettings, duration_s: float = 100.0, run: RunSett
 
 def test_the_tables_have_the_columns_that_are_described() -> None:
     assert sensor_tables(Simulation(Scenario(duration_s=1.0))) == {}
-    made = sensor_tables(Simulation(Scenario(duration_s=30.0, sensors=SensorSettings())))
+    sensors = SensorSettings(ranging=RangingSettings(units=(GroundUnit(name="A", chainage_m=60.0),)))
+    made = sensor_tables(Simulation(Scenario(duration_s=30.0, sensors=sensors)))
     assert {name: list(frame.columns) for name, frame in made.items()} == {n: list(c) for n, c in COLUMNS.items()}
-    for frame in made.values():
-        assert frame["time_gpst"].dtype == pl.Datetime("ns")
-        assert frame["time_gpst"].is_sorted()
-    again = sensor_tables(Simulation(Scenario(duration_s=30.0, sensors=SensorSettings())))
+    for name in made.keys() - {"ranging_units"}:
+        assert made[name]["time_gpst"].dtype == pl.Datetime("ns")
+        assert made[name]["time_gpst"].is_sorted()
+    again = sensor_tables(Simulation(Scenario(duration_s=30.0, sensors=sensors)))
     assert all(made[name].equals(again[name]) for name in made)
 
 
@@ -352,3 +355,114 @@ def test_settings_are_read_from_plain_tables() -> None:
 def test_settings_out_of_range_are_refused(settings: Any, names: str) -> None:
     with pytest.raises(ValidationError, match=names):
         settings()
+
+
+# ---------------------------------------------------------------- teeth
+
+
+def test_uneven_teeth_come_back_every_turn_and_a_whole_turn_cancels_them() -> None:
+    """Cruising at constant speed the interval of 60 pulses is even, that of one pulse is not."""
+    plain = pulses(TachometerSettings())[1]
+    _, uneven = pulses(TachometerSettings(tooth_sigma=0.05))
+    assert len(uneven) == pytest.approx(len(plain), abs=1)
+    simulation = only(100.0, tachometer=TachometerSettings())
+    cruising = uneven[np.abs(simulation.motion.acceleration_at(uneven)) == 0.0]
+    cruising = cruising[(cruising > 35.0) & (cruising < 70.0)]
+    spacing = np.diff(cruising) / np.diff(plain[(plain > 36.0) & (plain < 60.0)]).mean()
+    # Difference of two independent teeth: sqrt(2) times their sigma.
+    assert spacing.std() == pytest.approx(0.05 * np.sqrt(2.0), rel=0.25)
+    assert spacing[60:] == pytest.approx(spacing[:-60], abs=1e-6), "the same teeth every turn"
+    turn = cruising[60:] - cruising[:-60]
+    assert np.ptp(turn) / turn.mean() < 1e-8
+
+
+def test_lost_and_doubled_pulses_are_as_many_as_their_chances_say() -> None:
+    _, plain = pulses(TachometerSettings(), 200.0)
+    _, lost = pulses(TachometerSettings(lost_chance=0.02), 200.0)
+    _, doubled = pulses(TachometerSettings(doubled_chance=0.03), 200.0)
+    n = len(plain)
+    assert n - len(lost) == pytest.approx(0.02 * n, abs=4.0 * np.sqrt(0.02 * n))
+    assert np.isin(lost, plain).all()
+    assert len(doubled) - n == pytest.approx(0.03 * n, abs=4.0 * np.sqrt(0.03 * n))
+    assert np.isin(plain, doubled).all()
+    extra = doubled[~np.isin(doubled, plain)]
+    after = np.searchsorted(plain, extra)
+    inside = after < n
+    part = (extra - plain[after - 1])[inside] / (plain[np.minimum(after, n - 1)] - plain[after - 1])[inside]
+    assert part.min() > 0.09
+    assert part.max() < 0.61
+
+
+# ---------------------------------------------------------------- vibration
+
+
+def test_vibration_has_its_sigma_and_frequency_and_none_at_rest() -> None:
+    run = RunSettings(cruise_mps=10.0)
+    settings = InertialSettings(vibration_sigma_mps2=0.4, vibration_sigma_radps=0.02, vibration_hz=12.0)
+    plain, shaken = inertial(InertialSettings(), run=run), inertial(settings, run=run)
+    more = shaken - plain
+    simulation = only(100.0, inertial=settings, run=run)
+    speed = simulation.motion.at(np.arange(len(more)) / 100.0)[1]
+    assert (more[speed == 0.0] == 0.0).all()
+    cruising = more[speed == 10.0]
+    assert len(cruising) > 3000
+    # Half of the size at half of 20 m/s.
+    assert cruising[:, :3].std(axis=0) == pytest.approx(0.2, rel=0.1)
+    assert cruising[:, 3:].std(axis=0) == pytest.approx(0.01, rel=0.1)
+    crossings = (np.diff(np.sign(cruising[:, 0])) != 0).sum()
+    assert crossings / 2.0 / (len(cruising) / 100.0) == pytest.approx(12.0, rel=0.08)
+    assert np.abs(np.corrcoef(cruising.T)[np.triu_indices(6, 1)]).max() < 0.2
+
+
+# ---------------------------------------------------------------- ranging
+
+
+def ranging(
+    duration_s: float = 100.0, *, run: RunSettings | None = None, **settings: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measured less true ranges [m] of one unit at chainage 250 m, and the chainage of the vehicle's middle."""
+    unit = settings.pop("unit", GroundUnit(name="A", chainage_m=250.0, lateral_m=4.0, height_m=2.0))
+    simulation = only(duration_s, run=run, ranging=RangingSettings(units=(unit,), **settings))
+    frame = table(simulation, "ranging")
+    time = since_start(simulation, frame["time_gpst"])
+    place = table(simulation, "ranging_units").select("x_m", "y_m", "z_m").to_numpy()[0]
+    vehicle, _ = simulation.body_truth((9.0, 0.0, 3.0), time)
+    true = np.linalg.norm(vehicle.ecef_m - place, axis=1)
+    return frame["range_m"].to_numpy() - true, simulation.motion.at(time)[0]
+
+
+def test_a_range_without_errors_is_the_distance_and_ends_at_its_reach() -> None:
+    error, chainage = ranging()
+    assert len(error) > 50
+    assert np.abs(error).max() < 1e-6
+    assert np.abs(chainage + 9.0 - 250.0).max() == pytest.approx(100.0, abs=2.5)
+    # On a straight by Pythagoras: 4 m to the side, 1 m lower, so many metres ahead.
+    unit = GroundUnit(name="B", chainage_m=60.0, lateral_m=4.0, height_m=2.0)
+    simulation = only(1.0, ranging=RangingSettings(units=(unit,)))
+    first = table(simulation, "ranging")["range_m"][0]
+    assert first == pytest.approx(np.sqrt((60.0 - 29.0) ** 2 + 4.0**2 + 1.0**2), abs=0.02)
+
+
+def test_each_error_of_a_range_comes_back_alone() -> None:
+    # The sigma of P2 3.3 on the straight.
+    noise, _ = ranging(400.0, noise_sigma_m=0.19)
+    assert noise.std() == pytest.approx(0.19, rel=0.15)
+    assert ranging(unit=GroundUnit(name="A", chainage_m=250.0, delay_bias_m=0.15))[0] == pytest.approx(0.15, abs=1e-6)
+    full, kept = ranging(400.0)[0], ranging(400.0, lost_chance=0.3)[0]
+    assert len(kept) / len(full) == pytest.approx(0.7, abs=0.1)
+    echoes, _ = ranging(400.0, echo_chance=0.2, echo_delay_m=0.8)
+    late = echoes > 1e-6
+    assert late.mean() == pytest.approx(0.2, abs=0.08)
+    assert echoes.min() > -1e-6, "an echo is never early"
+    assert echoes[late].mean() == pytest.approx(0.8, rel=0.35)
+
+
+def test_ranging_errors_stay_while_the_train_stands() -> None:
+    run = RunSettings(first_stand_s=1e6)
+    unit = GroundUnit(name="A", chainage_m=60.0)
+    still, _ = ranging(20.0, run=run, unit=unit, multipath_sigma_m=0.3, echo_chance=0.5)
+    assert len(still) == 101
+    assert np.ptp(still) < 1e-9
+    moving, _ = ranging(60.0, multipath_sigma_m=0.3)
+    assert moving.std() == pytest.approx(0.3, rel=0.25)
+    assert abs(np.corrcoef(moving[1:], moving[:-1])[0, 1]) < 0.3

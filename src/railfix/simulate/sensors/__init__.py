@@ -1,10 +1,12 @@
-"""Vehicle sensors besides the satellite receivers: tachometer, inertial sensor, radar."""
+"""Vehicle sensors besides the satellite receivers: tachometer, inertial sensor, radar, ranging."""
 
 from railfix.simulate.sensors.settings import (
     DrawnSlips,
     Dropout,
+    GroundUnit,
     InertialSettings,
     RadarSettings,
+    RangingSettings,
     SensorSettings,
     SlipInterval,
     TachometerSettings,
@@ -13,8 +15,10 @@ from railfix.simulate.sensors.settings import (
 __all__ = [
     "DrawnSlips",
     "Dropout",
+    "GroundUnit",
     "InertialSettings",
     "RadarSettings",
+    "RangingSettings",
     "SensorSettings",
     "SlipInterval",
     "TachometerSettings",

@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.simulate.body_motion import FULL_SPEED_MPS
 from railfix.simulate.errors.processes import GaussMarkov
+from railfix.simulate.random_functions import RandomFunction
 from railfix.simulate.sensors.settings import InertialSettings
 
 if TYPE_CHECKING:
@@ -32,8 +34,8 @@ _LEVER_M: Final = 10.0
 #: Normal gravity of WGS 84 at the equator [m/s^2], Somigliana's constant, flattening, m, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
 _ECCENTRICITY_2: Final = 6.694_379_990_14e-3
-#: Streams of random numbers: noise, bias drifts, bias walk.
-_NOISE, _ACCEL_DRIFT, _GYRO_DRIFT, _WALK = 22, 23, 24, 25
+#: Streams of random numbers: noise, bias drifts, bias walk, vibration.
+_NOISE, _ACCEL_DRIFT, _GYRO_DRIFT, _WALK, _VIBRATION = 22, 23, 24, 25, 29
 
 
 def gravity_mps2(latitude_deg: Floats, height_m: Floats) -> Floats:
@@ -88,11 +90,28 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
     true = np.concatenate(
         [true_motion(simulation, offset, time[k : k + _BLOCK], half) for k in range(0, len(time), _BLOCK)]
     )
-    measured = _with_errors(true, time, settings, scenario.seed)
+    measured = _with_errors(true + _vibration(simulation, settings, time), time, settings, scenario.seed)
     names = ("force_forward_mps2", "force_right_mps2", "force_down_mps2", "roll_rate_radps", "pitch_rate_radps",
              "yaw_rate_radps")  # fmt: skip
     tag = scenario.start + np.round(time * 1e9).astype("timedelta64[ns]")
     return pl.DataFrame({"time_gpst": tag, **{name: measured[:, k] for k, name in enumerate(names)}})
+
+
+def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Floats) -> Floats | float:
+    """Vibration of the six axes at times, shape (n, 6); 0 where there is none."""
+    sigmas = np.repeat([settings.vibration_sigma_mps2, settings.vibration_sigma_radps], 3)
+    if not sigmas.any():
+        return 0.0
+    axes = [
+        RandomFunction.periodic(
+            np.random.default_rng([simulation.scenario.seed, _VIBRATION, axis]),
+            sigma=float(sigma),
+            period=1.0 / settings.vibration_hz,
+        ).at(time_s)
+        for axis, sigma in enumerate(sigmas)
+    ]
+    size = np.minimum(np.abs(simulation.motion.at(time_s)[1]) / FULL_SPEED_MPS, 1.0)
+    return np.asarray(np.stack(axes, axis=1) * size[:, None])
 
 
 def _with_errors(true: Floats, time_s: Floats, settings: InertialSettings, seed: int) -> Floats:

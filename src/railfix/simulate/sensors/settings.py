@@ -68,6 +68,10 @@ class TachometerSettings(ScenarioSettings):
         Standard deviation of a pulse's time.
     lowest_mps : float
         No pulses come below this speed of the wheel.
+    tooth_sigma : float
+        Standard deviation of each tooth's place as a share of the spacing of the teeth; the same every turn.
+    lost_chance, doubled_chance : float
+        Probability that a pulse is not seen, and that it is followed by a second one before the next tooth.
     slips : tuple of SlipInterval
         In order, without overlap.
     drawn_slips : DrawnSlips
@@ -79,6 +83,9 @@ class TachometerSettings(ScenarioSettings):
     resolution_s: NotNegative = 0.0
     jitter_s: NotNegative = 0.0
     lowest_mps: NotNegative = 0.0
+    tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
+    lost_chance: Share = 0.0
+    doubled_chance: Share = 0.0
     slips: tuple[SlipInterval, ...] = ()
     drawn_slips: DrawnSlips = DrawnSlips()
 
@@ -120,6 +127,10 @@ class InertialSettings(ScenarioSettings):
         Small rotations of the unit about forward, right and down.
     accel_resolution_mps2, gyro_resolution_radps : float
         Quantisation step; 0: none.
+    vibration_sigma_mps2, vibration_sigma_radps : float
+        Vibration of the body at 20 m/s and more, of each axis, in proportion to the speed below that.
+    vibration_hz : float
+        Its mean frequency; the relative bandwidth is 15 percent. Frequencies above half of `rate_hz` are aliased.
     """
 
     rate_hz: Positive = 100.0
@@ -140,6 +151,9 @@ class InertialSettings(ScenarioSettings):
     misalignment_rad: Three = (0.0, 0.0, 0.0)
     accel_resolution_mps2: NotNegative = 0.0
     gyro_resolution_radps: NotNegative = 0.0
+    vibration_sigma_mps2: NotNegative = 0.0
+    vibration_sigma_radps: NotNegative = 0.0
+    vibration_hz: Positive = 12.0
 
 
 class Dropout(Interval):
@@ -187,6 +201,68 @@ class RadarSettings(ScenarioSettings):
     dropout_duration_s: Positive = 5.0
 
 
+class GroundUnit(ScenarioSettings):
+    """Ranging unit beside the track.
+
+    Attributes
+    ----------
+    name : str
+    chainage_m, lateral_m, height_m : float
+        Position: along the line, to the right of the track's axis, above the rails.
+    delay_bias_m : float
+        Error of the constant answering delay, as range.
+    """
+
+    name: str = Field(min_length=1)
+    chainage_m: Finite
+    lateral_m: Finite = 3.0
+    height_m: Finite = 3.0
+    delay_bias_m: Finite = 0.0
+
+
+class RangingSettings(ScenarioSettings):
+    """Two-way ranging to units beside the track (P2, table 3: every 200 ms, about 100 m; 3.3: sigma 0.19 to 0.24 m).
+
+    Attributes
+    ----------
+    units : tuple of GroundUnit
+    interval_s : float
+    reach_m : float
+        Largest range that is measured.
+    along_m, across_m, up_m : float
+        Position of the vehicle's unit, as the antennas'.
+    noise_sigma_m : float
+        White in time.
+    multipath_sigma_m, multipath_cell_m : float
+        Error that depends on the position alone, independent from cell to cell of this length along the line.
+    echo_chance, echo_delay_m : float
+        Share of the cells where an echo hides the direct path, and the mean of its exponential excess.
+    lost_chance : float
+        Probability that an answer is lost.
+    """
+
+    units: tuple[GroundUnit, ...] = ()
+    interval_s: Positive = 0.2
+    reach_m: Positive = 100.0
+    along_m: Finite = 9.0
+    across_m: Finite = 0.0
+    up_m: Finite = 3.0
+    noise_sigma_m: NotNegative = 0.0
+    multipath_sigma_m: NotNegative = 0.0
+    multipath_cell_m: Positive = 0.25
+    echo_chance: Share = 0.0
+    echo_delay_m: NotNegative = 0.8
+    lost_chance: Share = 0.0
+
+    @field_validator("units")
+    @classmethod
+    def _names_differ(cls, units: tuple[GroundUnit, ...]) -> tuple[GroundUnit, ...]:
+        names = [unit.name for unit in units]
+        if len(set(names)) < len(names):
+            raise ValueError(f"must have different names; they are {names}")
+        return units
+
+
 class SensorSettings(ScenarioSettings):
     """Sensors of the vehicle; None: no sensor of that kind.
 
@@ -195,8 +271,10 @@ class SensorSettings(ScenarioSettings):
     tachometer : TachometerSettings or None
     inertial : InertialSettings or None
     radar : RadarSettings or None
+    ranging : RangingSettings or None
     """
 
     tachometer: TachometerSettings | None = TachometerSettings()
     inertial: InertialSettings | None = InertialSettings()
     radar: RadarSettings | None = RadarSettings()
+    ranging: RangingSettings | None = None

@@ -8,6 +8,7 @@ import polars as pl
 
 from railfix.simulate.sensors.inertial import inertial_table
 from railfix.simulate.sensors.radar import radar_table
+from railfix.simulate.sensors.ranging import ranging_table, unit_table
 from railfix.simulate.sensors.wheel import pulse_table, slip_table
 
 if TYPE_CHECKING:
@@ -21,9 +22,9 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
         "direction": "1 when the vehicle moves forward (rising chainage), -1 back",
     },
     "wheel_slips": {
-        "time_gpst": "truth: when the wheel begins to slip or slide, GPS time",
-        "end_gpst": "truth: when it rolls again",
-        "ratio": "truth: most of (wheel speed - train speed) / train speed, in the middle; negative slides",
+        "time_gpst": "ground truth: when the wheel begins to slip or slide, GPS time",
+        "end_gpst": "ground truth: when it rolls again",
+        "ratio": "ground truth: most of (wheel speed - train speed) / train speed, in the middle; negative slides",
     },
     "inertial": {
         "time_gpst": "instant of the sample, GPS time",
@@ -38,6 +39,19 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
         "time_gpst": "instant of the sample, GPS time",
         "speed_mps": "speed [m/s], forward positive; NaN where nothing was measured",
     },
+    "ranging": {
+        "time_gpst": "instant of the measurement, GPS time",
+        "unit": "ground unit",
+        "range_m": "measured distance between the vehicle's unit and the ground unit [m]",
+    },
+    "ranging_units": {
+        "unit": "ground unit",
+        "chainage_m": "surveyed chainage [m]",
+        "lateral_m": "to the right of the track's axis [m]",
+        "x_m": "surveyed position, ECEF [m]",
+        "y_m": "surveyed position, ECEF [m]",
+        "z_m": "surveyed position, ECEF [m]",
+    },
 }
 
 
@@ -51,8 +65,8 @@ def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
     Returns
     -------
     dict of str to polars.DataFrame
-        ``tachometer`` and ``wheel_slips`` (the truth of its wheel), ``inertial``, ``radar``; the
-        columns are those of `COLUMNS`, all rows in order of `time_gpst`.
+        ``tachometer`` and ``wheel_slips`` (ground truth of its wheel), ``inertial``, ``radar``, ``ranging``
+        and ``ranging_units``; the columns are those of `COLUMNS`, all rows in order of `time_gpst`.
     """
     settings = simulation.scenario.sensors
     tables: dict[str, pl.DataFrame] = {}
@@ -65,4 +79,7 @@ def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
         tables["inertial"] = inertial_table(simulation, settings.inertial)
     if settings.radar is not None:
         tables["radar"] = radar_table(simulation, settings.radar)
+    if settings.ranging is not None:
+        tables["ranging"] = ranging_table(simulation, settings.ranging)
+        tables["ranging_units"] = unit_table(simulation, settings.ranging)
     return tables

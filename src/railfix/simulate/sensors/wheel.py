@@ -21,8 +21,8 @@ _STEP_S: Final = 0.01
 #: Spacing of the search for accelerations and brakings [s], and their least size [m/s^2].
 _LOOK_S: Final = 0.1
 _HARD_MPS2: Final = 0.05
-#: Streams of random numbers.
-_WHEEL, _SLIPS = 20, 21
+#: Streams of random numbers: phase and jitter, slips, teeth, lost and doubled pulses.
+_WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
@@ -67,7 +67,13 @@ def slip_ratio(slips: list[SlipInterval], time_s: Floats) -> Floats:
 
 
 def pulse_times_s(
-    motion: Motion, settings: TachometerSettings, slips: list[SlipInterval], duration_s: float, phase: float
+    motion: Motion,
+    settings: TachometerSettings,
+    slips: list[SlipInterval],
+    duration_s: float,
+    phase: float,
+    *,
+    tooth_errors: Floats | None = None,
 ) -> Floats:
     """Exact times of the pulses [s after the start].
 
@@ -79,6 +85,8 @@ def pulse_times_s(
     duration_s : float
     phase : float
         Part of a pulse's distance that the wheel turns before the first one, in [0, 1).
+    tooth_errors : ndarray, shape (pulses_per_turn,), optional
+        Displacement of each tooth as a share of their spacing.
 
     Returns
     -------
@@ -94,15 +102,38 @@ def pulse_times_s(
     turned = np.concatenate([[0.0], np.cumsum(np.maximum(rolled, 0.0))])
     apart = np.pi * (settings.wheel_diameter_m + settings.diameter_error_m) / settings.pulses_per_turn
     target = apart * np.arange(phase, turned[-1] / apart, 1.0)
-    cell = np.clip(np.searchsorted(turned, target, side="left") - 1, 0, len(step) - 1)
-    # Even acceleration in each cell: s = v t + a t^2 / 2 with the distance of the whole cell kept.
-    start = (np.abs(speed) + surplus)[cell]
-    bend = 2.0 * (turned[cell + 1] - turned[cell] - start * step[cell]) / step[cell] ** 2
-    ahead = target - turned[cell]
+    times = _times_at(target, node, turned, np.abs(speed) + surplus)
+    if tooth_errors is None:
+        return times
+    # The same tooth passes again after a turn, in either direction.
+    tooth = np.cumsum(np.where(motion.at(times)[1] < 0.0, -1, 1)) % len(tooth_errors)
+    moved = np.clip(target + apart * tooth_errors[tooth], 0.0, turned[-1])
+    return _times_at(np.sort(moved), node, turned, np.abs(speed) + surplus)
+
+
+def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Floats) -> Floats:
+    """Times at which the wheel has turned by given lengths of its rim; constant acceleration between nodes."""
+    step = np.diff(node_s)
+    cell = np.clip(np.searchsorted(turned_m, target_m, side="left") - 1, 0, len(step) - 1)
+    # s = v t + a t^2 / 2 with the distance of the cell kept.
+    start = speed_mps[cell]
+    bend = 2.0 * (turned_m[cell + 1] - turned_m[cell] - start * step[cell]) / step[cell] ** 2
+    ahead = target_m - turned_m[cell]
     root = np.sqrt(np.maximum(start**2 + 2.0 * bend * ahead, 0.0))
     with np.errstate(invalid="ignore", divide="ignore"):
         since = np.where(ahead > 0.0, 2.0 * ahead / (start + root), 0.0)
-    return np.asarray(node[cell] + np.minimum(since, step[cell]))
+    return np.asarray(node_s[cell] + np.minimum(since, step[cell]))
+
+
+def _miscounted(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
+    """Pulse times with pulses lost and doubled at random; a doubled one comes before the next tooth."""
+    if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
+        return time_s
+    lost, doubled, part = np.random.default_rng([seed, _MISCOUNT]).uniform(size=(3, len(time_s)))
+    gap = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
+    second = time_s + (0.1 + 0.5 * part) * gap
+    kept = lost >= settings.lost_chance
+    return np.sort(np.concatenate([time_s[kept], second[kept & (doubled < settings.doubled_chance)]]))
 
 
 def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataFrame:
@@ -110,7 +141,13 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _WHEEL])
     slips = wheel_slips(simulation, settings)
-    time = pulse_times_s(simulation.motion, settings, slips, scenario.duration_s, float(rng.uniform()))
+    teeth = None
+    if settings.tooth_sigma > 0.0:
+        draw = np.random.default_rng([scenario.seed, _TEETH]).standard_normal(settings.pulses_per_turn)
+        teeth = np.clip(settings.tooth_sigma * draw, -0.45, 0.45)
+    phase = float(rng.uniform())
+    time = pulse_times_s(simulation.motion, settings, slips, scenario.duration_s, phase, tooth_errors=teeth)
+    time = _miscounted(time, settings, scenario.seed)
     speed = simulation.motion.at(time)[1]
     turning = np.abs(speed) * (1.0 + slip_ratio(slips, time))
     kept = turning >= settings.lowest_mps
