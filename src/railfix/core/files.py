@@ -129,13 +129,15 @@ class _HatanakaStream(ByteStream):
         return f"the Hatanaka (CRX) data are cut short or damaged{place}: {reason}; download it again"
 
 
-def open_stream(path: FilePath) -> ByteStream:
+def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
     """Open a file as a stream of its decompressed bytes.
 
     Parameters
     ----------
     path : path-like
         Plain text, gzip, compress (.Z), or Hatanaka-compressed RINEX plain or in one of these.
+    content : {"text", "bytes"}
+        What the file may hold: with "text" a binary file is an error.
 
     Returns
     -------
@@ -163,7 +165,7 @@ def open_stream(path: FilePath) -> ByteStream:
             source = _unpack_compress(path, source, held)
             head = source.read(_HEAD_BYTES)
             source.seek(0)
-        _reject_content(path, head)
+        _reject_content(path, head, content)
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
         return ByteStream(path, source, held.pop_all())
@@ -324,11 +326,11 @@ def _reject_archive(path: FilePath, head: bytes) -> None:
             raise InputFileError(path, f"is {name}; unpack it first (.gz and .Z are read as they are)")
 
 
-def _reject_content(path: FilePath, head: bytes) -> None:
+def _reject_content(path: FilePath, head: bytes, content: str) -> None:
     if not head.strip():
         raise InputFileError(path, "is empty")
-    if b"\0" in head:
-        raise InputFileError(path, "is binary, a text file was expected; convert a receiver's log to RINEX first")
+    if content == "text" and b"\0" in head:
+        raise InputFileError(path, "is binary, a text file was expected")
 
 
 def _temporary(held: ExitStack) -> IO[bytes]:

@@ -6,16 +6,11 @@ from railfix.io.georinex_layout import (
     observations_from_xarray,
     observations_to_xarray,
 )
+from railfix.io.logs import read_navigation, read_observations, scan_observations
 from railfix.io.nmea import read_any_positions, read_nmea
 from railfix.io.position_log import PositionLog, read_positions
 from railfix.io.reference_log import AntennaReference, read_reference, write_reference
-from railfix.io.rinex import (
-    read_navigation,
-    read_observations,
-    scan_observations,
-    write_navigation,
-    write_observations,
-)
+from railfix.io.rinex import write_navigation, write_observations
 from railfix.io.sp3 import read_sp3
 
 __all__ = [

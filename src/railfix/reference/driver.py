@@ -16,9 +16,9 @@ import numpy as np
 from railfix import __version__
 from railfix.core.errors import InputFileError
 from railfix.gnss.observations import concatenate
+from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
-from railfix.io.rinex import read_navigation
 from railfix.io.sensor_log import read_acceleration, read_pulses
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log

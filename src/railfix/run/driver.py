@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from railfix.gnss.navigation import Navigation
-from railfix.io.rinex import read_navigation
+from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor, State

@@ -14,7 +14,7 @@ import numpy as np
 from railfix.core.errors import SettingsError
 from railfix.core.files import BrokenLines
 from railfix.gnss.observations import Observations
-from railfix.io.rinex import scan_observations
+from railfix.io.logs import scan_observations
 from railfix.run.inputs import Antenna
 from railfix.run.options import TrackReading
 from railfix.track import Track, read_track

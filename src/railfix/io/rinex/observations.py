@@ -121,7 +121,7 @@ def scan_observations(
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
     wanted = _wanted(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return _pieces(_runs(_as_list(path), wanted, progress), epochs)
+    return in_pieces(_runs(_as_list(path), wanted, progress), epochs)
 
 
 def _as_list(path: Paths) -> list[str]:
@@ -161,7 +161,7 @@ def _runs(paths: list[str], wanted: Wanted, progress: Callable[[float], None] | 
         joint = before is not None and before.epochs > 0
         for run in reader.blocks():
             if joint and len(run):
-                run = _with_break_at_gap(last, run)
+                run = with_break_at_gap(last, run)
                 joint = False
             found += len(run)
             last = run if len(run) else last
@@ -185,7 +185,7 @@ def _in_order_of_time(paths: list[str], wanted: Wanted) -> list[str]:
     return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
 
 
-def _with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
+def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
     """A break before the first epoch of a further file, unless it follows at the log's own interval."""
     if last is None:
         return run
@@ -200,7 +200,7 @@ def _with_break_at_gap(last: Observations | None, run: Observations) -> Observat
     return replace(run, break_before=before)
 
 
-def _pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
+def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
     """Runs cut and joined to pieces of equal length; problems go with the piece being collected."""
     waiting: list[Observations] = []
     length = 0

@@ -18,7 +18,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.gnss.orbits import satellite_states
-from railfix.io.rinex import read_navigation, scan_observations
+from railfix.io.logs import read_navigation, scan_observations
 from railfix.ranges.cn0_curve.curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Samples, CurveFit, fit_cn0_curve
 
 #: P1 2.3(1) asks for about a day; below this a note is made [s].

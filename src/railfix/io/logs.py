@@ -1,0 +1,199 @@
+"""Receiver logs and navigation files of any kind, told apart by their content.
+
+RINEX 2 to 4 (plain, packed, Hatanaka), UBX, RTCM 3 and mixed receiver streams are logs like any other: the
+functions here have the arguments of `railfix.io.rinex` and hand each file to its reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from os import PathLike
+
+import numpy as np
+
+from railfix.core.errors import MismatchError
+from railfix.core.files import BrokenLines, FilePath
+from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.observations import Observations, concatenate
+from railfix.io import rinex
+from railfix.io.receiver.log import head_of, is_receiver_log, read_receiver_navigation, scan_receiver_log
+from railfix.io.rinex.observations import DEFAULT_EPOCHS, in_pieces, with_break_at_gap, without_empty_channels
+
+Paths = FilePath | Sequence[FilePath]
+Time = np.datetime64 | str | None
+
+
+def read_observations(
+    path: Paths,
+    *,
+    broken_lines: BrokenLines = "stop",
+    systems: Iterable[str] | None = None,
+    start: Time = None,
+    end: Time = None,
+    date: Time = None,
+) -> Observations:
+    """Observations of one receiver from RINEX files or receiver logs.
+
+    Parameters
+    ----------
+    path : path or sequence of path
+        RINEX observation files, or logs in UBX or RTCM 3 (other protocols between them are passed over),
+        plain or packed. Several files are put in order of time; they are all of one of these two kinds.
+    broken_lines, systems, start, end
+        As `railfix.io.rinex.read_observations`. What is broken in a receiver log is always counted.
+    date : datetime64 or str, optional
+        Some time within half a week of the log: needed for RTCM 3, whose observations carry no week.
+
+    Raises
+    ------
+    InputFileError
+        A file cannot be read, or holds no observations that can be dated.
+    MismatchError
+        No epoch lies between `start` and `end`; receiver logs and RINEX files are mixed.
+    """
+    pieces = scan_observations(
+        path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62
+    )
+    return concatenate(list(pieces))
+
+
+def scan_observations(
+    path: Paths,
+    *,
+    epochs: int = DEFAULT_EPOCHS,
+    broken_lines: BrokenLines = "stop",
+    systems: Iterable[str] | None = None,
+    start: Time = None,
+    end: Time = None,
+    date: Time = None,
+    progress: Callable[[float], None] | None = None,
+) -> Iterator[Observations]:
+    """Observations of one receiver in pieces of `epochs` epochs; see `read_observations`."""
+    paths = _listed(path)
+    receiver = [is_receiver_log(head_of(p)) for p in paths]
+    if not any(receiver):
+        return rinex.scan_observations(
+            paths, epochs=epochs, broken_lines=broken_lines, systems=systems, start=start, end=end, progress=progress
+        )
+    if not all(receiver):
+        raise MismatchError(
+            f"{paths[receiver.index(False)]} is RINEX and {paths[receiver.index(True)]} a receiver's log; "
+            "give files of one kind for one antenna"
+        )
+    limits = (_instant(start), _instant(end), _instant(date))
+    return in_pieces(_receiver_runs(paths, systems, limits, progress), epochs)
+
+
+def _listed(path: Paths) -> list[str]:
+    paths = [path] if isinstance(path, str | PathLike) else list(path)
+    if not paths:
+        raise ValueError("no file was given")
+    return [str(p) for p in paths]
+
+
+def _instant(time: Time) -> np.datetime64 | None:
+    return None if time is None else np.asarray(time, dtype="datetime64[ns]").reshape(1)[0]
+
+
+def _receiver_runs(
+    paths: list[str],
+    systems: Iterable[str] | None,
+    limits: tuple[np.datetime64 | None, np.datetime64 | None, np.datetime64 | None],
+    progress: Callable[[float], None] | None,
+) -> Iterator[Observations]:
+    """Blocks of all receiver logs in order of time, cut to constellations and times wanted."""
+    start, end, date = limits
+    letters = None if systems is None else list(systems)
+    found, last = 0, None
+    for k, path in enumerate(_in_order(paths, date)):
+
+        def share(part: float, k: int = k) -> None:
+            if progress is not None:
+                progress((k + part) / len(paths))
+
+        joint = k > 0
+        for run in scan_receiver_log(path, date=date, progress=share):
+            chosen = run if letters is None else _of_systems(run, letters)
+            first = 0 if start is None else int(np.searchsorted(chosen.time, start))
+            stop = len(chosen) if end is None else int(np.searchsorted(chosen.time, end))
+            if last is not None:
+                first = max(first, int(np.searchsorted(chosen.time, last.time[-1], side="right")))
+            part = replace(chosen[first:stop], passed_over=run.passed_over)
+            if joint and len(part):
+                part, joint = with_break_at_gap(last, part), False
+            found += len(part)
+            last = part if len(part) else last
+            yield part
+    if not found:
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+
+
+def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
+    if len(paths) == 1:
+        return paths
+    firsts = [next(run.time[0] for run in scan_receiver_log(p, date=date) if len(run)) for p in paths]
+    return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
+
+
+def _of_systems(run: Observations, letters: list[str]) -> Observations:
+    chosen = np.isin(run.system, letters)
+    arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
+    return without_empty_channels(
+        replace(
+            run,
+            satellite=run.satellite[chosen],
+            signal=run.signal[chosen],
+            **{name: getattr(run, name)[:, chosen] for name in arrays},
+        )
+    )
+
+
+def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
+    """Navigation records from RINEX navigation files and receiver logs, mixed at will.
+
+    Parameters
+    ----------
+    paths : path or sequence of path
+    broken_lines : {"stop", "count"}
+        As `railfix.io.rinex.read_navigation`.
+    date : datetime64 or str, optional
+        Some time within half a week of RTCM 3 logs.
+
+    Raises
+    ------
+    InputFileError
+        A file cannot be read or holds no usable record.
+    """
+    names = _listed(paths)
+    receiver = [is_receiver_log(head_of(name)) for name in names]
+    parts = []
+    if not all(receiver):
+        files = [name for name, is_log in zip(names, receiver, strict=True) if not is_log]
+        parts.append(rinex.read_navigation(files, broken_lines=broken_lines))
+    if any(receiver):
+        logs = [name for name, is_log in zip(names, receiver, strict=True) if is_log]
+        parts.append(read_receiver_navigation(logs, date=_instant(date)))
+    return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _joined(parts: list[Navigation]) -> Navigation:
+    """Records of several sources; ionosphere and leap seconds of the first that has them."""
+
+    def rows(kind: str, table: type[KeplerRecords] | type[GlonassRecords]) -> dict[str, np.ndarray]:
+        names = table.__dataclass_fields__
+        return {name: np.concatenate([getattr(getattr(part, kind), name) for part in parts]) for name in names}
+
+    counts: dict[str, int] = {}
+    for part in parts:
+        for what, number in part.passed_over.items():
+            counts[what] = counts.get(what, 0) + number
+    return Navigation(
+        kepler=KeplerRecords(**rows("kepler", KeplerRecords)),
+        glonass=GlonassRecords(**rows("glonass", GlonassRecords)),
+        klobuchar={letter: value for part in reversed(parts) for letter, value in part.klobuchar.items()},
+        leap_seconds=next((part.leap_seconds for part in parts if part.leap_seconds is not None), None),
+        passed_over=counts,
+        notes=tuple(note for part in parts for note in part.notes),
+        sources=tuple(source for part in parts for source in part.sources),
+    )

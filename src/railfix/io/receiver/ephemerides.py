@@ -1,0 +1,348 @@
+"""Ephemerides put together from navigation subframes as they are received.
+
+A record needs several subframes of one issue: GPS and QZSS three, Galileo five words, BeiDou three (D1)
+or ten pages (D2), GLONASS four strings. `assembled` takes the subframes of a piece of a stream and what
+earlier pieces left unfinished, so that a stream cut anywhere gives the same records.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Datetimes
+from railfix.gnss.navigation import Navigation
+from railfix.io.receiver import nav_messages
+from railfix.io.receiver.bits import Field, fields, unsigned
+from railfix.io.receiver.records import Record, Values, beidou_record, galileo_record, glonass_record, gps_record
+from railfix.io.receiver.subframes import Subframes, packed_words
+from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
+
+#: Galileo data source: I/NAV with clock and group delay E5b/E1, received on E1-B or on E5b-I.
+_E1B_SOURCE, _E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
+#: Constellation of RTCM ephemeris messages; others (Galileo F/NAV, 1045) are counted.
+_RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1046: "E", 1020: "R"}
+_UBX_E5B: Final = (5, 6)
+_SAME_STRINGS_S: Final = 15.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unfinished:
+    """What the subframes so far left.
+
+    Attributes
+    ----------
+    latest : mapping
+        Fields of the latest subframe by satellite and number (with the time it was received).
+    issued : mapping of str to tuple
+        What tells the last record of a satellite from the next.
+    """
+
+    latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
+    issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assembled:
+    """Records of a piece of a stream.
+
+    Attributes
+    ----------
+    records : tuple of RawRecord
+        In the order in which they became complete.
+    complete_at : ndarray of datetime64[ns], shape (len(records),)
+        Receiver's time of the subframe that completed each; NaT before the receiver knew the time.
+    klobuchar : mapping of str to ndarray, shape (8,)
+    leap_seconds : int or None
+    passed_over : mapping of str to int
+    """
+
+    records: tuple[RawRecord, ...]
+    complete_at: Datetimes
+    klobuchar: Mapping[str, np.ndarray]
+    leap_seconds: int | None
+    passed_over: Mapping[str, int]
+
+
+def assembled(subframes: Subframes, time: Datetimes, state: Unfinished | None = None) -> tuple[Assembled, Unfinished]:
+    """Ephemerides that a piece of a stream completes.
+
+    Parameters
+    ----------
+    subframes : Subframes
+    time : ndarray of datetime64[ns], shape (N,)
+        When each was received, to within some seconds: resolves weeks and days.
+    state : Unfinished, optional
+
+    Returns
+    -------
+    Assembled
+    Unfinished
+    """
+    state = state or Unfinished()
+    builder = _Builder(dict(state.latest), dict(state.issued))
+    pages, counts = _pages(subframes)
+    for row, satellite, number, values in pages:
+        builder.add(satellite, number, values, time[row])
+    for raw, why in builder.rejected:
+        _count(counts, f"{raw.satellite[0]} {why}", 1)
+    result = Assembled(
+        records=tuple(builder.records),
+        complete_at=np.array(builder.times, dtype="datetime64[ns]"),
+        klobuchar=builder.klobuchar,
+        leap_seconds=builder.leap_seconds,
+        passed_over=counts,
+    )
+    return result, Unfinished(latest=builder.latest, issued=builder.issued)
+
+
+def assembled_rtcm(
+    messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished | None = None
+) -> tuple[Assembled, Unfinished]:
+    """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`), repeated ones once.
+
+    Parameters
+    ----------
+    messages : iterable of (place in the stream, message number, fields)
+    time : ndarray of datetime64[ns], shape (number of messages,)
+    state : Unfinished, optional
+    """
+    state = state or Unfinished()
+    builder = _Builder(dict(state.latest), dict(state.issued))
+    counts: dict[str, int] = {}
+    for (_, kind, values), at in zip(messages, time, strict=True):
+        letter = _RTCM_SYSTEMS.get(kind, "")
+        if not letter:
+            _count(counts, f"RTCM {kind}", 1)
+            continue
+        satellite = f"{letter}{int(values['number']):02d}"
+        builder.issue(satellite, _rtcm_record(satellite, values, at), at)
+    for raw, why in builder.rejected:
+        _count(counts, f"{raw.satellite[0]} {why}", 1)
+    result = Assembled(
+        records=tuple(builder.records),
+        complete_at=np.array(builder.times, dtype="datetime64[ns]"),
+        klobuchar={},
+        leap_seconds=None,
+        passed_over=counts,
+    )
+    return result, Unfinished(latest=builder.latest, issued=builder.issued)
+
+
+def _rtcm_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
+    """Record of one RTCM 3 ephemeris message."""
+    match satellite[0]:
+        case "E":
+            return galileo_record(satellite, {**values, "source": float(_E1B_SOURCE | _E5B_SOURCE)})
+        case "C":
+            return beidou_record(satellite, "", values)
+        case "R":
+            return glonass_record(satellite, {**values, "channel": values["channel"] - 7}, time)
+    return gps_record(satellite, values, time)
+
+
+def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigation:
+    """Navigation data from assembled records."""
+    klobuchar = {letter: value for letter, value in parts.klobuchar.items() if np.any(value)}
+    return Navigation(
+        kepler=kepler_records([r for r in parts.records if r.system != "R"]),
+        glonass=glonass_records([r for r in parts.records if r.system == "R"]),
+        klobuchar=klobuchar,
+        leap_seconds=parts.leap_seconds,
+        passed_over=dict(parts.passed_over),
+        sources=sources,
+    )
+
+
+def _pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], dict[str, int]]:
+    """Decoded pages in the order of the stream: row, satellite, number, fields."""
+    counts: dict[str, int] = {}
+    pages: list[tuple[int, str, int, Values]] = []
+    letters = subframes.satellite.astype("<U1")
+    for letter, decode in (("G", _lnav), ("J", _lnav), ("E", _inav), ("C", _beidou), ("R", _glonass)):
+        rows = np.flatnonzero(letters == letter)
+        if len(rows):
+            for row, number, values in decode(subframes.take(rows), counts):
+                pages.append((int(rows[row]), str(subframes.satellite[rows[row]]), number, values))
+    pages.sort(key=lambda page: page[0])
+    return pages, counts
+
+
+def _rows(bits: Bytes, rows: np.ndarray, layout: Mapping[str, Field]) -> Iterator[tuple[int, Values]]:
+    """Fields of some rows, a mapping each."""
+    table = fields(bits[rows], layout)
+    for k, row in enumerate(rows.tolist()):
+        yield row, {name: float(values[k]) for name, values in table.items()}
+
+
+def _count(counts: dict[str, int], what: str, number: int) -> None:
+    if number:
+        counts[what] = counts.get(what, 0) + number
+
+
+def _lnav(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+    civil = part.signal == 0
+    _count(counts, f"{part.satellite[0][0]} CNAV", int(np.count_nonzero(~civil)))
+    bits = packed_words(part.words, drop=6, keep=24)
+    number = unsigned(bits, 43, 3)
+    valid = civil & (unsigned(bits, 0, 8) == 0x8B)
+    for k in (1, 2, 3, 4):
+        for row, values in _rows(
+            bits, np.flatnonzero(valid & (number == k)), nav_messages.LNAV_HEAD | nav_messages.LNAV[k]
+        ):
+            yield row, k, values
+
+
+def _inav(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+    inav = np.isin(part.signal, (1, *_UBX_E5B))
+    _count(counts, "E F/NAV", int(np.count_nonzero(~inav)))
+    bits, valid = nav_messages.inav_words(part.words)
+    _count(counts, "E pages without valid CRC", int(np.count_nonzero(inav & ~valid)))
+    kind = unsigned(bits, 0, 6)
+    e5b = np.isin(part.signal, _UBX_E5B)
+    for k in range(1, 7):
+        for row, values in _rows(bits, np.flatnonzero(inav & valid & (kind == k)), nav_messages.INAV[k]):
+            yield row, k, {**values, "source": float(_E5B_SOURCE if e5b[row] else _E1B_SOURCE)}
+
+
+def _beidou(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+    legacy = np.isin(part.signal, (0, 1, 2, 3, 4, 10))
+    _count(counts, "C CNAV", int(np.count_nonzero(~legacy)))
+    bits = packed_words(part.words, drop=0, keep=30)
+    number = np.array([int(name[1:]) for name in part.satellite.tolist()])
+    geo = (number <= 5) | (number >= 59)
+    subframe = unsigned(bits, 15, 3)
+    valid = legacy & (unsigned(bits, 0, 11) == 0x712)
+    for k in (1, 2, 3):
+        layout = nav_messages.BDS_HEAD | nav_messages.D1[k]
+        for row, values in _rows(bits, np.flatnonzero(valid & ~geo & (subframe == k)), layout):
+            yield row, k, values
+    pages = np.flatnonzero(valid & geo & (subframe == 1))
+    page = unsigned(bits, 42, 4)
+    for k in range(1, 11):
+        for row, head in _rows(bits, pages[page[pages] == k], nav_messages.BDS_HEAD):
+            packed = int("".join(map(str, bits[row].tolist())), 2)
+            yield row, 100 + k, {**head, "page": packed}  # the page whole: its fields go over page ends
+
+
+def _glonass(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+    bits = packed_words(part.words[:, :3], drop=0, keep=32)[:, :85]
+    valid = nav_messages.glonass_hamming(bits)
+    _count(counts, "R strings without valid code", int(np.count_nonzero(~valid)))
+    number = unsigned(bits, 1, 4)
+    for k in (1, 2, 3, 4):
+        for row, values in _rows(bits, np.flatnonzero(valid & (number == k)), nav_messages.GLONASS[k]):
+            yield row, k, {**values, "channel": float(part.glonass_channel[row])}
+
+
+class _Builder:
+    """Latest subframes of all satellites, and the records they complete."""
+
+    def __init__(self, latest: dict[tuple[str, int], Values], issued: dict[str, tuple[float, ...]]) -> None:
+        self.latest, self.issued = latest, issued
+        self.records: list[RawRecord] = []
+        self.times: list[np.datetime64] = []
+        self.rejected: list[tuple[RawRecord, str]] = []
+        self.klobuchar: dict[str, np.ndarray] = {}
+        self.leap_seconds: int | None = None
+
+    def add(self, satellite: str, number: int, values: Values, time: np.datetime64) -> None:
+        """Take one subframe; a record it completes is appended."""
+        letter = satellite[0]
+        self.latest[satellite, number] = {**values, "received": float(time.astype(np.int64))}
+        if letter in "GJ" and number == 4:
+            self._ionosphere_gps(letter, values)
+            return
+        make = {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}.get(letter)
+        record = (make or (self._d2 if number > 100 else self._d1))(satellite, time)
+        self.issue(satellite, record, time)
+
+    def issue(self, satellite: str, record: Record | None, time: np.datetime64) -> None:
+        """Append a record, unless it is the satellite's last one again or cannot be."""
+        if record is None:
+            return
+        raw, issue = record
+        if self.issued.get(satellite) == issue:
+            return
+        fault = first_fault(raw)
+        if fault is not None:
+            self.rejected.append((raw, fault[1].split(" is ")[0]))
+            return
+        self.issued[satellite] = issue
+        self.records.append(raw)
+        self.times.append(time)
+
+    def _parts(self, satellite: str, numbers: tuple[int, ...]) -> list[Values] | None:
+        parts = [self.latest.get((satellite, k)) for k in numbers]
+        return None if any(part is None for part in parts) else [part for part in parts if part is not None]
+
+    def _ionosphere_gps(self, letter: str, values: Values) -> None:
+        # Page 18 of GPS has identity 56, as the page of QZSS for its wide area (that for Japan has 61).
+        if values["page_sv"] == 56 and values["data_id"] in (1, 3):
+            self.klobuchar[letter] = np.array([values[f"ion{k}"] for k in range(8)])
+            self.leap_seconds = int(values["leap_seconds"]) if letter == "G" else self.leap_seconds
+
+    def _gps(self, satellite: str, time: np.datetime64) -> Record | None:
+        parts = self._parts(satellite, (1, 2, 3))
+        if parts is None or not int(parts[0]["iodc"]) & 255 == parts[1]["iode"] == parts[2]["iode"]:
+            return None
+        return gps_record(satellite, {**parts[1], **parts[2], **parts[0]}, time)
+
+    def _galileo(self, satellite: str, time: np.datetime64) -> Record | None:  # noqa: ARG002 (one signature for all)
+        parts = self._parts(satellite, (1, 2, 3, 4, 5))
+        if parts is None or len({part["iod"] for part in parts[:4]}) != 1:
+            return None
+        values: dict[str, float] = {}
+        for part in parts:
+            values |= part
+        return galileo_record(satellite, values) if f"E{int(values['number']):02d}" == satellite else None
+
+    def _d1(self, satellite: str, time: np.datetime64) -> Record | None:  # noqa: ARG002 (one signature for all)
+        parts = self._parts(satellite, (1, 2, 3))
+        if parts is None or not parts[0]["tow_s"] + 12 == parts[1]["tow_s"] + 6 == parts[2]["tow_s"]:
+            return None
+        values = {**parts[1], **parts[2], **parts[0]}
+        values["toe_sow_s"] = (int(values["toe_high"]) << 15 | int(values["toe_low"])) * 8.0
+        self.klobuchar["C"] = np.array([values[f"ion{k}"] for k in range(8)])
+        return beidou_record(satellite, "D1", values)
+
+    def _d2(self, satellite: str, time: np.datetime64) -> Record | None:  # noqa: ARG002 (one signature for all)
+        parts = self._parts(satellite, tuple(range(101, 111)))
+        if parts is None or any(part["tow_s"] != parts[0]["tow_s"] + 3 * k for k, part in enumerate(parts)):
+            return None
+        text = "".join(f"{int(part['page']):0300b}" for part in parts)
+        bits = (np.frombuffer(text.encode(), np.uint8) - ord("0"))[None]
+        values = {name: float(value[0]) for name, value in fields(bits, nav_messages.D2).items()}
+        return beidou_record(satellite, "D2", {**values, "tow_s": parts[0]["tow_s"]})
+
+    def _glonass(self, satellite: str, time: np.datetime64) -> Record | None:
+        parts = self._parts(satellite, (1, 2, 3, 4))
+        if parts is None or f"R{int(parts[3]['slot']):02d}" != satellite:
+            return None
+        received = [part["received"] for part in parts]
+        if (max(received) - min(received)) * 1e-9 > _SAME_STRINGS_S:  # strings of one frame follow each other in 2 s
+            return None
+        values = {**parts[0], **parts[1], **parts[2], **parts[3]}
+        return glonass_record(satellite, {**values, "health": float(int(values["health"]) >> 2)}, time)
+
+
+def merged(parts: list[Assembled]) -> Assembled:
+    """Records of several pieces of one stream."""
+    counts: dict[str, int] = {}
+    klobuchar: dict[str, np.ndarray] = {}
+    leap: int | None = None
+    for part in parts:
+        klobuchar |= part.klobuchar
+        leap = part.leap_seconds if part.leap_seconds is not None else leap
+        for what, number in part.passed_over.items():
+            _count(counts, what, number)
+    return Assembled(
+        records=tuple(record for part in parts for record in part.records),
+        complete_at=np.concatenate([part.complete_at for part in parts]) if parts else np.zeros(0, "datetime64[ns]"),
+        klobuchar=klobuchar,
+        leap_seconds=leap,
+        passed_over=counts,
+    )

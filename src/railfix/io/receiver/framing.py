@@ -1,0 +1,276 @@
+"""Frames of UBX, RTCM 3, SBF and NMEA in a stream of bytes, protocols mixed, checksums verified.
+
+All frames of a buffer are found in one pass over arrays: candidates by their sync bytes, lengths by
+gathering, checksums of all candidates together. Bytes that belong to no frame with a valid checksum
+are counted, never guessed at.
+
+Sources: u-blox F9 HPG interface description (UBX-20033635), section 3; RTCM 10403.3, section 4;
+Septentrio mosaic-X5 reference guide, section 4.1 (SBF); NMEA 0183, section 5.3.
+"""
+
+from __future__ import annotations
+
+import binascii
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Indices, Integers, Masks, Strings
+
+#: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
+LONGEST_FRAME: Final = 16_384
+_NMEA_LONGEST: Final = 512
+_CRC24_POLYNOMIAL: Final = 0x1864CFB
+PROTOCOLS: Final = ("ubx", "rtcm3", "sbf", "nmea")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frames:
+    """Frames with valid checksums, in order of the stream.
+
+    Attributes
+    ----------
+    data : ndarray of uint8
+        The buffer.
+    protocol : ndarray of str, shape (N,)
+        One of `PROTOCOLS`.
+    kind : ndarray of int, shape (N,)
+        UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0.
+    start, end : ndarray of int, shape (N,)
+        Payload in `data`: UBX without header and checksum; RTCM 3 likewise (message number included);
+        SBF from the time stamp on (after the 8 bytes of header); NMEA from ``$`` up to, not including, ``*``.
+    frame_start : ndarray of int, shape (N,)
+        First byte of the frame, its sync included.
+    consumed : int
+        Bytes of the buffer that are dealt with; the rest may be the start of a frame, and belongs before
+        the next buffer.
+    skipped_bytes : int
+        Of those, bytes outside frames.
+    bad_checksums : int
+        Complete candidates (sync and length plausible) outside frames whose checksum failed.
+    """
+
+    data: Bytes
+    protocol: Strings
+    kind: Integers
+    start: Indices
+    end: Indices
+    frame_start: Indices
+    consumed: int
+    skipped_bytes: int
+    bad_checksums: int
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def of(self, protocol: str, *kinds: int) -> Indices:
+        """Positions of the frames of a protocol, of some kinds or of all."""
+        wanted = self.protocol == protocol
+        return np.flatnonzero(wanted & np.isin(self.kind, kinds) if kinds else wanted)
+
+    def payload(self, index: int) -> Bytes:
+        """Payload of one frame."""
+        return self.data[self.start[index] : self.end[index]]
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Places where a frame may start, with what its header says."""
+
+    name: str
+    frame: Indices
+    kind: Integers
+    start: Indices
+    end: Indices
+    frame_end: Indices
+    valid: Masks
+
+
+def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
+    """Frames in a buffer.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+    at_end : bool
+        Whether nothing follows: then an incomplete frame at the end is skipped, not kept for the next buffer.
+
+    Returns
+    -------
+    Frames
+    """
+    data = np.asarray(data, dtype=np.uint8)
+    candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data)]
+    incomplete = [c.frame[c.frame_end > len(data)] for c in candidates]
+    complete = [c.frame_end <= len(data) for c in candidates]
+    frame = np.concatenate([c.frame[k] for c, k in zip(candidates, complete, strict=True)])
+    order = np.argsort(frame, kind="stable")
+    frame = frame[order]
+
+    def joined(name: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        parts = [getattr(c, name)[k] for c, k in zip(candidates, complete, strict=True)]
+        return np.asarray(np.concatenate(parts)[order])
+
+    frame_end, valid = joined("frame_end"), joined("valid").astype(bool)
+    names = np.concatenate(
+        [np.full(int(np.count_nonzero(k)), c.name, dtype="<U5") for c, k in zip(candidates, complete, strict=True)]
+    )[order]
+    accepted = _without_overlap(frame, frame_end, valid)
+    last = int(frame_end[accepted[-1]]) if len(accepted) else 0
+    waiting = np.concatenate(incomplete)
+    waiting = waiting[waiting >= last]
+    consumed = len(data) if at_end or not len(waiting) else int(waiting.min())
+    if not at_end and not len(waiting):
+        consumed = max(last, len(data) - 2)  # the last two bytes may be the start of a header
+    inside = int((frame_end[accepted] - frame[accepted]).sum())
+    return Frames(
+        data=data,
+        protocol=names[accepted],
+        kind=joined("kind")[accepted],
+        start=joined("start")[accepted],
+        end=joined("end")[accepted],
+        frame_start=frame[accepted],
+        consumed=consumed,
+        skipped_bytes=consumed - inside,
+        bad_checksums=_outside(frame[~valid], frame[accepted], frame_end[accepted]),
+    )
+
+
+def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
+    """Valid candidates, earliest first, that do not lie inside one accepted before."""
+    accepted, free = [], 0
+    for k in np.flatnonzero(valid).tolist():
+        if start[k] >= free:
+            accepted.append(k)
+            free = int(end[k])
+    return np.array(accepted, dtype=np.intp)
+
+
+def _outside(places: Indices, start: Indices, end: Integers) -> int:
+    """How many places lie in none of the accepted frames."""
+    if not len(start):
+        return len(places)
+    before = np.searchsorted(start, places, side="right") - 1
+    return int(np.count_nonzero((before < 0) | (places >= end[np.maximum(before, 0)])))
+
+
+def _at(data: Bytes, index: Indices) -> Integers:
+    """Bytes at some places; 0 beyond the end."""
+    return np.where(index < len(data), data[np.minimum(index, len(data) - 1)], 0).astype(np.int64)
+
+
+def _pairs(data: Bytes, first: int, second: int) -> Indices:
+    """Places where two bytes follow each other."""
+    return np.flatnonzero((data[:-1] == first) & (data[1:] == second)) if len(data) > 1 else np.zeros(0, np.intp)
+
+
+def _ubx(data: Bytes) -> _Candidates:
+    frame = _pairs(data, 0xB5, 0x62)
+    length = _at(data, frame + 4) | _at(data, frame + 5) << 8
+    plausible = length <= LONGEST_FRAME
+    frame, length = frame[plausible], length[plausible]
+    start, end = frame + 6, frame + 6 + length
+    complete = end + 2 <= len(data)
+    valid = np.zeros(len(frame), dtype=bool)
+    # Fletcher's checksum of all frames from two running sums: A = sum b, B = sum of A, both from the class byte on.
+    sums = np.concatenate([[0], np.cumsum(data, dtype=np.int64)])
+    double = np.concatenate([[0], np.cumsum(sums[1:])])
+    a0, a1 = frame[complete] + 2, end[complete]
+    sum_a = sums[a1] - sums[a0]
+    sum_b = double[a1] - double[a0] - (a1 - a0) * sums[a0]
+    valid[complete] = (sum_a & 255 == data[a1]) & (sum_b & 255 == data[a1 + 1])
+    kind = _at(data, frame + 2) << 8 | _at(data, frame + 3)
+    return _Candidates("ubx", frame, kind, start, end, end + 2, valid)
+
+
+def _rtcm(data: Bytes) -> _Candidates:
+    frame = np.flatnonzero(data == 0xD3)
+    high = _at(data, frame + 1)
+    frame = frame[high < 4]
+    length = (_at(data, frame + 1) & 3) << 8 | _at(data, frame + 2)
+    frame, length = frame[length >= 2], length[length >= 2]
+    start, end = frame + 3, frame + 3 + length
+    complete = end + 3 <= len(data)
+    valid = np.zeros(len(frame), dtype=bool)
+    stop = end[complete]
+    sent = data[stop].astype(np.int64) << 16 | data[stop + 1].astype(np.int64) << 8 | data[stop + 2]
+    valid[complete] = crc24q(data, frame[complete], stop) == sent
+    kind = _at(data, start) << 4 | _at(data, start + 1) >> 4
+    return _Candidates("rtcm3", frame, kind, start, end, end + 3, valid)
+
+
+def _crc24_table() -> Integers:
+    table = np.arange(256, dtype=np.int64) << 16
+    for _ in range(8):
+        table = np.where(table & 0x800000, table << 1 ^ _CRC24_POLYNOMIAL, table << 1)
+    return table & 0xFFFFFF
+
+
+_CRC24: Final = _crc24_table()
+
+
+def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
+    """CRC-24Q of many stretches of a buffer, byte by byte over all of them together.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+    start, end : ndarray of int, shape (N,)
+
+    Returns
+    -------
+    ndarray of int64, shape (N,)
+    """
+    crc = np.zeros(len(start), dtype=np.int64)
+    order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix
+    first, length = start[order], (end - start)[order]
+    state = np.zeros(len(start), dtype=np.int64)
+    running = len(start)
+    for k in range(int(length[0]) if len(length) else 0):
+        while running and length[running - 1] <= k:
+            running -= 1
+        part = state[:running]
+        state[:running] = part << 8 & 0xFFFFFF ^ _CRC24[part >> 16 ^ data[first[:running] + k]]
+    crc[order] = state
+    return crc
+
+
+def _sbf(data: Bytes) -> _Candidates:
+    frame = _pairs(data, ord("$"), ord("@"))
+    length = _at(data, frame + 6) | _at(data, frame + 7) << 8
+    plausible = (length >= 8) & (length % 4 == 0) & (length <= LONGEST_FRAME)
+    frame, length = frame[plausible], length[plausible]
+    end = frame + length
+    valid = np.zeros(len(frame), dtype=bool)
+    for k in np.flatnonzero(end <= len(data)).tolist():
+        sent = int(data[frame[k] + 2]) | int(data[frame[k] + 3]) << 8
+        valid[k] = binascii.crc_hqx(data[frame[k] + 4 : end[k]].tobytes(), 0) == sent
+    kind = (_at(data, frame + 4) | _at(data, frame + 5) << 8) & 0x1FFF
+    return _Candidates("sbf", frame, kind, frame + 8, end, end, valid)
+
+
+def _nmea(data: Bytes) -> _Candidates:
+    dollar = np.flatnonzero(data == ord("$"))
+    dollar = dollar[_at(data, dollar + 1) != ord("@")]
+    star = np.flatnonzero(data == ord("*"))
+    after = np.searchsorted(star, dollar)
+    has = after < len(star)
+    end = np.where(has, star[np.minimum(after, len(star) - 1)] if len(star) else 0, len(data))
+    near = end - dollar < _NMEA_LONGEST
+    frame, end = dollar[near & has], end[near & has]
+    sums = np.concatenate([[0], np.bitwise_xor.accumulate(data)]) if len(data) else np.zeros(1, np.uint8)
+    complete = end + 3 <= len(data)
+    valid = np.zeros(len(frame), dtype=bool)
+    first, stop = frame[complete] + 1, end[complete]
+    valid[complete] = (sums[stop] ^ sums[first]) == (_hex(data[stop + 1]) << 4 | _hex(data[stop + 2]))
+    return _Candidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, end + 3, valid)
+
+
+def _hex(digit: Bytes) -> Integers:
+    """Values of hexadecimal digits, 255 for anything else."""
+    value = np.full(256, 255, dtype=np.int64)
+    value[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
+    value[np.frombuffer(b"ABCDEF", np.uint8)] = np.arange(10, 16)
+    value[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
+    return value[digit]

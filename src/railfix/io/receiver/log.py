@@ -1,0 +1,216 @@
+"""Receiver logs (UBX, RTCM 3, SBF, protocols mixed) read in pieces of bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes
+from railfix.core.errors import InputFileError
+from railfix.core.files import FilePath, open_stream
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.receiver import rtcm, ubx
+from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
+from railfix.io.receiver.framing import Frames, find_frames
+from railfix.io.receiver.measurements import Measurements, Tracking, joined, observations_of
+
+_BLOCK_BYTES: Final = 1 << 22
+#: Bytes in which a log must show a frame with a valid checksum to be taken for one.
+_HEAD_BYTES: Final = 1 << 16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Piece:
+    """What one block of a receiver log holds.
+
+    Attributes
+    ----------
+    measurements : Measurements
+    ephemerides : Assembled
+    skipped_bytes, bad_checksums, bytes : int
+        Bytes outside frames, candidates whose checksum failed, bytes read.
+    """
+
+    measurements: Measurements
+    ephemerides: Assembled
+    skipped_bytes: int = 0
+    bad_checksums: int = 0
+    bytes: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamState:
+    """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time."""
+
+    rest: bytes = b""
+    subframes: Unfinished = field(default_factory=Unfinished)
+    messages: Unfinished = field(default_factory=Unfinished)
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+
+
+def is_receiver_log(head: bytes) -> bool:
+    """Whether bytes from the beginning of a file hold a UBX, RTCM 3 or SBF frame with a valid checksum."""
+    frames = find_frames(np.frombuffer(head, dtype=np.uint8))
+    return bool(np.isin(frames.protocol, ["ubx", "rtcm3", "sbf"]).any())
+
+
+def head_of(path: FilePath) -> bytes:
+    """First bytes of a file, unpacked."""
+    with open_stream(path, content="bytes") as stream:
+        return stream.read(_HEAD_BYTES)
+
+
+def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
+    """Measurements and ephemerides of a block of bytes; a stream cut anywhere gives the same.
+
+    Parameters
+    ----------
+    data : bytes
+    state : StreamState
+        Left by the block before; its `time` (of the last epoch, or a date known otherwise) resolves the week
+        that RTCM 3 leaves out.
+    at_end : bool
+        Whether nothing follows.
+    """
+    buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
+    frames = find_frames(buffer, at_end=at_end)
+    raw = ubx.rawx_measurements(frames)
+    time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
+    msm = _without(frames) if np.isnat(time) else rtcm.msm_measurements(frames, time)
+    parts = [part for part in (raw, msm) if len(part.time) or part.passed_over]
+    measurements = joined(parts) if parts else raw
+    records, subframes, messages = _ephemerides(frames, raw, time, state)
+    last = measurements.time[-1] if len(measurements.time) else time
+    piece = Piece(
+        measurements=measurements,
+        ephemerides=records,
+        skipped_bytes=frames.skipped_bytes,
+        bad_checksums=frames.bad_checksums,
+        bytes=frames.consumed,
+    )
+    rest = buffer[frames.consumed :].tobytes()
+    return piece, StreamState(rest=rest, subframes=subframes, messages=messages, time=last)
+
+
+def _without(frames: Frames) -> Measurements:
+    """No measurements, where RTCM 3 has no week to be resolved with; the messages are counted."""
+    empty = rtcm.msm_measurements(_none(frames), np.datetime64("NaT", "ns"))
+    count = len(frames.of("rtcm3", *rtcm.MSM_NUMBERS))
+    return Measurements(
+        **{name: getattr(empty, name) for name in Measurements.__dataclass_fields__ if name != "passed_over"},
+        passed_over={"RTCM 3 observations without a date": count} if count else {},
+    )
+
+
+def _none(frames: Frames) -> Frames:
+    return find_frames(frames.data[:0])
+
+
+def _ephemerides(
+    frames: Frames, raw: Measurements, time: np.datetime64, state: StreamState
+) -> tuple[Assembled, Unfinished, Unfinished]:
+    subframes = ubx.sfrbx_subframes(frames)
+    epochs_at = frames.frame_start[frames.of("ubx", ubx.RXM_RAWX)]
+    epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
+    received = _time_at(subframes.order, epochs_at, raw.time, time)
+    first, unfinished = assembled(subframes, received, state.subframes)
+    messages = sorted(rtcm.ephemeris_fields(frames))
+    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), epochs_at, raw.time, time)
+    second, issued = assembled_rtcm(messages, at, state.messages)
+    return merged([first, second]), unfinished, issued
+
+
+def _time_at(places: np.ndarray, epochs_at: np.ndarray, epochs: Datetimes, before: np.datetime64) -> Datetimes:
+    """Time of the last epoch before each place of the stream; of the first one for places before it."""
+    if not len(epochs):
+        return np.full(len(places), before, dtype="datetime64[ns]")
+    index = np.searchsorted(epochs_at, places) - 1
+    first = epochs[0] if np.isnat(before) else before
+    return np.where(index < 0, first, epochs[np.maximum(index, 0)])
+
+
+def scan_pieces(
+    path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
+) -> Iterator[Piece]:
+    """Pieces of a receiver log, block by block.
+
+    Parameters
+    ----------
+    path : path
+        Plain or packed.
+    date : datetime64, optional
+        Some time within half a week of the log, for RTCM 3, whose observations carry no week.
+    progress : callable, optional
+        Called with the part of the file that has been read.
+    """
+    state = StreamState() if date is None else StreamState(time=date.astype("datetime64[ns]"))
+    with open_stream(path, content="bytes") as stream:
+        while True:
+            block = stream.read(_BLOCK_BYTES)
+            piece, state = decode(block, state, at_end=not block)
+            if progress is not None:
+                progress(stream.share)
+            yield piece
+            if not block:
+                return
+
+
+def scan_receiver_log(
+    path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
+) -> Iterator[Observations]:
+    """Observations of a receiver log in pieces of one block.
+
+    Raises
+    ------
+    InputFileError
+        No frame has a valid checksum, or no observation can be dated.
+    """
+    tracking = Tracking()
+    epochs = frames_seen = 0
+    undated = 0
+    for piece in scan_pieces(path, date=date, progress=progress):
+        observations, tracking = observations_of(piece.measurements, tracking)
+        frames_seen += piece.bytes - piece.skipped_bytes
+        undated += piece.measurements.passed_over.get("RTCM 3 observations without a date", 0)
+        counts = {"bytes outside messages": piece.skipped_bytes, "messages with a bad checksum": piece.bad_checksums}
+        passed_over = {**observations.passed_over, **{what: n for what, n in counts.items() if n}}
+        epochs += len(observations)
+        yield replace(observations, passed_over=passed_over)
+    if not frames_seen:
+        raise InputFileError(path, "holds no UBX, RTCM 3, SBF or NMEA message with a valid checksum")
+    if not epochs:
+        why = (
+            "its observations (RTCM 3) carry no date; give one with --date"
+            if undated
+            else "holds no observations (UBX RXM-RAWX, RTCM 3 MSM4 to MSM7)"
+        )
+        raise InputFileError(path, why)
+
+
+def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
+    """Navigation records of receiver logs.
+
+    Parameters
+    ----------
+    paths : iterable of path
+    date : datetime64, optional
+        As in `scan_pieces`; without it the newest week that is not after today is taken for RTCM 3.
+
+    Raises
+    ------
+    InputFileError
+        No log holds a whole ephemeris.
+    """
+    names = tuple(str(Path(path)) for path in paths)
+    parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
+    whole = merged(parts)
+    if not whole.records:
+        raise InputFileError(
+            ", ".join(names), "holds no whole ephemeris (UBX RXM-SFRBX, RTCM 3 1019, 1020, 1042, 1044, 1046)"
+        )
+    return navigation_of(whole, sources=names)

@@ -1,0 +1,214 @@
+"""Measurements as receivers send them, a row each, and their grid of epochs by channels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings
+from railfix.gnss.observations import ObservationHeader, Observations
+
+#: RINEX loss-of-lock bits: lock lost since the epoch before; half-cycle ambiguity possible.
+_SLIP, _HALF_CYCLE = 1, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurements:
+    """Measurements of a log, N rows in T epochs.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+        Time tags in the order of the stream.
+    epoch : ndarray of int, shape (N,)
+        Epoch of each measurement.
+    satellite, signal : ndarray of str, shape (N,)
+        Blank where RINEX has no name for it: not used, counted.
+    code_m, phase_cycles, doppler_hz, cn0_dbhz : ndarray, shape (N,)
+        NaN where absent or declared invalid by the receiver.
+    lock_s : ndarray, shape (N,) [s]
+        Time that the phase has been tracked without a break (at least).
+    half_cycle : ndarray of bool, shape (N,)
+        Half a cycle is unresolved.
+    polarity : ndarray of int, shape (N,)
+        A change means a jump of half a cycle.
+    glonass_channel : ndarray of int, shape (N,)
+        Frequency channel where the satellite is of GLONASS.
+    leap_seconds : int or None
+    receiver : str
+    passed_over : mapping of str to int
+    """
+
+    time: Datetimes
+    epoch: Indices
+    satellite: Strings
+    signal: Strings
+    code_m: Floats
+    phase_cycles: Floats
+    doppler_hz: Floats
+    cn0_dbhz: Floats
+    lock_s: Floats
+    half_cycle: Masks
+    polarity: Integers
+    glonass_channel: Integers
+    leap_seconds: int | None = None
+    receiver: str = ""
+    passed_over: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracking:
+    """What the epochs so far left.
+
+    Attributes
+    ----------
+    last : datetime64[ns]
+        Last epoch, NaT before the first.
+    lock : mapping of str to tuple of float
+        Lock time [s] and polarity of the last phase of each channel (satellite and signal joined).
+    """
+
+    last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def observations_of(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
+    """Observations on the grid of epochs by channels.
+
+    An epoch that is not after the one before it (a repeated message, a receiver that was restarted
+    with an older time) is passed over and counted.
+
+    Parameters
+    ----------
+    measurements : Measurements
+    tracking : Tracking, optional
+        Left by the piece before.
+
+    Returns
+    -------
+    Observations
+        Channels sorted by satellite, then signal.
+    Tracking
+    """
+    tracking = tracking or Tracking()
+    rising = rising_epochs(measurements.time, None if np.isnat(tracking.last) else tracking.last)
+    known = (measurements.satellite != "") & (measurements.signal != "")
+    row = np.cumsum(rising) - 1
+    use = known & rising[measurements.epoch]
+    names = np.char.add(measurements.satellite[use], measurements.signal[use])
+    channels, column = np.unique(names, return_inverse=True)
+    shape = (int(rising.sum()), len(channels))
+    epoch = row[measurements.epoch[use]]
+
+    def grid(values: Floats) -> Floats:
+        array = np.full(shape, np.nan)
+        array[epoch, column] = values[use]
+        return array
+
+    phase, lock = grid(measurements.phase_cycles), grid(measurements.lock_s)
+    half = grid(measurements.half_cycle.astype(np.float64)) == 1.0
+    lock, polarity = np.where(np.isnan(phase), np.nan, lock), grid(measurements.polarity.astype(np.float64))
+    before = np.array([tracking.lock.get(name, (np.nan, np.nan)) for name in channels.tolist()]).reshape(-1, 2)
+    lock, polarity = np.vstack([before[:, 0], lock]), np.vstack([before[:, 1], polarity])
+    slipped = slips(lock, polarity)[1:]
+    indicator = _SLIP * slipped + _HALF_CYCLE * half
+    passed_over = dict(measurements.passed_over)
+    for what, count in (
+        ("epochs not after the one before", int(np.count_nonzero(~rising))),
+        ("measurements of unknown signals", int(np.count_nonzero(~known))),
+    ):
+        if count:
+            passed_over[what] = passed_over.get(what, 0) + count
+    satellite, signal = channels.astype("<U3"), np.array([name[3:] for name in channels.tolist()], dtype="<U2")
+    observations = Observations(
+        time=measurements.time[rising],
+        satellite=satellite,
+        signal=signal,
+        code_m=grid(measurements.code_m),
+        phase_cycles=phase,
+        doppler_hz=grid(measurements.doppler_hz),
+        cn0_dbhz=grid(measurements.cn0_dbhz),
+        loss_of_lock=np.where(np.isnan(phase), 0, indicator).astype(np.uint8),
+        break_before=np.zeros(shape[0], dtype=bool),
+        header=_header(measurements, satellite, signal),
+        passed_over=passed_over,
+    )
+    return observations, _tracking_after(observations, tracking, channels, lock, polarity)
+
+
+def _tracking_after(
+    observations: Observations, tracking: Tracking, channels: Strings, lock_s: Floats, polarity: Floats
+) -> Tracking:
+    """State after a piece: of each channel the last lock time and polarity."""
+    rows = np.where(np.isnan(lock_s), -1, np.arange(len(lock_s))[:, None]).max(axis=0)
+    seen = np.flatnonzero(rows >= 0)
+    lock = {str(channels[k]): (float(lock_s[rows[k], k]), float(polarity[rows[k], k])) for k in seen.tolist()}
+    last = observations.time[-1] if len(observations) else tracking.last
+    return Tracking(last=last, lock={**tracking.lock, **lock})
+
+
+def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
+    """Epochs later than all before them, shape (T,)."""
+    ns = time.astype(np.int64)
+    floor = np.iinfo(np.int64).min if after is None else int(after.astype("datetime64[ns]").astype(np.int64))
+    before = np.concatenate([[floor], np.maximum(np.maximum.accumulate(ns), floor)[:-1]]) if len(ns) else ns
+    return np.asarray(ns > before)
+
+
+def slips(lock_s: Floats, polarity: Floats) -> Masks:
+    """Epochs whose phase is not continuous with the channel's last one, shape (T, M).
+
+    Lock time zero or less than before, or a change of polarity. The first phase of a channel counts as
+    continuous unless its lock time is zero.
+
+    Parameters
+    ----------
+    lock_s, polarity : ndarray, shape (T, M)
+        NaN where there is no phase.
+    """
+    present = ~np.isnan(lock_s)
+    epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
+    last = np.concatenate([np.full((1, lock_s.shape[1]), -1), np.maximum.accumulate(epochs, axis=0)[:-1]])
+    columns = np.arange(lock_s.shape[1])
+    has = present & (last >= 0)
+    before, polar = lock_s[last, columns], polarity[last, columns]
+    return np.asarray((present & (lock_s == 0.0)) | (has & ((lock_s < before) | (polarity != polar))))
+
+
+def _header(measurements: Measurements, satellite: Strings, signal: Strings) -> ObservationHeader:
+    signals: dict[str, set[str]] = {}
+    for name, code in zip(satellite.tolist(), signal.tolist(), strict=True):
+        signals.setdefault(name[0], set()).add(code)
+    glonass = np.char.startswith(measurements.satellite, "R")
+    channel = dict(
+        zip(measurements.satellite[glonass].tolist(), measurements.glonass_channel[glonass].tolist(), strict=True)
+    )
+    return ObservationHeader(
+        receiver=measurements.receiver,
+        glonass_channel={name: number for name, number in sorted(channel.items()) if -7 <= number <= 6},
+        leap_seconds=measurements.leap_seconds,
+        signals={system: tuple(sorted(codes)) for system, codes in sorted(signals.items())},
+    )
+
+
+def joined(parts: Sequence[Measurements]) -> Measurements:
+    """Measurements of several pieces, epochs with equal tags in neighbouring pieces kept apart."""
+    if len(parts) == 1:
+        return parts[0]
+    shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
+    arrays = "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel"
+    counts: dict[str, int] = {}
+    for part in parts:
+        for what, number in part.passed_over.items():
+            counts[what] = counts.get(what, 0) + number
+    leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
+    return Measurements(
+        time=np.concatenate([part.time for part in parts]),
+        epoch=np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)]),
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays.split()},
+        leap_seconds=leap[-1] if leap else None,
+        receiver=next((part.receiver for part in parts if part.receiver), ""),
+        passed_over=counts,
+    )

@@ -1,0 +1,295 @@
+"""Navigation messages, bit by bit: GPS and QZSS LNAV, Galileo I/NAV, BeiDou D1 and D2, GLONASS strings.
+
+Each function takes the bits of many messages of one kind and returns their fields, scaled, as arrays.
+Angles are turned from semicircles into radians.
+
+Sources: IS-GPS-200N, 20.3.3; IS-QZSS-PNT-005, 4.1.2; Galileo OS SIS ICD 2.1, 4.3.5; BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3;
+GLONASS ICD L1, L2 5.1, 4.4.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Floats, Masks
+from railfix.io.receiver.bits import Field, fields
+from railfix.io.receiver.framing import crc24q
+
+_PI: Final = np.pi
+
+
+def _p(*exponents: int) -> tuple[float, ...]:
+    return tuple(2.0**e for e in exponents)
+
+
+#: LNAV subframes without parity (10 words of 24 bits); TOW count and number are in all of them.
+LNAV_HEAD: Final[dict[str, Field]] = {"tow_s": (24, 17, 6.0, "u"), "subframe": (43, 3, 1.0, "u")}
+LNAV: Final[dict[int, dict[str, Field]]] = {
+    1: {
+        "week": (48, 10, 1.0, "u"),
+        "accuracy": (60, 4, 1.0, "u"),
+        "health": (64, 6, 1.0, "u"),
+        "iodc": (((70, 2), (168, 8)), 10, 1.0, "u"),
+        "group_delay_1_s": (160, 8, 2.0**-31, "s"),
+        "toc_s": (176, 16, 16.0, "u"),
+        "af2": (192, 8, 2.0**-55, "s"),
+        "af1": (200, 16, 2.0**-43, "s"),
+        "af0_s": (216, 22, 2.0**-31, "s"),
+        "codes": (58, 2, 1.0, "u"),
+        "flag": (72, 1, 1.0, "u"),
+    },
+    2: {
+        "iode": (48, 8, 1.0, "u"),
+        "crs": (56, 16, 2.0**-5, "s"),
+        "delta_n": (72, 16, 2.0**-43 * _PI, "s"),
+        "m0": (88, 32, 2.0**-31 * _PI, "s"),
+        "cuc": (120, 16, 2.0**-29, "s"),
+        "eccentricity": (136, 32, 2.0**-33, "u"),
+        "cus": (168, 16, 2.0**-29, "s"),
+        "sqrt_a": (184, 32, 2.0**-19, "u"),
+        "toe_sow_s": (216, 16, 16.0, "u"),
+        "fit": (232, 1, 1.0, "u"),
+    },
+    3: {
+        "cic": (48, 16, 2.0**-29, "s"),
+        "omega0": (64, 32, 2.0**-31 * _PI, "s"),
+        "cis": (96, 16, 2.0**-29, "s"),
+        "i0": (112, 32, 2.0**-31 * _PI, "s"),
+        "crc": (144, 16, 2.0**-5, "s"),
+        "omega": (160, 32, 2.0**-31 * _PI, "s"),
+        "omega_dot": (192, 24, 2.0**-43 * _PI, "s"),
+        "iode": (216, 8, 1.0, "u"),
+        "i_dot": (224, 14, 2.0**-43 * _PI, "s"),
+    },
+    4: {
+        "data_id": (48, 2, 1.0, "u"),
+        "page_sv": (50, 6, 1.0, "u"),
+        **{
+            f"ion{k}": (56 + 8 * k, 8, factor, "s")
+            for k, factor in enumerate(_p(-30, -27, -24, -24) + _p(11, 14, 16, 16))
+        },
+        "leap_seconds": (144, 8, 1.0, "s"),
+    },
+}
+#: Galileo I/NAV words of 128 bits, by word type.
+INAV: Final[dict[int, dict[str, Field]]] = {
+    1: {
+        "iod": (6, 10, 1.0, "u"),
+        "toe_sow_s": (16, 14, 60.0, "u"),
+        "m0": (30, 32, 2.0**-31 * _PI, "s"),
+        "eccentricity": (62, 32, 2.0**-33, "u"),
+        "sqrt_a": (94, 32, 2.0**-19, "u"),
+    },
+    2: {
+        "iod": (6, 10, 1.0, "u"),
+        "omega0": (16, 32, 2.0**-31 * _PI, "s"),
+        "i0": (48, 32, 2.0**-31 * _PI, "s"),
+        "omega": (80, 32, 2.0**-31 * _PI, "s"),
+        "i_dot": (112, 14, 2.0**-43 * _PI, "s"),
+    },
+    3: {
+        "iod": (6, 10, 1.0, "u"),
+        "omega_dot": (16, 24, 2.0**-43 * _PI, "s"),
+        "delta_n": (40, 16, 2.0**-43 * _PI, "s"),
+        "cuc": (56, 16, 2.0**-29, "s"),
+        "cus": (72, 16, 2.0**-29, "s"),
+        "crc": (88, 16, 2.0**-5, "s"),
+        "crs": (104, 16, 2.0**-5, "s"),
+        "accuracy": (120, 8, 1.0, "u"),
+    },
+    4: {
+        "iod": (6, 10, 1.0, "u"),
+        "number": (16, 6, 1.0, "u"),
+        "cic": (22, 16, 2.0**-29, "s"),
+        "cis": (38, 16, 2.0**-29, "s"),
+        "toc_s": (54, 14, 60.0, "u"),
+        "af0_s": (68, 31, 2.0**-34, "s"),
+        "af1": (99, 21, 2.0**-46, "s"),
+        "af2": (120, 6, 2.0**-59, "s"),
+    },
+    5: {
+        "group_delay_1_s": (47, 10, 2.0**-32, "s"),
+        "group_delay_2_s": (57, 10, 2.0**-32, "s"),
+        "e5b_health": (67, 2, 1.0, "u"),
+        "e1b_health": (69, 2, 1.0, "u"),
+        "e5b_invalid": (71, 1, 1.0, "u"),
+        "e1b_invalid": (72, 1, 1.0, "u"),
+        "week": (73, 12, 1.0, "u"),
+        "tow_s": (85, 20, 1.0, "u"),
+    },
+    6: {"leap_seconds": (63, 8, 1.0, "s"), "tow_s": (105, 20, 1.0, "u")},
+}
+#: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
+BDS_HEAD: Final[dict[str, Field]] = {"tow_s": (((18, 8), (30, 12)), 20, 1.0, "u"), "subframe": (15, 3, 1.0, "u")}
+D1: Final[dict[int, dict[str, Field]]] = {
+    1: {
+        "health": (42, 1, 1.0, "u"),
+        "aodc": (43, 5, 1.0, "u"),
+        "accuracy": (48, 4, 1.0, "u"),
+        "week": (60, 13, 1.0, "u"),
+        "toc_s": (((73, 9), (90, 8)), 17, 8.0, "u"),
+        "group_delay_1_s": (98, 10, 1e-10, "s"),
+        "group_delay_2_s": (((108, 4), (120, 6)), 10, 1e-10, "s"),
+        "ion0": (126, 8, 2.0**-30, "s"),
+        "ion1": (134, 8, 2.0**-27, "s"),
+        "ion2": (150, 8, 2.0**-24, "s"),
+        "ion3": (158, 8, 2.0**-24, "s"),
+        "ion4": (((166, 6), (180, 2)), 8, 2.0**11, "s"),
+        "ion5": (182, 8, 2.0**14, "s"),
+        "ion6": (190, 8, 2.0**16, "s"),
+        "ion7": (((198, 4), (210, 4)), 8, 2.0**16, "s"),
+        "af2": (214, 11, 2.0**-66, "s"),
+        "af0_s": (((225, 7), (240, 17)), 24, 2.0**-33, "s"),
+        "af1": (((257, 5), (270, 17)), 22, 2.0**-50, "s"),
+        "aode": (287, 5, 1.0, "u"),
+    },
+    2: {
+        "delta_n": (((42, 10), (60, 6)), 16, 2.0**-43 * _PI, "s"),
+        "cuc": (((66, 16), (90, 2)), 18, 2.0**-31, "s"),
+        "m0": (((92, 20), (120, 12)), 32, 2.0**-31 * _PI, "s"),
+        "eccentricity": (((132, 10), (150, 22)), 32, 2.0**-33, "u"),
+        "cus": (180, 18, 2.0**-31, "s"),
+        "crc": (((198, 4), (210, 14)), 18, 2.0**-6, "s"),
+        "crs": (((224, 8), (240, 10)), 18, 2.0**-6, "s"),
+        "sqrt_a": (((250, 12), (270, 20)), 32, 2.0**-19, "u"),
+        "toe_high": (290, 2, 1.0, "u"),
+    },
+    3: {
+        "toe_low": (((42, 10), (60, 5)), 15, 1.0, "u"),
+        "i0": (((65, 17), (90, 15)), 32, 2.0**-31 * _PI, "s"),
+        "cic": (((105, 7), (120, 11)), 18, 2.0**-31, "s"),
+        "omega_dot": (((131, 11), (150, 13)), 24, 2.0**-43 * _PI, "s"),
+        "cis": (((163, 9), (180, 9)), 18, 2.0**-31, "s"),
+        "i_dot": (((189, 13), (210, 1)), 14, 2.0**-43 * _PI, "s"),
+        "omega0": (((211, 21), (240, 11)), 32, 2.0**-31 * _PI, "s"),
+        "omega": (((251, 11), (270, 21)), 32, 2.0**-31 * _PI, "s"),
+    },
+}
+#: Where each page of D2, subframe 1, begins in the 3000 bits of its ten pages put after each other: page k (1 to 10) at
+#: 300 (k - 1); fields that go over a page are given in pieces.
+_PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
+D2: Final[dict[str, Field]] = {
+    "health": (_PAGE[1] + 46, 1, 1.0, "u"),
+    "aodc": (_PAGE[1] + 47, 5, 1.0, "u"),
+    "accuracy": (_PAGE[1] + 60, 4, 1.0, "u"),
+    "week": (_PAGE[1] + 64, 13, 1.0, "u"),
+    "toc_s": (((_PAGE[1] + 77, 5), (_PAGE[1] + 90, 12)), 17, 8.0, "u"),
+    "group_delay_1_s": (_PAGE[1] + 102, 10, 1e-10, "s"),
+    "group_delay_2_s": (_PAGE[1] + 120, 10, 1e-10, "s"),
+    "af0_s": (((_PAGE[3] + 100, 12), (_PAGE[3] + 120, 12)), 24, 2.0**-33, "s"),
+    "af1": (((_PAGE[3] + 132, 4), (_PAGE[4] + 46, 6), (_PAGE[4] + 60, 12)), 22, 2.0**-50, "s"),
+    "af2": (((_PAGE[4] + 72, 10), (_PAGE[4] + 90, 1)), 11, 2.0**-66, "s"),
+    "aode": (_PAGE[4] + 91, 5, 1.0, "u"),
+    "delta_n": (_PAGE[4] + 96, 16, 2.0**-43 * _PI, "s"),
+    "cuc": (((_PAGE[4] + 120, 14), (_PAGE[5] + 46, 4)), 18, 2.0**-31, "s"),
+    "m0": (((_PAGE[5] + 50, 2), (_PAGE[5] + 60, 22), (_PAGE[5] + 90, 8)), 32, 2.0**-31 * _PI, "s"),
+    "cus": (((_PAGE[5] + 98, 14), (_PAGE[5] + 120, 4)), 18, 2.0**-31, "s"),
+    "eccentricity": (((_PAGE[5] + 124, 10), (_PAGE[6] + 46, 6), (_PAGE[6] + 60, 16)), 32, 2.0**-33, "u"),
+    "sqrt_a": (((_PAGE[6] + 76, 6), (_PAGE[6] + 90, 22), (_PAGE[6] + 120, 4)), 32, 2.0**-19, "u"),
+    "cic": (((_PAGE[6] + 124, 10), (_PAGE[7] + 46, 6), (_PAGE[7] + 60, 2)), 18, 2.0**-31, "s"),
+    "cis": (_PAGE[7] + 62, 18, 2.0**-31, "s"),
+    "toe_sow_s": (((_PAGE[7] + 80, 2), (_PAGE[7] + 90, 15)), 17, 8.0, "u"),
+    "i0": (
+        ((_PAGE[7] + 105, 7), (_PAGE[7] + 120, 14), (_PAGE[8] + 46, 6), (_PAGE[8] + 60, 5)),
+        32,
+        2.0**-31 * _PI,
+        "s",
+    ),
+    "crc": (((_PAGE[8] + 65, 17), (_PAGE[8] + 90, 1)), 18, 2.0**-6, "s"),
+    "crs": (_PAGE[8] + 91, 18, 2.0**-6, "s"),
+    "omega_dot": (((_PAGE[8] + 109, 3), (_PAGE[8] + 120, 16), (_PAGE[9] + 46, 5)), 24, 2.0**-43 * _PI, "s"),
+    "omega0": (((_PAGE[9] + 51, 1), (_PAGE[9] + 60, 22), (_PAGE[9] + 90, 9)), 32, 2.0**-31 * _PI, "s"),
+    "omega": (((_PAGE[9] + 99, 13), (_PAGE[9] + 120, 14), (_PAGE[10] + 46, 5)), 32, 2.0**-31 * _PI, "s"),
+    "i_dot": (((_PAGE[10] + 51, 1), (_PAGE[10] + 60, 13)), 14, 2.0**-43 * _PI, "s"),
+}
+#: GLONASS strings of 85 bits, the idle bit first, by number.
+GLONASS: Final[dict[int, dict[str, Field]]] = {
+    1: {
+        "hour": (9, 5, 3600.0, "u"),
+        "minute": (14, 6, 60.0, "u"),
+        "half_minute": (20, 1, 30.0, "u"),
+        "x_velocity": (21, 24, 2.0**-20, "m"),
+        "x_acceleration": (45, 5, 2.0**-30, "m"),
+        "x": (50, 27, 2.0**-11, "m"),
+    },
+    2: {
+        "health": (5, 3, 1.0, "u"),
+        "tb_s": (9, 7, 900.0, "u"),
+        "y_velocity": (21, 24, 2.0**-20, "m"),
+        "y_acceleration": (45, 5, 2.0**-30, "m"),
+        "y": (50, 27, 2.0**-11, "m"),
+    },
+    3: {
+        "relative_frequency": (6, 11, 2.0**-40, "m"),
+        "z_velocity": (21, 24, 2.0**-20, "m"),
+        "z_acceleration": (45, 5, 2.0**-30, "m"),
+        "z": (50, 27, 2.0**-11, "m"),
+    },
+    4: {
+        "tau_s": (5, 22, 2.0**-30, "m"),
+        "age": (32, 5, 1.0, "u"),
+        "day": (59, 11, 1.0, "u"),
+        "slot": (70, 5, 1.0, "u"),
+    },
+}
+#: User range accuracy of GPS, QZSS and BeiDou [m] by index (IS-GPS-200N, 20.3.3.3.1.3).
+URA_M: Final = np.array([2.4, 3.4, 4.85, 6.85, 9.65, 13.65, 24, 48, 96, 192, 384, 768, 1536, 3072, 6144, np.nan])
+#: The nominal values that RINEX writes for them.
+URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192])
+
+
+def lnav_fields(bits: Bytes, subframe: int) -> dict[str, Floats]:
+    """Fields of LNAV subframes of one number, bits shape (N, 240)."""
+    return fields(bits, {**LNAV_HEAD, **LNAV[subframe]})
+
+
+def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
+    """Words of Galileo I/NAV page pairs, and which have a valid CRC.
+
+    Parameters
+    ----------
+    words : ndarray of uint32, shape (N, 8)
+        Even page (four words of 32 bits, 120 bits used), then odd page.
+
+    Returns
+    -------
+    bits : ndarray of uint8, shape (N, 128)
+        The data word.
+    valid : ndarray of bool, shape (N,)
+        Even page first, no alert page, CRC right.
+    """
+    octets = words[:, :8].astype(">u4").view(np.uint8).reshape(len(words), 32)
+    bits = np.unpackbits(octets, axis=1)
+    even, odd = bits[:, :120], bits[:, 128:248]
+    checked = np.concatenate([np.zeros((len(bits), 4), np.uint8), even[:, :114], odd[:, :82]], axis=1)
+    data = np.packbits(checked, axis=1)
+    start = np.arange(len(data)) * data.shape[1]
+    crc = crc24q(data.reshape(-1), start, start + data.shape[1])
+    sent = fields(odd, {"crc": (82, 24, 1.0, "u")})["crc"]
+    valid = (even[:, 0] == 0) & (odd[:, 0] == 1) & (even[:, 1] == 0) & (odd[:, 1] == 0) & (crc == sent)
+    return np.concatenate([even[:, 2:114], odd[:, 2:18]], axis=1), valid
+
+
+def sisa_m(index: Floats) -> Floats:
+    """Signal-in-space accuracy of Galileo [m] by index; NaN where no prediction is available (ICD, table 89)."""
+    i = np.asarray(index)
+    value = np.select(
+        [i < 50, i < 75, i < 100, i < 126],
+        [0.01 * i, 0.5 + 0.02 * (i - 50), 1.0 + 0.04 * (i - 75), 2.0 + 0.16 * (i - 100)],
+        default=np.nan,
+    )
+    return np.asarray(value)
+
+
+def glonass_hamming(bits: Bytes) -> Masks:
+    """Whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
+    # Bit 85 of the ICD is sent first. Its data bits 9 to 85 have the places of a Hamming code that are no powers of
+    # two, in this order; check bit k covers the places with bit k set. Check bits are the ICD's bits 1 to 7.
+    value = bits[:, 84::-1].astype(np.int64)
+    places = np.array([place for place in range(1, 86) if place & (place - 1)])[:77]
+    checks = [(value[:, 8:][:, places >> k & 1 == 1].sum(axis=1) + value[:, k]) & 1 for k in range(7)]
+    total = value.sum(axis=1) & 1
+    wrong = np.stack(checks, axis=1).any(axis=1)
+    return np.asarray(~wrong & (total == 0))

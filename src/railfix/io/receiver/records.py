@@ -1,0 +1,126 @@
+"""Navigation records from the fields of broadcast messages, whichever way they were received."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes
+from railfix.core.timescale import from_week, gpst_minus_utc, nearest_week, seconds, timedelta, to_week
+from railfix.io.receiver import nav_messages
+from railfix.io.rinex.navigation_records import FIELDS, RawRecord
+
+Values = Mapping[str, float]
+#: A record, and what tells it from the satellite's next one.
+Record = tuple[RawRecord, tuple[float, ...]]
+
+_GALILEO_WEEK_MINUS_GPS: Final = 1024
+_BDS_WEEK_MINUS_GPS: Final = 1356
+_MOSCOW_S: Final = 3 * 3600.0
+
+
+def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
+    """Record of GPS or QZSS from the fields of its message.
+
+    Parameters
+    ----------
+    satellite : str
+    values : mapping of str to float
+        Of LNAV subframes 1 to 3, or of RTCM 1019 or 1044 (which have no ``tow_s``).
+    time : datetime64[ns]
+        Within some years: resolves the week.
+    """
+    if np.isnat(time):
+        return None
+    week = _near_week(values["week"], 1024, time)
+    epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toc_s"])))
+    numbers = {
+        **values,
+        "data_source": values["codes"],
+        "accuracy_m": nav_messages.URA_NOMINAL_M[int(values["accuracy"])],
+        "group_delay_2_s": values["iodc"],
+        "transmitted": values.get("tow_s", np.nan),
+        "fit": (6.0 if values["fit"] else 4.0) if satellite[0] == "G" else values["fit"],
+        "week": float(week),
+    }
+    return _raw(satellite, "LNAV", epoch, numbers), _issue(values, "iodc", "toe_sow_s", "toc_s", "health")
+
+
+def galileo_record(satellite: str, values: Values) -> Record:
+    """Record of Galileo I/NAV from the fields of its words 1 to 5, or of RTCM 1046."""
+    week = int(values["week"]) + _GALILEO_WEEK_MINUS_GPS
+    epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toe_sow_s"])))
+    health = int(values["e5b_health"]) << 7 | int(values["e5b_invalid"]) << 6
+    health |= int(values["e1b_health"]) << 1 | int(values["e1b_invalid"])
+    numbers = {
+        **values,
+        "iode": values["iod"],
+        "data_source": values["source"],
+        "accuracy_m": float(nav_messages.sisa_m(np.asarray(values["accuracy"]))),
+        "health": float(health),
+        "transmitted": values.get("tow_s", np.nan),
+        "week": float(week),
+    }
+    return _raw(satellite, "INAV", epoch, numbers), (*_issue(values, "iod", "toe_sow_s", "source"), float(health))
+
+
+def beidou_record(satellite: str, message: str, values: Values) -> Record | None:
+    """Record of BeiDou from the fields of D1, D2 or RTCM 1042; None where the parts are of two issues."""
+    if values["toc_s"] != values["toe_sow_s"]:  # one issue has one reference time (ICD, 5.2.4.9)
+        return None
+    week = int(values["week"]) + _BDS_WEEK_MINUS_GPS
+    epoch = nearest_week(values["toc_s"], from_week(week, values.get("tow_s", values["toe_sow_s"])))
+    numbers = {
+        **values,
+        "iode": values["aode"],
+        "data_source": 0.0,
+        "accuracy_m": nav_messages.URA_NOMINAL_M[int(values["accuracy"])],
+        "transmitted": values.get("tow_s", np.nan),
+        "fit": values["aodc"],
+        "week": values["week"],
+    }
+    return _raw(satellite, message, epoch, numbers), _issue(values, "aode", "aodc", "toe_sow_s", "health")
+
+
+def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
+    """Record of GLONASS from the fields of its strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
+    if np.isnat(time):
+        return None
+    utc = np.asarray(time - gpst_minus_utc(time).astype("timedelta64[s]"), dtype="datetime64[ns]")
+    epoch = _near_day(values["tb_s"] - _MOSCOW_S, utc)
+    frame = _near_day(values["hour"] + values["minute"] + values["half_minute"] - _MOSCOW_S, utc)
+    _, message_time = to_week(frame)
+    numbers = {
+        **values,
+        "clock_bias": -values["tau_s"],
+        "message_time": float(message_time),
+        "frequency_channel": values["channel"],
+    }
+    issue = (*_issue(values, "tb_s", "health"), float(epoch.astype(np.int64)))
+    return _raw(satellite, "", epoch, numbers), issue
+
+
+def _issue(values: Values, *names: str) -> tuple[float, ...]:
+    return tuple(values[name] for name in names)
+
+
+def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers: Mapping[str, float]) -> RawRecord:
+    """A record in the order of numbers that RINEX has; what the message lacks is NaN."""
+    values = [float(numbers.get(name, np.nan)) for name in FIELDS[satellite[0]]]
+    return RawRecord(
+        satellite[0], satellite, message, np.asarray(epoch, dtype="datetime64[ns]").reshape(1)[0], values, 3.0
+    )
+
+
+def _near_week(broadcast: float, modulus: int, time: np.datetime64) -> int:
+    """Full week nearest to a time from a week number that rolls over."""
+    week = int(to_week(time)[0])
+    return week + (int(broadcast) - week + modulus // 2) % modulus - modulus // 2
+
+
+def _near_day(second_of_day: float, near: Datetimes) -> np.datetime64:
+    """The instant with a second of day that is nearest to another instant."""
+    day = near.astype("datetime64[D]").astype("datetime64[ns]") + timedelta(second_of_day)
+    return np.datetime64(day + np.rint(seconds(near - day) / 86_400.0).astype(np.int64).astype("timedelta64[D]"), "ns")

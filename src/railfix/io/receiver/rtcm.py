@@ -1,0 +1,327 @@
+"""RTCM 3 messages as arrays: multiple signal messages (MSM4 to MSM7) and ephemerides.
+
+Source: RTCM 10403.3, sections 3.5.11 (1019, 1020, 1042, 1044 to 1046) and 3.5.16 (MSM).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Strings
+from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP, SPEED_OF_LIGHT
+from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
+from railfix.io.receiver.bits import Field, fields, signed, unsigned
+from railfix.io.receiver.framing import Frames
+from railfix.io.receiver.measurements import Measurements, joined
+
+#: Constellation letter by tens of the message number of an MSM.
+SYSTEMS: Final = {107: "G", 108: "R", 109: "E", 110: "S", 111: "J", 112: "C"}
+#: RINEX signal by constellation and number in the signal mask.
+SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
+    "G": dict(zip((2, 3, 4, 8, 9, 10, 15, 16, 17, 22, 23, 24, 30, 31, 32),
+                  "1C 1P 1W 2C 2P 2W 2S 2L 2X 5I 5Q 5X 1S 1L 1X".split(), strict=True)),
+    "R": {2: "1C", 3: "1P", 8: "2C", 9: "2P"},
+    "E": dict(zip((2, 3, 4, 5, 6, 8, 9, 10, 11, 12, 14, 15, 16, 18, 19, 20, 22, 23, 24),
+                  "1C 1A 1B 1X 1Z 6C 6A 6B 6X 6Z 7I 7Q 7X 8I 8Q 8X 5I 5Q 5X".split(), strict=True)),
+    "S": {2: "1C", 22: "5I", 23: "5Q", 24: "5X"},
+    "J": dict(zip((2, 9, 10, 11, 15, 16, 17, 22, 23, 24, 30, 31, 32),
+                  "1C 6S 6L 6X 2S 2L 2X 5I 5Q 5X 1S 1L 1X".split(), strict=True)),
+    "C": dict(zip((2, 3, 4, 8, 9, 10, 14, 15, 16, 22, 23, 24, 25, 30, 31, 32),
+                  "2I 2Q 2X 6I 6Q 6X 7I 7Q 7X 5D 5P 5X 7D 1D 1P 1X".split(), strict=True)),
+}  # fmt: skip
+_MS: Final = SPEED_OF_LIGHT * 1e-3
+_HEADER_BITS: Final = 169
+#: Bits and resolution [ms] of fine code and phase, bits of lock and C/N0, resolution of C/N0, fine rate present.
+_LAYOUT: Final = {
+    4: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, False),
+    5: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, True),
+    6: (20, 2.0**-29, 24, 2.0**-31, 10, 10, 0.0625, False),
+    7: (20, 2.0**-29, 24, 2.0**-31, 10, 10, 0.0625, True),
+}
+MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
+_MOSCOW_S: Final = 10_800.0
+_GLONASS_RANGE: Final = range(-7, 7)
+
+
+def _lock_table(bits: int) -> Floats:
+    """Least lock time [s] by indicator: DF402 (4 bits), DF407 (10 bits)."""
+    if bits == 4:
+        return np.array([0.0] + [2.0 ** (k + 4) for k in range(1, 16)]) * 1e-3
+    steps = np.concatenate([np.ones(64), np.repeat(2.0 ** np.arange(1, 21), 32)])
+    values = np.concatenate([[0.0], np.cumsum(steps)])[:705]
+    return np.concatenate([values, np.full(1024 - 705, values[-1])]) * 1e-3
+
+
+def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
+    """Measurements of all MSM4 to MSM7 messages; messages of one instant make one epoch.
+
+    Parameters
+    ----------
+    frames : Frames
+    near : datetime64[ns]
+        A time within half a week of the log, GPS time: the messages carry the time of week only.
+
+    Returns
+    -------
+    Measurements
+    """
+    parts = [part for number in MSM_NUMBERS for part in _of_number(frames, number, near)]
+    counts = {"broken MSM": 0}
+    if not parts:
+        return _no_measurements()
+    order = np.concatenate([order for order, _ in parts])
+    rows = joined([rows for _, rows in parts])
+    # Messages of one instant become one epoch; instants stay in the order of the stream.
+    by_stream = np.argsort(order, kind="stable")
+    time = rows.time[by_stream]
+    starts = np.concatenate([[True], time[1:] != time[:-1]])
+    epoch_of = np.empty(len(order), dtype=np.intp)
+    epoch_of[by_stream] = np.cumsum(starts) - 1
+    broken = sum(int(rows_.passed_over.get("broken MSM", 0)) for _, rows_ in parts)
+    counts["broken MSM"] = broken
+    return Measurements(
+        **{name: getattr(rows, name) for name in _ROW_NAMES},
+        time=time[starts],
+        epoch=epoch_of[rows.epoch],
+        receiver="RTCM 3",
+        passed_over={what: number for what, number in counts.items() if number},
+    )
+
+
+_ROW_NAMES: Final = (
+    "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel".split()
+)
+
+
+def _no_measurements() -> Measurements:
+    nothing, names = np.zeros(0), np.zeros(0, dtype="<U3")
+    return Measurements(
+        time=np.zeros(0, dtype="datetime64[ns]"),
+        epoch=np.zeros(0, dtype=np.intp),
+        satellite=names,
+        signal=names,
+        code_m=nothing,
+        phase_cycles=nothing,
+        doppler_hz=nothing,
+        cn0_dbhz=nothing,
+        lock_s=nothing,
+        half_cycle=np.zeros(0, dtype=bool),
+        polarity=np.zeros(0, dtype=np.int64),
+        glonass_channel=np.zeros(0, dtype=np.int64),
+        receiver="RTCM 3",
+    )
+
+
+def bits_of(frames: Frames, chosen: Indices, length: int) -> Bytes:
+    """First bits of some payloads, 0 beyond their ends, shape (N, at least `length`)."""
+    octets = np.arange((length + 7) // 8)
+    place = frames.start[chosen][:, None] + octets
+    inside = octets < (frames.end - frames.start)[chosen][:, None]
+    data = frames.data[np.minimum(place, len(frames.data) - 1)] if len(frames.data) else np.zeros(place.shape, np.uint8)
+    return np.unpackbits(np.where(inside, data, 0).astype(np.uint8), axis=1)
+
+
+def _of_number(frames: Frames, number: int, near: np.datetime64) -> Iterator[tuple[Integers, Measurements]]:
+    """Measurements of one kind of message, those with equal masks together; and each message's place in the stream."""
+    chosen = frames.of("rtcm3", number)
+    if not len(chosen):
+        return
+    head = bits_of(frames, chosen, _HEADER_BITS + 64)
+    n_satellites = head[:, 73:137].sum(axis=1).astype(np.int64)
+    n_signals = head[:, 137:169].sum(axis=1).astype(np.int64)
+    cells = n_satellites * n_signals
+    plausible = (cells > 0) & (cells <= 64)
+    used = np.where(np.arange(64) < cells[:, None], head[:, 169:233], 0)
+    keys = np.packbits(np.concatenate([head[:, 73:169], used], axis=1), axis=1)
+    length = (frames.end - frames.start)[chosen] * 8
+    needed = _HEADER_BITS + cells + _bits_needed(number % 10, n_satellites, used.sum(axis=1).astype(np.int64))
+    plausible &= needed <= length
+    rows = np.flatnonzero(plausible)
+    _, group, inverse = np.unique(keys[rows], axis=0, return_index=True, return_inverse=True)
+    for k in range(len(group)):
+        members = rows[inverse.reshape(-1) == k]
+        bits = bits_of(frames, chosen[members], int(needed[members[0]]))
+        satellites = np.flatnonzero(head[members[0], 73:137]) + 1
+        signals = np.flatnonzero(head[members[0], 137:169]) + 1
+        mask = used[members[0], : len(satellites) * len(signals)].reshape(len(satellites), len(signals)) == 1
+        yield frames.frame_start[chosen[members]], _decoded(number, bits, satellites, signals, mask, near)
+
+
+def _bits_needed(kind: int, n_satellites: Integers, n_cells: Integers) -> Integers:
+    code, _, phase, _, lock, cn0, _, rate = _LAYOUT[kind]
+    return n_satellites * (36 if rate else 18) + n_cells * (code + phase + lock + 1 + cn0 + (15 if rate else 0))
+
+
+def _decoded(
+    number: int,
+    bits: Bytes,
+    satellites: Integers,
+    signals: Integers,
+    mask: np.ndarray,
+    near: np.datetime64,
+) -> Measurements:
+    """Measurements of N messages with equal masks: every field is an array (N, satellites) or (N, cells)."""
+    system = SYSTEMS[number // 10]
+    code_bits, code_step, phase_bits, phase_step, lock_bits, cn0_bits, cn0_step, with_rate = _LAYOUT[number % 10]
+    n_satellites, n_cells = len(satellites), int(mask.sum())
+    cursor = _HEADER_BITS + mask.size
+
+    def block(count: int, length: int, *, two_complement: bool = False) -> Integers:
+        nonlocal cursor
+        part = bits[:, cursor : cursor + count * length].reshape(-1, length)
+        cursor += count * length
+        read = signed if two_complement else unsigned
+        return read(part, 0, length).reshape(len(bits), count)
+
+    whole_ms = block(n_satellites, 8)
+    extended = block(n_satellites, 4) if with_rate else np.full((len(bits), n_satellites), 15)
+    rough_ms = np.where(whole_ms == 255, np.nan, whole_ms + block(n_satellites, 10) / 1024.0)
+    rough_rate = block(n_satellites, 14, two_complement=True) if with_rate else np.full(rough_ms.shape, -8192)
+    fine_code = block(n_cells, code_bits, two_complement=True)
+    fine_phase = block(n_cells, phase_bits, two_complement=True)
+    lock = _lock_table(lock_bits)[block(n_cells, lock_bits)]
+    half = block(n_cells, 1) == 1
+    cn0 = block(n_cells, cn0_bits) * cn0_step
+    fine_rate = block(n_cells, 15, two_complement=True) if with_rate else np.full(fine_code.shape, -16384)
+    of_satellite, of_signal = np.nonzero(mask)
+    range_ms = rough_ms[:, of_satellite]
+    code = np.where(fine_code == -(1 << code_bits - 1), np.nan, range_ms + fine_code * code_step) * _MS
+    phase_m = np.where(fine_phase == -(1 << phase_bits - 1), np.nan, range_ms + fine_phase * phase_step) * _MS
+    rate = rough_rate[:, of_satellite] + fine_rate * 1e-4
+    rate = np.where((rough_rate[:, of_satellite] == -8192) | (fine_rate == -16384), np.nan, rate)
+    names = np.array([f"{system}{k + 19 if system == 'S' else k:02d}" for k in satellites.tolist()])[of_satellite]
+    codes = np.array([SIGNALS[system].get(k, "") for k in signals.tolist()])[of_signal]
+    channel = extended[:, of_satellite] - 7
+    frequency = _frequency(system, codes, channel)
+    shape = (len(bits), n_cells)
+    return Measurements(
+        time=_times(system, bits, near),
+        epoch=np.repeat(np.arange(len(bits)), n_cells),
+        satellite=np.broadcast_to(names, shape).reshape(-1),
+        signal=np.broadcast_to(codes, shape).reshape(-1),
+        code_m=code.reshape(-1),
+        phase_cycles=(phase_m * frequency / SPEED_OF_LIGHT).reshape(-1),
+        doppler_hz=(-rate * frequency / SPEED_OF_LIGHT).reshape(-1),
+        cn0_dbhz=np.where(cn0 > 0, cn0, np.nan).reshape(-1),
+        lock_s=lock.reshape(-1),
+        half_cycle=half.reshape(-1),
+        polarity=np.zeros(shape[0] * shape[1], dtype=np.int64),
+        glonass_channel=np.where(np.isin(channel, list(_GLONASS_RANGE)), channel, 99).reshape(-1),
+    )
+
+
+def _frequency(system: str, codes: Strings, channel: Integers) -> Floats:
+    """Carrier of each cell [Hz], NaN where it is not known (GLONASS without channel)."""
+    frequency = np.full(channel.shape, np.nan)
+    for k, code in enumerate(codes.tolist()):
+        if not code:
+            continue
+        frequency[:, k] = CARRIER_FREQUENCY[system].get(code[0], np.nan)
+        if system == "R":
+            known = np.isin(channel[:, k], list(_GLONASS_RANGE))
+            frequency[:, k] += np.where(known, channel[:, k] * GLONASS_STEP[code[0]], np.nan)
+    return frequency
+
+
+def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
+    """Epoch times of messages, GPS time."""
+    if system == "R":
+        day, of_day = unsigned(bits, 24, 3), unsigned(bits, 27, 27) * 1e-3
+        utc_s = day * 86_400.0 + of_day - _MOSCOW_S
+        near_utc = near - gpst_minus_utc(near).astype("timedelta64[s]")
+        utc = nearest_week(utc_s, np.full(len(bits), near_utc))
+        return np.asarray(utc + gpst_minus_utc(near).astype("timedelta64[s]"), dtype="datetime64[ns]")
+    of_week = unsigned(bits, 24, 30) * 1e-3
+    time = nearest_week(of_week, np.full(len(bits), near))
+    return bdt_to_gpst(time) if system == "C" else time
+
+
+def _sequence(*items: tuple[str, int, float, str]) -> dict[str, Field]:
+    """A layout from fields that follow each other after the message number."""
+    layout: dict[str, Field] = {}
+    first = 12
+    for name, length, factor, coding in items:
+        layout[name] = (first, length, factor, coding)
+        first += length
+    return layout
+
+
+_SC: Final = np.pi
+_ANGLE, _RATE_A = 2.0**-31 * _SC, 2.0**-43 * _SC
+#: Ephemeris messages: fields in the order in which they are sent.
+EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
+    1019: _sequence(
+        ("number", 6, 1, "u"), ("week", 10, 1, "u"), ("accuracy", 4, 1, "u"), ("codes", 2, 1, "u"),
+        ("i_dot", 14, _RATE_A, "s"), ("iode", 8, 1, "u"), ("toc_s", 16, 16, "u"), ("af2", 8, 2.0**-55, "s"),
+        ("af1", 16, 2.0**-43, "s"), ("af0_s", 22, 2.0**-31, "s"), ("iodc", 10, 1, "u"), ("crs", 16, 2.0**-5, "s"),
+        ("delta_n", 16, _RATE_A, "s"), ("m0", 32, _ANGLE, "s"), ("cuc", 16, 2.0**-29, "s"),
+        ("eccentricity", 32, 2.0**-33, "u"), ("cus", 16, 2.0**-29, "s"), ("sqrt_a", 32, 2.0**-19, "u"),
+        ("toe_sow_s", 16, 16, "u"), ("cic", 16, 2.0**-29, "s"), ("omega0", 32, _ANGLE, "s"),
+        ("cis", 16, 2.0**-29, "s"), ("i0", 32, _ANGLE, "s"), ("crc", 16, 2.0**-5, "s"), ("omega", 32, _ANGLE, "s"),
+        ("omega_dot", 24, _RATE_A, "s"), ("group_delay_1_s", 8, 2.0**-31, "s"), ("health", 6, 1, "u"),
+        ("flag", 1, 1, "u"), ("fit", 1, 1, "u"),
+    ),
+    1044: _sequence(
+        ("number", 4, 1, "u"), ("toc_s", 16, 16, "u"), ("af2", 8, 2.0**-55, "s"), ("af1", 16, 2.0**-43, "s"),
+        ("af0_s", 22, 2.0**-31, "s"), ("iode", 8, 1, "u"), ("crs", 16, 2.0**-5, "s"), ("delta_n", 16, _RATE_A, "s"),
+        ("m0", 32, _ANGLE, "s"), ("cuc", 16, 2.0**-29, "s"), ("eccentricity", 32, 2.0**-33, "u"),
+        ("cus", 16, 2.0**-29, "s"), ("sqrt_a", 32, 2.0**-19, "u"), ("toe_sow_s", 16, 16, "u"),
+        ("cic", 16, 2.0**-29, "s"), ("omega0", 32, _ANGLE, "s"), ("cis", 16, 2.0**-29, "s"), ("i0", 32, _ANGLE, "s"),
+        ("crc", 16, 2.0**-5, "s"), ("omega", 32, _ANGLE, "s"), ("omega_dot", 24, _RATE_A, "s"),
+        ("i_dot", 14, _RATE_A, "s"), ("codes", 2, 1, "u"), ("week", 10, 1, "u"), ("accuracy", 4, 1, "u"),
+        ("health", 6, 1, "u"), ("group_delay_1_s", 8, 2.0**-31, "s"), ("iodc", 10, 1, "u"), ("fit", 1, 1, "u"),
+    ),
+    1042: _sequence(
+        ("number", 6, 1, "u"), ("week", 13, 1, "u"), ("accuracy", 4, 1, "u"), ("i_dot", 14, _RATE_A, "s"),
+        ("aode", 5, 1, "u"), ("toc_s", 17, 8, "u"), ("af2", 11, 2.0**-66, "s"), ("af1", 22, 2.0**-50, "s"),
+        ("af0_s", 24, 2.0**-33, "s"), ("aodc", 5, 1, "u"), ("crs", 18, 2.0**-6, "s"), ("delta_n", 16, _RATE_A, "s"),
+        ("m0", 32, _ANGLE, "s"), ("cuc", 18, 2.0**-31, "s"), ("eccentricity", 32, 2.0**-33, "u"),
+        ("cus", 18, 2.0**-31, "s"), ("sqrt_a", 32, 2.0**-19, "u"), ("toe_sow_s", 17, 8, "u"),
+        ("cic", 18, 2.0**-31, "s"), ("omega0", 32, _ANGLE, "s"), ("cis", 18, 2.0**-31, "s"), ("i0", 32, _ANGLE, "s"),
+        ("crc", 18, 2.0**-6, "s"), ("omega", 32, _ANGLE, "s"), ("omega_dot", 24, _RATE_A, "s"),
+        ("group_delay_1_s", 10, 1e-10, "s"), ("group_delay_2_s", 10, 1e-10, "s"), ("health", 1, 1, "u"),
+    ),
+    **{
+        number: _sequence(
+            ("number", 6, 1, "u"), ("week", 12, 1, "u"), ("iod", 10, 1, "u"), ("accuracy", 8, 1, "u"),
+            ("i_dot", 14, _RATE_A, "s"), ("toc_s", 14, 60, "u"), ("af2", 6, 2.0**-59, "s"), ("af1", 21, 2.0**-46, "s"),
+            ("af0_s", 31, 2.0**-34, "s"), ("crs", 16, 2.0**-5, "s"), ("delta_n", 16, _RATE_A, "s"),
+            ("m0", 32, _ANGLE, "s"), ("cuc", 16, 2.0**-29, "s"), ("eccentricity", 32, 2.0**-33, "u"),
+            ("cus", 16, 2.0**-29, "s"), ("sqrt_a", 32, 2.0**-19, "u"), ("toe_sow_s", 14, 60, "u"),
+            ("cic", 16, 2.0**-29, "s"), ("omega0", 32, _ANGLE, "s"), ("cis", 16, 2.0**-29, "s"),
+            ("i0", 32, _ANGLE, "s"), ("crc", 16, 2.0**-5, "s"), ("omega", 32, _ANGLE, "s"),
+            ("omega_dot", 24, _RATE_A, "s"), ("group_delay_1_s", 10, 2.0**-32, "s"), *rest,
+        )
+        for number, rest in (
+            (1045, (("e5a_health", 2, 1, "u"), ("e5a_invalid", 1, 1, "u"))),
+            (1046, (("group_delay_2_s", 10, 2.0**-32, "s"), ("e5b_health", 2, 1, "u"), ("e5b_invalid", 1, 1, "u"),
+                    ("e1b_health", 2, 1, "u"), ("e1b_invalid", 1, 1, "u"))),
+        )
+    },
+    1020: _sequence(
+        ("number", 6, 1, "u"), ("channel", 5, 1, "u"), ("almanac", 4, 1, "u"), ("hour", 5, 3600, "u"),
+        ("minute", 6, 60, "u"), ("half_minute", 1, 30, "u"), ("health", 1, 1, "u"), ("p2", 1, 1, "u"),
+        ("tb_s", 7, 900, "u"), ("x_velocity", 24, 2.0**-20, "m"), ("x", 27, 2.0**-11, "m"),
+        ("x_acceleration", 5, 2.0**-30, "m"), ("y_velocity", 24, 2.0**-20, "m"), ("y", 27, 2.0**-11, "m"),
+        ("y_acceleration", 5, 2.0**-30, "m"), ("z_velocity", 24, 2.0**-20, "m"), ("z", 27, 2.0**-11, "m"),
+        ("z_acceleration", 5, 2.0**-30, "m"), ("p3", 1, 1, "u"), ("relative_frequency", 11, 2.0**-40, "m"),
+        ("p", 2, 1, "u"), ("ln", 1, 1, "u"), ("tau_s", 22, 2.0**-30, "m"), ("dtau", 5, 2.0**-30, "m"),
+        ("age", 5, 1, "u"),
+    ),
+}  # fmt: skip
+
+
+def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float]]]:
+    """Fields of every ephemeris message: place in the stream, message number, values."""
+    for number, layout in EPHEMERIDES.items():
+        chosen = frames.of("rtcm3", number)
+        needed = max(first + length for first, length, _, _ in layout.values() if isinstance(first, int))
+        chosen = chosen[(frames.end - frames.start)[chosen] * 8 >= needed]
+        if not len(chosen):
+            continue
+        table = fields(bits_of(frames, chosen, needed), layout)
+        for k, place in enumerate(frames.frame_start[chosen].tolist()):
+            yield place, number, {name: float(values[k]) for name, values in table.items()}

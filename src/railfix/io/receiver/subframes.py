@@ -1,0 +1,57 @@
+"""Navigation subframes as receivers send them, a row each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Integers, Strings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Subframes:
+    """Raw navigation words, N rows in the order of the stream.
+
+    Attributes
+    ----------
+    satellite : ndarray of str, shape (N,)
+    signal : ndarray of int, shape (N,)
+        Signal number of the receiver (UBX sigId).
+    glonass_channel : ndarray of int, shape (N,)
+    words : ndarray of uint32, shape (N, 10)
+        Words of 30 or 32 bits, right-aligned; unused ones 0.
+    order : ndarray of int, shape (N,)
+        Place in the stream, to tell which epoch came before.
+    """
+
+    satellite: Strings
+    signal: Integers
+    glonass_channel: Integers
+    words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
+    order: Integers
+
+    def __len__(self) -> int:
+        return len(self.satellite)
+
+    def of(self, letters: str) -> Subframes:
+        """The rows of some constellations."""
+        chosen = np.isin(self.satellite.astype("<U1"), list(letters)) & (self.satellite != "")
+        return self.take(chosen)
+
+    def take(self, rows: Integers | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Subframes:
+        """Some of the rows."""
+        return Subframes(
+            satellite=self.satellite[rows],
+            signal=self.signal[rows],
+            glonass_channel=self.glonass_channel[rows],
+            words=self.words[rows],
+            order=self.order[rows],
+        )
+
+
+def packed_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:
+    """Bits of words of which the lowest `drop` are left out and the next `keep` kept, shape (N, words * keep)."""
+    shift = np.arange(keep - 1, -1, -1, dtype=np.uint32) + np.uint32(drop)
+    bits = words[:, :, None] >> shift & np.uint32(1)
+    return bits.reshape(len(words), -1).astype(np.uint8)

@@ -1,0 +1,262 @@
+"""u-blox UBX messages as arrays: raw measurements, navigation subframes, the receiver's own positions.
+
+Source: u-blox F9 HPG 1.32 interface description (UBX-22008968), sections 3.15 (NAV) and 3.17 (RXM).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Datetimes, Strings
+from railfix.core.timescale import from_week
+from railfix.io.receiver.framing import Frames
+from railfix.io.receiver.measurements import Measurements
+from railfix.io.receiver.subframes import Subframes
+
+RXM_RAWX: Final = 0x0215
+RXM_SFRBX: Final = 0x0213
+NAV_PVT: Final = 0x0107
+NAV_HPPOSLLH: Final = 0x0114
+
+#: Constellation letter by gnssId.
+SYSTEMS: Final = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
+#: RINEX signal by gnssId and sigId (section 1.5.4 of the interface description, "Signal identifiers").
+SIGNALS: Final = {
+    (0, 0): "1C",
+    (0, 3): "2L",
+    (0, 4): "2S",
+    (0, 6): "5I",
+    (0, 7): "5Q",
+    (1, 0): "1C",
+    (2, 0): "1C",
+    (2, 1): "1B",
+    (2, 3): "5I",
+    (2, 4): "5Q",
+    (2, 5): "7I",
+    (2, 6): "7Q",
+    (2, 8): "6B",
+    (2, 9): "6C",
+    (2, 10): "6A",
+    (3, 0): "2I",
+    (3, 1): "2I",
+    (3, 2): "7I",
+    (3, 3): "7I",
+    (3, 4): "6I",
+    (3, 5): "1P",
+    (3, 6): "1D",
+    (3, 7): "5P",
+    (3, 8): "5D",
+    (3, 10): "6I",
+    (5, 0): "1C",
+    (5, 1): "1Z",
+    (5, 4): "2S",
+    (5, 5): "2L",
+    (5, 8): "5I",
+    (5, 9): "5Q",
+    (6, 0): "1C",
+    (6, 2): "2C",
+    (7, 0): "5A",
+}
+#: One measurement of RXM-RAWX.
+_MEASUREMENT: Final = np.dtype(
+    [
+        ("code", "<f8"),
+        ("phase", "<f8"),
+        ("doppler", "<f4"),
+        ("gnss", "u1"),
+        ("sv", "u1"),
+        ("signal", "u1"),
+        ("channel", "u1"),
+        ("lock", "<u2"),
+        ("cn0", "u1"),
+        ("code_std", "u1"),
+        ("phase_std", "u1"),
+        ("doppler_std", "u1"),
+        ("tracking", "u1"),
+        ("reserved", "u1"),
+    ]
+)
+_RAWX_HEADER: Final = np.dtype(
+    [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
+)
+_PVT: Final = np.dtype(
+    [
+        ("tow_ms", "<u4"),
+        ("calendar", "V20"),
+        ("fix", "u1"),
+        ("flags", "u1"),
+        ("flags2", "u1"),
+        ("satellites", "u1"),
+        ("longitude", "<i4"),
+        ("latitude", "<i4"),
+        ("height_mm", "<i4"),
+        ("sea_level_mm", "<i4"),
+        ("horizontal_mm", "<u4"),
+        ("vertical_mm", "<u4"),
+    ]
+)
+_HPPOSLLH: Final = np.dtype(
+    [
+        ("version", "u1"),
+        ("_", "V2"),
+        ("flags", "u1"),
+        ("tow_ms", "<u4"),
+        ("longitude", "<i4"),
+        ("latitude", "<i4"),
+        ("height_mm", "<i4"),
+        ("sea_level_mm", "<i4"),
+        ("longitude_fine", "i1"),
+        ("latitude_fine", "i1"),
+        ("height_fine", "i1"),
+        ("sea_level_fine", "i1"),
+        ("horizontal", "<u4"),
+        ("vertical", "<u4"),
+    ]
+)
+_PHASE_VALID, _HALF_CYCLE_KNOWN, _HALF_CYCLE_REMOVED, _CODE_VALID = 2, 4, 8, 1
+#: Largest standard deviation of a phase that is used, in units of 0.004 cycle (as RTKLIB 2.4.3 does).
+_LARGEST_PHASE_STD: Final = 5
+
+
+def _name_table() -> Strings:
+    """Names of satellites by gnssId and svId, blank where there is none; SBAS PRN 120 is S20."""
+    table = np.full((256, 256), "", dtype="<U3")
+    for system, letter in SYSTEMS.items():
+        shift = 100 if letter == "S" else 0
+        for number in range(1, 100):
+            table[system, number + shift] = f"{letter}{number:02d}"
+    return table
+
+
+_NAMES: Final = _name_table()
+
+
+def rawx_measurements(frames: Frames) -> Measurements:
+    """Raw measurements of all RXM-RAWX messages.
+
+    Messages whose length does not fit their count of measurements are passed over and counted.
+    """
+    chosen = frames.of("ubx", RXM_RAWX)
+    length = frames.end[chosen] - frames.start[chosen]
+    header = gathered(frames.data, frames.start[chosen][length >= 16], _RAWX_HEADER)
+    chosen, length = chosen[length >= 16], length[length >= 16]
+    whole = length == 16 + 32 * header["count"].astype(np.int64)
+    plausible = whole & (header["week"] > 0) & (header["tow"] >= 0) & (header["tow"] < 604_800)
+    passed_over = {"broken RXM-RAWX": int(np.count_nonzero(~whole)), "RXM-RAWX without time": 0}
+    passed_over["RXM-RAWX without time"] = int(np.count_nonzero(whole & ~plausible))
+    chosen, header = chosen[plausible], header[plausible]
+    count = header["count"].astype(np.int64)
+    epoch = np.repeat(np.arange(len(chosen)), count)
+    within = np.arange(len(epoch)) - np.repeat(np.cumsum(count) - count, count)
+    rows = gathered(frames.data, frames.start[chosen][epoch] + 16 + 32 * within, _MEASUREMENT)
+    system, tracking = rows["gnss"].astype(np.int64), rows["tracking"].astype(np.int64)
+    signal = _signal_table()[np.minimum(system, 7), np.minimum(rows["signal"], 15)]
+    phase_valid = (tracking & _PHASE_VALID != 0) & (rows["phase"] != 0) & (rows["phase"] != -0.5)
+    phase_valid &= rows["phase_std"] & 15 <= _LARGEST_PHASE_STD
+    leap = header["leap"][header["status"] & 1 == 1]
+    return Measurements(
+        time=from_week(header["week"].astype(np.int64), header["tow"]),
+        epoch=epoch,
+        satellite=_NAMES[system, rows["sv"]],
+        signal=signal,
+        code_m=np.where((tracking & _CODE_VALID != 0) & (rows["code"] > 0), rows["code"], np.nan),
+        phase_cycles=np.where(phase_valid, rows["phase"], np.nan),
+        doppler_hz=np.where(np.isfinite(rows["doppler"]), rows["doppler"].astype(np.float64), np.nan),
+        cn0_dbhz=np.where(rows["cn0"] > 0, rows["cn0"].astype(np.float64), np.nan),
+        lock_s=rows["lock"] * 1e-3,
+        half_cycle=phase_valid & (tracking & _HALF_CYCLE_KNOWN == 0),
+        polarity=(tracking & _HALF_CYCLE_REMOVED != 0).astype(np.int64),
+        glonass_channel=rows["channel"].astype(np.int64) - 7,
+        leap_seconds=int(leap[-1]) if len(leap) else None,
+        receiver="u-blox",
+        passed_over={k: v for k, v in passed_over.items() if v},
+    )
+
+
+def _signal_table() -> Strings:
+    table = np.full((8, 16), "", dtype="<U2")
+    for (system, number), name in SIGNALS.items():
+        table[system, number] = name
+    return table
+
+
+def gathered(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
+    """Structures of one layout at many places of a buffer, shape (N,)."""
+    block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
+    return np.ascontiguousarray(block).view(layout)[:, 0]
+
+
+def sfrbx_subframes(frames: Frames) -> Subframes:
+    """Navigation subframes of all RXM-SFRBX messages, words as received (32 bits, right-aligned as u-blox has them)."""
+    chosen = frames.of("ubx", RXM_SFRBX)
+    length = frames.end[chosen] - frames.start[chosen]
+    chosen, length = chosen[length >= 8], length[length >= 8]
+    first = frames.start[chosen]
+    count = frames.data[first + 4].astype(np.int64)
+    whole = length == 8 + 4 * count
+    chosen, first, count = chosen[whole], first[whole], count[whole]
+    words = np.zeros((len(chosen), 10), dtype=np.uint32)
+    for k in range(10):
+        has = count > k
+        place = first[has] + 8 + 4 * k
+        block = frames.data[place[:, None] + np.arange(4)] if len(place) else np.zeros((0, 4), np.uint8)
+        words[has, k] = np.ascontiguousarray(block).view("<u4")[:, 0]
+    system = frames.data[first].astype(np.int64)
+    return Subframes(
+        satellite=_NAMES[system, frames.data[first + 1]],
+        signal=frames.data[first + 2].astype(np.int64),
+        glonass_channel=frames.data[first + 3].astype(np.int64) - 7,
+        words=words,
+        order=frames.frame_start[chosen],
+    )
+
+
+def positions(frames: Frames, epochs: Datetimes) -> dict[str, np.ndarray]:
+    """The receiver's own positions: of NAV-HPPOSLLH where it is sent, else of NAV-PVT.
+
+    Parameters
+    ----------
+    frames : Frames
+    epochs : ndarray of datetime64[ns]
+        Times of the log; the messages carry the time of week only.
+
+    Returns
+    -------
+    dict
+        ``time``, ``latitude_deg``, ``longitude_deg``, ``height_m`` (ellipsoidal), ``sigma_m`` (horizontal), ``fixed``.
+    """
+    fine = frames.of("ubx", NAV_HPPOSLLH)
+    fine = fine[frames.end[fine] - frames.start[fine] == _HPPOSLLH.itemsize]
+    if len(fine):
+        rows = gathered(frames.data, frames.start[fine], _HPPOSLLH)
+        valid = rows["flags"] & 1 == 0
+        latitude = rows["latitude"] * 1e-7 + rows["latitude_fine"] * 1e-9
+        longitude = rows["longitude"] * 1e-7 + rows["longitude_fine"] * 1e-9
+        height = rows["height_mm"] * 1e-3 + rows["height_fine"] * 1e-4
+        sigma = rows["horizontal"] * 1e-4
+    else:
+        coarse = frames.of("ubx", NAV_PVT)
+        coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]
+        rows = gathered(frames.data, frames.start[coarse], _PVT)
+        valid = (rows["flags"] & 1 == 1) & np.isin(rows["fix"], [2, 3, 4])
+        latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7
+        height, sigma = rows["height_mm"] * 1e-3, rows["horizontal_mm"] * 1e-3
+    rows, place = rows[valid], np.flatnonzero(valid)
+    return {
+        "time": weeks_near(rows["tow_ms"].astype(np.float64) * 1e-3, epochs),
+        "latitude_deg": latitude[place],
+        "longitude_deg": longitude[place],
+        "height_m": height[place],
+        "sigma_m": sigma[place],
+    }
+
+
+def weeks_near(seconds_of_week: np.ndarray, epochs: Datetimes) -> Datetimes:
+    """Times of week as instants of the week nearest to a log's epochs."""
+    from railfix.core.timescale import nearest_week
+
+    if not len(epochs):
+        return np.full(len(seconds_of_week), np.datetime64("NaT", "ns"))
+    return nearest_week(seconds_of_week, np.full(len(seconds_of_week), epochs[len(epochs) // 2]))

@@ -1,0 +1,297 @@
+"""Receiver logs: values against RTKLIB's, cuts and damage, protocols mixed, logs in place of RINEX."""
+
+from __future__ import annotations
+
+import gzip
+import shutil
+import subprocess
+import time as clock
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import railfix
+from railfix.core.errors import InputFileError, MismatchError
+from railfix.gnss.observations import Observations, concatenate
+from railfix.io import rinex
+from railfix.io.receiver.framing import crc24q, find_frames
+from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.measurements import Tracking, observations_of
+
+pytestmark = pytest.mark.requirement("A8")
+
+COLD_START = "16dBatt_no_interference_coldstart.ubx.gz"
+TWO_BANDS = "F9T-L2-5min.ubx.gz"
+RTCM = "idd2023229c.rtc.gz"
+NUMBERS = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")
+
+
+@pytest.fixture(scope="module", params=[COLD_START, TWO_BANDS], ids=["cold start", "two bands"])
+def ubx(request: pytest.FixtureRequest, recordings: Path) -> Path:
+    return recordings / "live" / request.param
+
+
+def program(name: str) -> str:
+    found = shutil.which(name)
+    if found is None:
+        pytest.skip(f"{name} (Debian package rtklib) is not installed")
+    return found
+
+
+def unpacked(path: Path, folder: Path) -> Path:
+    target = folder / path.name.removesuffix(".gz")
+    target.write_bytes(gzip.decompress(path.read_bytes()))
+    return target
+
+
+def convbin(source: Path, kind: str, day: str = "2025/04/25") -> tuple[Path, Path]:
+    """RINEX observation and navigation files that RTKLIB makes of a log."""
+    observations, navigation = source.with_suffix(".obs"), source.with_suffix(".nav")
+    words = [
+        program("convbin"),
+        "-r",
+        kind,
+        "-od",
+        "-os",
+        "-f",
+        "5",
+        "-v",
+        "3.04",
+        "-o",
+        observations,
+        "-n",
+        navigation,
+    ]
+    words += ["-tr", day, "06:00:00"] if kind == "rtcm3" else []
+    subprocess.run([*map(str, words), str(source)], capture_output=True, check=True, timeout=120)
+    return observations, navigation
+
+
+def channels(observations: Observations) -> list[tuple[str, str]]:
+    return list(zip(observations.satellite.tolist(), observations.signal.tolist(), strict=True))
+
+
+def assert_same_values(ours: Observations, theirs: Observations, *, without: tuple[str, ...] = ()) -> int:
+    """Every value of the channels that both have: absent in both, or within what RINEX rounds to."""
+    assert len(ours) == len(theirs)
+    assert np.abs((ours.time - theirs.time).astype(np.int64)).max() <= 50  # RINEX has 100 ns
+    common = [c for c in channels(theirs) if c in channels(ours)]
+    mine, others = [channels(ours).index(c) for c in common], [channels(theirs).index(c) for c in common]
+    compared = 0
+    for name in NUMBERS:
+        if name in without:
+            continue
+        a, b = getattr(ours, name)[:, mine], getattr(theirs, name)[:, others]
+        assert np.array_equal(np.isnan(a), np.isnan(b)), name
+        assert np.nanmax(np.abs(a - b)) <= 0.00062, name
+        compared += int(np.isfinite(b).sum())
+    return compared
+
+
+def test_ubx_observations_are_those_of_rtklib(ubx: Path, tmp_path: Path) -> None:
+    observations, _ = convbin(unpacked(ubx, tmp_path), "ubx")
+    assert assert_same_values(railfix.read_observations(ubx), rinex.read_observations(observations)) > 40_000
+
+
+@pytest.mark.parametrize("kind", [7, 4])
+def test_rtcm_observations_are_those_of_rtklib(recordings: Path, tmp_path: Path, kind: int) -> None:
+    """MSM4 and MSM7 that `str2str` makes of the UBX log."""
+    source = unpacked(recordings / "live" / TWO_BANDS, tmp_path)
+    target = tmp_path / "log.rtcm3"
+    messages = ",".join(f"{tens}{kind}(1)" for tens in (107, 108, 109, 110, 111, 112))
+    words = [program("str2str"), "-in", f"file://{source}#ubx", "-out", f"file://{target}#rtcm3", "-msg", messages]
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    size, still, until = 0, 0, clock.monotonic() + 60
+    while still < 4 and clock.monotonic() < until:  # str2str does not end by itself
+        clock.sleep(0.5)
+        now = target.stat().st_size if target.exists() else 0
+        still, size = (still + 1 if now == size > 0 else 0), now
+    process.terminate()
+    process.wait()
+    observations, _ = convbin(target, "rtcm3", "2025/08/11")
+    ours = railfix.read_observations(target, date="2025-08-11")
+    without = ("doppler_hz",) if kind == 4 else ()
+    assert assert_same_values(ours, rinex.read_observations(observations), without=without) > 20_000
+    with pytest.raises(InputFileError, match="carry no date"):
+        railfix.read_observations(target)
+
+
+def test_ubx_ephemerides_are_those_of_rtklib(recordings: Path, tmp_path: Path) -> None:
+    log = recordings / "live" / COLD_START
+    ours = railfix.read_navigation(log)
+    _, navigation = convbin(unpacked(log, tmp_path), "ubx")
+    theirs = rinex.read_navigation(navigation)
+    assert_same_records(ours, theirs, expected=9)
+    assert sorted(ours.kepler.satellite.astype("<U1").tolist()) == ["E"] * 19 + ["G"] * 9
+
+
+def test_rtcm_ephemerides_are_those_of_the_rinex_file(recordings: Path) -> None:
+    """GPS records of a caster beside those of a station's file of the same hours; Galileo is F/NAV there."""
+    ours = railfix.read_navigation(recordings / "live" / RTCM, date="2023-08-17T02:00")
+    theirs = rinex.read_navigation(recordings / "live" / "OBE42023229c.nav.gz")
+    # RTCM has no transmission time.
+    assert_same_records(ours, theirs, expected=10, systems="G", without=("transmitted",))
+
+
+def assert_same_records(
+    ours: railfix.Navigation,
+    theirs: railfix.Navigation,
+    *,
+    expected: int,
+    systems: str = "GE",
+    without: tuple[str, ...] = (),
+) -> None:
+    a, b = ours.kepler, theirs.kepler
+    keys = [list(zip(k.satellite.tolist(), k.toe.tolist(), k.iode.tolist(), strict=True)) for k in (a, b)]
+    common = [key for key in keys[1] if key in keys[0] and key[0][0] in systems]
+    assert len(common) >= expected
+    mine, others = [keys[0].index(key) for key in common], [keys[1].index(key) for key in common]
+    for name in type(a).__dataclass_fields__:
+        if name in without:
+            continue
+        x, y = getattr(a, name)[mine], getattr(b, name)[others]
+        if x.dtype.kind == "f":
+            assert np.allclose(x, y, rtol=1e-11, atol=0.0, equal_nan=True), name
+        else:
+            assert x.tolist() == y.tolist(), name
+
+
+def in_fragments(data: bytes, cuts: list[int]) -> tuple[Observations, list[object]]:
+    """A log decoded as it arrives in fragments."""
+    state, tracking = StreamState(), Tracking()
+    parts, records = [], []
+    for first, last in zip([0, *cuts], [*cuts, None], strict=True):
+        piece, state = decode(data[first:last], state, at_end=last is None)
+        observations, tracking = observations_of(piece.measurements, tracking)
+        parts.append(observations)
+        records += [(r.satellite, r.epoch, tuple(r.numbers)) for r in piece.ephemerides.records]
+    return concatenate(parts), [repr(record) for record in records]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_stream_cut_anywhere_gives_the_same(recordings: Path, seed: int) -> None:
+    data = gzip.decompress((recordings / "live" / COLD_START).read_bytes())[:900_000]
+    cuts = sorted(np.random.default_rng(seed).integers(1, len(data), 60).tolist())
+    whole, records = in_fragments(data, [])
+    pieces, records_in_pieces = in_fragments(data, cuts)
+    assert records == records_in_pieces
+    assert channels(whole) == channels(pieces)
+    for name in ("time", *NUMBERS, "loss_of_lock"):
+        assert np.array_equal(
+            getattr(whole, name), getattr(pieces, name), equal_nan=name not in ("time", "loss_of_lock")
+        ), name
+
+
+def damaged(data: bytes, seed: int) -> bytes:
+    """Bytes flipped, dropped, doubled, put in between, or the end cut off."""
+    rng = np.random.default_rng(seed)
+    values = bytearray(data)
+    for _ in range(int(rng.integers(1, 40))):
+        place = int(rng.integers(0, len(values) - 300))
+        match int(rng.integers(0, 4)):
+            case 0:
+                values[place] ^= int(rng.integers(1, 256))
+            case 1:
+                del values[place : place + int(rng.integers(1, 300))]
+            case 2:
+                values[place:place] = values[place : place + int(rng.integers(1, 300))]
+            case _:
+                values[place:place] = rng.integers(0, 256, int(rng.integers(1, 300))).astype(np.uint8).tobytes()
+    return bytes(values[: int(rng.integers(len(values) // 2, len(values)))])
+
+
+def observed(observations: Observations) -> set[tuple[object, ...]]:
+    """Every measurement as (time, satellite, signal, values)."""
+    names = channels(observations)
+    rows = {}
+    for t, m in np.argwhere(np.isfinite(observations.cn0_dbhz)).tolist():
+        values = [np.nan_to_num(getattr(observations, name)[t, m], nan=-1.0).item() for name in NUMBERS]
+        rows[observations.time[t].astype(np.int64).item(), *names[m], *values] = None
+    return set(rows)
+
+
+@pytest.mark.parametrize("block", range(10))
+def test_damage_gives_no_false_observation(recordings: Path, block: int) -> None:
+    """30 variants a block: no exception, nothing observed that the whole log does not have, counts add up."""
+    data = gzip.decompress((recordings / "live" / TWO_BANDS).read_bytes())[:120_000]
+    whole, _ = in_fragments(data, [])
+    true = observed(whole)
+    seen = 0
+    for seed in range(30 * block, 30 * block + 30):
+        broken = damaged(data, seed)
+        piece, state = decode(broken, StreamState(), at_end=True)
+        observations, _ = observations_of(piece.measurements)
+        assert observed(observations) <= true
+        assert piece.bytes == len(broken)
+        assert state.rest == b""
+        frames = find_frames(np.frombuffer(broken, np.uint8))
+        overhead = {"ubx": (6, 2), "rtcm3": (3, 3), "sbf": (8, 0), "nmea": (0, 3)}
+        inside = sum(
+            int(last - first) + sum(overhead[protocol])
+            for first, last, protocol in zip(frames.start, frames.end, frames.protocol.tolist(), strict=True)
+        )
+        assert inside + piece.skipped_bytes == len(broken)
+        seen += len(observations)
+    assert seen > 100
+
+
+def test_protocols_in_one_stream(recordings: Path) -> None:
+    """UBX, RTCM 3 and NMEA one after the other, with text between, each found whole."""
+    ubx = gzip.decompress((recordings / "live" / TWO_BANDS).read_bytes())[:30_000]
+    rtcm = gzip.decompress((recordings / "live" / RTCM).read_bytes())[:30_000]
+    nmea = b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76\r\n"
+    alone = [find_frames(np.frombuffer(part, np.uint8)) for part in (ubx, rtcm, nmea)]
+    mixed = find_frames(np.frombuffer(ubx + b"\xff\xfe caf\xe9 " + nmea + rtcm + nmea, np.uint8))
+    expected = len(alone[0]) + len(alone[1]) + 2 * len(alone[2])
+    assert len(mixed) == expected
+    assert len(alone[2]) == 1
+    assert np.count_nonzero(mixed.protocol == "nmea") == 2
+
+
+def test_crc24q_by_hand() -> None:
+    """The message of RTCM 10403.3, 4.2 (1005 of station 2003), with its parity 36 98 DE -> 0x360998."""
+    message = bytes.fromhex("D300133ED7D30202980EDEEF34B4BD62AC0941986F33360B98")
+    data = np.frombuffer(message, np.uint8)
+    assert crc24q(data, np.array([0]), np.array([len(data) - 3])).tolist() == [0x360B98]
+    assert find_frames(data).kind.tolist() == [1005]
+
+
+def test_a_restarted_receiver_and_repeated_messages(recordings: Path) -> None:
+    """The log twice over: the second time nothing is new, and that is counted."""
+    data = gzip.decompress((recordings / "live" / TWO_BANDS).read_bytes())
+    whole, _ = in_fragments(data, [])
+    twice, _ = in_fragments(data + data, [])
+    assert np.array_equal(whole.time, twice.time)
+    assert twice.passed_over["epochs not after the one before"] == len(whole)
+
+
+def pieces_of(path: Path, epochs: int) -> Iterator[Observations]:
+    return railfix.scan_observations(path, epochs=epochs)
+
+
+def test_pieces_are_the_whole(ubx: Path) -> None:
+    whole = railfix.read_observations(ubx)
+    pieces = concatenate(list(pieces_of(ubx, 100)))
+    assert channels(whole) == channels(pieces)
+    for name in NUMBERS:
+        assert np.array_equal(getattr(whole, name), getattr(pieces, name), equal_nan=True)
+    some = railfix.read_observations(ubx, systems="G", start=whole.time[10], end=whole.time[20])
+    assert len(some) == 10
+    assert set(some.system.tolist()) == {"G"}
+
+
+def test_messages_of_what_cannot_be_read(recordings: Path, tmp_path: Path) -> None:
+    live = recordings / "live"
+    with pytest.raises(InputFileError, match="holds no observations"):
+        railfix.read_observations(live / RTCM)
+    with pytest.raises(InputFileError, match="holds no whole ephemeris"):
+        railfix.read_navigation(live / TWO_BANDS)
+    noise = tmp_path / "noise.ubx"
+    noise.write_bytes(np.random.default_rng(1).integers(0, 256, 5000).astype(np.uint8).tobytes())
+    with pytest.raises(InputFileError, match="is binary"):
+        railfix.read_observations(noise)
+    text = next((recordings / "kinematic").glob("japan*/SEPT265G.21O"))
+    with pytest.raises(MismatchError, match="one kind"):
+        railfix.read_observations([live / TWO_BANDS, text])

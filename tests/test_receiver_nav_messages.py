@@ -1,0 +1,218 @@
+"""Navigation messages bit by bit: random contents, decoded here and by RTKLIB (pyrtklib5)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from railfix.io.receiver import nav_messages
+from railfix.io.receiver.bits import fields, sign_magnitude, signed, unsigned
+
+pytestmark = pytest.mark.requirement("A8")
+
+#: Attributes of RTKLIB's ephemeris by the names of the fields here.
+EPHEMERIS = {
+    "af0_s": "f0",
+    "af1": "f1",
+    "af2": "f2",
+    "eccentricity": "e",
+    "m0": "M0",
+    "delta_n": "deln",
+    "omega0": "OMG0",
+    "i0": "i0",
+    "omega": "omg",
+    "omega_dot": "OMGd",
+    "i_dot": "idot",
+    "cuc": "cuc",
+    "cus": "cus",
+    "crc": "crc",
+    "crs": "crs",
+    "cic": "cic",
+    "cis": "cis",
+    "toe_sow_s": "toes",
+    "health": "svh",
+}
+
+
+def rtklib() -> Any:
+    return pytest.importorskip("pyrtklib5", reason="the independent decoder is not installed")
+
+
+def octets(rtk: Any, values: np.ndarray) -> Any:
+    array = getattr(rtk, "Arr1Dunsigned char")(len(values))
+    for k, value in enumerate(values.tolist()):
+        array[k] = value
+    return array
+
+
+def put(bits: np.ndarray, first: int, length: int, value: int) -> None:
+    bits[first : first + length] = [value >> (length - 1 - k) & 1 for k in range(length)]
+
+
+def random_bits(seed: int, length: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 2, length).astype(np.uint8)
+
+
+def compare(values: dict[str, np.ndarray], ephemeris: Any, names: dict[str, str] = EPHEMERIS) -> None:
+    checked = 0
+    for name, theirs in names.items():
+        if name in values:
+            expected = float(getattr(ephemeris, theirs))
+            assert float(values[name][0]) == pytest.approx(expected, rel=1e-14, abs=0.0), name
+            checked += 1
+    assert checked > 10 or names is not EPHEMERIS
+
+
+def test_integers_by_hand() -> None:
+    """0b1011 is 11, as two's complement -5, as sign and magnitude -3."""
+    bits = np.array([[0, 1, 0, 1, 1, 0]], dtype=np.uint8)
+    assert unsigned(bits, 1, 4).tolist() == [11]
+    assert signed(bits, 1, 4).tolist() == [-5]
+    assert sign_magnitude(bits, 1, 4).tolist() == [-3]
+    assert fields(bits, {"x": (((1, 1), (3, 2)), 3, 0.5, "u")})["x"].tolist() == [3.5]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_gps_lnav(seed: int) -> None:
+    rtk = rtklib()
+    bits = random_bits(seed, 5 * 240)
+    for k in range(5):
+        put(bits, 240 * k, 8, 0x8B)
+        put(bits, 240 * k + 43, 3, k + 1)
+    for k in (3, 4):
+        put(bits, 240 * k + 48, 2, 0)  # no almanac, which RTKLIB would write into an array of all satellites
+    put(bits, 240 + 48, 8, 77)
+    put(bits, 480 + 216, 8, 77)
+    put(bits, 168, 8, 77)
+    ephemeris = rtk.eph_t()
+    almanac, ion, utc = rtk.alm_t(), rtk.Arr1Ddouble(8), rtk.Arr1Ddouble(9)
+    rtk.decode_frame(octets(rtk, np.packbits(bits)), rtk.SYS_GPS, ephemeris, almanac, ion, utc)
+    values: dict[str, np.ndarray] = {}
+    for k in (1, 2, 3):
+        values |= nav_messages.lnav_fields(bits[240 * (k - 1) : 240 * k][None], k)
+    compare(values, ephemeris)
+    assert values["sqrt_a"][0] ** 2 == pytest.approx(ephemeris.A, rel=1e-14)
+    assert (values["iodc"][0], values["iode"][0]) == (ephemeris.iodc, ephemeris.iode)
+    assert values["group_delay_1_s"][0] == pytest.approx(ephemeris.tgd[0] if bits[160:168].any() else 0.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_galileo_inav(seed: int) -> None:
+    rtk = rtklib()
+    words = random_bits(seed, 7 * 128).reshape(7, 128)
+    for kind in range(7):
+        put(words[kind], 0, 6, kind)
+    for kind in (1, 2, 3, 4):
+        put(words[kind], 6, 10, 333)
+    put(words[4], 16, 6, 12)
+    put(words[0], 6, 2, 2)
+    put(words[0], 96, 12, 1200)
+    put(words[5], 73, 12, 1200)
+    put(words[0], 108, 20, 1000)
+    put(words[5], 85, 20, 1000)
+    ephemeris = rtk.eph_t()
+    rtk.decode_gal_inav(octets(rtk, np.packbits(words.reshape(-1))), ephemeris, rtk.Arr1Ddouble(8), rtk.Arr1Ddouble(8))
+    values: dict[str, np.ndarray] = {}
+    for kind in range(1, 6):
+        values |= fields(words[kind][None], nav_messages.INAV[kind])
+    compare(values, ephemeris, {k: v for k, v in EPHEMERIS.items() if k != "health"})
+    assert values["group_delay_1_s"][0] == pytest.approx(ephemeris.tgd[0], rel=1e-14)
+    assert values["group_delay_2_s"][0] == pytest.approx(ephemeris.tgd[1], rel=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_beidou_d1(seed: int) -> None:
+    rtk = rtklib()
+    bits = random_bits(seed, 3 * 304).reshape(3, 304)[:, :300]
+    for k in range(3):
+        put(bits[k], 15, 3, k + 1)
+        sow = 1000 + 6 * k
+        put(bits[k], 18, 8, sow >> 12)
+        put(bits[k], 30, 12, sow & 0xFFF)
+    values: dict[str, np.ndarray] = {}
+    for k in range(3):
+        values |= fields(bits[k][None], nav_messages.D1[k + 1])
+    toe = (int(values["toe_high"][0]) << 15 | int(values["toe_low"][0])) * 8
+    for first, length, shift in ((73, 9, 8), (90, 8, 0)):  # RTKLIB asks that toc and toe are equal
+        put(bits[0], first, length, toe // 8 >> shift & (1 << length) - 1)
+    padded = np.zeros((3, 304), np.uint8)
+    padded[:, :300] = bits
+    ephemeris = rtk.eph_t()
+    buffer = np.packbits(padded, axis=1)
+    whole = np.zeros(38 * 5, np.uint8)
+    whole[: 38 * 3] = buffer.reshape(-1)
+    rtk.decode_bds_d1(octets(rtk, whole), ephemeris, rtk.Arr1Ddouble(8), rtk.Arr1Ddouble(8))
+    values["toe_sow_s"] = np.array([toe])
+    compare(values, ephemeris)
+    assert values["group_delay_2_s"][0] == pytest.approx(ephemeris.tgd[1], rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_beidou_d2(seed: int) -> None:
+    rtk = rtklib()
+    bits = random_bits(seed, 10 * 300).reshape(10, 300)
+    for k in range(10):
+        put(bits[k], 15, 3, 1)
+        put(bits[k], 42, 4, k + 1)
+        sow = 1000 + 3 * k
+        put(bits[k], 18, 8, sow >> 12)
+        put(bits[k], 30, 12, sow & 0xFFF)
+    put(bits[4], 124, 1, 0)  # RTKLIB reads the first piece of the eccentricity as signed; no orbit has 0.5
+    values = fields(bits.reshape(1, -1), nav_messages.D2)
+    toe = int(values["toe_sow_s"][0])
+    for first, length, shift in ((77, 5, 12), (90, 12, 0)):
+        put(bits[0], first, length, toe // 8 >> shift & (1 << length) - 1)
+    padded = np.zeros((10, 304), np.uint8)
+    padded[:, :300] = bits
+    ephemeris = rtk.eph_t()
+    rtk.decode_bds_d2(octets(rtk, np.packbits(padded, axis=1).reshape(-1)), ephemeris, rtk.Arr1Ddouble(8))
+    compare(fields(bits.reshape(1, -1), nav_messages.D2), ephemeris)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_glonass_hamming(seed: int) -> None:
+    """One of the 256 codes passes here, RTKLIB accepts it too; no string with one bit flipped passes."""
+    rtk = rtklib()
+    strings = np.repeat(random_bits(seed, 88)[None], 256, axis=0)
+    strings[:, 85:] = 0
+    for code in range(256):
+        put(strings[code], 77, 8, code)
+    valid = np.flatnonzero(nav_messages.glonass_hamming(strings[:, :85]))
+    assert len(valid) == 1
+    good = strings[valid[0]]
+    assert rtk.test_glostr(octets(rtk, np.packbits(good)))
+    flipped = good[None, :85] ^ np.eye(85, dtype=np.uint8)
+    assert not nav_messages.glonass_hamming(flipped).any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_glonass_strings(seed: int) -> None:
+    rtk = rtklib()
+    bits = random_bits(seed, 5 * 80).reshape(5, 80)
+    for k in range(5):
+        put(bits[k], 1, 4, k + 1)
+    put(bits[0], 9, 5, 10)
+    put(bits[0], 14, 6, 30)
+    put(bits[1], 9, 7, 20)
+    put(bits[3], 70, 5, 7)
+    ephemeris = rtk.geph_t()
+    ephemeris.tof = rtk.epoch2time(array(rtk, [2024, 3, 5, 3, 0, 0]))
+    assert rtk.decode_glostr(octets(rtk, np.packbits(bits, axis=1).reshape(-1)), ephemeris, rtk.Arr1Ddouble(8))
+    values: dict[str, np.ndarray] = {}
+    for k in range(4):
+        values |= fields(bits[k][None], nav_messages.GLONASS[k + 1])
+    for axis, letter in enumerate("xyz"):
+        assert values[letter][0] * 1e3 == pytest.approx(ephemeris.pos[axis], rel=1e-12)
+        assert values[f"{letter}_velocity"][0] * 1e3 == pytest.approx(ephemeris.vel[axis], rel=1e-12)
+        assert values[f"{letter}_acceleration"][0] * 1e3 == pytest.approx(ephemeris.acc[axis], rel=1e-12)
+    assert values["relative_frequency"][0] == pytest.approx(ephemeris.gamn, rel=1e-12)
+    assert values["tau_s"][0] == pytest.approx(ephemeris.taun, rel=1e-12)
+
+
+def array(rtk: Any, values: list[float]) -> Any:
+    values_of = rtk.Arr1Ddouble(len(values))
+    for k, value in enumerate(values):
+        values_of[k] = value
+    return values_of
