@@ -23,6 +23,7 @@ class _Program(LazyCommands):
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
         "evaluate": "Compute errors of runs against references.",
         "reference": "Build a reference trajectory from fixed positions, gaps bridged.",
+        "convert": "Write receiver logs as RINEX files.",
         "cn0-curve": "Fit the mean C/N0 over elevation of an antenna and receiver.",
         "error-model": "Model the pseudorange errors of a line from runs with references.",
         "plot-screens": "Plot each screen's metric against its limit.",

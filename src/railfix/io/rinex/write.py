@@ -1,4 +1,4 @@
-"""Writers of RINEX 3.04 observation and navigation files.
+"""Writers of RINEX 3.04 and 4.02 observation and navigation files.
 
 Text is put together as bytes of whole blocks of epochs, never value by value, so that an hour at
 10 Hz takes seconds, and a log of any length is written piece by piece in bounded memory.
@@ -24,7 +24,7 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.header_text import header_line, program_line
 from railfix.io.rinex.packing import Packing, open_target
-from railfix.io.rinex.write_navigation import write_navigation
+from railfix.io.rinex.write_navigation import RinexVersion, write_navigation
 
 __all__ = ["write_navigation", "write_observations"]
 
@@ -46,13 +46,14 @@ def write_observations(
     path: str | PathLike[str],
     *,
     packing: Packing | None = None,
+    version: RinexVersion = "3.04",
     observables: Mapping[str, Sequence[str]] | None = None,
     header: ObservationHeader | None = None,
     comments: Sequence[str] = (),
     run_by: str = "",
     created: np.datetime64 | None = None,
 ) -> None:
-    """Write a RINEX 3.04 observation file; it appears whole or not at all.
+    """Write a RINEX observation file; it appears whole or not at all.
 
     Parameters
     ----------
@@ -62,6 +63,7 @@ def write_observations(
     path : path-like
     packing : {"plain", "gz", "crx", "crx.gz"}, optional
         Without it the name tells: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
+    version : {"3.04", "4.02"}
     observables : mapping of str to sequence of str, optional
         Columns of each constellation (``{"G": ["C1C", "L1C"]}``). Without it C, L, D and S of
         every signal among the channels of the first piece.
@@ -87,7 +89,7 @@ def write_observations(
     header = header or first.header
     columns = _columns(first, observables)
     with open_target(path, packing=packing) as target:
-        target.write(_observation_header(first, header, columns, program_line(run_by, created), comments))
+        target.write(_observation_header(first, header, columns, version, program_line(run_by, created), comments))
         for piece in chain([first], pieces):
             for block in _text_blocks(piece, columns):
                 target.write(block)
@@ -120,6 +122,7 @@ def _observation_header(
     first: Observations,
     header: ObservationHeader,
     columns: Mapping[str, Sequence[str]],
+    version: RinexVersion,
     stamp: str,
     comments: Sequence[str],
 ) -> bytes:
@@ -129,7 +132,7 @@ def _observation_header(
     year, month, day, hour, minute, ticks = _calendar(first.time[0])
     date = f"{year:6d}{month:6d}{day:6d}{hour:6d}{minute:6d}{ticks // 10_000_000:5d}.{ticks % 10_000_000:07d}"
     lines = [
-        header_line(f"{'3.04':>9}{'':11}{'OBSERVATION DATA':<20}{letter:<20}", "RINEX VERSION / TYPE"),
+        header_line(f"{version:>9}{'':11}{'OBSERVATION DATA':<20}{letter:<20}", "RINEX VERSION / TYPE"),
         stamp,
         *(header_line(comment, "COMMENT") for comment in comments),
         header_line(header.marker, "MARKER NAME"),

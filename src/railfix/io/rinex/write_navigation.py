@@ -1,10 +1,10 @@
-"""Writer of RINEX 3.04 navigation files (RINEX 3.04, tables A5 to A15)."""
+"""Writer of RINEX navigation files (RINEX 3.04, tables A5 to A15; RINEX 4.02, tables A9 to A34)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from os import PathLike
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,10 @@ UNKNOWN_TRANSMISSION_S: Final = 0.9999e9
 #: Name of a constellation's Klobuchar coefficients.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}
 _BLANK: Final = " " * 19
+#: Versions that can be written.
+RinexVersion = Literal["3.04", "4.02"]
+#: Last line of a GLONASS record of version 4: flags, group delay and accuracy, which are not known here.
+_GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
 
 
 def write_navigation(
@@ -28,11 +32,12 @@ def write_navigation(
     path: str | PathLike[str],
     *,
     packing: Packing | None = None,
+    version: RinexVersion = "3.04",
     comments: Sequence[str] = (),
     run_by: str = "",
     created: np.datetime64 | None = None,
 ) -> None:
-    """Write a RINEX 3.04 navigation file; it appears whole or not at all.
+    """Write a RINEX navigation file; it appears whole or not at all.
 
     Records stand in order of clock time, then satellite. What `Navigation` does not hold (L2 code
     and P flags, the GLONASS status words) is written as 0; NaN as blank; an unknown transmission
@@ -44,6 +49,8 @@ def write_navigation(
     path : path-like
     packing : {"plain", "gz"}, optional
         Without it the name tells (``.gz``).
+    version : {"3.04", "4.02"}
+        Version 4 names the message of each record, and has the ionosphere as records.
     comments : sequence of str
         Each at most 60 characters.
     run_by : str
@@ -63,11 +70,11 @@ def write_navigation(
     letters = sorted({str(s)[0] for s in (*kepler.satellite, *glonass.satellite)})
     kind = letters[0] if len(letters) == 1 else "M"
     head = [
-        header_line(f"{'3.04':>9}{'':11}{'N: GNSS NAV DATA':<20}{kind:<20}", "RINEX VERSION / TYPE"),
+        header_line(f"{version:>9}{'':11}{'N: GNSS NAV DATA':<20}{kind:<20}", "RINEX VERSION / TYPE"),
         program_line(run_by, created),
         *(header_line(comment, "COMMENT") for comment in comments),
     ]
-    for letter, values in sorted(navigation.klobuchar.items()):
+    for letter, values in sorted(navigation.klobuchar.items()) if version == "3.04" else ():
         for part, half in (("A", values[:4]), ("B", values[4:])):
             text = f"{_IONOSPHERE[letter]}{part} " + "".join(f"{v:12.4E}" for v in half)
             head.append(header_line(text, "IONOSPHERIC CORR"))
@@ -75,12 +82,33 @@ def write_navigation(
         head.append(header_line(f"{navigation.leap_seconds:6d}", "LEAP SECONDS"))
     head.append(header_line("", "END OF HEADER"))
     body = np.concatenate([_kepler_text(kepler), _glonass_text(glonass)])
+    if version != "3.04":
+        titles = [f"> EPH {s} {m}\n" for s, m in zip(kepler.satellite.tolist(), kepler.message.tolist(), strict=True)]
+        titles += [f"> EPH {s} FDMA\n" for s in glonass.satellite.tolist()]
+        ends = np.where(np.arange(len(body)) < len(kepler), "", _GLONASS_STATUS)
+        body = np.char.add(np.char.add(np.array(titles, dtype=np.str_), body), ends) if len(body) else body
     order = np.lexsort(
         (np.concatenate([kepler.satellite, glonass.satellite]), np.concatenate([kepler.toc, glonass.toe]))
     )
     with open_target(path, packing=packing) as target:
         target.write("".join(head).encode("ascii"))
+        if version != "3.04":
+            target.write(_ionosphere_records(navigation).encode("ascii"))
         target.write("".join(body[order].tolist()).encode("ascii"))
+
+
+def _ionosphere_records(navigation: Navigation) -> str:
+    """Klobuchar coefficients as records of version 4 (RINEX 4.02, table A34), dated with the first clock time."""
+    if not len(navigation.kepler):
+        return ""
+    first = str(_calendar_text(navigation.kepler.toc[:1].min())).strip()
+    text = ""
+    for letter, values in sorted(navigation.klobuchar.items()):
+        numbers = [f"{value:19.12E}" for value in values.tolist()]
+        message = "D1D2" if letter == "C" else "LNAV"
+        text += f"> ION {letter}01 {message}\n    {first}{''.join(numbers[:3])}\n"
+        text += f"    {''.join(numbers[3:7])}\n    {numbers[7]}{0.0:19.12E}\n"
+    return text
 
 
 def _field(values: Floats) -> Strings:
