@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import sys
 from collections import Counter
@@ -22,6 +23,8 @@ from railfix.core.errors import InputFileError, OutputError, RailfixError
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
 #: A signal ends the program with this exit code plus its number, as in a shell.
 SIGNALLED: Final = 128
+#: What `pathlib` reports of a link that leads to itself.
+_LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
 #: What the system reports of a standard output that cannot take any more.
 _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
@@ -74,10 +77,11 @@ class Commands(TyperGroup):
                 raise
             _discard_output()
             _end(OutputError(f"the standard output cannot be written ({error.strerror}); free space, or redirect it"))
-        except RecursionError as error:
-            if "pydantic" in repr(error):
+        except RuntimeError as error:
+            loop = _LOOP.match(str(error))
+            if loop is None:
                 raise
-            _end(InputFileError("an input file", "is nested too deeply to be read; simplify it"))
+            _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; link to the file"))
 
 
 class LazyCommands(Commands):

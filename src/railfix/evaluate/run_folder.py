@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.pipeline.protection_levels import KINDS
-from railfix.run.folder import RunRecord, read_record
+from railfix.run.folder import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
@@ -224,7 +224,7 @@ def _read_table(path: Path, name: str, needed: Sequence[str]) -> tuple[Path, pl.
 def _table(file: Path) -> pl.DataFrame:
     try:
         if file.suffix == ".parquet":
-            table = pl.read_parquet(file)
+            table = read_parquet(file)
         else:
             table = pl.read_csv(file, schema_overrides={"time_gpst": pl.Datetime("ns")}, infer_schema_length=None)
     except (PolarsError, OSError) as error:

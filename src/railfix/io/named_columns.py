@@ -120,7 +120,10 @@ def parse_named_columns(text: str, path: FilePath) -> NamedColumns:
                 key, value = pair
                 metadata[key] = f"{metadata[key]}; {value}" if key in metadata else value
             continue
-        cells = [cell.strip() for cell in next(csv.reader([line]))]
+        try:
+            cells = [cell.strip() for cell in next(csv.reader([line]))]
+        except csv.Error as error:
+            raise InputFileError(path, f"is not a row of cells with commas between ({error})", line=number) from None
         if not header:
             header, header_line = cells, number
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -162,7 +163,7 @@ def positions_times(table: NamedColumns) -> Datetimes:
         if cell.endswith("Z") or "+" in cell:
             raise table.error(row, f"time_gpst '{cell}' carries a time zone; GPS time without one was expected")
     try:
-        return np.array([cell or "NaT" for cell in cells], dtype="datetime64[ns]")
+        return _times([cell or "NaT" for cell in cells])
     except ValueError:
         row = next(i for i, cell in enumerate(cells) if not _is_time(cell))
         raise table.error(row, f"time_gpst '{cells[row]}' is no ISO 8601 time such as 2021-09-22T06:30:00.2") from None
@@ -170,10 +171,20 @@ def positions_times(table: NamedColumns) -> Datetimes:
 
 def _is_time(cell: str) -> bool:
     try:
-        np.datetime64(cell or "NaT", "ns")
+        _times([cell or "NaT"])
     except ValueError:
         return False
     return True
+
+
+def _times(texts: list[str]) -> Datetimes:
+    """Parse ISO 8601 times; raise `ValueError` where one is not, or has a time zone."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        try:
+            return np.array(texts, dtype="datetime64[ns]")
+        except UserWarning as warning:
+            raise ValueError(str(warning)) from None
 
 
 # --- RTKLIB ------------------------------------------------------------------
@@ -246,7 +257,7 @@ def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple
     calendar = "/" in cells[0][0]
     try:
         if calendar:
-            time = np.array([f"{d.replace('/', '-')}T{t}" for d, t in cells], dtype="datetime64[ns]")
+            time = _times([f"{d.replace('/', '-')}T{t}" for d, t in cells])
         else:
             time = from_week([int(w) for w, _ in cells], [float(s) for _, s in cells])
     except ValueError:
@@ -254,7 +265,7 @@ def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple
         for line, (first, second) in zip(number, cells, strict=True):
             try:
                 if calendar:
-                    np.datetime64(f"{first.replace('/', '-')}T{second}", "ns")
+                    _times([f"{first.replace('/', '-')}T{second}"])
                 else:
                     int(first), float(second)
             except ValueError:

@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats
+from railfix.core.errors import InputFileError
 from railfix.evaluate import EvaluationOptions
 from railfix.evaluate.integrity import LEVELS_OF, epochs_diagram
 from railfix.report.plots.chart import Chart, SkyEpochs
@@ -127,7 +128,12 @@ def run_group(run: ReportedRun) -> Group:
     start = start_of(run.folder.positions)
     if not all(chunks.get(name) for name in ("first_epoch_gpst", "epochs", "positioning_s")):
         return Group(title="Processing time", charts=(), start=start, absent=(NO_TIMES,))
-    return Group(title="Processing time", charts=(processing_time(chunks),), start=start)
+    try:
+        chart = processing_time(chunks)
+    except (ValueError, TypeError) as error:
+        path = run.folder.path / "run.json"
+        raise InputFileError(path, f"has chunks that are not times and numbers ({error}); repeat the run") from None
+    return Group(title="Processing time", charts=(chart,), start=start)
 
 
 def _kept(*charts: Chart) -> tuple[Chart, ...]:

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-from polars.exceptions import PolarsError
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.evaluate import Evaluation, RunAndReference, evaluate_runs
 from railfix.evaluate.run_folder import RunFolder, read_run
-from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
+from railfix.run.folder import read_parquet
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,10 +112,7 @@ def read_runs(
 
 
 def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None) -> ReportedRun:
-    source = folder.path / "run.json"
-    if not isinstance(folder.record.get("settings_used"), Mapping):
-        raise InputFileError(source, "has no settings_used; it is not what this railfix writes, repeat the run")
-    config = parse_config(dict(folder.record["settings_used"]), source=str(source))
+    config = folder.config
     curve, notes = _curve(folder, config)
     errors, reference = None, ""
     if evaluation is not None:
@@ -138,11 +135,7 @@ def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None) -> Re
 def _observations(path: Path) -> pl.DataFrame | None:
     if not path.is_file():
         return None
-    try:
-        table = pl.read_parquet(path)
-    except (PolarsError, OSError) as error:
-        told = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(path, f"cannot be read as a table ({told}); run railfix run again") from error
+    table = read_parquet(path)
     needed = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
     if lacking := sorted(needed - set(table.columns)):
         raise InputFileError(path, f"has no column {lacking[0]}; run again with this railfix")

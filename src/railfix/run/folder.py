@@ -8,6 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import polars as pl
+from polars.exceptions import PanicException, PolarsError
+
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import file_sha256, read_json_object
 from railfix.core.settings import Model, validated
@@ -146,3 +149,18 @@ def read_record(folder: Path) -> RunRecord:
     if not path.is_file():
         raise InputFileError(path, "there is no such file; railfix run writes it beside the positions")
     return RunRecord(path=folder, record=read_json_object(path, what="the record of a run"))
+
+
+def read_parquet(path: Path) -> pl.DataFrame:
+    """Read a table that a run wrote.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be read as Parquet.
+    """
+    try:
+        return pl.read_parquet(path)
+    except (PolarsError, PanicException, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputFileError(path, f"cannot be read as a table ({reason}); run railfix run again") from None

@@ -165,6 +165,8 @@ def load_recipe(name: str | PathLike[str]) -> Recipe:
     base: Mapping[str, Any] = {}
     if "base" in table:
         beside = path.parent / str(table["base"])
+        if beside.is_file() and beside.samefile(path):
+            raise SettingsError(f"{path}: is based on itself; name a single run as base")
         below = load_recipe(beside if beside.is_file() else str(table["base"]))
         if len(below.names) > 1 or below.names[0]:
             raise SettingsError(f"{path}: base {table['base']!r} is a recipe itself; name a single run")

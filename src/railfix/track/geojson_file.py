@@ -176,6 +176,8 @@ def read_geojson_segments(
         document = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputFileError(path, f"this is not JSON ({error.msg})", line=error.lineno) from None
+    except RecursionError:
+        raise InputFileError(path, "this JSON is nested too deeply for a GeoJSON object") from None
     if not isinstance(document, dict):
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
     named = _crs_member(str(path), document)

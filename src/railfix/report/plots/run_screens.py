@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import polars as pl
-from polars.exceptions import PolarsError
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Masks
-from railfix.core.errors import InputFileError, OutputError, SettingsError
+from railfix.core.errors import InputFileError, OutputError
 from railfix.core.reasons import Reason
-from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.config import Config
 from railfix.report.plots.screens import ScreenPicture, draw_screen
+from railfix.run.folder import read_parquet, read_record
 
 _NEEDED: Final = ("run.json", "positions.parquet", "observations.parquet")
 
@@ -130,14 +129,8 @@ def _read(run: Path) -> tuple[Config, pl.DataFrame, pl.DataFrame]:
         if not (run / name).is_file():
             hint = "; run again with --observations" if name == "observations.parquet" else ""
             raise InputFileError(run / name, f"there is no such file; expected the folder of a railfix run{hint}")
-    try:
-        record: dict[str, Any] = json.loads((run / "run.json").read_text(encoding="utf-8"))
-        config = parse_config(record["settings_used"], source=str(run / "run.json"))
-        positions, observations = (pl.read_parquet(run / name) for name in _NEEDED[1:])
-    except (ValueError, KeyError, TypeError, OSError, SettingsError, PolarsError) as error:
-        raise InputFileError(
-            run, f"is not what this railfix writes ({' '.join(str(error).split())}); run again"
-        ) from None
+    config = read_record(run).config
+    positions, observations = (read_parquet(run / name) for name in _NEEDED[1:])
     lacking = {"raim_statistic", "metric_antenna_spacing_m"} - set(positions.columns)
     lacking |= {"metric_doppler_m", "limit_doppler_m", "metric_antenna_pair_m"} - set(observations.columns)
     if lacking:

@@ -1,0 +1,70 @@
+"""Every kind of input file with every fault: one sentence, the documented exit code, nothing destroyed."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from bad_inputs import CASES, COMMANDS, FAULTS, Desk, desk_in
+from railfix.cli import app
+
+pytestmark = pytest.mark.requirement("D3")
+
+#: Faults that leave nothing to be read.
+UNREADABLE = ("missing", "folder", "dangling_link", "link_to_itself", "empty", "zeros", "gzip_cut", "zip_archive")
+#: An empty TOML file is one without settings; without Parquet the CSV file of the positions is read.
+HARMLESS = {(kind, "empty") for kind in COMMANDS if kind.endswith(".toml")} | {
+    ("results/positions.parquet", fault) for fault in ("missing", "folder", "dangling_link", "link_to_itself")
+}
+
+RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Desk:
+    return desk_in(tmp_path_factory.mktemp("desk"))
+
+
+@pytest.fixture
+def desk(good: Desk, tmp_path: Path) -> Desk:
+    """A copy of the good inputs; files are linked, a fault replaces the link."""
+    shutil.copytree(good.folder, tmp_path / "desk", copy_function=lambda a, b: Path(b).hardlink_to(a))
+    return Desk(folder=tmp_path / "desk")
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Digest of every file below a folder."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+@pytest.mark.parametrize("kind", COMMANDS)
+def test_the_good_inputs_are_good(desk: Desk, kind: str) -> None:
+    result = RUNNER.invoke(app, desk.words(COMMANDS[kind]))
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize(("kind", "fault"), CASES, ids=lambda name: name.replace("/", "-"))
+def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -> None:
+    FAULTS[fault](desk.folder / kind)
+    before = contents(desk.folder)
+    result = RUNNER.invoke(app, desk.words(COMMANDS[kind]))
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert result.exit_code in (0, 3, 4, 5, 6, 7), result.output
+    after = contents(desk.folder)
+    new = {name for name in after if name not in before}
+    assert {name: after[name] for name in before} == before
+    if result.exit_code in (0, 6):
+        assert all(name.split("/")[0].startswith("out") for name in new)
+    else:
+        assert result.stderr.startswith("railfix: error: ")
+        assert result.stderr.count("\n") == 1
+        assert new == set()
+    if fault in UNREADABLE and (kind, fault) not in HARMLESS:
+        assert result.exit_code == 3, result.output
