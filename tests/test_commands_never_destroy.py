@@ -133,7 +133,8 @@ def test_a_run_into_the_folder_of_its_inputs_leaves_them(desk: Desk) -> None:
 def test_a_leftover_is_removed_and_a_living_run_is_not_disturbed(tmp_path: Path) -> None:
     with OutputFolder(tmp_path / "out") as folder:
         (folder.staged("a.txt")).write_text("a")
-        code = "import sys; from pathlib import Path; from railfix.run.output import OutputFolder as F; F(Path(sys.argv[1]))"
+        code = "import sys; from pathlib import Path; from railfix.run.output import OutputFolder as Folder\n"
+        code += "Folder(Path(sys.argv[1]))"
         command = [sys.executable, "-c", code, str(tmp_path / "out")]
         other = subprocess.run(command, capture_output=True, text=True, check=False)
         assert f"another railfix (process {os.getpid()}) is writing there" in other.stderr
