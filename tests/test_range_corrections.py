@@ -109,6 +109,17 @@ def test_sbas_sigma_by_hand_on_two_frequencies() -> None:
     assert (found.reason == 0).all()
 
 
+def test_the_troposphere_of_sbas_grows_with_its_mapping() -> None:
+    """2.4 m in the zenith of 36 N at 100 m, 1.001/sqrt(0.002001 + sin^2) of it at 30 degrees."""
+    l1 = np.array([FREQUENCY_L1])
+    zenith, low = (
+        sbas_delays(engine_of(1.0, 1.0, 1.0), fixes_of(1), TIME, one_satellite(angle, 1), l1).troposphere_m[0, 0]
+        for angle in (90.0, 30.0)
+    )
+    assert zenith == pytest.approx(2.4, abs=0.1)
+    assert low / zenith == pytest.approx(np.sqrt(1.002001 / 0.252001))
+
+
 def test_every_sbas_term_widens_sigma_and_rss_adds_squares() -> None:
     names = ("sigma_udre_m", "fast_growth_m", "rate_growth_m", "long_term_growth_m", "en_route_m")
     seen, l1 = one_satellite(45.0, 1), np.array([FREQUENCY_L1])
@@ -247,6 +258,40 @@ def uniform_model(sigma_m: float, bias_m: float) -> ErrorModel:
         **{name: np.full(bins.shape, value) for name, value in figures.items()},
     )
     return ErrorModel(bins=bins, before=statistics, after=statistics, covers="satellite_and_atmosphere")
+
+
+def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is_not() -> None:
+    observations = {"front": cases.clean_observations()["front"][:5]}
+    model = uniform_model(3.0, 0.0)
+    for covers, extra in (("local", 1.0), ("satellite_and_atmosphere", 0.0)):
+        processor = EpochProcessor(
+            parse_config({"error_model": "line.toml"}),
+            cases.clean_trajectories(),
+            navigation=cases.clean_navigation(),
+            error_model=replace(model, covers=cast("Any", covers)),
+        )
+        result = processor.process(observations)[0].antennas["front"]
+        used = result.reason == 0
+        nominal = NominalErrors().sigma_m(result.elevation_deg)
+        assert result.sigma_m[used] == pytest.approx(np.sqrt(9.0 + extra * nominal[used] ** 2))
+
+
+def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
+    """Code + satellite clock - group delay - Klobuchar - Saastamoinen, each from the place of the solution."""
+    observations, navigation = cases.clean_observations()["front"][:10], cases.clean_navigation()
+    result = cases.front_alone(observations, {"screens": [], "systems": ["G"]})
+    columns, used = result.columns, result.reason[:, result.columns] == 0
+    seen = SeenFrom.of(result.conventional_ecef_m, result.satellites.position_ecef_m)
+    frequency = np.full(len(columns), FREQUENCY_L1)
+    delays = modelled_delays(
+        result.time, seen, frequency, klobuchar=navigation.klobuchar["G"], troposphere="saastamoinen"
+    )
+    states = result.satellites
+    code = observations.code_m[:, columns] + states.clock_m - states.group_delay_m
+    expected = code - delays.ionosphere_m - delays.troposphere_m
+    assert (delays.troposphere_m[used] > 2.0).all()
+    assert (delays.ionosphere_m[used] > 1.0).all()
+    np.testing.assert_allclose(result.corrected_code_m[:, columns][used], expected[used], atol=0.02)
 
 
 def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:

@@ -1,8 +1,8 @@
 """Mean C/N0 over elevation of one antenna and receiver, from a day of open sky (P1 2.3(1), figure 3).
 
-The curve belongs to the pair of antenna and receiver: the antenna makes its shape, and receivers
-measure C/N0 each in its own way. It is fitted per constellation and signal; the satellites of BeiDou
-and QZSS stand in two kinds of orbits of different transmit power and are told apart.
+The curve belongs to the pair of antenna and receiver: the antenna pattern gives its shape, and each type of
+receiver estimates C/N0 differently. It is fitted per constellation and signal; satellites of BeiDou and QZSS
+fly in two kinds of orbits with different transmit power, which have curves of their own.
 
 Of each bin of elevation the mean is taken without outliers (beyond three robust standard deviations
 from the median). Between the middles of the bins the curve runs by monotone cubic interpolation
@@ -20,9 +20,11 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 from scipy.interpolate import PchipInterpolator
 
 from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
+from railfix.core.settings import Settings
 from railfix.gnss.observations import ObservationHeader
 
 #: Standard deviation of a normal variable against its median absolute deviation.
@@ -32,7 +34,7 @@ _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *ran
 #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 _QZSS_GEO: Final = frozenset({7, 8})
 
-#: Kinds of satellites of one transmit power, and what they are called.
+#: Kinds of satellites of one transmit power, and their names.
 KINDS: Final[dict[str, str]] = {
     "G": "GPS",
     "J": "QZSS",
@@ -56,9 +58,8 @@ def satellite_kind(satellite: str) -> str:
     return letter
 
 
-@dataclass(frozen=True, kw_only=True)
-class CurveFit:
-    """How a curve is fitted.
+class CurveFit(Settings):
+    """Settings of the fit of a curve.
 
     Attributes
     ----------
@@ -72,18 +73,10 @@ class CurveFit:
         Samples further from their bin's median, in robust standard deviations, are left out.
     """
 
-    bin_deg: float = 5.0
-    least_samples: int = 30
-    least_bins: int = 4
-    clip_sigma: float = 3.0
-
-    def __post_init__(self) -> None:
-        if not 0.1 <= self.bin_deg <= 30.0:
-            raise ValueError(f"bin_deg must lie in [0.1, 30], got {self.bin_deg}")
-        if self.least_samples < 1 or self.least_bins < 2:
-            raise ValueError("least_samples must be at least 1 and least_bins at least 2")
-        if not self.clip_sigma > 0.0:
-            raise ValueError(f"clip_sigma must be positive, got {self.clip_sigma}")
+    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)
+    least_samples: int = Field(default=30, ge=1)
+    least_bins: int = Field(default=4, ge=2)
+    clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,9 +125,8 @@ class Cn0Mean:
         return np.asarray(self._interpolated(inside), dtype=np.float64)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cn0CurveSource:
-    """What a curve was made from.
+class Cn0CurveSource(Settings):
+    """Log that a curve was made from.
 
     Attributes
     ----------
@@ -145,7 +137,7 @@ class Cn0CurveSource:
         First and last epoch used, ISO 8601, GPS time.
     epochs : int
     position_ecef_m : tuple of float
-        Where the antenna stood.
+        Position of the antenna.
     railfix_version : str
     """
 
@@ -203,7 +195,7 @@ class Cn0Curve:
         return result
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """What differs between the log the curve was made from and one it is applied to, a sentence each."""
+        """Differences of antenna and receiver between the log of the curve and another, one sentence each."""
         notes = []
         for what in ("antenna", "receiver"):
             ours, theirs = _plain(getattr(self.source, what)), _plain(getattr(header, what))
@@ -227,7 +219,7 @@ class Cn0Samples:
         self._parts: dict[tuple[str, str], list[NDArray[np.float32]]] = defaultdict(list)
 
     def add(self, cn0_dbhz: ArrayLike, elevation_deg: ArrayLike, satellite: Strings, signal: Strings) -> None:
-        """Take in arrays of shape (T, M); NaN in either is left out."""
+        """Add samples of shape (T, M); those with NaN in either are left out."""
         cn0, elevation = np.asarray(cn0_dbhz), np.asarray(elevation_deg)
         finite = np.isfinite(cn0) & np.isfinite(elevation) & (elevation >= 0.0)
         for m, (name, code) in enumerate(zip(satellite.tolist(), signal.tolist(), strict=True)):
@@ -264,7 +256,7 @@ def fit_cn0_curve(
     Returns
     -------
     Cn0Curve
-        One curve a kind and signal with bins enough; `Cn0Mean.count` tells the samples of each.
+        One curve a kind and signal with bins enough; `Cn0Mean.count` holds the samples of each bin.
 
     Raises
     ------
@@ -277,16 +269,16 @@ def fit_cn0_curve(
         for part in samples:
             collected.add(*part)
         samples = collected
-    means = [_fit_one(key, *samples.of(*key), fit) for key in samples.keys()]  # noqa: SIM118 (no mapping)
-    found = tuple(mean for mean in means if mean is not None)
-    if not found:
+    means = [_fit_mean(key, *samples.of(*key), fit) for key in samples.keys()]  # noqa: SIM118 (no mapping)
+    fitted = tuple(mean for mean in means if mean is not None)
+    if not fitted:
         raise ValueError(
             f"no constellation and signal has {fit.least_bins} bins of {fit.least_samples} samples over elevation"
         )
-    return Cn0Curve(means=found, source=source or Cn0CurveSource())
+    return Cn0Curve(means=fitted, source=source or Cn0CurveSource())
 
 
-def _fit_one(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
+def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
     """Curve of one kind and signal, None where there are too few bins."""
     which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
     bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
@@ -307,6 +299,6 @@ def _robust(values: Floats, clip_sigma: float) -> tuple[float, float]:
     """Mean without outliers, and robust standard deviation."""
     middle = float(np.median(values))
     spread = _NORMAL_MAD * float(np.median(np.abs(values - middle)))
-    # C/N0 is told in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
+    # C/N0 is reported in steps of up to 1 dB-Hz, so that the spread of a few samples may vanish
     kept = values[np.abs(values - middle) <= clip_sigma * max(spread, 0.5)]
     return float(kept.mean()), spread

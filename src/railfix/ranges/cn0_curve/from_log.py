@@ -23,19 +23,19 @@ from railfix.ranges.cn0_curve.curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0S
 
 #: P1 2.3(1) asks for about a day; below this a note is made [s].
 _SHORT_S: Final = 12 * 3600.0
-#: P1 table 6: signals this far below the mean are refused [dB-Hz].
+#: P1 table 6: signals this far below the mean are rejected [dB-Hz].
 _DEFICIT_DBHZ: Final = 10.0
-#: Elevation from which that is looked at [deg], and the share of the calibration itself that is worth a note.
-_LOOKED_AT_DEG, _REFUSED_SHARE = 15.0, 0.01
-#: A satellite further below the horizon than this cannot be seen from where the antenna is said to be [deg].
+#: Lowest elevation of that check [deg], and the share of rejected samples of the calibration that gives a note.
+_CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
+#: Elevation below which a satellite cannot be received: the position of the antenna is wrong [deg].
 _BELOW_DEG: Final = -5.0
-#: Share of satellites below the horizon that is put down to odd records.
+#: Share of satellites below the horizon that faulty navigation records may cause.
 _BELOW_SHARE: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cn0Calibration:
-    """A curve, and what it was made from.
+    """A curve with the samples it was fitted to.
 
     Attributes
     ----------
@@ -116,11 +116,11 @@ def cn0_curve_from_log(
             place = _position(header, position_ecef_m, observations[0])
         end, epochs = part.time[-1], epochs + len(part)
         elevation = satellite_elevation_deg(part, records, place)
-        low.look(elevation)
+        low.count(elevation)
         samples.add(part.cn0_dbhz, elevation, part.satellite, part.signal)
     if header is None:
         raise InputFileError(observations[0], "has no epochs")
-    low.judge(observations[0])
+    low.check(observations[0])
     if not samples.keys():
         raise InputFileError(observations[0], "has no C/N0 (S1C, S2I, ...); log it in the receiver's RINEX output")
     source = Cn0CurveSource(
@@ -142,24 +142,24 @@ def cn0_curve_from_log(
 
 
 class _Horizon:
-    """How many satellites stand where they cannot be seen."""
+    """Count of satellites below the horizon of the position."""
 
     def __init__(self) -> None:
         self.seen = 0
         self.below = 0
 
-    def look(self, elevation_deg: Floats) -> None:
+    def count(self, elevation_deg: Floats) -> None:
         self.seen += int(np.count_nonzero(np.isfinite(elevation_deg)))
         self.below += int(np.count_nonzero(elevation_deg < _BELOW_DEG))
 
-    def judge(self, path: Path) -> None:
+    def check(self, path: Path) -> None:
         if not self.seen:
             raise MismatchError(f"{path}: the navigation files have no orbit for any satellite and time of this log")
         if self.below > _BELOW_SHARE * self.seen:
             share = 100.0 * self.below / self.seen
             raise MismatchError(
                 f"{path}: {share:.0f} % of the satellites tracked stand below the horizon of the position; "
-                "give the place of the antenna, or the navigation files of this day"
+                "give the position of the antenna, or the navigation files of this day"
             )
 
 
@@ -180,10 +180,10 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
         notes.append(f"too few samples over elevation, no curve: {', '.join(without)}")
     for mean in curve.means:
         elevation, cn0 = samples.of(mean.kind, mean.signal)
-        high = elevation >= _LOOKED_AT_DEG
-        refused = np.count_nonzero(mean.at(elevation[high]) - cn0[high] > _DEFICIT_DBHZ)
-        if refused > _REFUSED_SHARE * np.count_nonzero(high):
-            share = 100.0 * refused / np.count_nonzero(high)
+        high = elevation >= _CHECKED_FROM_DEG
+        rejected = np.count_nonzero(mean.at(elevation[high]) - cn0[high] > _DEFICIT_DBHZ)
+        if rejected > _REJECTED_SHARE * np.count_nonzero(high):
+            share = 100.0 * rejected / np.count_nonzero(high)
             notes.append(
                 f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of this open sky lie "
                 f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; its satellites differ, or the sky is not open"
