@@ -169,7 +169,7 @@ BROKEN = {
     "text for epochs": (("epochs = 2880", 'epochs = "many"'), "epochs"),
     "no curve": (("[[curve]]", "[[curves]]"), "curves"),
     "other kind": (('kind = "G"', 'kind = "X"'), "kind: one of G, J"),
-    "signal": (('signal = "1C"', 'signal = "L1"\nband = 1'), "unknown entry curve.0.band"),
+    "signal": (('signal = "1C"', 'signal = "L1"\nband = 1'), "unknown entry curve.2.band; known are count"),
     "missing column": (("spread_db", "spread"), "spread_db"),
     "not rising": (("2.5,\n    7.5", "7.5,\n    7.5"), "rise"),
     "out of range": (("2.5,\n    7.5", "2.5,\n    97.5"), "97.5"),

@@ -107,6 +107,8 @@ def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[s
     for part in location:
         if get_origin(kind) is dict:
             kind = get_args(kind)[1]
+        elif get_origin(kind) in (tuple, list) and isinstance(part, int):
+            kind = get_args(kind)[0]
         elif isinstance(kind, type) and issubclass(kind, BaseModel) and part in kind.model_fields:
             kind = kind.model_fields[str(part)].annotation
         else:
