@@ -324,9 +324,9 @@ def setting_of_a_single_one_as_a_group(_: Bench) -> Options:
     return {"set": ["min_satellites=3", "min_satellites.front=4"]}
 
 
-@broken(SETTING, "off_map_m")
+@broken(SETTING, "off_map_risk")
 def setting_out_of_range(_: Bench) -> Options:
-    return {"set": "off_map_m=-5"}
+    return {"set": "off_map_risk=-5"}
 
 
 @broken(SETTING, "--start", "--end")

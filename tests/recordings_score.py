@@ -25,8 +25,9 @@ from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
-from railfix.positioning.noise_scale import noise_scale, own_sigma_m
+from railfix.positioning.noise_scale import NoiseState, own_sigma_m, robust_scale
 from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.robust_fit import map_information, robust_fit
 from railfix.positioning.section_search import SearchIndex, search
 from railfix.positioning.single_point import single_point
 from railfix.ranges.weights import code_sigma_m
@@ -173,7 +174,9 @@ def smartloc_ranges(folder: Path) -> SmartlocLog:
     )
 
 
-def smartloc_chain(ranges: Ranges, trajectory: Trajectory, start_ecef_m: np.ndarray, config: Config) -> np.ndarray:
+def smartloc_chain(
+    time: np.ndarray, ranges: Ranges, trajectory: Trajectory, start_ecef_m: np.ndarray, config: Config
+) -> np.ndarray:
     """The rooms in the order of the pipeline, on ranges that have no ephemerides; arcs, NaN where dropped."""
     index = SearchIndex(trajectory)
     middle = trajectory.ecef_m.mean(axis=0)
@@ -184,8 +187,10 @@ def smartloc_chain(ranges: Ranges, trajectory: Trajectory, start_ecef_m: np.ndar
         return constrained_position(part, trajectory, np.where(part.n_used >= config.min_satellites, vertex, -1))
 
     got = place(ranges)
-    redundancy = ranges.n_used - ranges.n_clocks - 1
-    scale, _ = noise_scale(redundancy, got.wsse, (0.0, 0.0), prior=config.noise_prior)
+    known = np.isfinite(got.arc_m)
+    at = np.where(known[:, None], trajectory.at_arc(np.where(known, got.arc_m, 0.0)), middle)
+    agreeing = robust_fit(ranges, at, information=map_information(trajectory, np.maximum(got.section, 0)))
+    scale, _ = robust_scale(time, agreeing, known, NoiseState(), limits=config.noise_scale)
     failed = np.zeros(len(ranges), dtype=bool)
     if "raim" in config.screens:
         model = constrained_model(ranges, trajectory, got.arc_m, section=got.section)
@@ -218,7 +223,7 @@ def smartloc(data: Path, config: Config = SETTINGS) -> Outcome:
     clocks = tuple(CLOCK_GROUP[str(log.satellite[group.start])[0]] for group in ranges.groups)
     ties, _ = tie_clocks(log.time, clocks, "G", ranges, point, OffsetState(), limits=config.clock_offsets)
     ranges = replace(ranges, ties=ties)
-    arc = smartloc_chain(ranges, trajectory, point.ecef_m, config)
+    arc = smartloc_chain(log.time, ranges, trajectory, point.ecef_m, config)
     reference = interpolate_reference(log.time, time, ecef)
     observed = np.isfinite(reference[:, 0]) & np.isfinite(log.code_m).any(axis=1)
     nearest, _ = trajectory.nearest(point.ecef_m)

@@ -55,7 +55,9 @@ def test_chunks_give_the_whole(size: int, epochs: int):
     for name in ANTENNAS:
         same(whole[name], pieces[name], atol=1e-9)
         assert state.antennas[name].offsets == state_of_pieces.antennas[name].offsets
-        assert state.antennas[name].log_variance_sum == state_of_pieces.antennas[name].log_variance_sum
+        assert np.array_equal(state.antennas[name].noise.robust, state_of_pieces.antennas[name].noise.robust)
+        assert np.array_equal(state.antennas[name].noise.remaining, state_of_pieces.antennas[name].noise.remaining)
+        assert np.array_equal(state.antennas[name].map_offset.sums, state_of_pieces.antennas[name].map_offset.sums)
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +153,9 @@ def test_receiver_clock_steps_change_nothing(told: str):
 
 @pytest.mark.requirement("A4")
 def test_error_over_its_own_sigma():
-    result, _ = processor().process(clean_observations())
+    """The run has noise alone: no satellite or atmospheric errors are to be stated."""
+    exact = {"nominal": {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}}
+    result, _ = processor(exact).process(clean_observations())
     for name, found in result.antennas.items():
         settled = np.arange(len(found)) > 100
         error = found.chainage_m - true_chainage(name)
@@ -170,11 +174,11 @@ def test_noise_scale_finds_the_receivers_noise():
     observations = clean_observations()["front"]
     found = front_alone(observations, settings_)
     assert found.noise_scale[0] == 1.0
-    assert found.noise_scale[-1] == pytest.approx(0.5, rel=0.03)
+    assert found.noise_scale[-1] == pytest.approx(0.5, rel=0.05)
     sigma = found.sigma_m * found.noise_scale[-1]
     extra = np.random.default_rng(1).normal(size=sigma.shape) * np.where(np.isfinite(sigma), sigma, 0.0) * np.sqrt(3.0)
     louder = front_alone(with_code(observations, extra), settings_)
-    assert louder.noise_scale[-1] == pytest.approx(1.0, rel=0.03)
+    assert louder.noise_scale[-1] == pytest.approx(1.0, rel=0.05)
 
 
 OFFSET_M = {"E": -4.0, "G": 0.0, "J": 0.0}

@@ -84,6 +84,9 @@ class Status(IntEnum):
     ANTENNAS_DISAGREE = 8
     #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9
+    #: A position, but the 3-D positions of the last minutes lie beside or above the line by more than noise,
+    #: satellites, atmosphere and the stated error of the map explain: the map is wrong here, or it is another track.
+    MAP_OFFSET = 10
 
     @property
     def text(self) -> str:
@@ -94,7 +97,7 @@ class Status(IntEnum):
 #: Statuses of positions that failed a check; `Config.failed_checks` keeps or drops their coordinates.
 CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN)
 #: Statuses that come with coordinates (those of `CHECK_FAILED` unless they are dropped).
-POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, *CHECK_FAILED)
+POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, *CHECK_FAILED)
 
 
 def reason_text(reason: int) -> str:

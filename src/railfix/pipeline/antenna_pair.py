@@ -105,7 +105,7 @@ def pair_antennas(
 def antenna_pair_screened(
     pair: AntennaPair, ranges: Mapping[str, CorrectedRanges], limits: AntennaPairLimits
 ) -> dict[str, CorrectedRanges]:
-    """Return the ranges of two antennas after the comparison of their codes; a misfit is rejected on both.
+    """Return the ranges of two antennas after the comparison of their codes: misfits weighted down or rejected on both.
 
     Parameters
     ----------
@@ -138,5 +138,9 @@ def antenna_pair_screened(
         metric = np.full(antenna.reason.shape, np.nan)
         metric[np.ix_(epochs, channels)] = verdict.metric
         reject = on_channels(verdict.reject, antenna.reason.shape, epochs, channels)
-        screened[name] = antenna.screened("antenna_pair", Screened(metric=metric, reject=reject), Reason.ANTENNA_PAIR)
+        result = Screened(metric=metric, reject=reject)
+        if limits.verdict == "reject":
+            screened[name] = antenna.screened("antenna_pair", result, Reason.ANTENNA_PAIR)
+        else:
+            screened[name] = antenna.suspected("antenna_pair", result, metric)
     return screened

@@ -79,6 +79,7 @@ def antenna_result(
         phase=solution.phase,
         raim=replace(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
         protection=None if protection is None else judged(protection, solution.status, has, config),
+        map_offset=solution.map_offset,
         clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m,
         clock_offset_sigma_m=solution.ties.sigma_m,

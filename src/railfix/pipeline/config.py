@@ -37,6 +37,9 @@ from railfix.integrity.raim import RaimLimits
 from railfix.positioning.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
+from railfix.positioning.map_offset import MapOffsetLimits
+from railfix.positioning.noise_scale import NoiseScaleLimits
+from railfix.positioning.robust_fit import RobustFitLimits
 from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
 from railfix.ranges.sbas import SbasLimits
@@ -70,6 +73,9 @@ ROOMS: Final = (
     "raim",
     "antenna_spacing",
     "clock_offsets",
+    "noise_scale",
+    "robust_fit",
+    "map_offset",
     "single_point",
     "section",
     "constrained",
@@ -92,8 +98,8 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
         "failed_checks": "drop",
         "elevation": {"mask_deg": 20.0},
         "cn0": {"floor_dbhz": 30.0, "deficit_dbhz": 10.0},
-        "doppler": {"mode": "fixed", "step_m": 1.5, "hold_s": 0.0},
-        "antenna_pair": {"limit_m": 5.0},
+        "doppler": {"mode": "fixed", "step_m": 1.5, "hold_s": 0.0, "verdict": "reject"},
+        "antenna_pair": {"limit_m": 5.0, "verdict": "reject"},
         "raim": {"mode": "fixed", "fixed_limit_m2": 100.0, "max_excluded": 2},
         "antenna_spacing": {"limit_m": 5.0},
     },
@@ -130,18 +136,21 @@ class Config(Settings):
         Satellites asked for (P1 3.2: 3; 2 is possible and doubtful on curves).
     dilution_limit : float
         Largest along-track dilution [m/m] that still counts as a position.
-    off_map_m, off_map_risk : float
-        A position is called off the map when the 3-D one lies further than this from the line and
-        noise explains it with less than this probability.
+    off_map_risk : float
+        A position is called off the map when its ranges fit the line worse than the 3-D position by more than noise
+        explains with this probability, the noise judged by the 3-D fit's own residuals.
     ionosphere : {"klobuchar", "off"}
     troposphere : {"saastamoinen", "off"}
     max_ephemeris_age_s : float or None
         Tighter limit on the age of a record than its own validity.
     map_plan_sigma_m, map_height_sigma_m : float or None
         In place of the track's own map error (P1 4.1(3): 0.30 m and 0.60 m).
-    noise_prior : float
-        Redundant ranges that the assumed noise scale 1 counts for while the receiver's own is
-        being estimated; infinite holds the scale at 1.
+    noise_scale : NoiseScaleLimits
+        How the noise of the receiver is learnt from the residuals.
+    robust_fit : RobustFitLimits
+        Which ranges of an epoch agree with each other: what clock offsets and noise are learnt from.
+    map_offset : MapOffsetLimits
+        The test of the map against the 3-D positions of the last minutes.
     sbas : tuple of path
         Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
         one are refused. None: no SBAS.
@@ -186,14 +195,15 @@ class Config(Settings):
     largest_sigma_m: float = Field(default=20.0, gt=0)
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)
-    off_map_m: float = Field(default=200.0, gt=0)
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
-    noise_prior: float = Field(default=100.0, gt=0)
+    noise_scale: NoiseScaleLimits = Field(default_factory=NoiseScaleLimits)
+    robust_fit: RobustFitLimits = Field(default_factory=RobustFitLimits)
+    map_offset: MapOffsetLimits = Field(default_factory=MapOffsetLimits)
     noise: CodeNoise = Field(default_factory=CodeNoise)
     cn0: Cn0Limits = Field(default_factory=lambda: Cn0Limits(floor_dbhz=None))
     doppler: DopplerLimits = Field(default_factory=lambda: DopplerLimits(mode="receiver", prior_epochs=5.0))

@@ -23,7 +23,7 @@ from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
-from railfix.screens import Screened
+from railfix.screens import Screened, suspicion_sigma_m
 
 #: Standard deviation given to raw ranges for the approximate place of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
@@ -51,6 +51,8 @@ class CorrectedRanges:
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
         Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none.
     corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
+    nominal_m : ndarray, shape (T, K) [m]
+        Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`.
     bias_m : ndarray, shape (T, K) [m]
         Largest nominal bias of each range by the error model; 0 without one.
     reason : ndarray of int64, shape (T, K)
@@ -74,6 +76,7 @@ class CorrectedRanges:
     troposphere_m: Floats
     corrected_code_m: Floats
     sigma_m: Floats
+    nominal_m: Floats
     bias_m: Floats
     reason: Bits
     screens: Mapping[str, Screened] = field(default_factory=dict)
@@ -127,6 +130,11 @@ class CorrectedRanges:
     def screened(self, name: str, verdict: Screened, reason: Reason) -> CorrectedRanges:
         """Return the ranges with the verdict of a screen, its rejects carrying the reason."""
         return replace(self.rejected(verdict.reject, reason), screens={**self.screens, name: verdict})
+
+    def suspected(self, name: str, verdict: Screened, size_m: Floats) -> CorrectedRanges:
+        """Return the ranges with the verdict of a screen, its rejects weighted down by the error that it measured."""
+        sigma = suspicion_sigma_m(verdict.reject, size_m, self.sigma_m)
+        return replace(self, sigma_m=sigma, screens={**self.screens, name: verdict})
 
     def ranges(self) -> Ranges:
         """Return the ranges without a reason against them, ready to be fitted."""
@@ -202,8 +210,9 @@ def correct_ranges(
         reason = np.where(observed, reason | delays.reason, reason)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
     local, bias = _local_errors(seen, cn0, index, config, error_model)
+    nominal = config.nominal.sigma_m(seen.elevation_deg) if sbas is None else delays.sigma_m
     if error_model is not None and error_model.covers == "local" and sbas is None:
-        local = np.hypot(local, config.nominal.sigma_m(seen.elevation_deg))
+        local = np.hypot(local, nominal)
     sigma = np.hypot(local, delays.sigma_m)
     uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))
     return CorrectedRanges(
@@ -220,6 +229,7 @@ def correct_ranges(
         troposphere_m=delays.troposphere_m,
         corrected_code_m=clean,
         sigma_m=sigma,
+        nominal_m=nominal,
         bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
     )

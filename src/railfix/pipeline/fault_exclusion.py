@@ -23,11 +23,9 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.results import RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
-from railfix.positioning.constrained import Constrained
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.positioning.single_point import single_point
-from railfix.track.trajectory import Trajectory
 
 
 def fault_free(
@@ -141,11 +139,8 @@ def _second_attempt(
     return exclude(there, limits=config.raim, scale=scale[epochs])
 
 
-def with_p4_level(
-    raim: RaimResult, ranges: Ranges, trajectory: Trajectory, constrained: Constrained, scale: Floats, config: Config
-) -> RaimResult:
+def with_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, config: Config) -> RaimResult:
     """Return the RAIM result with P4's protection level, where no fault is left in the position."""
-    model = constrained_model(ranges, trajectory, constrained.arc_m, section=constrained.section)
     level = reliability(model, limits=config.raim, scale=scale).protection_level_m
     faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
     return replace(raim, protection_level_m=np.where(faulty, np.nan, level))

@@ -222,7 +222,10 @@ class EpochProcessor:
                 limits=self.config.doppler,
                 state=state.screens.get("doppler"),
             )
-            ranges = ranges.screened("doppler", changes, Reason.DOPPLER)
+            if self.config.doppler.verdict == "reject":
+                ranges = ranges.screened("doppler", changes, Reason.DOPPLER)
+            else:
+                ranges = ranges.suspected("doppler", changes, np.fmax(np.abs(changes.level_m), changes.limit_m))
             state = replace(state, screens={**state.screens, "doppler": doppler})
         if self.config.carrier != "off":
             before = state.carrier or CarrierState()

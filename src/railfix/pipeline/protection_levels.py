@@ -10,13 +10,11 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.integrity.protection import LevelStatus, ProtectionLevel, RiskBudget, along_track_level, availability
-from railfix.integrity.raim import Outcome, constrained_model
+from railfix.integrity.raim import LinearModel, Outcome
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.results import ProtectionResult, RaimResult
-from railfix.positioning.constrained import Constrained
-from railfix.positioning.normal_equations import Ranges
-from railfix.track.trajectory import Trajectory
+from railfix.positioning.map_offset import MapOffset
 
 #: What a level rests on: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
@@ -57,9 +55,8 @@ def risk_of(config: Config) -> RiskBudget:
 
 def protection_levels(
     corrected: CorrectedRanges,
-    ranges: Ranges,
-    trajectory: Trajectory,
-    constrained: Constrained,
+    model: LinearModel,
+    offset: MapOffset,
     raim: RaimResult,
     scale: Floats,
     config: Config,
@@ -69,13 +66,13 @@ def protection_levels(
     Parameters
     ----------
     corrected : CorrectedRanges
-    ranges : Ranges
-        What the positions were solved with.
-    trajectory : Trajectory
-    constrained : Constrained
+    model : LinearModel
+        Of the positions on the line.
+    offset : MapOffset
+        What of it lies beyond its own sigma is a bias of the level.
     raim : RaimResult
     scale : ndarray, shape (T,)
-        The receiver's noise scale; an error model stands for itself and is not scaled.
+        The receiver's noise scale; an error model stands for itself and is scaled by 1 at least.
     config : Config
 
     Returns
@@ -83,14 +80,14 @@ def protection_levels(
     ProtectionResult
     """
     faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
-    arc = np.where(faulty, np.nan, constrained.arc_m)
-    model = constrained_model(ranges, trajectory, arc, section=np.maximum(constrained.section, 0))
+    covariance = np.where(faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(
-        model,
+        replace(model, covariance_m2=covariance),
         [name[0] for name in corrected.satellite.tolist()],
         risk=risk_of(config),
         scale=_level_scale(scale, config),
         bias_m=None if config.error_model is None else corrected.bias_m,
+        map_bias_m=np.stack(offset.beyond_m, axis=1),
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
@@ -124,6 +121,6 @@ def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Conf
     level = ProtectionLevel(**values)
     verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
-    doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP])
+    doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET])
     verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
     return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind)

@@ -18,6 +18,8 @@ from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import Constrained
 from railfix.positioning.intersystem_bias import OffsetState
+from railfix.positioning.map_offset import MapOffset, MapOffsetState
+from railfix.positioning.noise_scale import NoiseState
 from railfix.positioning.section_search import Section
 from railfix.positioning.single_point import SinglePoint
 from railfix.screens import Screened
@@ -79,9 +81,10 @@ class AntennaState:
 
     Attributes
     ----------
-    log_variance_sum, log_variance_weight : float
-        Sums of the noise scale: the receiver's post-fit variance against the weights, averaged as a logarithm so that
-        multipath has little influence.
+    noise : NoiseState
+        Sums behind the noise scales.
+    map_offset : MapOffsetState
+        Sums behind the test of the map.
     offsets : OffsetState
         Inter-system biases estimated so far.
     screens : mapping of str to object
@@ -90,8 +93,8 @@ class AntennaState:
         State of the carrier-phase stages, where they are used.
     """
 
-    log_variance_sum: float = 0.0
-    log_variance_weight: float = 0.0
+    noise: NoiseState = field(default_factory=NoiseState)
+    map_offset: MapOffsetState = field(default_factory=MapOffsetState)
     offsets: OffsetState = field(default_factory=OffsetState)
     screens: Mapping[str, Any] = field(default_factory=dict)
     carrier: CarrierState | None = None
@@ -129,14 +132,15 @@ class AntennaResult(NotebookTable):
         Along the line (reference point named by the trajectory), its own marking, and along the
         antenna's trajectory. NaN where the status has no position.
     along_sigma_m : ndarray, shape (T,) [m]
-        Standard deviation along the line, the receiver's noise scale and the map error included.
+        Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
+        itself; satellites and atmosphere; the map error.
     own_sigma_m : ndarray, shape (T,) [m]
         Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of
         the receiver's noise and the noise of these residuals, widened by Student's t where few ranges are
         redundant. Also given where the position is dropped.
     noise_scale : ndarray, shape (T,)
-        Standard deviation of this receiver's ranges against the one the weights assume, as
-        estimated from the epochs before.
+        Standard deviation of this receiver's ranges against the one the weights assume: root mean square of
+        what RAIM left in the epochs before, with forgetting.
     ecef_m : ndarray, shape (T, 3) [m]
         Antenna.
     latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
@@ -167,6 +171,8 @@ class AntennaResult(NotebookTable):
         Detection and exclusion; `outcome` is UNTESTABLE throughout where the screen is off.
     protection : ProtectionResult or None
         Protection levels along the line; None where they are off.
+    map_offset : MapOffset
+        Mean offset of the 3-D positions of the last minutes from the line.
     clocks : tuple of str
         Letter of each receiver clock of the results above, length G.
     clock_offset_m, clock_offset_sigma_m : ndarray, shape (T, G) [m]
@@ -209,6 +215,7 @@ class AntennaResult(NotebookTable):
     phase: PhasePositions | None
     raim: RaimResult
     protection: ProtectionResult | None
+    map_offset: MapOffset
     clocks: tuple[str, ...]
     clock_offset_m: Floats
     clock_offset_sigma_m: Floats

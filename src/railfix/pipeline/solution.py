@@ -11,19 +11,21 @@ from scipy.stats import chi2
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
-from railfix.integrity.raim import Outcome
+from railfix.integrity.raim import LinearModel, Outcome, constrained_model
 from railfix.pipeline.carrier_phase import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
-from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.protection_levels import protection_levels
 from railfix.pipeline.reason_table import alone_on_their_clocks
-from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult
+from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.intersystem_bias import tie_clocks
-from railfix.positioning.noise_scale import noise_scale, own_sigma_m
+from railfix.positioning.map_offset import MapOffset, beyond_threshold, map_offset
+from railfix.positioning.noise_scale import NoiseState, epoch_variance, own_sigma_m, robust_scale, stated_scale
 from railfix.positioning.normal_equations import ClockTies, Ranges, fit
+from railfix.positioning.robust_fit import map_information, robust_fit
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
 from railfix.track.trajectory import Trajectory
@@ -49,6 +51,7 @@ class Solution:
         Position that is published: from the codes, or from code and phase.
     phase : PhasePositions or None
     protection : ProtectionResult or None
+    map_offset : MapOffset
     """
 
     point: SinglePoint
@@ -62,6 +65,7 @@ class Solution:
     along_sigma_m: Floats
     phase: PhasePositions | None
     protection: ProtectionResult | None
+    map_offset: MapOffset
 
 
 def solve(
@@ -84,11 +88,12 @@ def solve(
     predicted : PredictedPlace, optional
         Limits the section search.
     """
-    trajectory, ranges = index.trajectory, corrected.ranges()
+    trajectory, ranges, time = index.trajectory, corrected.ranges(), corrected.time
     point = single_point(ranges, corrected.anchor_ecef_m, limits=config.single_point)
+    agreeing, free = _agreeing(ranges, point, corrected.anchor_ecef_m, config)
     reference = CLOCK_GROUP[config.systems[0]]
     ties, offsets = tie_clocks(
-        corrected.time, corrected.clocks, reference, ranges, point, state.offsets, limits=config.clock_offsets
+        time, corrected.clocks, reference, agreeing, free, state.offsets, limits=config.clock_offsets
     )
     tied = point
     if len(corrected.groups) > 1:
@@ -97,41 +102,103 @@ def solve(
         tied = single_point(ranges, start, limits=config.single_point)
     place = place_on_line(ranges, index, tied, config, predicted=predicted)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
-    sums = (state.log_variance_sum, state.log_variance_weight)
-    scale, sums = noise_scale(redundancy_of(ranges), place.constrained.wsse, sums, prior=config.noise_prior)
-    ranges, place, raim = fault_free(ranges, index, place, scale, config, predicted=predicted)
-    constrained = place.constrained
+    robust, robust_sums = _robust_scale(corrected, ranges, trajectory, place, config, state)
+    ranges, place, raim = fault_free(ranges, index, place, robust, config, predicted=predicted)
+    constrained, redundancy = place.constrained, redundancy_of(ranges)
+    off_map = _off_map(ranges, trajectory, place, constrained.arc_m, config)
+    teaching = ~off_map & ~np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE])
+    if "raim" not in config.screens:
+        teaching[:] = False
+    scale, stated_sums = stated_scale(
+        time, constrained.wsse, redundancy, teaching, robust, state.noise, limits=config.noise_scale
+    )
+    scale = np.maximum(scale, _least_scale(config))
+    offset, map_state = map_offset(
+        time, agreeing, free, corrected.nominal_m, np.maximum(scale, 1.0) ** 2, trajectory,
+        constrained.arc_m, state.map_offset, limits=config.map_offset,
+    )  # fmt: skip
+    model = constrained_model(ranges, trajectory, constrained.arc_m, section=np.maximum(constrained.section, 0))
     if "raim" in config.screens and config.raim_protection == "on":
-        raim = with_p4_level(raim, ranges, trajectory, constrained, scale, config)
+        raim = with_p4_level(raim, model, scale, config)
     corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
     level = None
     if config.protection == "on" and config.carrier != "float":
-        level = protection_levels(corrected, ranges, trajectory, constrained, raim, scale, config)
-    own_sigma = own_sigma_m(redundancy_of(ranges), constrained.wsse, constrained.exact_map_sigma_m, scale)
+        level = protection_levels(corrected, model, offset, raim, scale, config)
+    own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
+    variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
+    nominal = _nominal_variance_m2(model, corrected, config)
     phase, carrier = None, state.carrier
     if config.carrier == "float" and corrected.slips is not None:
         phase, carrier = code_and_phase(
             corrected, corrected.slips, ranges, trajectory, arc, config, carrier or CarrierState()
         )
-        arc, exact, total = phase.arc_m, phase.noise_sigma_m, phase.sigma_m
-    along_sigma = np.sqrt((scale * exact) ** 2 + (total**2 - exact**2))
+        arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
+    along_sigma = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own_sigma if phase is None else along_sigma
+    if phase is not None:
+        off_map = _off_map(ranges, trajectory, place, arc, config)
     solution = Solution(
         point=point,
         place=place,
         ties=ties,
         raim=raim,
-        status=_status(corrected, ranges, trajectory, place, raim, judged, arc, config),
+        status=_status(corrected, ranges, place, raim, judged, arc, off_map, offset, config),
         noise_scale=scale,
         own_sigma_m=own_sigma,
         arc_m=arc,
         along_sigma_m=along_sigma,
         phase=phase,
         protection=level,
+        map_offset=offset,
     )
-    after = replace(state, offsets=offsets, log_variance_sum=sums[0], log_variance_weight=sums[1], carrier=carrier)
+    noise = NoiseState(time=time[-1] if len(time) else state.noise.time, robust=robust_sums, remaining=stated_sums)
+    after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, carrier=carrier)
     return corrected, solution, after
+
+
+def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> tuple[Ranges, SinglePoint]:
+    """Return the ranges that agree with each other in space, and the 3-D positions from these."""
+    place = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
+    fit = robust_fit(ranges, place, limits=config.robust_fit)
+    dropped = (ranges.weight > 0) & ~fit.kept
+    changed = np.flatnonzero(dropped.any(axis=1))
+    if not len(changed):
+        return ranges, point
+    agreeing = without(ranges, dropped)
+    again = single_point(agreeing.take(changed), place[changed], limits=config.single_point)
+    return agreeing, patched(point, changed, again)
+
+
+def _robust_scale(
+    corrected: CorrectedRanges,
+    ranges: Ranges,
+    trajectory: Trajectory,
+    place: Place,
+    config: Config,
+    state: AntennaState,
+) -> tuple[Floats, Floats]:
+    """Return the noise scale that RAIM tests with, and its new sums."""
+    arc, section = place.constrained.arc_m, np.maximum(place.constrained.section, 0)
+    known = np.isfinite(arc)
+    at = np.where(known[:, None], trajectory.at_arc(np.where(known, arc, 0.0)), corrected.anchor_ecef_m)
+    fit = robust_fit(ranges, at, information=map_information(trajectory, section), limits=config.robust_fit)
+    teaching = known & ~_off_map(ranges, trajectory, place, arc, config)
+    scale, sums = robust_scale(corrected.time, fit, teaching, state.noise, limits=config.noise_scale)
+    return np.maximum(scale, _least_scale(config)), sums
+
+
+def _least_scale(config: Config) -> float:
+    """Return the least noise scale: an error model and SBAS state overbounds, which quiet residuals do not shrink."""
+    return 1.0 if config.error_model is not None or config.sbas else 0.0
+
+
+def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config: Config) -> Floats:
+    """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
+    if config.error_model is not None or config.sbas:
+        return np.zeros(len(model))
+    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.nan_to_num(corrected.nominal_m), 0.0)
+    return np.asarray((share**2).sum(axis=1))
 
 
 @lru_cache
@@ -141,16 +208,20 @@ def _chi_square_limit(risk: float, freedom: int) -> float:
 
 
 def _off_map(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, config: Config) -> Masks:
-    """Return the epochs whose ranges contradict the map at the position, or pull it beyond an end, shape (T,)."""
-    point, constrained, redundancy = place.point, place.constrained, redundancy_of(ranges)
-    position = trajectory.at_arc(arc)
+    """Return the epochs whose ranges contradict the map at the position, or pull it beyond an end, shape (T,).
+
+    The line fits worse than the 3-D position, in variances that the 3-D fit itself shows (1 at least): the misfit of
+    the line must not be measured by itself.
+    """
+    point, constrained = place.point, place.constrained
     wsse = constrained.wsse
     if arc is not constrained.arc_m:
         known = np.isfinite(arc)
-        wsse = np.where(known, fit(ranges, np.where(known[:, None], position, 0.0)), np.nan)
-    away = np.linalg.norm(position - point.ecef_m, axis=1)
-    misfit = (wsse - point.wsse) / np.maximum(1.0, wsse / np.maximum(redundancy, 1))
-    lost = (away > config.off_map_m) & (misfit > _chi_square_limit(config.off_map_risk, 2))
+        position = np.where(known[:, None], trajectory.at_arc(arc), 0.0)
+        wsse = np.where(known, fit(ranges, position), np.nan)
+    freedom = ranges.n_used - ranges.n_clocks - 3
+    shown = np.maximum(1.0, point.wsse / np.maximum(freedom, 1))
+    lost = (freedom >= 1) & ((wsse - point.wsse) / shown > _chi_square_limit(config.off_map_risk, 2))
     beyond = constrained.overshoot_m > np.maximum(4.0 * constrained.sigma_m, trajectory.sigma_plan_m)
     return np.asarray(lost | beyond)
 
@@ -158,11 +229,12 @@ def _off_map(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, 
 def _status(
     corrected: CorrectedRanges,
     ranges: Ranges,
-    trajectory: Trajectory,
     place: Place,
     raim: RaimResult,
     sigma: Floats,
     arc: Floats,
+    off_map: Masks,
+    offset: MapOffset,
     config: Config,
 ) -> Codes:
     """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first."""
@@ -172,7 +244,8 @@ def _status(
         ((ranges.n_used < config.min_satellites) | (redundancy < 0), Status.TOO_FEW_SATELLITES),
         (constrained.dilution > config.dilution_limit, Status.UNOBSERVABLE),
         (~np.isfinite(arc), Status.NO_CONVERGENCE),
-        (_off_map(ranges, trajectory, place, arc, config), Status.OFF_MAP),
+        (off_map, Status.OFF_MAP),
+        (beyond_threshold(offset, config.map_offset), Status.MAP_OFFSET),
         (np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE]), Status.INCONSISTENT),
         (sigma > config.largest_sigma_m, Status.UNCERTAIN),
         ((section.excess <= config.section.threshold) | (redundancy < config.section.redundancy), Status.AMBIGUOUS),

@@ -14,15 +14,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes
-from railfix.core.timescale import seconds
+from railfix.core.settings import Settings
+from railfix.positioning.forgetting import decayed_sums, steps_s
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
 from railfix.positioning.single_point import SinglePoint
 
 
-@dataclass(frozen=True, kw_only=True)
-class ClockOffsetLimits:
+class ClockOffsetLimits(Settings):
     """How offsets are trusted.
 
     Attributes
@@ -33,14 +34,14 @@ class ClockOffsetLimits:
     correlation_s : float
         Epochs nearer to each other than this say the same thing twice: errors of a standing
         train are correlated over tens of seconds.
+    window_s : float
+        Time constant of forgetting: receivers keep their offsets to a metre over hours, so half an hour loses
+        nothing, and a receiver that starts anew, or an error learnt unnoticed, is forgotten.
     """
 
-    stability_m: float = 1.0
-    correlation_s: float = 30.0
-
-    def __post_init__(self) -> None:
-        if not (self.stability_m > 0.0 and self.correlation_s > 0.0):
-            raise ValueError("stability_m and correlation_s must be positive")
+    stability_m: float = Field(default=1.0, gt=0)
+    correlation_s: float = Field(default=30.0, gt=0)
+    window_s: float = Field(default=1800.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,9 +82,9 @@ def tie_clocks(
     reference : str
         Letter of the clock that the others are told against.
     ranges : Ranges
-        Without ties.
+        Without ties; those that agree with each other alone, so that a faulty satellite moves no offset.
     free : SinglePoint
-        Position with every clock on its own, where one range at least is redundant.
+        Position from these ranges with every clock on its own, where one range at least is redundant.
     state : OffsetState
     limits : ClockOffsetLimits, optional
 
@@ -96,8 +97,8 @@ def tie_clocks(
     epochs = len(time)
     offset, sigma = np.zeros((epochs, len(clocks))), np.full((epochs, len(clocks)), UNTIED_M)
     information, moment = dict(state.information), dict(state.moment)
-    step = seconds(np.diff(np.concatenate([np.asarray([state.last], dtype="datetime64[ns]"), time])))
-    fresh = np.clip(np.nan_to_num(step, nan=0.0) / limits.correlation_s, 0.0, 1.0)
+    step = steps_s(time, state.last)
+    fresh = np.minimum(step / limits.correlation_s, 1.0)
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
     base = clocks.index(reference) if reference in clocks else -1
@@ -115,14 +116,14 @@ def tie_clocks(
             variance = misfit * (1.0 / np.maximum(one.sum(axis=1), 1e-12) + 1.0 / np.maximum(two.sum(axis=1), 1e-12))
             weight = np.where(usable, fresh / np.where(usable, variance, 1.0), 0.0)
             difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)
-        # Sums up to and without each epoch: the same additions however epochs are cut.
-        known = np.cumsum(np.concatenate([[information.get(letter, 0.0)], weight]))
-        moments = np.cumsum(np.concatenate([[moment.get(letter, 0.0)], weight * difference]))
-        has = known[:-1] > 0.0
-        safe = np.where(has, known[:-1], 1.0)
-        offset[:, g] = np.where(has, moments[:-1] / safe, 0.0)
+        start = np.array([information.get(letter, 0.0), moment.get(letter, 0.0)])
+        values = np.stack([weight, weight * difference], axis=1)
+        before, after = decayed_sums(time, values, start, state.last, window_s=limits.window_s)
+        has = before[:, 0] > 0.0
+        safe = np.where(has, before[:, 0], 1.0)
+        offset[:, g] = np.where(has, before[:, 1] / safe, 0.0)
         spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
         sigma[:, g] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
-        information[letter], moment[letter] = float(known[-1]), float(moments[-1])
+        information[letter], moment[letter] = float(after[0]), float(after[1])
     last = time[-1] if epochs else state.last
     return ClockTies(offset_m=offset, sigma_m=sigma), OffsetState(information=information, moment=moment, last=last)

@@ -1,56 +1,171 @@
-"""How noisy is this receiver? The scale of its ranges against the weights, and what one epoch vouches for."""
+"""Receiver noise scale, single-epoch variance and single-epoch sigma.
+
+Two scales are learnt from earlier epochs, both as root mean squares with exponential forgetting:
+
+- the robust one, from the ranges of each epoch that agree with each other (`robust_fit`): RAIM tests with it. It
+  does not depend on what RAIM decides, so that neither one bad satellite from the first epoch on nor a wrong
+  start can settle in it;
+- the stated one, from the ranges that RAIM left, under every sigma and level.
+
+Epochs that RAIM did not resolve, and epochs off the map, teach neither of them.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from scipy.special import digamma, ndtri, stdtrit
+from pydantic import Field
+from scipy.special import ndtri, stdtrit
 
-from railfix.core.arrays import Floats, Integers
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.settings import Settings
+from railfix.positioning.forgetting import decayed_sums
+from railfix.positioning.robust_fit import RobustFit
 
 #: Half-widths of the 95 % interval, Student's t against the normal distribution, by degrees of freedom from 1.
 _WIDENED: Final = stdtrit(np.arange(1, 129), 0.975) / ndtri(0.975)
 
 
-def noise_scale(
-    redundancy: Integers, wsse: Floats, sums: tuple[float, float], *, prior: float
-) -> tuple[Floats, tuple[float, float]]:
-    """Standard deviation of a receiver's ranges against the weights', from the epochs before each.
+class NoiseScaleLimits(Settings):
+    """How the noise of a receiver is learnt.
 
-    The mean of the logarithm of wsse / degrees of freedom, each weighted by its degrees of freedom,
-    less what the logarithm of a chi-square variable is lower by. A logarithm, so that multipath does
-    not carry it.
+    Attributes
+    ----------
+    window_s : float [s]
+        Time constant of forgetting. Errors of codes stay alike for about 20 s (correlation 0.6 after 10 s on
+        recordings): five such times are independent enough for a mean, and short enough that a street
+        or a station left behind is forgotten before the next one.
+    prior : float
+        Redundant ranges that a scale of 1 counts for, never forgotten: two or three epochs. Infinite holds the scale
+        at 1.
+    spread : float
+        Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
+        says, so the variance stated for an epoch is that of its window counted this many times, and that of its own
+        residuals. 4 is also the Student t of code errors on recordings.
+    """
+
+    window_s: float = Field(default=100.0, gt=0)
+    prior: float = Field(default=20.0, gt=0)
+    spread: float = Field(default=4.0, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseState:
+    """Decayed sums behind the noise scales, after the last epoch.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Of the last epoch; NaT before the first.
+    robust, remaining : ndarray, shape (2,)
+        Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of
+        those that RAIM left.
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    robust: Floats = field(default_factory=lambda: np.zeros(2))
+    remaining: Floats = field(default_factory=lambda: np.zeros(2))
+
+
+def robust_scale(
+    time: Datetimes, fit: RobustFit, teaching: Masks, state: NoiseState, *, limits: NoiseScaleLimits
+) -> tuple[Floats, Floats]:
+    """Standard deviation of the ranges against their weights, from what agreed in the epochs before each.
 
     Parameters
     ----------
-    redundancy : ndarray of int, shape (T,)
-        Degrees of freedom of each epoch's fit.
-    wsse : ndarray, shape (T,)
-    sums : tuple of float
-        Left by the epochs before: weighted sum of the logarithms, and of the weights.
-    prior : float
-        Degrees of freedom that a scale of 1 counts for.
+    time : ndarray of datetime64[ns], shape (T,)
+    fit : RobustFit
+        On the line.
+    teaching : ndarray of bool, shape (T,)
+        Epochs to learn from: those that are on the map.
+    state : NoiseState
+    limits : NoiseScaleLimits
 
     Returns
     -------
     scale : ndarray, shape (T,)
-    sums : tuple of float
+    sums : ndarray, shape (2,)
+        New `NoiseState.robust`.
     """
-    freedom = redundancy.astype(np.float64)
-    usable = (freedom > 0) & (wsse > 0)
-    safe = np.where(usable, freedom, 1.0)
-    level = np.log(np.where(usable, wsse, 1.0) / safe) - (digamma(safe / 2) - np.log(safe / 2))
-    weight = np.where(usable, freedom, 0.0)
-    # cumsum from the carried sums: the same additions in the same order however epochs are cut.
-    total = np.cumsum(np.concatenate([[sums[0]], weight * level]))
-    weights = np.cumsum(np.concatenate([[sums[1]], weight]))
-    scale = np.exp(0.5 * total[:-1] / (weights[:-1] + prior))
-    return scale, (float(total[-1]), float(weights[-1]))
+    use = teaching & (fit.freedom > 0) & np.isfinite(fit.variance)
+    return _learnt(time, np.where(use, fit.variance * fit.freedom, 0.0), np.where(use, fit.freedom, 0), state.robust,
+                   np.ones(len(time)), state, limits)  # fmt: skip
+
+
+def stated_scale(
+    time: Datetimes,
+    wsse: Floats,
+    redundancy: Integers,
+    teaching: Masks,
+    robust: Floats,
+    state: NoiseState,
+    *,
+    limits: NoiseScaleLimits,
+) -> tuple[Floats, Floats]:
+    """Standard deviation of the ranges against their weights, from what RAIM left in the epochs before each.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    wsse : ndarray, shape (T,)
+        Weighted sum of squared residuals after exclusions.
+    redundancy : ndarray of int, shape (T,)
+    teaching : ndarray of bool, shape (T,)
+        Epochs to learn from: resolved, and on the map.
+    robust : ndarray, shape (T,)
+        Robust scale, which takes the place of a scale of 1 as the prior.
+    state : NoiseState
+    limits : NoiseScaleLimits
+
+    Returns
+    -------
+    scale : ndarray, shape (T,)
+    sums : ndarray, shape (2,)
+        New `NoiseState.remaining`.
+    """
+    use = teaching & (redundancy > 0) & np.isfinite(wsse)
+    return _learnt(time, np.where(use, wsse, 0.0), np.where(use, redundancy, 0), state.remaining, robust, state, limits)
+
+
+def _learnt(
+    time: Datetimes,
+    wsse: Floats,
+    freedom: Integers,
+    start: Floats,
+    prior: Floats,
+    state: NoiseState,
+    limits: NoiseScaleLimits,
+) -> tuple[Floats, Floats]:
+    """Root mean square with forgetting around a prior scale, and the sums to go on with."""
+    values = np.stack([wsse, freedom.astype(np.float64)], axis=1)
+    before, after = decayed_sums(time, values, start, state.time, window_s=limits.window_s)
+    if np.isinf(limits.prior):
+        return prior, after
+    return np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior)), after
+
+
+def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits: NoiseScaleLimits) -> Floats:
+    """Variance of the ranges of each epoch against their weights, shape (T,).
+
+    Posterior mean of a variance that scatters about that of the window with `spread` degrees of freedom (scaled inverse
+    chi-square distribution), given the epoch's own residuals.
+
+    Parameters
+    ----------
+    scale, wsse : ndarray, shape (T,)
+    redundancy : ndarray of int, shape (T,)
+    limits : NoiseScaleLimits
+    """
+    freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
+    own = np.where(freedom > 0, np.maximum(np.nan_to_num(wsse), 0.0), 0.0)
+    return np.asarray((limits.spread * scale**2 + own) / (limits.spread + freedom))
 
 
 def own_sigma_m(redundancy: Integers, wsse: Floats, sigma_m: Floats, scale: Floats) -> Floats:
-    """What the ranges of each epoch vouch for along the line, shape (T,) [m].
+    """Single-epoch sigma along the line, shape (T,) [m].
 
     The standard deviation by the weights, times the larger of the receiver's scale and the one that
     the epoch's own residuals show, widened as Student's t is where few ranges are redundant.

@@ -22,7 +22,7 @@ from railfix.screens.cn0 import Cn0Limits, Cn0Screened, cn0_screen
 from railfix.screens.doppler import DopplerScreened, DopplerState, doppler_screen
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m
 from railfix.screens.elevation import ElevationLimits, elevation_screen
-from railfix.screens.result import Screened
+from railfix.screens.result import Screened, suspicion_sigma_m
 
 __all__ = [
     "AntennaPairLimits",
@@ -47,4 +47,5 @@ __all__ = [
     "pair_channels",
     "pair_epochs",
     "spacing_direction",
+    "suspicion_sigma_m",
 ]

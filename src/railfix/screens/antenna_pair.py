@@ -53,6 +53,9 @@ class AntennaPairLimits:
         "median": satellites of a constellation that both antennas need.
     tag_tolerance_s : float [s]
         Largest difference of the time tags of a pair of epochs.
+    verdict : {"weigh", "reject"}
+        What becomes of a satellite whose difference does not fit: its sigma grows on both antennas, for which of
+        them is wrong is not known, or it is rejected on both, as P1 does.
     """
 
     limit_m: float = 5.0
@@ -61,6 +64,7 @@ class AntennaPairLimits:
     clocks: Literal["common", "median"] = "median"
     least_satellites: int = 4
     tag_tolerance_s: float = 0.01
+    verdict: Literal["weigh", "reject"] = "weigh"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.limit_m < np.inf:

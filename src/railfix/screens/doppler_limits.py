@@ -74,6 +74,10 @@ class DopplerLimits:
         refuses the epoch of a jump only, and the jump back too, which is P1's test to the letter.
     least_satellites : int
         Satellites of one clock needed to take its step out.
+    verdict : {"weigh", "reject"}
+        What becomes of a suspected satellite in a run: its sigma grows by the size of the jump
+        (`railfix.screens.suspicion_sigma_m`), or it is rejected, as P1 does. Where few satellites are left,
+        the geometry without one turns a few metres into a hundred; a weight does not.
     """
 
     mode: Literal["fixed", "receiver", "sigma"] = "fixed"
@@ -87,6 +91,7 @@ class DopplerLimits:
     longest_interval_s: float = 2.5
     hold_s: float = 2.0
     least_satellites: int = 3
+    verdict: Literal["weigh", "reject"] = "weigh"
 
     def __post_init__(self) -> None:
         if self.mode not in ("fixed", "receiver", "sigma"):

@@ -139,6 +139,7 @@ def along_track_level(
     risk: RiskBudget | None = None,
     scale: ArrayLike = 1.0,
     bias_m: ArrayLike | None = None,
+    map_bias_m: ArrayLike | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
     """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension, up to two satellites).
@@ -154,6 +155,8 @@ def along_track_level(
         Noise scale: multiplies the sigmas of the ranges, not the map error.
     bias_m : array_like, shape (T, M) or (M,) [m], optional
         Largest nominal bias of each range, as a paired overbound gives it; none: 0.
+    map_bias_m : array_like, shape (T, 2) or (2,) [m], optional
+        Offset of the map across and up that is not within its sigma; none: 0.
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
 
@@ -177,12 +180,14 @@ def along_track_level(
         raise ValueError("the noise scale must be positive")
     out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
     bias = None if bias_m is None else np.broadcast_to(np.asarray(bias_m, dtype=np.float64), (epochs, channels))
+    offset = None if map_bias_m is None else np.broadcast_to(np.asarray(map_bias_m, dtype=np.float64), (epochs, 2))
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     plan = _plan(model, systems, risk, out)
     result = _empty(epochs, plan)
     for block in _blocks(model, np.flatnonzero(located)):
         some = None if bias is None else bias[block]
-        _level_of_block(result, block, model.take(block), plan, scale[block], some)
+        moved = None if offset is None else offset[block]
+        _level_of_block(result, block, model.take(block), plan, scale[block], some, moved)
     return result
 
 
@@ -254,10 +259,16 @@ def _blocks(model: LinearModel, rows: Indices) -> Iterator[Indices]:
 
 
 def _level_of_block(
-    result: ProtectionLevel, rows: Indices, model: LinearModel, plan: _Plan, scale: Floats, bias: Floats | None
+    result: ProtectionLevel,
+    rows: Indices,
+    model: LinearModel,
+    plan: _Plan,
+    scale: Floats,
+    bias: Floats | None,
+    map_bias: Floats | None,
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
-    all_of = whole(model, scale, bias)
+    all_of = whole(model, scale, bias, map_bias)
     sigma = all_of.sigma_m
     k_fault_free, k_false_alarm = one_sided_k(plan.fault_free[rows] / 2.0), plan.k_false_alarm[rows]
     fault_free = k_fault_free * sigma + all_of.bias_m

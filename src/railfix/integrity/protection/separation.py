@@ -39,6 +39,7 @@ class Whole:
     variance_m2: Floats  # (T,) of the weights, scale 1
     scale: Floats  # (T,)
     range_bias: Floats | None  # (T, n) largest nominal bias of each range, over its sigma
+    map_bias: Floats  # (T, 2) offset of the map across and up, over the sigma of the map error
 
     @property
     def sigma_m(self) -> Floats:
@@ -47,10 +48,11 @@ class Whole:
 
     @property
     def bias_m(self) -> Floats:
-        """Largest movement by nominal biases, shape (T,)."""
+        """Largest movement by nominal biases, and that by the offset of the map, shape (T,)."""
+        of_map = np.abs((self.map_m * self.map_bias).sum(axis=1))
         if self.range_bias is None:
-            return np.zeros(len(self.channel))
-        return np.asarray((np.abs(self.gain_m) * self.range_bias).sum(axis=1))
+            return np.asarray(of_map)
+        return np.asarray(of_map + (np.abs(self.gain_m) * self.range_bias).sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def scaled(variance_m2: Floats, map_m: Floats, scale: Floats) -> Floats:
     return np.asarray(np.maximum(square * (variance_m2 - from_map) + from_map, 0.0))
 
 
-def whole(model: LinearModel, scale: Floats, bias_m: Floats | None) -> Whole:
+def whole(model: LinearModel, scale: Floats, bias_m: Floats | None, map_bias_m: Floats | None = None) -> Whole:
     """The parts that every subset asks for.
 
     Parameters
@@ -79,6 +81,7 @@ def whole(model: LinearModel, scale: Floats, bias_m: Floats | None) -> Whole:
         T epochs with a position, on the line.
     scale : ndarray, shape (T,)
     bias_m : ndarray, shape (T, M) [m], or None
+    map_bias_m : ndarray, shape (T, 2) [m], or None
     """
     parts = compact(model)
     root = np.sqrt(np.einsum("ii->i", model.prior))[1:]
@@ -98,6 +101,7 @@ def whole(model: LinearModel, scale: Floats, bias_m: Floats | None) -> Whole:
         variance_m2=model.covariance_m2[:, 0, 0],
         scale=scale,
         range_bias=range_bias,
+        map_bias=np.zeros((len(model), 2)) if map_bias_m is None else map_bias_m * root,
     )
 
 
@@ -214,10 +218,12 @@ def _separations(
 ) -> Separations:
     """From the variance of the distance (T, K), and its response to the map error (T, K, 2)."""
     apart = np.sqrt(scaled(square, response, all_of.scale))
-    total = scaled(all_of.variance_m2[:, None] + square, all_of.map_m[:, None] + response, all_of.scale)
+    whole_response = all_of.map_m[:, None] + response
+    total = scaled(all_of.variance_m2[:, None] + square, whole_response, all_of.scale)
+    of_map = np.abs((whole_response * all_of.map_bias[:, None]).sum(axis=2))
     return Separations(
         sigma_m=np.where(blind, np.inf, np.sqrt(total)),
         separation_sigma_m=np.where(blind, np.inf, apart),
         moved_m=np.where(blind, 0.0, moved),
-        bias_m=np.where(blind, 0.0, bias),
+        bias_m=np.where(blind, 0.0, bias + of_map),
     )

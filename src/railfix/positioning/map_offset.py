@@ -1,0 +1,198 @@
+"""Offset of the 3-D positions from the line over minutes: the test of a wrong map.
+
+A map whose heights lack the geoid, a map of the next track or in another reference frame lies beside or
+above the path of the antenna by a constant. Single epochs hide it in their noise; the mean over a window does not. Its
+sigma has three parts: noise, which the window averages; errors of satellites and atmosphere, which it does not; and the
+stated error of the map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import chi2
+
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.settings import Settings
+from railfix.positioning.forgetting import decayed_sums, steps_s
+from railfix.positioning.normal_equations import Ranges, normal_equations
+from railfix.positioning.single_point import SinglePoint
+from railfix.track.trajectory import Trajectory
+
+
+class MapOffsetLimits(Settings):
+    """Limits of the test of the map.
+
+    Attributes
+    ----------
+    window_s : float [s]
+        Time constant of forgetting: long enough for six independent samples, short enough to find a wrong stretch.
+    correlation_s : float [s]
+        Epochs nearer to each other than this count as one sample.
+    least_samples : float
+        Independent samples needed before a verdict: one minute.
+    note_risk, risk : float
+        Probability that noise alone passes the test (chi-square, two degrees of freedom): of the note, of the status.
+        The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic
+        stays below the threshold of the status, 13.8 (``tests/integrity_tables.py``).
+    """
+
+    window_s: float = Field(default=120.0, gt=0)
+    correlation_s: float = Field(default=20.0, gt=0)
+    least_samples: float = Field(default=3.0, gt=0)
+    note_risk: float = Field(default=1e-2, gt=0, lt=1)
+    risk: float = Field(default=1e-3, gt=0, lt=1)
+
+    @property
+    def note_threshold(self) -> float:
+        """Statistic from which on a run has a note."""
+        return float(chi2.isf(self.note_risk, 2))
+
+    @property
+    def threshold(self) -> float:
+        """Statistic from which on epochs have the status."""
+        return float(chi2.isf(self.risk, 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOffsetState:
+    """Decayed sums after the last epoch.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Of the last epoch; NaT before the first.
+    sums : ndarray, shape (9,)
+        Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples.
+    """
+
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    sums: Floats = field(default_factory=lambda: np.zeros(9))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOffset:
+    """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples.
+
+    Attributes
+    ----------
+    across_m, up_m : ndarray, shape (T,) [m]
+        Right of the line in the direction of rising chainage, and above it.
+    across_sigma_m, up_sigma_m : ndarray, shape (T,) [m]
+        Standard deviations of a right map: noise, satellites, atmosphere and the stated error of the map.
+    statistic : ndarray, shape (T,)
+        Square of the offset in sigmas, both components together.
+    """
+
+    across_m: Floats
+    up_m: Floats
+    across_sigma_m: Floats
+    up_sigma_m: Floats
+    statistic: Floats
+
+    @property
+    def beyond_m(self) -> tuple[Floats, Floats]:
+        """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 without a verdict."""
+        across = np.sign(self.across_m) * np.maximum(np.abs(self.across_m) - self.across_sigma_m, 0.0)
+        up = np.sign(self.up_m) * np.maximum(np.abs(self.up_m) - self.up_sigma_m, 0.0)
+        return np.nan_to_num(across), np.nan_to_num(up)
+
+
+def map_offset(
+    time: Datetimes,
+    ranges: Ranges,
+    point: SinglePoint,
+    nominal_m: Floats,
+    variance: Floats,
+    trajectory: Trajectory,
+    arc_m: Floats,
+    state: MapOffsetState,
+    *,
+    limits: MapOffsetLimits | None = None,
+) -> tuple[MapOffset, MapOffsetState]:
+    """Compute the mean offset of 3-D positions from the line, each epoch's own position included.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    ranges : Ranges
+        What the 3-D positions were solved with: ranges that agree with each other.
+    point : SinglePoint
+        3-D positions.
+    nominal_m : ndarray, shape (T, M) [m]
+        Standard deviations of satellites and atmosphere in the ranges.
+    variance : ndarray, shape (T,)
+        Of the ranges against their weights.
+    trajectory : Trajectory
+    arc_m : ndarray, shape (T,) [m]
+        Positions on the line; NaN where there is none.
+    state : MapOffsetState
+    limits : MapOffsetLimits, optional
+
+    Returns
+    -------
+    MapOffset
+    MapOffsetState
+    """
+    limits = limits or MapOffsetLimits()
+    usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.n_used - ranges.n_clocks > 3)
+    arc = np.where(usable, arc_m, 0.0)
+    section = trajectory.segment_at(arc)[0]
+    axes = np.stack([trajectory.across[section], trajectory.up[section]], axis=1)
+    place = trajectory.at_arc(arc)
+    at = np.where(usable[:, None], point.ecef_m, place)
+    offset = np.einsum("tij,tj->ti", axes, at - place)
+    covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
+    equations = normal_equations(ranges, at)
+    gain = (axes @ covariance) @ (equations.design * ranges.weight[:, None])
+    nominal = gain * np.where(ranges.weight > 0, np.nan_to_num(nominal_m), 0.0)[:, None]
+    bias = nominal @ nominal.swapaxes(1, 2)
+    noise = (axes @ covariance @ axes.swapaxes(1, 2)) * variance[:, None, None]
+    information = _inverse_2x2(noise)
+    step = steps_s(time, state.time)
+    fresh = np.where(usable, np.minimum(step / limits.correlation_s, 1.0), 0.0)
+    values = fresh[:, None] * np.concatenate(
+        [
+            information[:, [0, 0, 1], [0, 1, 1]],
+            np.einsum("tij,tj->ti", information, offset),
+            bias[:, [0, 0, 1], [0, 1, 1]],
+            np.ones((len(time), 1)),
+        ],
+        axis=1,
+    )
+    before, after = decayed_sums(time, values, state.sums, state.time, window_s=limits.window_s)
+    sums = before + values
+    enough = sums[:, 8] >= limits.least_samples
+    sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+    mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])
+    known = of_noise + sums[:, [5, 6, 6, 7]].reshape(-1, 2, 2) / sums[:, 8, None, None]
+    known = known + np.diag([trajectory.sigma_plan_m**2, trajectory.sigma_height_m**2])
+    statistic = np.einsum("ti,tij,tj->t", mean, _inverse_2x2(known), mean)
+    sigma = np.sqrt(known[:, [0, 1], [0, 1]])
+
+    def judged(values: Floats) -> Floats:
+        return np.where(enough, values, np.nan)
+
+    result = MapOffset(
+        across_m=judged(mean[:, 0]),
+        up_m=judged(mean[:, 1]),
+        across_sigma_m=judged(sigma[:, 0]),
+        up_sigma_m=judged(sigma[:, 1]),
+        statistic=judged(statistic),
+    )
+    return result, MapOffsetState(time=time[-1] if len(time) else state.time, sums=after)
+
+
+def _inverse_2x2(matrix: Floats) -> Floats:
+    """Inverse of symmetric 2 x 2 matrices, shape (T, 2, 2)."""
+    a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
+    determinant = np.maximum(a * d - b * b, 1e-300)
+    return np.stack([d, -b, -b, a], axis=1).reshape(-1, 2, 2) / determinant[:, None, None]
+
+
+def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:
+    """Epochs whose window contradicts the map, shape (T,)."""
+    return np.asarray(np.nan_to_num(offset.statistic) > limits.threshold)
