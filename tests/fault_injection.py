@@ -103,7 +103,7 @@ class Clean:
     """Ranges of T epochs by M channels as the pipeline prepared them, solved, with their noise scale.
 
     Of these `calm` are the epochs that pass without a fault put in: only they are clean. The scale is
-    one number for the recording, the pipeline's own at its end, found from the residuals as recorded.
+    one number for the recording, the median of the pipeline's own, found from the residuals as recorded.
     """
 
     ranges: Ranges
@@ -158,7 +158,7 @@ def clean(recording: Recording) -> Clean:
     located = np.flatnonzero(np.isfinite(result.constrained.arc_m))
     arc = result.constrained.arc_m[located]
     vertex = np.argmin(np.abs(trajectory.arc_m - arc[:, None]), axis=1)
-    return solved(ranges.take(located), trajectory, vertex, float(result.noise_scale[-1]))
+    return solved(ranges.take(located), trajectory, vertex, float(np.median(result.noise_scale[located])))
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,14 @@ from railfix.pipeline.solve import Place, place_on_line, redundancy_of
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.intersystem_bias import tie_clocks
 from railfix.positioning.map_offset import MapOffset, beyond_threshold, map_offset
-from railfix.positioning.noise_scale import NoiseState, epoch_variance, own_sigma_m, robust_scale, stated_scale
+from railfix.positioning.noise_scale import (
+    NoiseState,
+    epoch_variance,
+    noise_age,
+    own_sigma_m,
+    robust_scale,
+    stated_scale,
+)
 from railfix.positioning.normal_equations import ClockTies, Ranges, fit
 from railfix.positioning.robust_fit import map_information, robust_fit
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
@@ -152,7 +159,10 @@ def solve(
         protection=level,
         map_offset=offset,
     )
-    noise = NoiseState(time=time[-1] if len(time) else state.noise.time, robust=robust_sums, remaining=stated_sums)
+    noise = state.noise
+    if len(time):
+        age = noise_age(time, noise, limits=config.noise_scale)
+        noise = NoiseState(time=time[-1], age=float(age[-1]), robust=robust_sums, remaining=stated_sums)
     after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, carrier=carrier)
     return corrected, solution, after
 

@@ -10,7 +10,7 @@ from railfix.core.arrays import Datetimes, Floats
 from railfix.core.timescale import seconds
 
 #: Windows that one running sum spans; exp(50) = 5e21, so that it overflows nowhere and keeps all digits of its terms.
-_SPAN: Final = 50
+_SPAN: Final = 50.0
 
 
 def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
@@ -26,24 +26,41 @@ def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
     return np.maximum(np.nan_to_num(seconds(np.diff(before)), nan=0.0), 0.0)
 
 
-def decayed_sums(
-    time: Datetimes, values: Floats, start: Floats, last: np.datetime64, *, window_s: float
-) -> tuple[Floats, Floats]:
-    """Sums of the values of all earlier epochs, each times ``exp(-age / window)``.
+def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
+    """Age of each epoch since the start of a log, shape (T,) [windows].
 
-    Running sums are kept in units of the decay since the start of a span of absolute time (a multiple of 50 windows),
-    so that the same numbers are added in the same order wherever a chunk begins.
+    A window is `window_s` or `least_epochs` epochs, whichever is longer: a gap ages what was learnt by one epoch, and a
+    log of one epoch in half a minute is not forgotten faster than new epochs come.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (T,)
+    last : datetime64[ns]
+        Epoch before the first one; NaT before all.
+    last_age : float [windows]
+        Of that epoch; 0 before all.
+    window_s : float [s]
+    least_epochs : float
+    """
+    step = np.minimum(steps_s(time, last) / window_s, 1.0 / least_epochs)
+    return np.cumsum(np.concatenate([[last_age], step]))[1:]
+
+
+def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
+    """Sums of the values of all earlier epochs, each times ``exp(-difference of the ages)``.
+
+    Running sums are kept in units of the decay since the start of a span of 50 windows, so that the same
+    numbers are added in the same order wherever a chunk begins.
+
+    Parameters
+    ----------
+    age : ndarray, shape (T,) [windows]
+        `ages`.
     values : ndarray, shape (T, K)
     start : ndarray, shape (K,)
         Running sums after the epoch before the first one; 0 before all.
-    last : datetime64[ns]
-        That epoch; NaT before all.
-    window_s : float [s]
-        Time after which a value counts for 1/e.
+    last_age : float [windows]
+        Of that epoch.
 
     Returns
     -------
@@ -52,26 +69,15 @@ def decayed_sums(
     after : ndarray, shape (K,)
         Running sums after the last epoch: `start` of the next chunk.
     """
-    window = round(window_s * 1e9)
-    span, age = _span_and_age(time, window)
-    current = np.asarray(start, dtype=np.float64)
-    of_current = -1 if np.isnat(last) else int(_span_and_age(np.asarray([last], dtype="datetime64[ns]"), window)[0][0])
+    span = np.floor(age / _SPAN)
+    current, of_current = np.asarray(start, dtype=np.float64), np.floor(last_age / _SPAN)
     before = np.empty(values.shape)
     edges = np.flatnonzero(np.concatenate([[True], span[1:] != span[:-1], [True]])) if len(span) else np.zeros(1, int)
     for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        if of_current >= 0:
-            current = current * np.exp(-float(_SPAN) * (int(span[first]) - of_current))
-        of_current = int(span[first])
-        growth = np.exp(age[first:end])[:, None]
+        current = current * np.exp(-_SPAN * (span[first] - of_current))
+        of_current = span[first]
+        growth = np.exp(age[first:end] - _SPAN * of_current)[:, None]
         sums = np.cumsum(np.concatenate([current[None], growth * values[first:end]]), axis=0)
         before[first:end] = sums[:-1] / growth
         current = sums[-1]
     return before, current
-
-
-def _span_and_age(time: Datetimes, window_ns: int) -> tuple[Floats, Floats]:
-    """Number of the span that each instant lies in, and windows since the start of that span."""
-    instant = time.astype("datetime64[ns]").astype(np.int64)
-    length = _SPAN * window_ns
-    span = instant // length
-    return span, (instant - span * length) / window_ns

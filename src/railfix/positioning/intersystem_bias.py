@@ -18,7 +18,7 @@ from pydantic import Field
 
 from railfix.core.arrays import Datetimes
 from railfix.core.settings import Settings
-from railfix.positioning.forgetting import decayed_sums, steps_s
+from railfix.positioning.forgetting import ages, decayed_sums, steps_s
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges
 from railfix.positioning.single_point import SinglePoint
 
@@ -55,11 +55,14 @@ class OffsetState:
         Information times offset.
     last : datetime64[ns]
         Time of the last epoch, NaT before the first.
+    age : float [windows]
+        Of the last epoch.
     """
 
     information: Mapping[str, float] = field(default_factory=dict)
     moment: Mapping[str, float] = field(default_factory=dict)
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0
 
 
 def tie_clocks(
@@ -99,6 +102,8 @@ def tie_clocks(
     information, moment = dict(state.information), dict(state.moment)
     step = steps_s(time, state.last)
     fresh = np.minimum(step / limits.correlation_s, 1.0)
+    samples = limits.window_s / limits.correlation_s
+    age = ages(time, state.last, state.age, window_s=limits.window_s, least_epochs=samples)
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
     base = clocks.index(reference) if reference in clocks else -1
@@ -118,7 +123,7 @@ def tie_clocks(
             difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)
         start = np.array([information.get(letter, 0.0), moment.get(letter, 0.0)])
         values = np.stack([weight, weight * difference], axis=1)
-        before, after = decayed_sums(time, values, start, state.last, window_s=limits.window_s)
+        before, after = decayed_sums(age, values, start, state.age)
         has = before[:, 0] > 0.0
         safe = np.where(has, before[:, 0], 1.0)
         offset[:, g] = np.where(has, before[:, 1] / safe, 0.0)
@@ -126,4 +131,6 @@ def tie_clocks(
         sigma[:, g] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
         information[letter], moment[letter] = float(after[0]), float(after[1])
     last = time[-1] if epochs else state.last
-    return ClockTies(offset_m=offset, sigma_m=sigma), OffsetState(information=information, moment=moment, last=last)
+    return ClockTies(offset_m=offset, sigma_m=sigma), OffsetState(
+        information=information, moment=moment, last=last, age=float(age[-1]) if epochs else state.age
+    )

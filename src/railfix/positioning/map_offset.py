@@ -16,7 +16,7 @@ from scipy.stats import chi2
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.forgetting import decayed_sums, steps_s
+from railfix.positioning.forgetting import ages, decayed_sums, steps_s
 from railfix.positioning.normal_equations import Ranges, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -64,11 +64,14 @@ class MapOffsetState:
     ----------
     time : datetime64[ns]
         Of the last epoch; NaT before the first.
+    age : float [windows]
+        Of the last epoch.
     sums : ndarray, shape (9,)
         Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples.
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0
     sums: Floats = field(default_factory=lambda: np.zeros(9))
 
 
@@ -162,7 +165,9 @@ def map_offset(
         ],
         axis=1,
     )
-    before, after = decayed_sums(time, values, state.sums, state.time, window_s=limits.window_s)
+    samples = limits.window_s / limits.correlation_s
+    age = ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=samples)
+    before, after = decayed_sums(age, values, state.sums, state.age)
     sums = before + values
     enough = sums[:, 8] >= limits.least_samples
     sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -183,7 +188,7 @@ def map_offset(
         up_sigma_m=judged(sigma[:, 1]),
         statistic=judged(statistic),
     )
-    return result, MapOffsetState(time=time[-1] if len(time) else state.time, sums=after)
+    return result, MapOffsetState(time=time[-1], age=float(age[-1]), sums=after) if len(time) else state
 
 
 def _inverse_2x2(matrix: Floats) -> Floats:

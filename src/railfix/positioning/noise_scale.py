@@ -21,7 +21,7 @@ from scipy.special import ndtri, stdtrit
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.forgetting import decayed_sums
+from railfix.positioning.forgetting import ages, decayed_sums
 from railfix.positioning.robust_fit import RobustFit
 
 #: Half-widths of the 95 % interval, Student's t against the normal distribution, by degrees of freedom from 1.
@@ -38,8 +38,10 @@ class NoiseScaleLimits(Settings):
         recordings): five such times are independent enough for a mean, and short enough that a street
         or a station left behind is forgotten before the next one.
     prior : float
-        Redundant ranges that a scale of 1 counts for, never forgotten: two or three epochs. Infinite holds the scale
-        at 1.
+        Redundant ranges that a scale of 1 counts for, never forgotten: two or three epochs. Infinite holds the
+        scale at 1.
+    least_epochs : float
+        Epochs that the window spans at least, however slow the log, and gaps left out.
     spread : float
         Degrees of freedom of the scale from epoch to epoch: the noise of single epochs varies more than chi-square
         says, so the variance stated for an epoch is that of its window counted this many times, and that of its own
@@ -48,6 +50,7 @@ class NoiseScaleLimits(Settings):
 
     window_s: float = Field(default=100.0, gt=0)
     prior: float = Field(default=20.0, gt=0)
+    least_epochs: float = Field(default=20.0, ge=1)
     spread: float = Field(default=4.0, gt=0)
 
 
@@ -59,14 +62,22 @@ class NoiseState:
     ----------
     time : datetime64[ns]
         Of the last epoch; NaT before the first.
+    age : float [windows]
+        Of the last epoch.
     robust, remaining : ndarray, shape (2,)
         Weighted sum of squared residuals, and degrees of freedom: of the ranges that the robust fit kept, and of
         those that RAIM left.
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    age: float = 0.0
     robust: Floats = field(default_factory=lambda: np.zeros(2))
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
+
+
+def noise_age(time: Datetimes, state: NoiseState, *, limits: NoiseScaleLimits) -> Floats:
+    """Age of each epoch, shape (T,) [windows]."""
+    return ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=limits.least_epochs)
 
 
 def robust_scale(
@@ -141,7 +152,7 @@ def _learnt(
 ) -> tuple[Floats, Floats]:
     """Root mean square with forgetting around a prior scale, and the sums to go on with."""
     values = np.stack([wsse, freedom.astype(np.float64)], axis=1)
-    before, after = decayed_sums(time, values, start, state.time, window_s=limits.window_s)
+    before, after = decayed_sums(noise_age(time, state, limits=limits), values, start, state.age)
     if np.isinf(limits.prior):
         return prior, after
     return np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior)), after
