@@ -224,7 +224,7 @@ CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
         0,
     ),
     Reason.DOPPLER: lambda: (
-        front_alone(one_wrong(60.0, from_epoch=20), {"screens": ["doppler"]}),
+        front_alone(one_wrong(60.0, from_epoch=20), {"screens": ["doppler"], "doppler": {"verdict": "reject"}}),
         AT,
         20,
     ),
@@ -249,9 +249,27 @@ def test_reason_is_given(reason: Reason):
 def test_antenna_pair_is_given():
     parts = {name: whole[400:440] for name, whole in clean_observations().items()}
     parts["front"] = one_wrong(40.0)
-    result, _ = processor({"screens": ["elevation", "antenna_pair"]}).process(parts)
+    pair = {"screens": ["elevation", "antenna_pair"], "antenna_pair": {"verdict": "reject"}}
+    result, _ = processor(pair).process(parts)
     for found in result.antennas.values():
         assert np.all(found.reason[:, AT] == Reason.ANTENNA_PAIR)
+
+
+@pytest.mark.requirement("B0")
+@pytest.mark.parametrize("screen", ["doppler", "antenna_pair"])
+def test_a_suspicion_weighs_and_takes_nothing_away(screen: str):
+    """The sigma of a suspected satellite grows by what the screen measured; that of the others stays."""
+    parts = {name: whole[400:440] for name, whole in clean_observations().items()}
+    parts["front"] = one_wrong(40.0, from_epoch=20)
+    result, _ = processor({"screens": ["elevation", screen]}).process(parts)
+    without, _ = processor({"screens": ["elevation"]}).process(parts)
+    found, plain = result.antennas["front"], without.antennas["front"]
+    assert np.array_equal(found.reason, plain.reason)
+    at = 21
+    assert found.sigma_m[at, AT] == pytest.approx(np.hypot(plain.sigma_m[at, AT], 40.0), rel=0.05)
+    unsuspected = ~found.screens[screen].reject[at]
+    columns = found.columns
+    assert np.array_equal(found.sigma_m[at, columns][unsuspected], plain.sigma_m[at, columns][unsuspected])
 
 
 def test_reasons_gather():

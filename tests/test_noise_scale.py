@@ -1,0 +1,106 @@
+"""What the noise scale and the clock offsets learn from: agreeing ranges, with forgetting (requirements B4, C3)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline_cases import clean_trajectories, demo_observations, with_code
+from railfix.core.geodesy import range_with_rotation
+from railfix.core.reasons import Status
+from railfix.core.timescale import timedelta
+from railfix.io.rinex import read_navigation
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.positioning.forgetting import ages, decayed_sums
+from railfix.positioning.noise_scale import NoiseScaleLimits, epoch_variance
+from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.robust_fit import robust_fit
+from railfix.simulate.demo_data import demo_files
+
+
+def with_fault(satellite: str, size_m: float, *, since: int = 0) -> AntennaResult:
+    """The front antenna of the demonstration, one satellite too long by a constant from an epoch on."""
+    observations = demo_observations()["front"]
+    change = np.zeros(observations.code_m.shape)
+    change[since:, observations.satellite == satellite] = size_m
+    lines = {"front": clean_trajectories()["front"]}
+    processor = EpochProcessor(parse_config({}), lines, navigation=read_navigation(demo_files()["nav"]))
+    return processor.process({"front": with_code(observations, change)})[0].antennas["front"]
+
+
+@pytest.fixture(scope="module")
+def clean() -> AntennaResult:
+    return with_fault("G06", 0.0)
+
+
+@pytest.mark.requirement("B4")
+@pytest.mark.parametrize(("satellite", "size_m"), [("G06", 10.0), ("G06", 20.0), ("G06", 100.0), ("E05", 20.0)])
+def test_a_fault_from_the_first_epoch_on_teaches_nothing(clean: AntennaResult, satellite: str, size_m: float) -> None:
+    found = with_fault(satellite, size_m)
+    ok = (found.status == Status.OK) & (clean.status == Status.OK)
+    assert np.median(np.abs(found.chainage_m - clean.chainage_m)[ok]) < 1.0
+    assert found.noise_scale[-1] == pytest.approx(clean.noise_scale[-1], rel=0.15)
+    known = found.clock_offset_sigma_m[-1] < 100.0
+    assert np.abs(found.clock_offset_m[-1] - clean.clock_offset_m[-1])[known].max() < 1.0
+    assert found.protection is not None
+    assert (found.protection.status == 0).mean() > 0.8
+
+
+def test_sums_decay_as_one_by_one() -> None:
+    """The recursion by hand, over uneven steps, several spans and a gap."""
+    generator = np.random.default_rng(3)
+    step = generator.uniform(0.1, 400.0, 300)
+    time = np.datetime64("2024-03-05T00:00:00", "ns") + timedelta(np.cumsum(step))
+    values = generator.normal(size=(300, 2))
+    nothing = np.datetime64("NaT", "ns")
+    age = ages(time, nothing, 0.0, window_s=100.0, least_epochs=4.0)
+    before, after = decayed_sums(age, values, np.zeros(2), 0.0)
+    total = np.zeros(2)
+    for t in range(300):
+        if t:
+            total = total * np.exp(-min(step[t] / 100.0, 0.25))
+        assert before[t] == pytest.approx(total, abs=1e-9)
+        total = total + values[t]
+    half = decayed_sums(age[:150], values[:150], np.zeros(2), 0.0)
+    rest = decayed_sums(age[150:], values[150:], half[1], float(age[149]))
+    assert np.array_equal(np.concatenate([half[0], rest[0]]), before)
+    assert np.array_equal(rest[1], after)
+
+
+def test_the_robust_fit_finds_one_and_two_outliers() -> None:
+    """Twelve satellites of one clock around the zenith, noise of half their sigma."""
+    generator = np.random.default_rng(8)
+    epochs, channels = 200, 12
+    place = np.broadcast_to([6.37e6, 0.0, 0.0], (epochs, 3))
+    elevation, azimuth = generator.uniform(0.2, 1.5, channels), np.linspace(0.0, 2.0 * np.pi, channels, endpoint=False)
+    level = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1) * np.cos(elevation)[:, None]
+    unit = np.concatenate([np.sin(elevation)[:, None], level], axis=1)
+    satellites = np.broadcast_to(place[0] + 2.2e7 * unit, (epochs, channels, 3))
+    plain = Ranges(
+        sat_ecef_m=satellites,
+        code_m=np.zeros((epochs, channels)),
+        weight=np.full((epochs, channels), 0.25),
+        groups=(slice(0, channels),),
+    )
+    distance, _ = range_with_rotation(satellites, place[:, None, :])
+    noise = generator.normal(size=(epochs, channels))
+    clean_fit = robust_fit(replace(plain, code_m=distance + noise), place)
+    assert np.mean(clean_fit.kept) > 0.97
+    assert np.nanmean(clean_fit.variance) == pytest.approx(0.25, rel=0.15)
+    faulty = noise.copy()
+    faulty[:, 3] += 30.0
+    faulty[:, 7] -= 20.0
+    found = robust_fit(replace(plain, code_m=distance + faulty), place)
+    assert not found.kept[:, [3, 7]].any()
+    assert np.nanmean(found.variance) == pytest.approx(0.25, rel=0.2)
+
+
+def test_the_variance_of_an_epoch_lies_between_window_and_residuals() -> None:
+    limits = NoiseScaleLimits(spread=4.0)
+    scale, wsse, redundancy = np.array([1.0, 1.0, 0.5]), np.array([40.0, np.nan, 1.0]), np.array([10, 3, 4])
+    found = epoch_variance(scale, wsse, redundancy, limits=limits)
+    assert found == pytest.approx([(4.0 + 40.0) / 14.0, 1.0, (1.0 + 1.0) / 8.0])

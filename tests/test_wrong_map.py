@@ -1,0 +1,91 @@
+"""Off the map, and maps that are wrong: beside the line, on the next track, without the geoid (requirements B6, C4)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline_cases import clean_trajectories, demo_observations
+from railfix.core.reasons import Status
+from railfix.integrity.protection import LevelStatus
+from railfix.io.rinex import read_navigation
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.simulate.demo_data import demo_files
+from railfix.track.trajectory import Trajectory
+
+
+def moved(trajectory: Trajectory, *, across_m: float = 0.0, up_m: float = 0.0) -> Trajectory:
+    """The same line beside or above its place."""
+    across = np.concatenate([trajectory.across, trajectory.across[-1:]])
+    up = np.concatenate([trajectory.up, trajectory.up[-1:]])
+    return replace(trajectory, ecef_m=trajectory.ecef_m + across_m * across + up_m * up)
+
+
+def on_a_map(*, across_m: float = 0.0, up_m: float = 0.0) -> AntennaResult:
+    """The front antenna of the demonstration on a moved map."""
+    line = moved(clean_trajectories()["front"], across_m=across_m, up_m=up_m)
+    processor = EpochProcessor(parse_config({}), {"front": line}, navigation=read_navigation(demo_files()["nav"]))
+    return processor.process({"front": demo_observations()["front"]})[0].antennas["front"]
+
+
+def in_the_middle(result: AntennaResult) -> np.ndarray:
+    """Epochs with a position that is not clamped to an end of the line."""
+    return np.isfinite(result.constrained.arc_m) & (result.constrained.overshoot_m == 0.0)
+
+
+@pytest.fixture(scope="module")
+def right() -> AntennaResult:
+    return on_a_map()
+
+
+def test_the_right_map_is_neither_off_nor_offset(right: AntennaResult) -> None:
+    assert not np.isin(right.status, [Status.OFF_MAP, Status.MAP_OFFSET]).any()
+    assert np.nanmax(right.map_offset.statistic) < 9.2
+
+
+@pytest.mark.requirement("C4")
+@pytest.mark.parametrize(("across_m", "least"), [(50.0, 0.97), (200.0, 0.97), (2000.0, 0.97)])
+def test_off_the_map_in_the_middle_of_a_line(across_m: float, least: float) -> None:
+    """The nearest point is within the line: no end that clamps tells it."""
+    result = on_a_map(across_m=across_m)
+    middle = in_the_middle(result)
+    assert middle.sum() > 500
+    told = np.isin(result.status, [Status.OFF_MAP, Status.MAP_OFFSET])
+    assert told[middle].mean() > least
+    assert result.protection is not None
+    assert not (result.protection.status[told] == LevelStatus.AVAILABLE).any()
+
+
+@pytest.mark.requirement("C4")
+@pytest.mark.parametrize(("across_m", "most"), [(20.0, 0.019), (50.0, 0.0)])
+def test_a_map_beside_the_line_is_not_ok(across_m: float, most: float) -> None:
+    result = on_a_map(across_m=across_m)
+    observed = result.status != Status.NO_OBSERVATION
+    assert (result.status[observed] == Status.OK).mean() <= most
+
+
+@pytest.mark.requirement("C4")
+def test_a_forgotten_geoid_is_not_ok(right: AntennaResult) -> None:
+    result = on_a_map(up_m=37.0)
+    assert (result.status == Status.OK).sum() < 0.1 * (right.status == Status.OK).sum()
+    offset = result.map_offset
+    assert np.nanmax(offset.statistic) > 13.8
+    assert np.nanmedian(offset.up_m) == pytest.approx(-37.0, abs=3.0 * float(np.nanmedian(offset.up_sigma_m)))
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize("offset", [{"up_m": 10.0}, {"across_m": 5.0}], ids=["10 m above", "5 m beside"])
+def test_a_small_offset_is_a_term_of_the_level(right: AntennaResult, offset: dict[str, float]) -> None:
+    """Satellites and atmosphere can do as much, so it is no verdict; the level grows by what is beyond one sigma."""
+    result = on_a_map(**offset)
+    late = np.arange(len(right)) > 1500
+    assert right.protection is not None
+    assert result.protection is not None
+    before, after = (r.protection.level.level_m[late] for r in (right, result))
+    assert np.nanmedian(after) > np.nanmedian(before) + 0.3
+    across, up = result.map_offset.beyond_m
+    assert max(np.median(np.abs(across[late])), np.median(np.abs(up[late]))) > 1.0
