@@ -21,7 +21,7 @@ import numpy as np
 from conftest import ROOT
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.gnss.orbits import satellite_states
-from railfix.integrity.protection import along_track_level, sbas_level
+from railfix.integrity.protection import along_track_level
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
@@ -35,6 +35,7 @@ from railfix.ranges.sbas_delays import corrected_satellites
 from railfix.ranges.weights import CodeNoise, code_sigma_m
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
+from sbas_levels import sbas_level
 
 #: Latitude, longitude [deg] of the ends.
 LINES: Final = {

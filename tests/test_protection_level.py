@@ -15,12 +15,11 @@ import raim_oracle as oracle
 from protection_hand_case import HAND, hand_model
 from railfix.integrity.protection import (
     Cause,
+    LevelStatus,
     ProtectionLevel,
     RiskBudget,
-    Status,
     along_track_level,
     availability,
-    sbas_level,
 )
 from railfix.integrity.raim import constrained_model, point_model
 from railfix.positioning.normal_equations import UNTIED_M
@@ -72,7 +71,7 @@ def test_case_worked_by_hand():
     off = along_track_level(hand_model((6.0, 0.0, 0.0, 0.0, 0.0)), list("GGGGG"), risk=HAND)
     assert not off.consistent[0]
     assert off.separation[0] == pytest.approx(2.0 * got.separation[0], abs=1e-9)
-    assert availability(off.level_m, 20.0, consistent=off.consistent)[0] == Status.ALARM
+    assert availability(off.level_m, 20.0, consistent=off.consistent)[0] == LevelStatus.ALARM
 
 
 def test_case_worked_by_hand_against_rows_and_columns():
@@ -270,15 +269,13 @@ def test_refusals():
     space = point_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE.at_arc(ARC))
     with pytest.raises(ValueError, match="a model on the line"):
         along_track_level(space, list("GGGGG"))
-    with pytest.raises(ValueError, match="a model on the line"):
-        sbas_level(space, k=5.33)
 
 
 def test_status():
     level = np.array([19.0, 20.0, 21.0, np.inf, np.nan, 5.0, np.inf, np.nan])
     consistent = np.array([True, True, True, True, True, False, False, False])
     got = availability(level, 20.0, consistent=consistent)
-    assert [Status(s).name for s in got] == [
+    assert [LevelStatus(s).name for s in got] == [
         "AVAILABLE",
         "AVAILABLE",
         "UNAVAILABLE",

@@ -8,9 +8,10 @@ import pytest
 import raim_oracle as oracle
 import synthetic
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
-from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, RiskBudget, levels_in_space, sbas_level
+from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, RiskBudget
 from railfix.integrity.raim import constrained_model
 from railfix.positioning.normal_equations import Ranges, clock_groups
+from sbas_levels import levels_in_space, sbas_level
 
 pytestmark = pytest.mark.requirement("C2")
 

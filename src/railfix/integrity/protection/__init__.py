@@ -1,17 +1,15 @@
 """Protection level along the track (P1 2.4): how wrong may the position be, at a stated risk?
 
-From the model of `railfix.integrity.raim`, once for noise alone and once with fault hypotheses::
+From the model of `railfix.integrity.raim`::
 
     risk = RiskBudget()
     model = constrained_model(ranges, trajectory, arc_m)
-    sbas = sbas_level(model, k=risk.sample_k)
     got = along_track_level(model, systems, risk=risk, n_excluded=n_excluded)
     status = availability(got.level_m, 20.0, consistent=got.consistent)
 """
 
 from railfix.integrity.protection.level import Cause, ProtectionLevel, along_track_level
 from railfix.integrity.protection.risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
-from railfix.integrity.protection.sbas import LevelsInSpace, levels_in_space, sbas_level
 from railfix.integrity.protection.status import LevelStatus, availability
 
 __all__ = [
@@ -22,12 +20,9 @@ __all__ = [
     "SATELLITE_PRIOR",
     "Cause",
     "LevelStatus",
-    "LevelsInSpace",
     "ProtectionLevel",
     "RiskBudget",
     "along_track_level",
     "availability",
     "k_factor",
-    "levels_in_space",
-    "sbas_level",
 ]

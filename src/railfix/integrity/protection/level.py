@@ -26,7 +26,6 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings
 from railfix.integrity.protection.risk import MOST_EXCLUDED, RiskBudget, more_than_two, one_sided_k, pair_sum
-from railfix.integrity.protection.sbas import along_the_line
 from railfix.integrity.protection.separation import Separations, whole, without_constellation, without_one, without_two
 from railfix.integrity.protection.tails import Tails, least_level
 from railfix.integrity.raim import LinearModel
@@ -170,7 +169,8 @@ def along_track_level(
         A model in space, a number of systems that is not that of the channels, a constellation without prior,
         a scale that is not positive.
     """
-    along_the_line(model)
+    if model.interest != 1:
+        raise ValueError("a level along the track asks for a model on the line (constrained_model)")
     risk = risk or RiskBudget()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:

@@ -30,15 +30,8 @@ def sbas_level(model: LinearModel, *, k: float, scale: ArrayLike = 1.0) -> Float
     scale : array_like, shape (T,) or ()
         Noise scale, as in `raim.reliability`.
     """
-    along_the_line(model)
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))
     return np.asarray(k * np.sqrt(model.position_covariance_m2(scale)[:, 0, 0]))
-
-
-def along_the_line(model: LinearModel) -> None:
-    """Refuse a model in space."""
-    if model.interest != 1:
-        raise ValueError("a level along the track asks for a model on the line (constrained_model)")
 
 
 @dataclass(frozen=True, kw_only=True)
