@@ -12,6 +12,7 @@ from rich.table import Table
 from railfix.cli.console import console_of_tables, progress_bar, show_summary
 from railfix.cli.options import OverwriteOption
 from railfix.evaluate import Evaluation
+from railfix.pipeline.config import Config
 from railfix.report import read_runs, write_page
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -32,8 +33,8 @@ def demo(
     ones (3-D single point, moved to the nearest point of the line), are compared with the ground truth as by
     `railfix report`.
 
-    Into DIR come `positions.csv`, `positions.parquet`, `observations.parquet`, `run.json` and
-    `report.html`, the page to open in a browser.
+    Into DIR come `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet`,
+    `run.json` and `report.html`, the page to open in a browser.
 
     Example:
 
@@ -44,7 +45,7 @@ def demo(
     inputs = demo_inputs()
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite="replace" if overwrite else "refuse", chunk_epochs=200)
-        summary = run_files(inputs, out=out, options=options, progress=progress)
+        summary = run_files(inputs, Config(filter="track"), out=out, options=options, progress=progress)
     show_summary(summary)
     runs, evaluation = read_runs([out], [demo_truth()])
     page = write_page(

@@ -21,6 +21,8 @@ def run(
     - `positions.csv` and `positions.parquet`: one row an epoch and antenna, also where there is no
       position; place along the line, its standard deviation, coordinates, the conventional
       position for comparison
+    - `train.csv` and `train.parquet`: positions of the filter along the track over all epochs so far,
+      with speed, direction and the probability of the branch (not with `--filter off`)
     - `observations.parquet` (with `--observations`): one row an epoch, satellite and signal
     - `run.json`: versions, hashes of the inputs, settings asked for and used, counts by status and
       reason, positioning rate
@@ -38,6 +40,8 @@ def run(
     written; 1 a defect of railfix.
     """
     settings, asked = settings_of(choices)
+    if "filter" not in asked:
+        settings = settings.replaced(filter="track")
     inputs = inputs.replaced(config=choices.config)
     with progress_bar() as progress:
         summary = run_files(inputs, settings, out=out, options=options, asked=asked, progress=progress)

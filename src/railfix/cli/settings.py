@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option, read_toml
@@ -26,6 +26,7 @@ class Choices(Settings):
         Names with commas, or "none".
     without : tuple of str
         Screens to switch off.
+    filter : {"track", "off"} or None
     cn0_curve, error_model : Path or None
     sbas : tuple of Path
     """
@@ -49,6 +50,11 @@ class Choices(Settings):
         metavar="NAME,NAME",
     )
     without: tuple[str, ...] = option("Switch one screen off; may be repeated.", (), metavar="NAME")
+    filter: Literal["track", "off"] | None = option(
+        "Filter along the track over all epochs, into train.csv and train.parquet: track (the default of railfix run) "
+        "or off.",
+        None,
+    )
     cn0_curve: Path | None = option(
         "Mean C/N0 over elevation of antenna and receiver, from railfix cn0-curve.", None, metavar="TOML"
     )
@@ -97,6 +103,8 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
         source = "--set"
     if choices.screens is not None:
         values["screens"] = [] if choices.screens.strip() == "none" else _screens("--screens", choices.screens)
+    if choices.filter is not None:
+        values["filter"] = choices.filter
     if choices.cn0_curve is not None:
         values["cn0_curve"] = str(choices.cn0_curve)
     if choices.error_model is not None:

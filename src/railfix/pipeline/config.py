@@ -45,6 +45,7 @@ from railfix.positioning.single_point import SinglePointLimits
 from railfix.ranges.sbas import SbasLimits
 from railfix.ranges.weights import CodeNoise, NominalErrors
 from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
+from railfix.tracking.limits import TrackingLimits
 
 #: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
 DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
@@ -83,6 +84,7 @@ ROOMS: Final = (
     "smoothing",
     "continuity",
     "phase",
+    "tracking",
 )
 
 #: Settings by the name of their preset. "strict": certainty before rate. "p1": table 6 of P1 to the
@@ -182,6 +184,11 @@ class Config(Settings):
         ambiguities under open sky; in towns, where arcs last seconds, neither takes off large errors.
     phase_sigma_m : float
         Standard deviation of a phase at the zenith, what multipath does to it included.
+    filter : {"track", "off"}
+        Whether epochs also go through one filter along the track (codes, Dopplers, changes of the carrier phase and
+        sensors, from this and earlier epochs), into a table of its own. `railfix run` and `railfix demo` ask for it.
+    tracking : TrackingLimits
+        Noise of motion and measurements of that filter.
     slips, smoothing, continuity, phase
         Limits of the rooms of the carrier phase.
     """
@@ -225,6 +232,8 @@ class Config(Settings):
     smoothing: SmoothingLimits = Field(default_factory=SmoothingLimits)
     continuity: ContinuityLimits = Field(default_factory=ContinuityLimits)
     phase: PhaseLimits = Field(default_factory=PhaseLimits)
+    filter: Literal["track", "off"] = "off"
+    tracking: TrackingLimits = Field(default_factory=TrackingLimits)
     clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
     elevation: ElevationLimits = Field(default_factory=ElevationLimits)
     single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)

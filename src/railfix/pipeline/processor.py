@@ -17,6 +17,7 @@ from railfix.core.reasons import Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
+from railfix.pipeline.along_track import AlongTrack, FilterState, along_track
 from railfix.pipeline.antenna_pair import AntennaPair, antenna_pair_screened, pair_antennas
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_phase import CarrierState, smoothed, with_slips
@@ -185,9 +186,20 @@ class EpochProcessor:
             name: antenna_result(corrected, self.trajectories[name], solutions[name], self.config)
             for name, corrected in ranges.items()
         }
-        # The filter along the track takes results, sensors and state.fusion here, and returns both its values.
+        tracks: dict[str, AlongTrack] = {}
+        filters = dict(state.fusion)
+        for name, corrected in ranges.items() if self.config.filter == "track" else ():
+            tracks[name], filters[name] = along_track(
+                corrected,
+                solutions[name].noise_scale,
+                self.trajectories[name],
+                received.navigation,
+                self.config,
+                filters.get(name, FilterState()),
+            )
         notes = (*received.notes, *self._lacking)
-        return Result(antennas=results, notes=notes, fusion=None), State(antennas=after, received=received)
+        result = Result(antennas=results, notes=notes, fusion=tracks)
+        return result, State(antennas=after, received=received, fusion=filters)
 
     def _screened(
         self, name: str, obs: Observations, received: Received, state: AntennaState

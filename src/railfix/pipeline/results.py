@@ -13,6 +13,7 @@ from railfix.core.display import NotebookTable, plural, time_span_text
 from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
+from railfix.pipeline.along_track import AlongTrack, FilterState
 from railfix.pipeline.carrier_phase import CarrierState
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
@@ -109,13 +110,13 @@ class State:
     antennas : mapping of str to AntennaState
     received : Received or None
         Navigation records and SBAS messages so far; None: those that the processor was made with.
-    fusion : None
-        State of the filter along the track, once there is one.
+    fusion : mapping of str to FilterState
+        State of the filter along the track, by antenna.
     """
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
     received: Received | None = None
-    fusion: None = None
+    fusion: Mapping[str, FilterState] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,13 +241,13 @@ class Result(NotebookTable):
     antennas : mapping of str to AntennaResult
     notes : tuple of str
         Differences between what was asked for and what was used, one sentence each.
-    fusion : None
-        Positions of the filter along the track, once there is one.
+    fusion : mapping of str to AlongTrack
+        Positions of the filter along the track, by antenna; empty where it is off.
     """
 
     antennas: Mapping[str, AntennaResult]
     notes: tuple[str, ...]
-    fusion: None = None
+    fusion: Mapping[str, AlongTrack] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         parts = (f"{name} {result.status_text()}" for name, result in self.antennas.items())

@@ -17,6 +17,7 @@ from railfix.core.arrays import Floats
 from railfix.core.reasons import Reason, Status, reason_text
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
+from railfix.pipeline.along_track import AlongTrack, innovations
 from railfix.pipeline.protection_levels import KINDS
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.screens import DopplerScreened
@@ -104,6 +105,10 @@ OBSERVATION_COLUMNS: Final[dict[str, str]] = {
     "limit_doppler_m": "screen `doppler`: what the size of that is compared with",
     "metric_antenna_pair_m": "screen `antenna_pair`: pseudorange rear less front, against what their spacing explains",
     "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty",
+    "innovation_code_m": "filter along the track: code less what earlier epochs predict",
+    "innovation_phase_m": "the same of the change of the carrier phase since the epoch before",
+    "innovation_doppler_mps": "the same of the Doppler",
+    "weight_code": "weight of the code in the filter; 1 is that of an error of one standard deviation",
 }
 
 #: Results with one value an epoch, and with one an epoch and channel.
@@ -125,7 +130,7 @@ _OF_CHANNEL: Final = (
 )
 
 
-def _floats(values: Floats) -> pl.Series:
+def float_column(values: Floats) -> pl.Series:
     """A column of floats, NaN as null."""
     return pl.Series(values=np.ascontiguousarray(values, dtype=np.float64), nan_to_null=True)
 
@@ -160,17 +165,17 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
         "longitude_deg",
         "height_m",
     ):
-        columns[column] = _floats(getattr(result, column))
+        columns[column] = float_column(getattr(result, column))
     for axis, column in enumerate(("x_m", "y_m", "z_m")):
-        columns[column] = _floats(result.ecef_m[:, axis])
+        columns[column] = float_column(result.ecef_m[:, axis])
     columns["n_used"] = pl.Series(values=result.n_used.astype(np.int16))
     columns["n_rejected"] = pl.Series(values=result.n_rejected.astype(np.int16))
-    columns["noise_scale"] = _floats(result.noise_scale)
+    columns["noise_scale"] = float_column(result.noise_scale)
     columns |= _raim_columns(result)
-    columns["conventional_chainage_m"] = _floats(result.conventional_chainage_m)
-    columns["conventional_offset_m"] = _floats(result.conventional_offset_m)
+    columns["conventional_chainage_m"] = float_column(result.conventional_chainage_m)
+    columns["conventional_offset_m"] = float_column(result.conventional_offset_m)
     for axis, column in enumerate(("conventional_x_m", "conventional_y_m", "conventional_z_m")):
-        columns[column] = _floats(result.conventional_ecef_m[:, axis])
+        columns[column] = float_column(result.conventional_ecef_m[:, axis])
     return pl.DataFrame(columns)
 
 
@@ -180,11 +185,11 @@ def _raim_columns(result: AntennaResult) -> dict[str, pl.Series]:
     spacing = result.screens.get("antenna_spacing")
     return {
         "raim_outcome": words.gather(pl.Series(values=result.raim.outcome.astype(np.uint32))),
-        "raim_statistic": _floats(result.raim.statistic),
-        "raim_threshold": _floats(result.raim.threshold),
-        "raim_level_m": _floats(result.raim.protection_level_m),
+        "raim_statistic": float_column(result.raim.statistic),
+        "raim_threshold": float_column(result.raim.threshold),
+        "raim_level_m": float_column(result.raim.protection_level_m),
         **_protection_columns(result),
-        "metric_antenna_spacing_m": _floats(np.full(len(result), np.nan) if spacing is None else spacing.metric),
+        "metric_antenna_spacing_m": float_column(np.full(len(result), np.nan) if spacing is None else spacing.metric),
     }
 
 
@@ -209,7 +214,7 @@ def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
         "protection_status": (LEVEL_STATUS_TYPE, None if found is None else found.status),
     }
     columns = {
-        name: _floats(np.full(epochs, np.nan) if found is None else getattr(found.level, field))
+        name: float_column(np.full(epochs, np.nan) if found is None else getattr(found.level, field))
         for name, field in _OF_LEVEL.items()
     }
     named = pl.Series(values=[None if found is None else found.kind], dtype=KIND_TYPE)
@@ -240,7 +245,7 @@ def positions_table(result: Result) -> pl.DataFrame:
     return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
 
 
-def antenna_observations(name: str, result: AntennaResult) -> pl.DataFrame:
+def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack | None = None) -> pl.DataFrame:
     """One row an epoch and channel that was observed, of one antenna.
 
     Parameters
@@ -248,6 +253,8 @@ def antenna_observations(name: str, result: AntennaResult) -> pl.DataFrame:
     name : str
         Goes into the column ``antenna``.
     result : AntennaResult
+    tracked : AlongTrack, optional
+        Of the filter along the track.
 
     Returns
     -------
@@ -268,9 +275,11 @@ def antenna_observations(name: str, result: AntennaResult) -> pl.DataFrame:
         "reason_text": texts.gather(pl.Series(values=inverse.astype(np.uint32))),
     }
     for column in ("residual_m", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "corrected_code_m"):
-        columns[column] = _floats(getattr(result, column)[epoch, channel])
+        columns[column] = float_column(getattr(result, column)[epoch, channel])
     for column, measured in screen_metrics(result).items():
-        columns[column] = _floats(measured[epoch, channel])
+        columns[column] = float_column(measured[epoch, channel])
+    for column, measured in innovations(tracked, result.columns, result.reason.shape).items():
+        columns[column] = float_column(measured[epoch, channel])
     return pl.DataFrame(columns)
 
 
@@ -317,7 +326,7 @@ def observations_table(result: Result) -> pl.DataFrame:
     polars.DataFrame
         Columns of `OBSERVATION_COLUMNS`.
     """
-    parts = [antenna_observations(name, antenna) for name, antenna in result.antennas.items()]
+    parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
     whole = pl.concat(parts)
     return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
 

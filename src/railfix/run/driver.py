@@ -17,6 +17,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor, State
 from railfix.pipeline.protection_levels import level_facts, risk_of
 from railfix.pipeline.tables import observations_table, positions_table, rounded
+from railfix.pipeline.train_table import train_table
 from railfix.run.checks import (
     RECORD_REACH,
     check_positions,
@@ -195,6 +196,10 @@ def _position(
         table = positions_table(result)
         folder.append_parquet("positions.parquet", table)
         folder.append_csv("positions.csv", rounded(table))
+        if result.fusion:
+            train = train_table(result)
+            folder.append_parquet("train.parquet", train)
+            folder.append_csv("train.csv", rounded(train))
         if options.observations == "write":
             folder.append_parquet("observations.parquet", observations_table(result))
         if progress is not None:

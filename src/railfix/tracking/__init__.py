@@ -11,6 +11,17 @@ from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus
+from railfix.tracking.rows import Kind
 from railfix.tracking.state import TrackState
 
-__all__ = ["GnssEpochs", "Line", "SensorEpochs", "TrackState", "TrackStatus", "Tracked", "TrackingLimits", "track"]
+__all__ = [
+    "GnssEpochs",
+    "Kind",
+    "Line",
+    "SensorEpochs",
+    "TrackState",
+    "TrackStatus",
+    "Tracked",
+    "TrackingLimits",
+    "track",
+]

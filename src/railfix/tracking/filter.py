@@ -131,8 +131,9 @@ def _step(
     noise = noise_of(channels, dt, limits, state.log_scale)
     rows = _all_rows(channels, sensors, epoch, line, mean, mean[:, [Unknown.PLACE, Unknown.BEFORE]], dt, noise)
     if rows.value.shape[1]:
-        mean, covariance, known = clocks_of_epoch(rows, channels, mean, covariance, state.offset_known)
-        rows = _all_rows(channels, sensors, epoch, line, mean, mean[:, [Unknown.PLACE, Unknown.BEFORE]], dt, noise)
+        shifted, covariance, known = clocks_of_epoch(rows, channels, mean, covariance, state.offset_known)
+        moved = (rows.design @ (shifted - mean)[..., None])[..., 0]
+        mean, rows = shifted, replace(rows, value=rows.value - moved)
         weight = first_weights(rows, covariance, limits.degrees_of_freedom)
         innovation = rows.value
         update = _settled(rows, weight, channels, sensors, epoch, line, mean, covariance, dt, noise, limits)
@@ -206,5 +207,5 @@ def _settled(
 
 def _least_weight(rows: Rows, update: Update, kinds: tuple[Kind, ...]) -> float:
     """Least mean weight of some kinds over the hypotheses; infinite without any."""
-    mask = np.isin(rows.kind, [int(kind) for kind in kinds])
+    mask = rows.of(kinds)
     return float(update.weight[:, mask].mean(axis=1).min()) if mask.any() else float("inf")

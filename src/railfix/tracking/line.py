@@ -67,9 +67,9 @@ class Line:
         axes : ndarray, shape (H, 3, 3)
             Rows: tangent, right, up; interpolated between vertices.
         """
-        index = np.clip(np.searchsorted(self.arc_m, arc_m, side="right") - 1, 0, len(self.segment) - 1)
+        index = np.searchsorted(self.arc_m[1:-1], arc_m, side="right")
         along = arc_m - self.arc_m[index]
-        share = np.clip(along / (self.arc_m[index + 1] - self.arc_m[index]), 0.0, 1.0)[:, None, None]
+        share = np.minimum(np.maximum(along / (self.arc_m[index + 1] - self.arc_m[index]), 0.0), 1.0)[:, None, None]
         axes = (1.0 - share) * self.axes[index] + share * self.axes[index + 1]
         axes = axes / np.sqrt((axes * axes).sum(axis=-1, keepdims=True))
         return self.ecef_m[index] + along[:, None] * self.segment[index], axes

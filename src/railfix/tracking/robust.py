@@ -136,5 +136,5 @@ def better_mode(
 
 def mean_weight(rows: Rows, weight: Floats, kinds: tuple[Kind, ...]) -> float:
     """Mean weight of the rows of some kinds, NaN without any; `weight` is that of one hypothesis, shape (M,)."""
-    mask = np.isin(rows.kind, [int(kind) for kind in kinds])
+    mask = rows.of(kinds)
     return float(weight[mask].mean()) if mask.any() else float("nan")

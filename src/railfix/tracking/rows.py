@@ -100,6 +100,13 @@ class Rows:
     kind: Integers
     column: Indices
 
+    def of(self, kinds: tuple[Kind, ...]) -> Masks:
+        """Rows of some kinds, shape (M,)."""
+        mask = self.kind == kinds[0]
+        for kind in kinds[1:]:
+            mask = mask | (self.kind == kind)
+        return mask
+
     @property
     def common(self) -> tuple[Masks, Masks, Masks]:
         """Rows of codes, phases and Dopplers."""

@@ -1,0 +1,180 @@
+"""Apply the filter along the track to the corrected ranges of each antenna."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
+from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.core.reasons import Reason
+from railfix.gnss.navigation import Navigation, glonass_channels
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.pipeline.config import Config
+from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import GnssEpochs, Kind, Line, SensorEpochs, Tracked, TrackState, track
+
+#: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
+_WEIGHED_BY_FILTER: Final = (
+    Reason.FAULT_EXCLUDED
+    | Reason.ALONE_ON_ITS_CLOCK
+    | Reason.DOPPLER
+    | Reason.CN0_FLOOR
+    | Reason.CN0_CURVE
+    | Reason.ANTENNA_PAIR
+)
+#: Slower than this, with two sigmas, the train stands [m/s]: 1 km/h, where tachometers give out too.
+STANDSTILL_MPS: Final = 1.0 / 3.6
+#: A direction is given where the speed is beyond this many of its sigmas.
+_DIRECTION_SIGMAS: Final = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterState:
+    """State of the filter along the track of one antenna after a chunk."""
+
+    slips: SlipState | None = None
+    track: TrackState | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlongTrack:
+    """Positions of one antenna by the filter along the track, T epochs.
+
+    Attributes
+    ----------
+    tracked : Tracked
+        Places along the antenna's trajectory, and what measured them; channels as `AntennaResult.columns`.
+    chainage_m, kilometrage_m : ndarray, shape (T,) [m]
+    ecef_m : ndarray, shape (T, 3) [m]
+    latitude_deg, longitude_deg, height_m : ndarray, shape (T,)
+    direction : ndarray of int8, shape (T,)
+        1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
+    standstill : ndarray of bool, shape (T,)
+    """
+
+    tracked: Tracked
+    chainage_m: Floats
+    kilometrage_m: Floats
+    ecef_m: Floats
+    latitude_deg: Floats
+    longitude_deg: Floats
+    height_m: Floats
+    direction: Codes
+    standstill: Masks
+
+    @property
+    def time(self) -> Datetimes:
+        """Time tags, shape (T,)."""
+        return self.tracked.time
+
+    def __len__(self) -> int:
+        return len(self.tracked)
+
+
+def along_track(
+    ranges: CorrectedRanges,
+    noise_scale: Floats,
+    trajectory: Trajectory,
+    navigation: Navigation,
+    config: Config,
+    state: FilterState,
+    *,
+    sensors: SensorEpochs | None = None,
+) -> tuple[AlongTrack, FilterState]:
+    """Return the filtered positions of one antenna, and the state to pass on.
+
+    Parameters
+    ----------
+    ranges : CorrectedRanges
+        After all screens and exclusions.
+    noise_scale : ndarray, shape (T,)
+        Noise of the receiver's codes against their sigmas.
+    trajectory : Trajectory
+    navigation : Navigation
+    config : Config
+    state : FilterState
+    sensors : SensorEpochs, optional
+        Sensor measurements at the epochs of the ranges.
+    """
+    epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
+    tracked, after = track(epochs, Line.of(trajectory), state.track, limits=config.tracking, sensors=sensors)
+    arc = tracked.arc_m
+    inside = np.where((arc >= 0.0) & (arc <= trajectory.arc_m[-1]), arc, np.nan)
+    ecef = trajectory.at_arc(inside)
+    latitude, longitude, height = geodetic_from_ecef(ecef)
+    speed, sigma = np.nan_to_num(tracked.speed_mps), np.nan_to_num(tracked.speed_sigma_mps, nan=np.inf)
+    direction = np.where(np.abs(speed) > _DIRECTION_SIGMAS * sigma, np.sign(speed), 0.0)
+    result = AlongTrack(
+        tracked=tracked,
+        chainage_m=trajectory.chainage_at(inside),
+        kilometrage_m=trajectory.kilometrage_at(inside),
+        ecef_m=ecef,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        direction=direction.astype(np.int8),
+        standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
+    )
+    return result, FilterState(slips=slips, track=after)
+
+
+def gnss_epochs(
+    ranges: CorrectedRanges, noise_scale: Floats, navigation: Navigation, config: Config, state: SlipState | None
+) -> tuple[GnssEpochs, SlipState | None]:
+    """Return the measurements of the filter, and the state of the slip detection.
+
+    The drift of a satellite's clock and the change of the troposphere, below 5 mm/s above 10 degrees, are left in
+    the Dopplers; the change of the carrier phase has both taken off.
+    """
+    obs, columns = ranges.observations, ranges.columns
+    slips, after = ranges.slips, state
+    if slips is None:
+        channels = {**glonass_channels(navigation), **obs.header.glonass_channel}
+        frequency = carrier_frequency_hz(obs.satellite, obs.signal, channels)
+        slips, after = find_slips(obs, state, frequency_hz=frequency, limits=config.slips)
+    healthy = (ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0
+    no_delay = np.zeros(ranges.code_m.shape)
+    phase = corrected_phase_m(
+        slips.phase_m[:, columns], ranges.satellites.clock_m, no_delay, np.nan_to_num(ranges.troposphere_m)
+    )
+    epochs = GnssEpochs(
+        time=obs.time,
+        satellite=ranges.satellite,
+        clock=np.array([CLOCK_GROUP[str(name)[0]] for name in ranges.satellite], dtype="<U1"),
+        sat_ecef_m=ranges.satellites.position_ecef_m,
+        sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
+        code_m=np.where(healthy, ranges.corrected_code_m, np.nan),
+        code_sigma_m=ranges.sigma_m * noise_scale[:, None],
+        phase_m=np.where(healthy, phase, np.nan),
+        phase_joined=~slips.slip[:, columns],
+        rate_mps=np.where(healthy, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
+        cn0_dbhz=ranges.cn0_dbhz,
+    )
+    return epochs, after
+
+
+def innovations(result: AlongTrack | None, columns: Indices, shape: tuple[int, ...]) -> dict[str, Floats]:
+    """Return innovations of the filter and weights of codes, by column of the table of observations.
+
+    Parameters
+    ----------
+    result : AlongTrack or None
+        None gives NaN throughout.
+    columns : ndarray of int, shape (K,)
+        Channels of the filter among all.
+    shape : tuple of int
+        Epochs and channels of the table.
+    """
+    names = ("innovation_code_m", "innovation_phase_m", "innovation_doppler_mps", "weight_code")
+    full = {name: np.full(shape, np.nan) for name in names}
+    if result is not None:
+        for kind, name in enumerate(names[:3]):
+            full[name][:, columns] = result.tracked.innovation[:, kind]
+        full["weight_code"][:, columns] = result.tracked.weight[:, Kind.CODE]
+    return full

@@ -1,0 +1,103 @@
+"""Positions of the filter along the track as a table."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.results import Result
+from railfix.pipeline.tables import float_column
+from railfix.tracking import Kind, TrackStatus
+
+#: Words of the column ``status`` of the filter along the track, and of ``direction``.
+TRACK_STATUS_TYPE: Final = pl.Enum([s.text for s in TrackStatus])
+DIRECTION_TYPE: Final = pl.Enum(["falling", "unknown", "rising"])
+
+#: Columns of the table of the filter along the track, with their unit and meaning.
+TRAIN_COLUMNS: Final[dict[str, str]] = {
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "status": "`tracking`; `several_branches`, the most probable place of several; `coasting`, predicted without a "
+    "measurement; `lost`, measurements contradict the track and places are sought again; `expired`, predicted too "
+    "far; `not_started`",
+    "chainage_m": "distance along the line from the first point of the track",
+    "kilometrage_m": "the line's own marking, where the track has one",
+    "along_sigma_m": "standard deviation along the line",
+    "speed_mps": "along the line, + toward rising chainage",
+    "speed_sigma_mps": "its standard deviation",
+    "acceleration_mps2": "along the line",
+    "direction": "`rising` or `falling` chainage, `unknown` where the speed does not tell",
+    "standstill": "slower than 1 km/h with two sigmas",
+    "branch_probability": "probability of the place given against other places of the line",
+    "hypotheses": "places that are possible",
+    "sources": "measurements used with a weight of more than a half: `code`, `phase`, `doppler`, `wheel`, `speed`, "
+    "`force`, `place`",
+    "latitude_deg": "antenna, WGS 84",
+    "longitude_deg": "antenna, WGS 84",
+    "height_m": "antenna, above the ellipsoid",
+    "x_m": "antenna, ECEF",
+    "y_m": "antenna, ECEF",
+    "z_m": "antenna, ECEF",
+    "code_weight": "mean weight of codes; 1 is that of an error of one standard deviation",
+    "motion_weight": "mean weight of Dopplers and phases",
+    "wheel_scale": "share that the wheel's way is too short by, as estimated",
+    "force_offset_mps2": "offset of the accelerometer, as estimated",
+}
+
+
+def train_table(result: Result) -> pl.DataFrame:
+    """Return the positions of the filter along the track, one row per epoch and antenna in order of time.
+
+    Parameters
+    ----------
+    result : Result
+
+    Returns
+    -------
+    polars.DataFrame
+        Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
+    """
+    parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
+    if not parts:
+        return pl.DataFrame()
+    table = pl.concat(parts)
+    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
+
+
+def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
+    """Return the filtered positions of one antenna, one row per epoch."""
+    tracked, epochs = result.tracked, len(result)
+    words = pl.Series(values=[s.text for s in TrackStatus], dtype=TRACK_STATUS_TYPE)
+    directions = pl.Series(values=DIRECTION_TYPE.categories, dtype=DIRECTION_TYPE)
+    kinds = [kind.name.lower() for kind in Kind]
+    used, which = np.unique(tracked.used > 0, axis=0, return_inverse=True)
+    texts = pl.Series(values=["+".join(np.array(kinds)[row]) for row in used], dtype=pl.String)
+    return pl.DataFrame(
+        {
+            "time_gpst": pl.Series(values=np.array(result.time)),
+            "antenna": pl.Series(values=[name], dtype=pl.String).new_from_index(0, epochs),
+            "status": words.gather(pl.Series(values=tracked.status.astype(np.uint32))),
+            "chainage_m": float_column(result.chainage_m),
+            "kilometrage_m": float_column(result.kilometrage_m),
+            "along_sigma_m": float_column(tracked.sigma_m),
+            "speed_mps": float_column(tracked.speed_mps),
+            "speed_sigma_mps": float_column(tracked.speed_sigma_mps),
+            "acceleration_mps2": float_column(tracked.acceleration_mps2),
+            "direction": directions.gather(pl.Series(values=(result.direction + 1).astype(np.uint32))),
+            "standstill": pl.Series(values=result.standstill),
+            "branch_probability": float_column(tracked.probability),
+            "hypotheses": pl.Series(values=tracked.hypotheses.astype(np.int16)),
+            "sources": texts.gather(pl.Series(values=which.reshape(-1).astype(np.uint32))),
+            "latitude_deg": float_column(result.latitude_deg),
+            "longitude_deg": float_column(result.longitude_deg),
+            "height_m": float_column(result.height_m),
+            **{column: float_column(result.ecef_m[:, axis]) for axis, column in enumerate(("x_m", "y_m", "z_m"))},
+            "code_weight": float_column(tracked.code_weight),
+            "motion_weight": float_column(tracked.motion_weight),
+            "wheel_scale": float_column(tracked.wheel_scale),
+            "force_offset_mps2": float_column(tracked.force_offset_mps2),
+        }
+    )
