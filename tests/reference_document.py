@@ -7,12 +7,15 @@ import importlib
 import inspect
 import re
 import sys
+from enum import IntEnum, IntFlag
 from pathlib import Path
 from typing import Any, Final
 
 from railfix.core import errors, reasons
 from railfix.pipeline.config import Config
 from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
+from railfix.pipeline.train_table import TRAIN_COLUMNS
+from railfix.tracking import TrackStatus
 
 DOCUMENT: Final = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
 
@@ -34,6 +37,8 @@ MODULES: Final = (
     "railfix.ranges.sbas",
     "railfix.ranges.cn0_curve",
     "railfix.pipeline.tables",
+    "railfix.pipeline.train_table",
+    "railfix.tracking",
     "railfix.run",
     "railfix.io.reference_log",
     "railfix.reference",
@@ -92,7 +97,7 @@ def _columns(heading: str, columns: dict[str, str]) -> list[str]:
     return lines + [f"| `{name}` | {_cell(text)} |" for name, text in columns.items()]
 
 
-def _members(heading: str, kind: type[reasons.Reason] | type[reasons.Status], head: str) -> list[str]:
+def _members(heading: str, kind: type[IntEnum] | type[IntFlag], head: str) -> list[str]:
     """Members of an enumeration with the comments above them in the source."""
     comments: dict[str, str] = {}
     comment: list[str] = []
@@ -161,8 +166,10 @@ def document() -> str:
     lines = ["# Reference", "", "Written by `python tests/reference_document.py` from the docstrings.", ""]
     lines += _exit_codes()
     lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS)
+    lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS)
     lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS)
     lines += _members("Statuses of an epoch", reasons.Status, "number")
+    lines += _members("Statuses of the filter along the track", TrackStatus, "number")
     lines += _members("Reasons of an observation", reasons.Reason, "bit")
     lines += _settings()
     for name in MODULES:

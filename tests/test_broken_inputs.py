@@ -45,7 +45,8 @@ def assert_one_sentence(outcome: Outcome, code: int, words: tuple[str, ...]) -> 
 def test_the_unbroken_run_is_sound(bench: Bench) -> None:
     outcome = bench.run(rear=bench.rear, vehicle=bench.vehicle)
     assert outcome.code == 0, outcome.stderr
-    assert sorted(p.name for p in bench.out.iterdir()) == ["positions.csv", "positions.parquet", "run.json"]
+    written = sorted(p.name for p in bench.out.iterdir())
+    assert written == ["positions.csv", "positions.parquet", "run.json", "train.csv", "train.parquet"]
 
 
 def test_there_are_enough_cases() -> None:

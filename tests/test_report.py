@@ -388,6 +388,9 @@ def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> Non
     assert result.output.count("protection level (separation), ") == 2
     assert "within the alarm limit of 20 m at" in result.output
     written = sorted(path.name for path in (tmp_path / "demo").iterdir())
-    assert written == ["observations.parquet", "positions.csv", "positions.parquet", "report.html", "run.json"]
+    assert written == [
+        "observations.parquet", "positions.csv", "positions.parquet", "report.html", "run.json", "train.csv",
+        "train.parquet",
+    ]  # fmt: skip
     names = [figure["data-name"] for figure in Page((tmp_path / "demo" / "report.html").read_text()).figures]
     assert names.count("error-time") == 2

@@ -102,10 +102,7 @@ class Rows:
 
     def of(self, kinds: tuple[Kind, ...]) -> Masks:
         """Rows of some kinds, shape (M,)."""
-        mask = self.kind == kinds[0]
-        for kind in kinds[1:]:
-            mask = mask | (self.kind == kind)
-        return mask
+        return np.asarray(np.logical_or.reduce([self.kind == kind for kind in kinds]), dtype=np.bool_)
 
     @property
     def common(self) -> tuple[Masks, Masks, Masks]:
