@@ -19,38 +19,32 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 SOURCE: Final = ROOT / "src" / "railfix"
 #: Test files by the beginning of a module's path, the longest that fits; quick ones first.
 TESTS: Final = {
-    "ranges": "test_range_corrections test_atmosphere test_sbas_pipeline test_pipeline_reasons "
-    "test_conventional_rtklib",
-    "ranges/model_file": "test_error_model test_cn0_curve",
-    "ranges/sbas": "test_sbas_corrections test_sbas_ionosphere test_sbas_reading test_sbas_decoding test_sbas_issues "
-    "test_sbas_state test_sbas_spans test_sbas_rtklib test_sbas_hour",
-    "ranges/error_model": "test_error_model test_range_corrections test_range_errors",
-    "ranges/cn0_curve": "test_cn0_curve test_screens_cn0",
-    "integrity/raim": "test_raim_model test_raim_detection test_raim_exclusion test_raim_reliability",
-    "integrity/protection": "test_protection_level test_protection_risk test_protection_separation "
-    "test_protection_sbas test_protection_brute_force",
-    "integrity/stanford": "test_stanford",
-    "integrity": "test_raim_model test_protection_level",
-    "pipeline": "test_pipeline_reasons test_settings test_range_corrections test_sbas_pipeline test_pipeline "
-    "test_carrying test_screen_columns test_run_chunks",
+    "ranges": "range_corrections atmosphere sbas_pipeline pipeline_reasons conventional_rtklib",
+    "ranges/model_file": "error_model cn0_curve",
+    "ranges/sbas": "sbas_corrections sbas_ionosphere sbas_reading sbas_decoding sbas_issues sbas_state sbas_spans "
+    "sbas_rtklib sbas_hour",
+    "ranges/error_model": "error_model range_corrections range_errors",
+    "ranges/cn0_curve": "cn0_curve screens_cn0",
+    "integrity": "raim_model protection_level stanford",
+    "integrity/raim": "raim_model raim_detection raim_exclusion raim_reliability",
+    "integrity/protection": "protection_level protection_risk protection_separation protection_sbas",
+    "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrying screen_columns pipeline",
 }
-SWAPS: Final[dict[type, type]] = {
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult, ast.Mod: ast.Mult,
-    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.And: ast.Or, ast.Or: ast.And, ast.Lt: ast.LtE, ast.LtE: ast.Lt,
-    ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.In: ast.NotIn, ast.Is: ast.IsNot,
-}  # fmt: skip
+_PAIRS: Final = (
+    (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.BitAnd, ast.BitOr), (ast.And, ast.Or), (ast.Lt, ast.LtE),
+    (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.In, ast.NotIn), (ast.Is, ast.IsNot),
+)  # fmt: skip
+SWAPS: Final[dict[type, type]] = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])} | {ast.Pow: ast.Mult}
 
 
-@dataclass(frozen=True)
-class Mutant:
+class Mutant(NamedTuple):
     """A change of the node with a number in a module's tree."""
 
     module: str
@@ -108,19 +102,14 @@ def mutated(text: str, mutant: Mutant) -> str:
     tree = ast.parse(text)
     target = next(node for number, (node, _) in enumerate(code_nodes(tree)) if number == mutant.node)
     new, _ = changed(target) or (target, "")
-
-    class Replace(ast.NodeTransformer):
-        def visit(self, node: ast.AST) -> ast.AST:
-            return new if node is target else self.generic_visit(node)
-
-    return ast.unparse(ast.fix_missing_locations(Replace().visit(tree)))
+    target.__class__, target.__dict__ = type(new), vars(new)
+    return ast.unparse(ast.fix_missing_locations(tree))
 
 
 def test_files(module: str) -> tuple[str, ...]:
     """Test files of a module."""
     key = max((key for key in TESTS if module.startswith(key)), key=len, default="")
-    files = (ROOT / "tests" / f"{name}.py" for name in TESTS.get(key, "").split())
-    return tuple(str(path) for path in files if path.exists())
+    return tuple(str(ROOT / "tests" / f"test_{name}.py") for name in TESTS.get(key, "").split())
 
 
 def passes(source: Path, files: tuple[str, ...], limit_s: float) -> bool:
@@ -136,7 +125,7 @@ def passes(source: Path, files: tuple[str, ...], limit_s: float) -> bool:
 
 def main() -> None:
     """Draw mutants, run the tests, print survivors and the score."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("package", help="for example ranges, integrity, pipeline or ranges/sbas")
     parser.add_argument("--sample", type=int, default=40, help="mutants to draw (default 40)")
     parser.add_argument("--seed", type=int, default=1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -61,6 +63,25 @@ def square(*values: tuple[float, int]) -> dict[int, dict[tuple[int, int], tuple[
 
 FOUR = ((1.0, 0), (2.0, 1), (3.0, 2), (5.0, 3))
 VARIANCE = (0.0084, 0.0333, 0.0749, 0.1331)
+
+
+def test_latitudes_of_the_bands_are_those_of_table_a_14() -> None:
+    """Every meridian up to 55 degrees, every other one at 65 and 75, few at 85; bands 9 and 10 around the poles."""
+    for band in range(BANDS):
+        number = POINT_OF_BIT[band][POINT_OF_BIT[band] >= 0]
+        found = Counter((5 * (number // 72) - 90).tolist())
+        if band < 9:
+            expected = Counter(dict.fromkeys(range(-55, 60, 5), 8))
+            expected.update(dict.fromkeys((-75, -65, 65, 75), 4))
+            # One at 85 north on every 90th meridian (bands 1, 3, ...), one south 40 degrees further (bands 0, 2, ...).
+            longitudes = range(-180 + 40 * band, -140 + 40 * band, 5)
+            expected[85] = sum(longitude % 90 == 0 for longitude in longitudes)
+            expected[-85] = sum((longitude - 40) % 90 == 0 for longitude in longitudes)
+        else:
+            sign = 1 if band == 9 else -1
+            expected = Counter({60 * sign: 72, 65 * sign: 36, 70 * sign: 36, 75 * sign: 36, 85 * sign: 12})
+        assert found == +expected, band
+        assert len(set(number.tolist())) == len(number)
 
 
 def test_every_point_of_the_bands_has_its_place() -> None:

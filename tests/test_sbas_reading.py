@@ -285,3 +285,27 @@ def test_names_tell_qzss_from_sbas() -> None:
         "QZSS L1S 186 type 1 PRN mask",
         "QZSS L1S 186 type 43 L1S disaster report of the Japan Meteorological Agency, not decoded",
     ]
+
+
+@pytest.mark.parametrize(
+    ("year", "expected"), [("80", 1980), ("99", 1999), ("00", 2000), ("79", 2079), ("2025", 2025), ("1999", 1999)]
+)
+def test_years_of_two_digits_are_those_of_1980_to_2079(tmp_path: Path, year: str, expected: int) -> None:
+    log = a_log()
+    prn, _, rest = as_ems(log).splitlines()[0].split(" ", 2)
+    (tmp_path / "a.ems").write_text(f"{prn} {year} {rest}\n")
+    assert read_sbas(tmp_path / "a.ems").time[0].astype("datetime64[Y]") == np.datetime64(str(expected), "Y")
+
+
+def test_a_message_of_250_binary_digits_is_that_of_the_hexadecimal_ones(tmp_path: Path) -> None:
+    """Some receivers write the bits themselves; 249 of them are no message."""
+    log = a_log()
+    head, digits = as_ems(log).splitlines()[0].rsplit(" ", 1)
+    binary = f"{int(digits.ljust(64, '0'), 16):0256b}"[:250]
+    (tmp_path / "a.ems").write_text(f"{head} {binary}\n")
+    found = read_sbas(tmp_path / "a.ems")
+    assert found.bits[0].tolist() == log.bits[0].tolist()
+    assert found.parity_bits[0] == 24
+    (tmp_path / "b.ems").write_text(f"{head} {binary[:-1]}\n")
+    with pytest.raises(InputFileError, match="249 hexadecimal digits"):
+        read_sbas(tmp_path / "b.ems")
