@@ -99,8 +99,8 @@ def test_concatenate_joins_headers_and_problems() -> None:
     one = ObservationHeader(marker="A", signals={"G": ("1C",)}, glonass_channel={"R01": 1, "R02": -4})
     two = ObservationHeader(marker="B", signals={"G": ("2W",), "E": ("1C",)}, glonass_channel={"R01": 5, "R03": 6})
     parts = [
-        observations(1, [("G05", "1C")], header=one, problems=("p",), problem_count=1, passed_over={"events": 2}),
-        observations(1, [("G05", "1C")], 1, header=two, problems=("q",), problem_count=1, passed_over={"events": 1}),
+        observations(1, [("G05", "1C")], header=one, problems=("p",), problem_count=1, skipped={"events": 2}),
+        observations(1, [("G05", "1C")], 1, header=two, problems=("q",), problem_count=1, skipped={"events": 1}),
     ]
     whole = concatenate(parts)
     assert whole.header.marker == "A"
@@ -108,7 +108,7 @@ def test_concatenate_joins_headers_and_problems() -> None:
     assert whole.header.glonass_channel == {"R01": 1, "R02": -4, "R03": 6}
     assert whole.problems == ("p", "q")
     assert whole.problem_count == 2
-    assert whole.passed_over == {"events": 3}
+    assert whole.skipped == {"events": 3}
 
 
 def test_concatenate_of_nothing_is_an_error_and_of_one_the_same() -> None:

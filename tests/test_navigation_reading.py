@@ -172,7 +172,7 @@ def test_version_4_reads_the_classic_messages_and_counts_the_rest(tmp_path: Path
         ("G01", "LNAV"), ("E03", "INAV"), ("E03", "FNAV"), ("C20", "D1"), ("C03", "D2"), ("J02", "LNAV"),
     ]  # fmt: skip
     assert navigation.glonass.satellite.tolist() == ["R05"]
-    assert navigation.passed_over == {
+    assert navigation.skipped == {
         "G CNAV": 1, "C CNV1": 1, "STO": 1, "EOP": 1, "S SBAS": 1, "I LNAV": 1,
     }  # fmt: skip
 
@@ -192,7 +192,7 @@ def test_version_4_ionosphere(tmp_path: Path) -> None:
     assert {k: v.tolist() for k, v in navigation.klobuchar.items()} == {
         letter: pytest.approx(scale * counted) for letter, scale in (("G", 1e-8), ("C", 2e-8), ("J", 3e-8))
     }
-    assert navigation.passed_over == {"ION E IFNV": 1, "ION C CNVX": 1}
+    assert navigation.skipped == {"ION E IFNV": 1, "ION C CNVX": 1}
 
 
 # ---------------------------------------------------------------- header
@@ -213,7 +213,7 @@ def test_ionosphere_of_versions_2_and_3(tmp_path: Path) -> None:
     assert sorted(three.klobuchar) == ["C", "G", "J"]
     assert all(v.tolist() == expected for v in three.klobuchar.values())
     assert three.leap_seconds is None
-    assert three.passed_over == {"ionosphere GAL": 1}
+    assert three.skipped == {"ionosphere GAL": 1}
 
 
 def test_zero_ionosphere_means_not_received(tmp_path: Path) -> None:
@@ -293,7 +293,7 @@ def test_duplicates_are_counted_and_corrections_kept(tmp_path: Path) -> None:
     text = header() + record("G01") + record("G01", changed) + record("G01") + record("E01", {"fit": None})
     navigation = read_navigation([write(tmp_path, text), write(tmp_path, text, "again.nav")])
     assert navigation.kepler.satellite.tolist() == ["G01", "G01", "E01"]
-    assert navigation.passed_over == {"duplicate": 5}
+    assert navigation.skipped == {"duplicate": 5}
 
 
 def test_records_of_another_year_are_kept_as_they_are(tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ def test_records_of_another_year_are_kept_as_they_are(tmp_path: Path) -> None:
 def test_other_constellations_are_counted(tmp_path: Path) -> None:
     sbas = "".join(record(f"S{n}").split("\n", 4)[i] + "\n" for n in (20, 37) for i in range(4))
     navigation = read(tmp_path, header() + sbas + record("I02") + record("G01"))
-    assert navigation.passed_over == {"S": 2, "I": 1}
+    assert navigation.skipped == {"S": 2, "I": 1}
     assert navigation.kepler.satellite.tolist() == ["G01"]
 
 
@@ -317,12 +317,12 @@ def test_packed_files(tmp_path: Path) -> None:
         assert read_navigation(tmp_path / name).kepler.satellite.tolist() == ["G01"]
 
 
-def test_lenient_reading_passes_over_and_names_what_is_broken(tmp_path: Path) -> None:
+def test_broken_records_are_skipped_counted_and_named(tmp_path: Path) -> None:
     broken = record("G02", {"sqrt_a": None}) + record("X03") + record("G04", time="2020 13 26 08 00 00")
     text = header() + record("G01") + broken + record("G05")
     navigation = read(tmp_path, text, broken_lines="count")
     assert navigation.kepler.satellite.tolist() == ["G01", "G05"]
-    assert navigation.passed_over == {"broken": 3}
+    assert navigation.skipped == {"broken": 3}
     assert [note.split(":")[1].split(",")[1] for note in navigation.notes] == [" line 13", " line 19", " line 27"]
 
 

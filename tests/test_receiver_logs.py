@@ -264,7 +264,7 @@ def test_a_restarted_receiver_and_repeated_messages(recordings: Path) -> None:
     whole, _ = in_fragments(data, [])
     twice, _ = in_fragments(data + data, [])
     assert np.array_equal(whole.time, twice.time)
-    assert twice.passed_over["epochs not after the one before"] == len(whole)
+    assert twice.skipped["epochs not after the one before"] == len(whole)
 
 
 def pieces_of(path: Path, epochs: int) -> Iterator[Observations]:

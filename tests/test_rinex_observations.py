@@ -247,7 +247,7 @@ def test_power_failure_new_site_and_cycle_slips(tmp_path: Path) -> None:
     lines += epoch_3("", flag=2, count=0) + epoch_3("02 33 18.0", one)
     observations = read_observations(write(tmp_path / "log", lines))
     assert observations.break_before.tolist() == [False, True, False, True, False, True]
-    assert observations.passed_over == {"cycle-slip records": 1, "external events": 1}
+    assert observations.skipped == {"cycle-slip records": 1, "external events": 1}
     assert observations.header.marker == "TRAIN"
 
 
@@ -276,7 +276,7 @@ def test_events_of_rinex_2(tmp_path: Path) -> None:
     lines += [" 05  4  2  0  0  3.7000000  5  0", *epoch_2(" 0  0  4.0000000", {"G05": [field(9.0)] * 6})]
     observations = read_observations(write(tmp_path / "log", lines))
     assert observations.break_before.tolist() == [False, True, True, False, False]
-    assert observations.passed_over == {"cycle-slip records": 1, "external events": 1}
+    assert observations.skipped == {"cycle-slip records": 1, "external events": 1}
     assert observations.code_m[:, channel(observations, "G05", "1W")].tolist()[3:] == [3.0, 9.0]
     assert observations.cn0_dbhz[:, channel(observations, "G05", "2W")].tolist()[3:] == [6.0, 9.0]
 
@@ -313,7 +313,7 @@ def test_selection_of_systems_and_time(tmp_path: Path) -> None:
     observations = read_observations(path, systems="E", start="2021-05-17T02:33:11", end="2021-05-17T02:33:14")
     assert observations.satellite.tolist() == ["E11"]
     assert (observations.time - np.datetime64("2021-05-17T02:33")).astype("m8[s]").astype(int).tolist() == [11, 12, 13]
-    assert observations.passed_over == {
+    assert observations.skipped == {
         "satellites of unknown constellations": 3,
-        "satellites of constellations not asked for": 3,
+        "satellites of constellations not selected": 3,
     }

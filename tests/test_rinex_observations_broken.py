@@ -1,4 +1,4 @@
-"""Broken observation files: what each error says, and what lenient reading makes of them."""
+"""Broken observation files: what each error says, and what is left when faults are counted."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def inserted(base: Callable[[], Lines], line: int, text: str) -> Lines:
     return lines
 
 
-#: Name: lines, words of the message, line number, epochs and values of G05 left in lenient (of 6).
+#: Name: lines, words of the message, line number, epochs and values of G05 left with "count" (of 6).
 BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "letter in a code": (edit(good_3, 10, "20000001.000", "2000O001.000"), "C1C of G05 is '  2000O001.000", 10, 6, 5),
     "two points": (edit(good_3, 10, "20000001.000", "20000.01.000"), "C1C of G05", 10, 6, 5),
@@ -70,13 +70,13 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "field not in its columns": (edit(good_3, 10, "G05  ", "G05 "), "C1C of G05", 10, 6, 5),
     "letter for loss of lock": (edit(good_3, 10, "100000001.000 ", "100000001.000x"), "L1C of G05", 10, 6, 5),
     "line cut in a number": (edit(good_3, 10, good_3()[9][24:], ""), "L1C of G05", 10, 6, 5),
-    "line too long": (edit(good_3, 10, "45.000  ", "45.000  7"), "goes on after its 4 announced", 10, 6, 5),
+    "line too long": (edit(good_3, 10, "45.000  ", "45.000  7"), "continues after its 4 declared", 10, 6, 5),
     "no satellite name": (edit(good_3, 10, "G05", "G-5"), "no satellite name can be read", 10, 6, 5),
     "satellite zero": (edit(good_3, 10, "G05", "G00"), "no satellite name can be read", 10, 6, 5),
     "satellite twice": (edit(good_3, 11, "G12", "G05"), "satellite G05 occurs twice", 11, 6, 6),
-    "types not announced": (edit(good_3, 10, "G05", "E05"), "E05: the header announces no observation types", 10, 6, 5),
-    "line missing": (without(good_3, 10), "announces 2 lines, 1 follow", 9, 5, 5),
-    "line too many": (inserted(good_3, 10, "G07      20000000.000"), "announces 2 lines, 3 follow", 9, 5, 5),
+    "types not declared": (edit(good_3, 10, "G05", "E05"), "E05: the header has no observation types", 10, 6, 5),
+    "line missing": (without(good_3, 10), "declares 2 lines, 1 follow", 9, 5, 5),
+    "line too many": (inserted(good_3, 10, "G07      20000000.000"), "declares 2 lines, 3 follow", 9, 5, 5),
     "line before the first epoch": (inserted(good_3, 6, "G07"), "an epoch line was expected, found 'G07'", 6, 6, 6),
     "month 13": (edit(good_3, 9, "2021 05", "2021 13"), "the month is none of 1 to 12", 9, 5, 5),
     "30 February": (edit(good_3, 9, "05 17", "02 30"), "the day does not exist in its month", 9, 5, 5),
@@ -89,9 +89,9 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "flag 7": (edit(good_3, 9, "14.0000000  0", "14.0000000  7"), "the epoch flag '7' is none of 0 to 6", 9, 5, 5),
     "count no number": (edit(good_3, 9, "0  2", "0  x"), "number of satellites '  x' is no number", 9, 5, 5),
     "epoch line short": (edit(good_3, 9, "  0  2", ""), "shorter than 35 characters", 9, 5, 5),
-    "time goes back": (edit(good_3, 12, "15.0000000", "13.5000000"), "come after 2021-05-17T02:33:14", 12, 5, 5),
-    "time stands still": (edit(good_3, 12, "15.0000000", "14.0000000"), "does not come after", 12, 5, 5),
-    "time runs ahead": (edit(good_3, 12, "2021", "2051"), "runs ahead of the epochs after it", 12, 5, 5),
+    "time goes back": (edit(good_3, 12, "15.0000000", "13.5000000"), "not later than 2021-05-17T02:33:14", 12, 5, 5),
+    "time stands still": (edit(good_3, 12, "15.0000000", "14.0000000"), "is not later than", 12, 5, 5),
+    "time runs ahead": (edit(good_3, 12, "2021", "2051"), "is later than those of the epochs after it", 12, 5, 5),
     "end in the middle": (good_3()[:-1], "ends in the middle of an epoch", 22, 5, 5),
     "end in an event": ([*good_3(), *epoch_3("", flag=4, count=3)], "ends in the middle of an epoch", 24, 6, 6),
     "INTERVAL no number": (inserted(good_3, 4, record("     o.1", "INTERVAL")), "'o.1' cannot be read", 4, 6, 6),
@@ -109,7 +109,7 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "RINEX 2: epoch line broken": (edit(good_2, 9, " 0  0  1.0", " 0  0  1,0"), "an epoch line was expected", 9, 5, 5),
     "RINEX 2: no name": (edit(good_2, 9, "G05", "G?5"), "no satellite name can be read", 10, 6, 5),
     "RINEX 2: names missing": (edit(good_2, 9, "G05G12", "G05"), "no satellite name can be read", 11, 6, 6),
-    "RINEX 2: time goes back": (edit(good_2, 12, "2.0000000", "0.5000000"), "does not come after", 12, 5, 5),
+    "RINEX 2: time goes back": (edit(good_2, 12, "2.0000000", "0.5000000"), "is not later than", 12, 5, 5),
     "RINEX 2: end in the middle": (good_2()[:-1], "ends in the middle of an epoch", 22, 5, 5),
     "end in an epoch line": ([*good_3(), "> 2021 05 17 02 3"], "ends in the middle of an epoch, in its", 24, 6, 6),
     "RINEX 2: end in an epoch line": ([*good_2(), " 05  4  2  0"], "ends in the middle of an epoch", 24, 6, 6),
@@ -125,14 +125,14 @@ def test_broken_line(tmp_path: Path, name: str) -> None:
         read_observations(path)
     assert caught.value.line == number
     assert str(caught.value).startswith(f"{path}, line {number}: ")
-    lenient = read_observations(path, broken_lines="count")
-    assert len(lenient) == epochs
-    five = (lenient.satellite == "G05") & (lenient.signal == "1C")
-    assert np.isfinite(lenient.code_m[:, five]).sum() == left
-    assert lenient.problem_count >= 1
-    assert f"line {number}: " in lenient.problems[0]
-    assert words in lenient.problems[0]
-    assert sum(lenient.passed_over.values()) == lenient.problem_count
+    counted = read_observations(path, broken_lines="count")
+    assert len(counted) == epochs
+    five = (counted.satellite == "G05") & (counted.signal == "1C")
+    assert np.isfinite(counted.code_m[:, five]).sum() == left
+    assert counted.problem_count >= 1
+    assert f"line {number}: " in counted.problems[0]
+    assert words in counted.problems[0]
+    assert sum(counted.skipped.values()) == counted.problem_count
 
 
 def test_strict_names_the_first_of_several(tmp_path: Path) -> None:
@@ -153,8 +153,8 @@ def test_many_problems_are_told_of_in_few_sentences(tmp_path: Path) -> None:
     whole = read_observations(path, broken_lines="count")
     assert (len(whole), whole.problem_count, len(whole.problems)) == (90, 90, 51)
     assert whole.problems[-1] == "and 40 more problems"
-    assert whole.passed_over == {"broken satellite lines": 90}
-    assert "the satellite was passed over in this epoch" in whole.problems[0]
+    assert whole.skipped == {"broken satellite lines": 90}
+    assert "the satellite was skipped in this epoch" in whole.problems[0]
 
 
 def _sp3() -> bytes:
@@ -190,7 +190,7 @@ WRONG_FILE: dict[str, tuple[bytes, str]] = {
     "only the first line": (text_of(good_3()[:1]), "has no END OF HEADER"),
     "no types": (text_of(header_3({})), "has no SYS / # / OBS TYPES"),
     "no types, RINEX 2": (text_of(without(good_2, 3)), "has no # / TYPES OF OBSERV"),
-    "types miscounted": (text_of(edit(good_3, 3, "G    4", "G    5")), "5 observation types of G are announced, 4"),
+    "types miscounted": (text_of(edit(good_3, 3, "G    4", "G    5")), "5 observation types of G are declared, 4"),
     "types uncounted": (text_of(edit(good_3, 3, "G    4", "G    x")), "the number of types 'x' is no whole number"),
     "type unknown": (text_of(edit(good_3, 3, "L1C", "Y1C")), "'Y1C' is no observation type"),
     "types of nothing": (text_of(edit(good_3, 3, "G    4", "      ")), "the constellation letter is missing"),
@@ -255,7 +255,7 @@ def test_zeros_left_by_a_failing_recorder(tmp_path: Path, old: str, words: str) 
 
 
 @pytest.mark.parametrize("pack", ["gzip", "hatanaka"])
-def test_lenient_reads_what_comes_before_damage(tmp_path: Path, pack: str) -> None:
+def test_data_before_damage_are_read(tmp_path: Path, pack: str) -> None:
     lines = header_3()
     rng = np.random.default_rng(3)
     for k in range(3600):
@@ -265,9 +265,9 @@ def test_lenient_reads_what_comes_before_damage(tmp_path: Path, pack: str) -> No
     path.write_bytes(packed[: len(packed) * 2 // 3])
     with pytest.raises(InputFileError, match=r"end early|cut short"):
         read_observations(path)
-    lenient = read_observations(path, broken_lines="count")
-    assert len(lenient) > 1000 or pack == "gzip"
-    assert "what came before was read" in lenient.problems[0]
+    counted = read_observations(path, broken_lines="count")
+    assert len(counted) > 1000 or pack == "gzip"
+    assert "the data before it were read" in counted.problems[0]
 
 
 def test_compress_cut_short_ends_in_the_middle(tmp_path: Path) -> None:
@@ -315,8 +315,8 @@ def test_whatever_is_broken_ends_in_one_sentence(
     else:
         assert not strict.problems
     try:
-        lenient = read_observations(path, broken_lines="count")
+        counted = read_observations(path, broken_lines="count")
     except InputFileError:
         return
-    assert len(lenient) > 0
-    assert (np.diff(lenient.time) > np.timedelta64(0)).all()
+    assert len(counted) > 0
+    assert (np.diff(counted.time) > np.timedelta64(0)).all()

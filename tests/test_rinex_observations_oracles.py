@@ -53,7 +53,7 @@ def test_recordings_are_read_without_a_fault(recordings: Path, name: str) -> Non
     assert observations.code_m.shape == shape
     assert (np.diff(observations.time) > np.timedelta64(0)).all()
     assert not observations.problems
-    assert not observations.passed_over
+    assert not observations.skipped
     code = observations.code_m[np.isfinite(observations.code_m)]
     assert code.size
     assert code.min() > 1.8e7
@@ -87,7 +87,7 @@ def compare_with_georinex(path: Path) -> int:
         for j, satellite in enumerate(theirs.sv.values.tolist()):
             system = satellite[0]
             values = theirs[name].values[:, j]
-            signal = signal_of(name, system=system, version=version, announced=names)
+            signal = signal_of(name, system=system, version=version, declared=names)
             at = column.get((f"{system}{int(satellite[1:]):02d}", str(signal)))
             kind = KINDS.index("C" if name[0] == "P" else name[0])
             if at is None:

@@ -33,7 +33,7 @@ def assert_same(first: Observations, second: Observations) -> None:
         assert one.tobytes() == other.tobytes(), name
     assert first.problems == second.problems
     assert first.problem_count == second.problem_count
-    assert first.passed_over == second.passed_over
+    assert first.skipped == second.skipped
 
 
 def busy_log_3(epochs: int = 120, *, seed: int = 5) -> list[str]:
@@ -102,7 +102,7 @@ def test_pieces_are_the_whole(tmp_path: Path, log: type, epochs: int) -> None:
 @pytest.mark.parametrize("block_bytes", [700, 3000, 20000])
 def test_where_blocks_of_text_end_does_not_matter(tmp_path: Path, log: type, block_bytes: int) -> None:
     path = write(tmp_path / "log", log(), strip=block_bytes != 3000, end="\r\n" if block_bytes == 700 else "\n")
-    wanted = observations_blocks.Wanted(broken_lines="count")
+    wanted = observations_blocks.Selection(broken_lines="count")
     runs = list(observations_blocks.BlockReader(path, wanted, block_bytes=block_bytes).blocks())
     assert len(runs) > 2
     joined = concatenate([run for run in runs if len(run)])
@@ -182,12 +182,12 @@ def test_files_of_a_log_are_joined_in_order_of_time(tmp_path: Path, interval: st
 
 def test_files_that_overlap(tmp_path: Path) -> None:
     parts = [_file(tmp_path, "a", range(12)), _file(tmp_path, "b", range(8, 20))]
-    with pytest.raises(InputFileError, match=r"b, line 8: .* does not come after .*of the file before"):
+    with pytest.raises(InputFileError, match=r"b, line 8: .* is not later than .*of the file before"):
         read_observations(parts)
     joined = read_observations(parts, broken_lines="count")
     assert (joined.time - joined.time[0]).astype("m8[s]").astype(int).tolist() == list(range(20))
-    assert joined.passed_over == {"epochs out of order": 4}
-    with pytest.raises(InputFileError, match="does not come after"):
+    assert joined.skipped == {"epochs out of order": 4}
+    with pytest.raises(InputFileError, match="is not later than"):
         read_observations([parts[0], parts[0]])
 
 

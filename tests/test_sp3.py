@@ -137,7 +137,7 @@ def test_files_are_joined_and_the_first_one_counts(tmp_path: Path) -> None:
     [
         (lambda s: "  3.05 NAVIGATION\n" + s, "first line must begin with #a"),
         (lambda s: s.replace("GPS ccc", "TAI ccc"), "time system 'TAI'"),
-        (lambda s: s.split("*")[0], "holds no satellite position"),
+        (lambda s: s.split("*")[0], "has no satellite position"),
         (lambda s: s.replace("PG05", "PGX5", 1), "line 25"),
         (lambda s: s.replace("*  2024  3 13", "*  2024 13 13", 1), "line 23"),
         (lambda s: s.replace("*  2024", "*  0024", 1), "line 23"),

@@ -27,7 +27,7 @@ from railfix.positioning.single_point import SinglePoint, single_point
 from railfix.track.trajectory import Trajectory
 
 LENGTHS_M = (1_000.0, 200_000.0)
-#: Wanted with a 3-D position.
+#: Selection with a 3-D position.
 RATIO = 1.5
 
 

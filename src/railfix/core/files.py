@@ -26,7 +26,8 @@ import subprocess
 import sys
 import tempfile
 import zlib
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import IO, Any, Final, Literal, cast
@@ -281,15 +282,30 @@ def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
     OutputError
         The file cannot be written.
     """
+    with staged_file(path, what=what) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def staged_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
+    """Yield a temporary path beside a file, which replaces the file where the block ends without error.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
     target = Path(path)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.replace(target)
+        try:
+            yield temporary
+            temporary.replace(target)
+        finally:
+            if temporary.parent.is_dir():
+                temporary.unlink(missing_ok=True)
     except OSError as error:
-        if temporary.parent.is_dir():
-            temporary.unlink(missing_ok=True)
-        raise OutputError(f"{target}: the {what} cannot be written ({error.strerror or error})") from None
+        raise OutputError(f"{target}: the {what} cannot be written ({error.strerror or error})") from error
 
 
 def read_text_lines(path: FilePath) -> list[str]:

@@ -208,7 +208,7 @@ class Navigation(NotebookTable):
         All-zero coefficients mean "not received": they are left out, and `notes` records it.
     leap_seconds : int or None
         GPST - UTC [s] from the header.
-    passed_over : mapping of str to int
+    skipped : mapping of str to int
         Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").
     notes : tuple of str
         Remarks for the user (no ionosphere, week resolved from the clock time).
@@ -222,7 +222,7 @@ class Navigation(NotebookTable):
     glonass: GlonassRecords
     klobuchar: Mapping[str, Floats] = field(default_factory=dict)
     leap_seconds: int | None = None
-    passed_over: Mapping[str, int] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     precise: PreciseEphemeris | None = None
     sources: tuple[str, ...] = ()

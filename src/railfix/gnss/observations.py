@@ -91,7 +91,7 @@ class Observations(NotebookTable):
         with the number of the others. A slice of epochs has none.
     problem_count : int
         Number of faults.
-    passed_over : mapping of str to int
+    skipped : mapping of str to int
         Number of items skipped, by kind: broken epochs and satellite lines, duplicate epochs,
         external events, satellites of unknown or unselected constellations.
     """
@@ -108,7 +108,7 @@ class Observations(NotebookTable):
     header: ObservationHeader = field(default_factory=ObservationHeader)
     problems: tuple[str, ...] = ()
     problem_count: int = 0
-    passed_over: Mapping[str, int] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         epochs, channels = len(self.time), len(self.satellite)
@@ -195,7 +195,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
         header=_joined_header(parts),
         problems=_joined_problems(parts),
         problem_count=sum(p.problem_count for p in parts),
-        passed_over=_joined_counts(parts),
+        skipped=_joined_counts(parts),
         **floats,
     )
 
@@ -227,6 +227,6 @@ def capped_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
 def _joined_counts(parts: Sequence[Observations]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for part in parts:
-        for kind, number in part.passed_over.items():
+        for kind, number in part.skipped.items():
             counts[kind] = counts.get(kind, 0) + number
     return counts

@@ -143,7 +143,7 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
         lock = None if flags is None else np.asarray(flags.transpose(*_DIMENSIONS).values, dtype=np.float64)
         for k in np.flatnonzero(np.isfinite(values).any(axis=0)):
             satellite = str(satellites[k])
-            signal = signal_of(name, system=satellite[0], version=version, announced=types)
+            signal = signal_of(name, system=satellite[0], version=version, declared=types)
             if signal is None:
                 continue
             channel = columns.setdefault((satellite, signal), {})
@@ -269,7 +269,7 @@ def navigation_from_xarray(data: xr.Dataset) -> Navigation:
     -------
     Navigation
         Records in order of satellite, then time. Records of constellations that railfix does not use are
-        counted in `passed_over`.
+        counted in `skipped`.
 
     Raises
     ------
@@ -284,11 +284,11 @@ def navigation_from_xarray(data: xr.Dataset) -> Navigation:
     times = np.asarray(data["time"].values, dtype="datetime64[ns]")
     satellites: Strings = np.array([str(name) for name in data["sv"].values], dtype=np.str_)
     raw: list[RawRecord] = []
-    passed_over: Counter[str] = Counter()
+    skipped: Counter[str] = Counter()
     for k, i in zip(*np.nonzero(np.isfinite(values["SVclockBias"]).T), strict=True):
         name = str(satellites[k])[:3]
         if name[0] not in _NAMES:
-            passed_over[name[0]] += 1
+            skipped[name[0]] += 1
             continue
         numbers = [_number(values, variable, i, k) for variable in _NAMES[name[0]]]
         record = RawRecord(name[0], name, "", times[i], numbers, float(data.attrs.get("version", 3.0)))
@@ -306,7 +306,7 @@ def navigation_from_xarray(data: xr.Dataset) -> Navigation:
             if np.any(data.attrs.get(name, 0.0))
         },
         leap_seconds=None if leap is None else int(leap),
-        passed_over=dict(passed_over),
+        skipped=dict(skipped),
         sources=(str(data.attrs.get("filename", "")),),
     )
 

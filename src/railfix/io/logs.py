@@ -119,7 +119,7 @@ def _receiver_runs(
             stop = len(chosen) if end is None else int(np.searchsorted(chosen.time, end))
             if last is not None:
                 first = max(first, int(np.searchsorted(chosen.time, last.time[-1], side="right")))
-            part = replace(chosen[first:stop], passed_over=run.passed_over)
+            part = replace(chosen[first:stop], skipped=run.skipped)
             if joint and len(part):
                 part, joint = with_break_at_gap(last, part), False
             found += len(part)
@@ -186,14 +186,14 @@ def _joined(parts: list[Navigation]) -> Navigation:
 
     counts: dict[str, int] = {}
     for part in parts:
-        for what, number in part.passed_over.items():
+        for what, number in part.skipped.items():
             counts[what] = counts.get(what, 0) + number
     return Navigation(
         kepler=KeplerRecords(**rows("kepler", KeplerRecords)),
         glonass=GlonassRecords(**rows("glonass", GlonassRecords)),
         klobuchar={letter: value for part in reversed(parts) for letter, value in part.klobuchar.items()},
         leap_seconds=next((part.leap_seconds for part in parts if part.leap_seconds is not None), None),
-        passed_over=counts,
+        skipped=counts,
         notes=tuple(note for part in parts for note in part.notes),
         sources=tuple(source for part in parts for source in part.sources),
     )

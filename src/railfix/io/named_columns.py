@@ -1,4 +1,4 @@
-"""Text tables whose columns have names: the shape of the CSV files that railfix reads.
+"""CSV tables with named columns.
 
 Comma separated, UTF-8 with or without a byte order mark, LF or CR LF, plain or packed (.gz, .Z). Lines
 that begin with ``#`` are comments; those above the header line may carry ``# key: value``. Every error
@@ -46,11 +46,11 @@ class NamedColumns:
         return name in self.cells
 
     def error(self, row: int, message: str) -> InputFileError:
-        """An error that names the line of a row."""
+        """Return an error that names the line of a row."""
         return InputFileError(self.path, message, line=int(self.line[row]))
 
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
-        """One column as finite numbers.
+        """Parse one column as finite numbers.
 
         Parameters
         ----------
@@ -77,7 +77,7 @@ class NamedColumns:
         bad |= np.isnan(values) & (blank is None)
         if bad.any():
             row = int(np.argmax(bad))
-            raise self.error(row, f"column {name}: '{cells[row]}' is not a finite number; remove or mend the row")
+            raise self.error(row, f"column {name}: '{cells[row]}' is not a finite number; remove or correct the row")
         return values
 
 
@@ -100,13 +100,13 @@ def read_named_columns(path: FilePath) -> NamedColumns:
     Raises
     ------
     InputFileError
-        No text, no header, a column name twice, a row with another number of cells.
+        The file is not text, has no header or a repeated column name, or a row has another number of cells.
     """
     return parse_named_columns(read_text(path), path)
 
 
 def parse_named_columns(text: str, path: FilePath) -> NamedColumns:
-    """The same from the text of the file; `path` is for the messages."""
+    """Parse the text of a file as `read_named_columns` does; `path` is for the messages."""
     metadata: dict[str, str] = {}
     header: list[str] = []
     header_line = 0
@@ -147,6 +147,6 @@ def _check_header(path: FilePath, header: list[str], line: int) -> None:
         raise InputFileError(path, "there is no header line with the names of the columns")
     if all(_is_number(cell) for cell in header):
         raise InputFileError(path, "numbers where a header line with the names of the columns was expected", line=line)
-    twice = sorted({name for name in header if header.count(name) > 1})
-    if twice:
-        raise InputFileError(path, f"column {twice[0]!r} occurs twice in the header", line=line)
+    repeated = sorted({name for name in header if header.count(name) > 1})
+    if repeated:
+        raise InputFileError(path, f"column {repeated[0]!r} occurs twice in the header", line=line)

@@ -1,7 +1,7 @@
-"""Positions from a receiver's NMEA 0183 log: GGA for the place, RMC or ZDA for the date.
+"""Positions from an NMEA 0183 log: GGA for the position, RMC or ZDA for the date.
 
-Heights are those of GGA above the geoid plus the geoid's separation that the same sentence carries.
-A receiver that writes minutes with five decimals tells places to 2 cm only.
+Heights are those of GGA above the geoid plus the geoid separation of the same sentence. Receivers that
+write minutes with five decimals resolve positions to 2 cm only.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from railfix.core.timescale import utc_to_gpst
 from railfix.gnss.observations import capped_problems
 from railfix.io.position_log import PositionLog, read_positions
 
-#: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); all others are 0, no position.
+#: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); others are 0, no position.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 _DAY_S: Final = 86_400.0
 _NS: Final = 1e9
 
 
 @dataclass(frozen=True)
-class _Place:
+class _Gga:
     """One GGA sentence: line, seconds of the day, quality, latitude, longitude, ellipsoidal height."""
 
     line: int
@@ -57,9 +57,9 @@ def read_nmea(
     Parameters
     ----------
     path : path
-        Text, .gz too; sentences of other kinds are read over.
+        Text, .gz too; sentences of other kinds are skipped.
     broken_lines : {"stop", "count"}
-        What to do with a sentence whose checksum or fields are wrong: an error, or a note.
+        A sentence with a wrong checksum or invalid fields is an error, or is skipped and noted.
     date : datetime64, optional
         UTC date of the first GGA, for logs without RMC and ZDA.
 
@@ -74,45 +74,47 @@ def read_nmea(
         No GGA, a broken sentence, no date, or heights without the geoid's separation.
     """
     problems: list[InputFileError] = []
-    places: list[_Place] = []
+    fixes: list[_Gga] = []
     dates: list[_Date] = []
     for number, fields in _sentences(path, problems):
         kind = fields[0][2:]
         try:
             if kind == "GGA":
-                places.append(_gga(number, fields))
-            elif kind in _DATED and fields[1] and (found := _DATED[kind](number, fields)):
-                dates.append(found)
+                fixes.append(_gga(number, fields))
+            elif kind in _DATED and fields[1] and (dated := _DATED[kind](number, fields)):
+                dates.append(dated)
         except (ValueError, IndexError) as error:
-            reason = str(error) if str(error).startswith("height") else f"a field of {kind} is not what it should be"
+            reason = str(error) if str(error).startswith("height") else f"a field of {kind} is invalid"
             problems.append(InputFileError(path, reason, line=number))
     if problems and broken_lines == "stop":
         raise problems[0]
-    if not places:
+    if not fixes:
         raise InputFileError(path, "there is no GGA sentence; an NMEA log with GGA was expected")
     if date is not None:
-        dates = [_Date(places[0].line, places[0].of_day_s, date.astype("datetime64[D]"))]
+        dates = [_Date(fixes[0].line, fixes[0].of_day_s, date.astype("datetime64[D]"))]
     if not dates:
-        raise InputFileError(path, "there is no RMC or ZDA sentence, so the date is not known; log one, or give a date")
+        raise InputFileError(
+            path, "there is no RMC or ZDA sentence, the date is unknown; log one of them, or give the date"
+        )
     notes = capped_problems((str(problem) for problem in problems), count=len(problems))
     return PositionLog(
         path=str(path),
-        time=_times(places, dates, chained=date is not None),
-        ecef_m=ecef_from_geodetic(*np.array([place.geodetic for place in places]).T),
-        quality=np.array([place.quality for place in places], dtype=np.int64),
-        sigma_m=np.full((len(places), 3), np.nan),
-        line=np.array([place.line for place in places], dtype=np.int64),
+        time=_times(fixes, dates, chained=date is not None),
+        ecef_m=ecef_from_geodetic(*np.array([fix.geodetic for fix in fixes]).T),
+        quality=np.array([fix.quality for fix in fixes], dtype=np.int64),
+        sigma_m=np.full((len(fixes), 3), np.nan),
+        line=np.array([fix.line for fix in fixes], dtype=np.int64),
         notes=(f"{path}: times converted from UTC to GPS time", *notes),
     )
 
 
 def _sentences(path: str | PathLike[str], problems: list[InputFileError]) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of every sentence whose checksum agrees."""
+    """Yield line number and fields of every sentence with a correct checksum."""
     for number, line in enumerate(read_text_lines(path), start=1):
         text = line.strip()
         if not text:
             continue
-        body, star, told = text[1:].partition("*")
+        body, star, checksum = text[1:].partition("*")
         if text[0] != "$" or not star:
             what = "has no checksum" if text[0] == "$" else "does not begin with $"
             problems.append(InputFileError(path, f"this sentence {what}; NMEA 0183 was expected", line=number))
@@ -120,8 +122,10 @@ def _sentences(path: str | PathLike[str], problems: list[InputFileError]) -> Ite
         total = 0
         for byte in body.encode("latin-1"):
             total ^= byte
-        if told[:2].upper() != f"{total:02X}":
-            problems.append(InputFileError(path, f"the checksum is {told[:2]}, {total:02X} was expected", line=number))
+        if checksum[:2].upper() != f"{total:02X}":
+            problems.append(
+                InputFileError(path, f"the checksum is {checksum[:2]}, {total:02X} was expected", line=number)
+            )
             continue
         yield number, body.split(",")
 
@@ -137,17 +141,17 @@ def _angle(text: str, side: str, negative: str, degrees: int) -> float:
     return -value if side == negative else value
 
 
-def _gga(line: int, fields: list[str]) -> _Place:
+def _gga(line: int, fields: list[str]) -> _Gga:
     quality = QUALITY.get(int(fields[6] or 0), 0)
-    place = (np.nan, np.nan, np.nan)
+    position = (np.nan, np.nan, np.nan)
     if fields[2] and fields[4]:
         if not fields[9] or not fields[11]:
             raise ValueError("height or geoid separation is missing in GGA; let the receiver write both")
         latitude, longitude = _angle(fields[2], fields[3], "S", 2), _angle(fields[4], fields[5], "W", 3)
         if abs(latitude) > 90.0 or abs(longitude) > 180.0:
             raise ValueError("range")
-        place = (latitude, longitude, float(fields[9]) + float(fields[11]))
-    return _Place(line, _of_day(fields[1]) if fields[1] else np.nan, quality, place)
+        position = (latitude, longitude, float(fields[9]) + float(fields[11]))
+    return _Gga(line, _of_day(fields[1]) if fields[1] else np.nan, quality, position)
 
 
 def _rmc(line: int, fields: list[str]) -> _Date | None:
@@ -169,17 +173,17 @@ def _day(year: int, month: str, day: str) -> np.datetime64:
 _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rmc, "ZDA": _zda}
 
 
-def _times(places: list[_Place], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """GPS time of each place: the day that puts it nearest to the date sentence before it (or the first).
+def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
+    """Compute the GPS time of each fix: the day nearest to the date sentence before it (or the first).
 
-    With one date for the whole log (`chained`), a day is added at every midnight.
+    With one date for the log (`chained`), a day is added at every midnight.
     """
-    of_day = np.array([place.of_day_s for place in places])
-    line = np.array([place.line for place in places])
+    of_day = np.array([fix.of_day_s for fix in fixes])
+    line = np.array([fix.line for fix in fixes])
     if chained:
         step = np.diff(of_day, prepend=of_day[:1])
         days = np.cumsum(np.nan_to_num(step) < -_DAY_S / 2)
-        base = np.full(len(places), dates[0].day, dtype="datetime64[D]")
+        base = np.full(len(fixes), dates[0].day, dtype="datetime64[D]")
     else:
         row = np.maximum(np.searchsorted([date.line for date in dates], line, side="right") - 1, 0)
         base = np.array([date.day for date in dates], dtype="datetime64[D]")[row]
@@ -197,7 +201,7 @@ def read_any_positions(
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> PositionLog:
-    """A log of positions of any kind: NMEA by its ending (``.nmea``, ``.nma``, ``.gga``), else `read_positions`.
+    """Read a log of positions of any kind: NMEA by its ending (``.nmea``, ``.nma``, ``.gga``), else `read_positions`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Positions from elsewhere: RTKLIB ``.pos`` files and CSV with named columns."""
+"""Position logs: RTKLIB ``.pos`` files and CSV with named columns."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ class PositionLog:
     ecef_m : ndarray, shape (n, 3) [m]
         NaN where a row has no position.
     quality : ndarray of int, shape (n,)
-        RTKLIB's Q (see `QUALITY_NAMES`), or the log's own number; -1 where it has none.
+        Q of RTKLIB (see `QUALITY_NAMES`), or the number in the log; -1 where it has none.
     sigma_m : ndarray, shape (n, 3) [m]
         Standard deviations north, east, up; NaN where the log has none.
     line : ndarray of int, shape (n,)
         Line number of each row in the file.
     notes : tuple of str
     ratio : ndarray, shape (n,), or None
-        Ratio of the ambiguities' test, where the log has it.
+        Ratio of the ambiguity test, where the log has it.
     """
 
     path: str
@@ -63,7 +63,7 @@ class PositionLog:
 
     @property
     def has_quality(self) -> bool:
-        """Whether the log tells a quality."""
+        """Whether any row has a quality."""
         return bool((self.quality >= 0).any())
 
 
@@ -74,7 +74,7 @@ def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | No
     ----------
     path : path
     columns : mapping of str, optional
-        For CSV whose columns have other names: railfix's name to the file's, for example
+        For CSV with other column names: name in railfix to name in the file, for example
         ``{"latitude_deg": "Lat"}``.
 
     Raises
@@ -102,7 +102,7 @@ def _read_csv(path: str | PathLike[str], columns: dict[str, str]) -> PositionLog
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Positions of a table that has been read already; see `read_positions`."""
+    """Convert a table that has been read to a position log; see `read_positions`."""
     path = table.path
     close = misspelt(table.cells, CSV_COLUMNS)
     absent = {right: wrong for wrong, right in close.items() if right not in table}
@@ -139,7 +139,7 @@ def _renamed(table: NamedColumns, columns: dict[str, str]) -> NamedColumns:
     cells = dict(table.cells)
     for ours, theirs in columns.items():
         if theirs not in table.cells:
-            message = f"there is no column {theirs!r} (asked for as {ours}); the columns are {', '.join(table.cells)}"
+            message = f"there is no column {theirs!r} (given for {ours}); the columns are {', '.join(table.cells)}"
             raise InputFileError(table.path, message, line=table.header_line)
         cells[ours] = table.cells[theirs]
     return NamedColumns(
@@ -155,7 +155,7 @@ def _check_latitude(table: NamedColumns, geodetic: Floats) -> None:
 
 
 def positions_times(table: NamedColumns) -> Datetimes:
-    """The column ``time_gpst``; NaT where it is blank or absent."""
+    """Parse the column ``time_gpst``; NaT where it is blank or absent."""
     if "time_gpst" not in table:
         return np.full(len(table), np.datetime64("NaT", "ns"))
     cells = table.cells["time_gpst"]
@@ -195,7 +195,7 @@ def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
 
     Time as week and seconds or as calendar date, in GPST, UTC or JST; coordinates as degrees,
     as degrees, minutes, seconds, or ECEF. Baselines (e/n/u) and heights above the geoid are
-    refused, for they do not say where on the ellipsoid the antenna is.
+    rejected, because they do not give an ellipsoidal position.
 
     References
     ----------
@@ -232,7 +232,7 @@ def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
 
 
 def _rtklib_header(path: str | PathLike[str], header: list[str]) -> tuple[str, list[str]]:
-    """Time scale, and the names of the columns after the time."""
+    """Read the time scale and the names of the columns after the time."""
     for line in header:
         if "lat/lon/height=" in line and "geodetic" in line.split("lat/lon/height=")[1].split(",")[0]:
             raise InputFileError(path, "the heights are above the geoid; write it with out-height=ellipsoidal")
@@ -269,7 +269,7 @@ def _rtklib_times(path: str | PathLike[str], number: Integers, cells: list[tuple
                 else:
                     int(first), float(second)
             except ValueError:
-                message = f"'{first} {second}' is no time such as {form}"
+                message = f"'{first} {second}' is not a time such as {form}"
                 raise InputFileError(path, message, line=int(line)) from None
         raise
     if scale == "JST":
@@ -307,7 +307,7 @@ def _rtklib_ecef(path: str | PathLike[str], number: Integers, values: Floats, na
 
 
 def _rtklib_sigma(rest: Floats, names: list[str]) -> Floats:
-    """Standard deviations north, east, up, where the file has the columns sdn, sde, sdu."""
+    """Return standard deviations north, east, up; NaN without the columns sdn, sde, sdu."""
     after = [name.split("(")[0] for name in names[3:]]
     if not {"sdn", "sde", "sdu"} <= set(after[: rest.shape[1]]):
         return np.full((len(rest), 3), np.nan)
@@ -315,7 +315,7 @@ def _rtklib_sigma(rest: Floats, names: list[str]) -> Floats:
 
 
 def _rtklib_ratio(rest: Floats, names: list[str]) -> Floats | None:
-    """The column ``ratio``, where the file has it."""
+    """Return the column ``ratio``; None where the file has none."""
     after = [name.split("(")[0] for name in names[3:]]
     return rest[:, after.index("ratio")] if "ratio" in after[: rest.shape[1]] else None
 

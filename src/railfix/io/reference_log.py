@@ -1,20 +1,20 @@
-"""Where each antenna really was: reference files, the simulator's truth, logs of good positions.
+"""Reference positions of each antenna: reference files, ground truth of the simulator, position logs.
 
-One CSV for all of them; a row is an antenna at an instant:
+All are one kind of CSV; a row is an antenna at an epoch:
 
 =========== ===============================================================================
 time_gpst   ISO 8601, GPS time
 antenna     ``front``, ``rear``
-chainage_m  of the line at the antenna's place; empty where it is not known
+chainage_m  along the line at the antenna; empty where unknown
 x_m y_m z_m ECEF
 speed_mps   along the line, + toward rising chainage
 sigma_m     standard deviation along the track
-source      ``rtk`` a position of a receiver, ``bridged`` carried between two, ``truth`` made up
-environment where the train is: ``open``, ``cutting``, or whatever words the file has
+source      ``rtk`` receiver position, ``bridged`` interpolated, ``truth`` simulated ground truth
+environment surroundings of the train: ``open``, ``cutting``, or any other word
 =========== ===============================================================================
 
-Only time and place are needed (geodetic coordinates will do). The simulator's ``truth.csv`` is
-such a file without a source, and so are logs of positions (RTKLIB, CSV, NMEA).
+Only time and position are required (geodetic coordinates are accepted). ``truth.csv`` of the simulator
+is such a file without a source, and so are position logs (RTKLIB, CSV, NMEA).
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from railfix.io.position_log import PositionLog, positions_of_table
 COLUMNS: Final = (
     "time_gpst", "antenna", "chainage_m", "x_m", "y_m", "z_m", "speed_mps", "sigma_m", "source", "environment",
 )  # fmt: skip
-#: Where an instant comes from; blank where the file does not tell.
+#: Source of a reference position; blank where the file has none.
 SOURCES: Final = ("rtk", "bridged", "truth", "")
-#: A CSV with these columns and no source is the simulator's truth.
+#: A CSV with these columns and no source is ground truth of the simulator.
 _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
 #: RTKLIB's quality of a fixed solution.
 _FIX: Final = 1
@@ -49,7 +49,7 @@ _FIX: Final = 1
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaReference:
-    """Places of one antenna, R instants.
+    """Reference positions of one antenna, R epochs.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class AntennaReference:
     chainage_m : ndarray, shape (R,) [m]
         NaN where the file has none.
     speed_mps : ndarray, shape (R,) [m/s]
-        Along the line, + toward rising chainage; NaN unknown.
+        Along the line, positive toward rising chainage; NaN where unknown.
     sigma_m : ndarray, shape (R,) [m]
-        Standard deviation along the track; NaN where it is not stated.
+        Standard deviation along the track; NaN where the file has none.
     source : ndarray of str, shape (R,)
         One of `SOURCES`.
     environment : ndarray of str, shape (R,)
-        Blank where it is not told.
+        Blank where the file has none.
     """
 
     time: Datetimes
@@ -77,19 +77,19 @@ class AntennaReference:
     environment: Strings
 
     def __post_init__(self) -> None:
-        instants = len(self.time)
-        if self.ecef_m.shape != (instants, 3):
-            raise ValueError(f"ecef_m has shape {self.ecef_m.shape}, expected ({instants}, 3)")
+        epochs = len(self.time)
+        if self.ecef_m.shape != (epochs, 3):
+            raise ValueError(f"ecef_m has shape {self.ecef_m.shape}, expected ({epochs}, 3)")
         for item in fields(self):
             value = getattr(self, item.name)
-            if len(value) != instants:
-                raise ValueError(f"{item.name} has {len(value)} instants, time has {instants}")
+            if len(value) != epochs:
+                raise ValueError(f"{item.name} has {len(value)} epochs, time has {epochs}")
             object.__setattr__(self, item.name, read_only(value))
         if np.isnat(self.time).any() or not (np.diff(self.time) > np.timedelta64(0, "ns")).all():
             raise ValueError("time must rise strictly")
-        strange = sorted(set(self.source.tolist()) - set(SOURCES))
-        if strange:
-            raise ValueError(f"source is {strange[0]!r}, expected one of {', '.join(map(repr, SOURCES))}")
+        unknown = sorted(set(self.source.tolist()) - set(SOURCES))
+        if unknown:
+            raise ValueError(f"source is {unknown[0]!r}, expected one of {', '.join(map(repr, SOURCES))}")
 
     def __len__(self) -> int:
         return len(self.time)
@@ -101,21 +101,21 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
     Parameters
     ----------
     path : path
-        A reference file or the simulator's truth (``.csv``, ``.csv.gz``), or a log of positions that
-        `railfix.io.nmea.read_any_positions` reads. Where quality is told, 1 (fix) alone counts.
+        A reference file or ground truth of the simulator (``.csv``, ``.csv.gz``), or a position log for
+        `railfix.io.nmea.read_any_positions`. Where the log has a quality, only 1 (fix) is used.
     antennas : sequence of str
-        Those that are wanted. A file without the column ``antenna`` is about the only one.
+        Antennas to read. A file without the column ``antenna`` holds one antenna.
 
     Returns
     -------
     dict of str to AntennaReference
-        Of every antenna asked for. Of rows with the same time the first counts. ``source`` is what
-        the file says; "truth" for the simulator's, "rtk" for a plain log of positions.
+        One entry for each of `antennas`. Of rows with the same time the first is used. ``source`` is
+        that of the file; else "truth" for files of the simulator, "rtk" for position logs.
 
     Raises
     ------
     InputFileError
-        No reference, no times, an unknown source, or nothing that says which antenna's they are.
+        No positions, no times, an unknown source, or no column ``antenna`` where two are to be read.
     """
     table = _table(Path(path))
     log = read_any_positions(path) if table is None else positions_of_table(table)
@@ -129,32 +129,32 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
         raise InputFileError(
             path, f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas"
         )
-    whole = _columns(log, table)
-    return {name: _of_antenna(path, name, owner, usable, whole) for name in antennas}
+    columns = _columns(log, table)
+    return {name: _of_antenna(path, name, owner, usable, columns) for name in antennas}
 
 
 def _table(path: Path) -> NamedColumns | None:
-    """The file as a table, or None where it is no CSV."""
+    """Read the file as a table; None for a file other than CSV."""
     return read_named_columns(path) if ending(path) == ".csv" else None
 
 
 def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[np.generic]]:
-    """All columns of all rows, blank where the file has none."""
+    """Collect all columns of all rows, blank where the file has none."""
     absent = np.full(len(log), np.nan)
-    found: dict[str, NDArray[np.generic]] = {"time": log.time, "ecef_m": log.ecef_m}
+    columns: dict[str, NDArray[np.generic]] = {"time": log.time, "ecef_m": log.ecef_m}
     for name in ("chainage_m", "speed_mps", "sigma_m"):
-        found[name] = table.numbers(name, blank=np.nan) if table is not None and name in table else absent
+        columns[name] = table.numbers(name, blank=np.nan) if table is not None and name in table else absent
     source = np.full(len(log), "truth" if table is not None and all(n in table for n in _OF_TRUTH) else "rtk")
     environment = np.full(len(log), "")
     if table is not None and "source" in table:
         source = np.array(table.cells["source"], dtype=np.str_)
-        strange = ~np.isin(source, SOURCES)
-        if strange.any():
-            row = int(np.argmax(strange))
+        unknown = ~np.isin(source, SOURCES)
+        if unknown.any():
+            row = int(np.argmax(unknown))
             raise table.error(row, f"source is '{source[row]}'; {', '.join(SOURCES[:-1])} or blank was expected")
     if table is not None and "environment" in table:
         environment = np.array(table.cells["environment"], dtype=np.str_)
-    return {**found, "source": source, "environment": environment}
+    return {**columns, "source": source, "environment": environment}
 
 
 def _of_antenna(
@@ -162,17 +162,17 @@ def _of_antenna(
     name: str,
     owner: Strings,
     usable: Masks,
-    whole: Mapping[str, NDArray[np.generic]],
+    columns: Mapping[str, NDArray[np.generic]],
 ) -> AntennaReference:
     rows = np.flatnonzero(usable & (owner == name))
-    _, first = np.unique(whole["time"][rows], return_index=True)
+    _, first = np.unique(columns["time"][rows], return_index=True)
     if len(first) < 2:
         raise InputFileError(path, f"fewer than two positions with a time for the antenna {name}")
-    return AntennaReference(**{key: values[rows[first]] for key, values in whole.items()})  # type: ignore[arg-type]
+    return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
 
 
 def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaReference]) -> None:
-    """Write references as CSV (`COLUMNS`), by time and then antenna; whole or not at all.
+    """Write references as CSV (`COLUMNS`), sorted by time; a failed write leaves no file.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaR
 
 
 def reference_lines(references: Mapping[str, AntennaReference]) -> list[str]:
-    """Lines of the CSV, the header first."""
+    """Format the lines of the CSV, header first."""
     if not references:
         return [",".join(COLUMNS)]
     parts = list(references.values())
@@ -209,5 +209,5 @@ def _decimals(parts: Sequence[AntennaReference], name: str) -> Strings:
 
 
 def _text(values: Floats) -> Strings:
-    """Numbers with four decimals, NaN blank."""
+    """Format numbers with four decimals, NaN blank."""
     return np.array([f"{value:.4f}" if value == value else "" for value in values.tolist()], dtype=np.str_)

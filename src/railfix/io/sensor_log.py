@@ -1,4 +1,4 @@
-"""Tables of the sensors on board: tachometer pulses and longitudinal acceleration."""
+"""On-board sensor tables: tachometer pulses and longitudinal acceleration."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from railfix.core.timescale import seconds
 from railfix.io.named_columns import NamedColumns, parse_named_columns, read_named_columns
 from railfix.io.position_log import positions_times
 
-#: How times are written.
+#: Format of times.
 _ISO: Final = "%Y-%m-%dT%H:%M:%S%.9f"
 
-#: Rows of a table further apart than this leave what lies between them unknown [s].
+#: Rows further apart than this are a gap, within which values are unknown [s].
 LONGEST_STEP_S = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pulses:
-    """Cumulated pulses of a tachometer, P rows.
+    """Cumulative pulses of a tachometer, P rows.
 
     Attributes
     ----------
     path : str
     time : ndarray of datetime64[ns], shape (P,)
     count : ndarray, shape (P,)
-        Falling where the train runs backward and the table can tell.
+        Falling where the train runs backward, if the table has the direction.
     kind : {"count", "pulse", "distance"}
-        Rows are readings of a counter, or single pulses, or metres run.
+        Rows are readings of a counter, single pulses, or distances in metres.
     signed : bool
-        Whether the count falls anywhere: then it tells the direction.
+        Whether the count has a direction: it falls somewhere, or the table has the column.
     """
 
     path: str
@@ -46,14 +46,14 @@ class Pulses:
     signed: bool
 
     def at(self, time: Datetimes) -> Floats:
-        """Count at instants, linearly; NaN outside and where the table has a hole while the train runs."""
+        """Interpolate the count linearly; NaN outside the table and in gaps during which the train moves."""
         at, known = seconds(time - self.time[0]), seconds(self.time - self.time[0])
-        found = np.interp(at, known, self.count, left=np.nan, right=np.nan)
+        count = np.interp(at, known, self.count, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
-        hole = (known[after] - known[after - 1] > LONGEST_STEP_S) & (self.kind != "pulse")
-        hole &= self.count[after] != self.count[after - 1]
-        hole &= (at != known[after]) & (at != known[after - 1])
-        return np.where(hole, np.nan, found)
+        gap = (known[after] - known[after - 1] > LONGEST_STEP_S) & (self.kind != "pulse")
+        gap &= self.count[after] != self.count[after - 1]
+        gap &= (at != known[after]) & (at != known[after - 1])
+        return np.where(gap, np.nan, count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Acceleration:
     time : ndarray of datetime64[ns], shape (A,)
     acceleration_mps2 : ndarray, shape (A,) [m/s2]
     kind : {"motion", "specific_force"}
-        Whether the gravity of gradients is in it, as an accelerometer measures it.
+        Acceleration of the motion, or specific force, which includes gravity on gradients.
     """
 
     path: str
@@ -75,24 +75,24 @@ class Acceleration:
     kind: str
 
     def mean_over(self, time: Datetimes) -> Floats:
-        """Mean from each instant to the next, shape (len(time) - 1,) [m/s2]; NaN where the table has a hole."""
+        """Compute the mean between consecutive times, shape (len(time) - 1,) [m/s2]; NaN across gaps of the table."""
         known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
         step = np.diff(known)
-        gained = np.concatenate(
+        velocity = np.concatenate(
             [[0.0], np.cumsum(step * (self.acceleration_mps2[1:] + self.acceleration_mps2[:-1]) / 2.0)]
         )
-        holes = np.concatenate([[0], np.cumsum(step > LONGEST_STEP_S)])
-        total = np.interp(at, known, gained, left=np.nan, right=np.nan)
-        before = holes[np.clip(np.searchsorted(known, at[:-1], side="right") - 1, 0, len(known) - 1)]
-        after = holes[np.clip(np.searchsorted(known, at[1:], side="left"), 0, len(known) - 1)]
+        gaps = np.concatenate([[0], np.cumsum(step > LONGEST_STEP_S)])
+        total = np.interp(at, known, velocity, left=np.nan, right=np.nan)
+        before = gaps[np.clip(np.searchsorted(known, at[:-1], side="right") - 1, 0, len(known) - 1)]
+        after = gaps[np.clip(np.searchsorted(known, at[1:], side="left"), 0, len(known) - 1)]
         return np.where(before == after, np.diff(total) / np.diff(at), np.nan)
 
 
 def read_pulses(path: str | PathLike[str]) -> Pulses:
-    """Read a tachometer's table: CSV (or the same as .parquet) with ``time_gpst`` and what was counted.
+    """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
 
-    ``count`` is a counter's reading (falling when it runs backward, never wrapping), ``distance_m`` metres run;
-    with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives pulses their sign.
+    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the
+    distance run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign.
 
     Raises
     ------
@@ -120,8 +120,8 @@ def read_pulses(path: str | PathLike[str]) -> Pulses:
 def read_acceleration(path: str | PathLike[str]) -> Acceleration:
     """Read a table of accelerations toward the front: CSV, or .parquet, with ``time_gpst`` and one other column.
 
-    ``specific_force_mps2`` is what an accelerometer measures (gravity on gradients is taken off by the map), and
-    so is ``force_forward_mps2`` of the simulator; ``acceleration_mps2`` is that of the motion alone.
+    ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
+    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is that of the motion.
 
     Raises
     ------
@@ -134,8 +134,8 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
         "force_forward_mps2": "specific_force",
         "acceleration_mps2": "motion",
     }
-    found = [name for name in kinds if name in table]
-    if len(found) != 1:
+    present = [name for name in kinds if name in table]
+    if len(present) != 1:
         raise InputFileError(
             path,
             f"one column of {', '.join(kinds)} was expected; the columns are {', '.join(table.cells)}",
@@ -144,8 +144,8 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
     return Acceleration(
         path=str(path),
         time=_rising_times(table),
-        acceleration_mps2=table.numbers(found[0]),
-        kind=kinds[found[0]],
+        acceleration_mps2=table.numbers(present[0]),
+        kind=kinds[present[0]],
     )
 
 
@@ -173,5 +173,5 @@ def _rising_times(table: NamedColumns) -> Datetimes:
         raise table.error(int(np.argmax(bad)), "there is no time")
     bad[1:] = np.diff(time) <= np.timedelta64(0, "ns")
     if bad.any():
-        raise table.error(int(np.argmax(bad)), "the time does not rise; sort the table and leave out doubles")
+        raise table.error(int(np.argmax(bad)), "the time does not rise; sort the table and remove duplicates")
     return time

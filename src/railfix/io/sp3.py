@@ -11,12 +11,10 @@ from typing import Final
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import read_text_lines
+from railfix.core.files import FilePath, read_text_lines
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits.precise import POINTS
-
-FilePath = str | PathLike[str]
 
 #: Time systems that are GPS time up to nanoseconds; SP3-a files name none and are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
@@ -28,7 +26,7 @@ _NO_CLOCK: Final = 999_999.0
 
 @dataclass
 class _States:
-    """States as they are read: epoch [ns of GPS time], satellite, position [km] and clock [us]."""
+    """States read so far: epoch [ns of GPS time], satellite, position [km] and clock [us]."""
 
     epoch: list[int] = field(default_factory=list)
     satellite: list[str] = field(default_factory=list)
@@ -36,7 +34,7 @@ class _States:
 
 
 def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
-    """Positions and clocks of one or several SP3 files, joined in order of time.
+    """Read positions and clocks of one or several SP3 files, joined in order of time.
 
     Parameters
     ----------
@@ -46,13 +44,13 @@ def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
     Returns
     -------
     PreciseEphemeris
-        Where files overlap, what the file given first says of an epoch and satellite counts.
+        Where files overlap, the file given first takes precedence.
 
     Raises
     ------
     InputFileError
-        A file is missing, no SP3 file, in an unknown time system, or broken; or all together hold
-        fewer epochs than the interpolation needs.
+        A file is missing, is not an SP3 file, is in an unknown time system, or is broken; or all files
+        together have fewer epochs than the interpolation needs.
     """
     files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
     if not files:
@@ -66,7 +64,7 @@ def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
     if len(times) < POINTS:
         raise InputFileError(source, f"has {len(times)} epochs, the interpolation of orbits needs at least {POINTS}")
     grid = np.full((len(times), len(satellites), 4), np.nan)
-    # Written backward, so that of several the first one stays.
+    # Assigned in reverse order, so that the first of several values is kept.
     grid[row[::-1], column[::-1]] = np.array(states.numbers)[::-1]
     position, clock = grid[..., :3], grid[..., 3]
     position[(position == 0.0).all(axis=-1)] = np.nan
@@ -83,7 +81,7 @@ def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
 def _read_file(path: FilePath, states: _States) -> None:
     lines = read_text_lines(path)
     if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
-        raise InputFileError(path, "is no SP3 file: its first line must begin with #a, #b, #c or #d", line=1)
+        raise InputFileError(path, "is not an SP3 file: its first line must begin with #a, #b, #c or #d", line=1)
     system = _time_system(path, lines)
     epoch: int | None = None
     before = len(states.epoch)
@@ -93,19 +91,19 @@ def _read_file(path: FilePath, states: _States) -> None:
                 epoch = _instant(line, system)
             elif line.startswith("P"):
                 if epoch is None:
-                    raise InputFileError(path, "a position stands before the first epoch", line=number)
+                    raise InputFileError(path, "a position comes before the first epoch", line=number)
                 states.satellite.append(_satellite(line[1:4]))
                 states.numbers.append(_numbers(line))
                 states.epoch.append(epoch)
         except ValueError:
-            what = f"{line.strip()!r} holds no satellite, time or number where one is due"
+            what = f"{line.strip()!r} has an invalid satellite, time or number"
             raise InputFileError(path, what, line=number) from None
     if len(states.epoch) == before:
-        raise InputFileError(path, "holds no satellite position; the file is cut short, give the whole one")
+        raise InputFileError(path, "has no satellite position; the file is cut short, give the complete one")
 
 
 def _satellite(text: str) -> str:
-    """``G01``; SP3-a leaves the letter of GPS out, and blanks stand for zeros."""
+    """Return the satellite as ``G01``; SP3-a omits the letter of GPS and may have blanks for zeros."""
     letter = text[0] if text[:1].isalpha() else "G"
     digits = text[1:].strip()
     if not digits.isdigit():
@@ -114,7 +112,7 @@ def _satellite(text: str) -> str:
 
 
 def _numbers(line: str) -> list[float]:
-    """Position [km] and clock [us]; a clock left blank is unknown."""
+    """Parse position [km] and clock [us]; a blank clock is unknown."""
     x, y, z = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(3))
     text = line[46:60].strip()
     clock = float(text) if text else np.nan
@@ -124,19 +122,19 @@ def _numbers(line: str) -> list[float]:
 
 
 def _time_system(path: FilePath, lines: list[str]) -> str:
-    """Time system of the first %c line."""
+    """Return the time system of the first %c line."""
     for number, line in enumerate(lines, start=1):
         if line.startswith("%c"):
             system = line[9:12].strip().upper()
             if system not in _GPST and system not in _TO_GPST:
-                what = f"time system {system!r} is not read; GPS, GAL, QZS, BDT, UTC and GLO are"
+                what = f"time system {system!r} is not supported; GPS, GAL, QZS, BDT, UTC and GLO are"
                 raise InputFileError(path, what, line=number)
             return system
     return "GPS"
 
 
 def _instant(line: str, system: str) -> int:
-    """Nanoseconds of GPS time since 1970."""
+    """Parse an epoch line as nanoseconds of GPS time since 1970."""
     year, month, day, hour, minute = (int(line[a:b]) for a, b in ((3, 7), (8, 10), (11, 13), (14, 16), (17, 19)))
     seconds = float(line[20:31])
     if not (1980 <= year < 2100 and 0.0 <= seconds <= 60.0):

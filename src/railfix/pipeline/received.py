@@ -159,10 +159,7 @@ def _merged(old: Navigation, new: Navigation) -> Navigation:
         glonass=_united(old.glonass, new.glonass, _GLONASS_KEY),
         klobuchar={**old.klobuchar, **new.klobuchar},
         leap_seconds=old.leap_seconds if new.leap_seconds is None else new.leap_seconds,
-        passed_over={
-            kind: old.passed_over.get(kind, 0) + new.passed_over.get(kind, 0)
-            for kind in {**old.passed_over, **new.passed_over}
-        },
+        skipped={kind: old.skipped.get(kind, 0) + new.skipped.get(kind, 0) for kind in {**old.skipped, **new.skipped}},
         notes=tuple(dict.fromkeys((*old.notes, *new.notes))),
         precise=old.precise if new.precise is None else new.precise,
         sources=tuple(dict.fromkeys((*old.sources, *new.sources))),

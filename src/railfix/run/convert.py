@@ -55,7 +55,7 @@ def convert_logs(conversion: Conversion, *, overwrite: Overwrite = "refuse") -> 
     version: Literal["3.04", "4.02"] = "3.04" if conversion.rinex == "3" else "4.02"
     lines: list[str] = []
     if conversion.out is not None:
-        header, epochs, passed_over = _scanned(conversion.logs, date)
+        header, epochs, skipped = _scanned(conversion.logs, date)
         pieces = (piece for piece in scan_observations(conversion.logs, date=date) if len(piece))
         observables = {
             system: [kind + signal for signal in signals for kind in "CLDS"]
@@ -63,13 +63,13 @@ def convert_logs(conversion: Conversion, *, overwrite: Overwrite = "refuse") -> 
         }
         write_observations(pieces, conversion.out, version=version, observables=observables, header=header)
         lines.append(f"wrote {conversion.out}: {epochs:,} epochs, RINEX {version}")
-        lines += [f"passed over: {count:,} {what}" for what, count in sorted(passed_over.items())]
+        lines += [f"passed over: {count:,} {what}" for what, count in sorted(skipped.items())]
     if conversion.nav_out is not None:
         navigation = read_navigation(conversion.logs, date=date)
         write_navigation(navigation, conversion.nav_out, version=version)
         records = len(navigation.kepler) + len(navigation.glonass)
         lines.append(f"wrote {conversion.nav_out}: {records:,} ephemerides, RINEX {version}")
-        lines += [f"passed over: {count:,} {what}" for what, count in sorted(navigation.passed_over.items())]
+        lines += [f"passed over: {count:,} {what}" for what, count in sorted(navigation.skipped.items())]
     return lines
 
 
@@ -77,14 +77,14 @@ def _scanned(logs: tuple[Path, ...], date: np.datetime64 | None) -> tuple[Observ
     """Header with the signals of the whole log, number of epochs, and what is passed over."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
-    header, epochs, passed_over = ObservationHeader(), 0, Counter[str]()
+    header, epochs, skipped = ObservationHeader(), 0, Counter[str]()
     for piece in scan_observations(logs, date=date):
         header = piece.header if not epochs else header
         channels |= piece.header.glonass_channel
         epochs += len(piece)
-        passed_over.update(piece.passed_over)
+        skipped.update(piece.skipped)
         for name, signal in zip(piece.satellite.tolist(), piece.signal.tolist(), strict=True):
             signals.setdefault(name[0], set()).add(signal)
     joined = {system: tuple(sorted(codes)) for system, codes in sorted(signals.items())}
     values = {name: getattr(header, name) for name in ObservationHeader.__dataclass_fields__}
-    return ObservationHeader(**{**values, "signals": joined, "glonass_channel": channels}), epochs, passed_over
+    return ObservationHeader(**{**values, "signals": joined, "glonass_channel": channels}), epochs, skipped

@@ -222,8 +222,8 @@ def notes_of(line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Ant
 def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
     for name, log in logs.items():
         yield from log.problems
-        if log.passed_over:
-            told = ", ".join(f"{count} {what}" for what, count in sorted(log.passed_over.items()))
+        if log.skipped:
+            told = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
             yield f"{name}: read over: {told}"
 
 

@@ -134,7 +134,7 @@ def run_record(
         "line": dict(line),
         "navigation": {
             "records": len(navigation.kepler) + len(navigation.glonass),
-            "passed_over": dict(navigation.passed_over),
+            "skipped": dict(navigation.skipped),
             "klobuchar_from": sorted(navigation.klobuchar),
             "precise": "" if navigation.precise is None else navigation.precise.source,
         },

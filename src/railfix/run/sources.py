@@ -106,7 +106,7 @@ class Log:
         Part of the files that has been read, 0 to 1.
     problems : list of str
         Sentences on what was broken and passed over.
-    passed_over : Counter of str
+    skipped : Counter of str
         What was read over, counted by what it is.
     """
 
@@ -117,7 +117,7 @@ class Log:
     end: datetime | None = None
     share: float = 0.0
     problems: list[str] = field(default_factory=list)
-    passed_over: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
 
     def parts(self) -> Iterator[Observations]:
         """Pieces of the log in order of time.
@@ -137,7 +137,7 @@ class Log:
         )
         for piece in pieces:
             self.problems += piece.problems
-            self.passed_over.update(piece.passed_over)
+            self.skipped.update(piece.skipped)
             if len(piece):
                 yield piece
 

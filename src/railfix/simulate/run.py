@@ -16,7 +16,7 @@ from railfix.core.errors import OutputError
 from railfix.core.settings import write_toml
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
-from railfix.io.rinex.write import write_navigation, write_observations
+from railfix.io.rinex import write_navigation, write_observations
 from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
 from railfix.simulate.run_readme import run_readme
 from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings

@@ -57,14 +57,14 @@ class Assembled:
         Receiver's time of the subframe that completed each; NaT before the receiver knew the time.
     klobuchar : mapping of str to ndarray, shape (8,)
     leap_seconds : int or None
-    passed_over : mapping of str to int
+    skipped : mapping of str to int
     """
 
     records: tuple[RawRecord, ...]
     complete_at: Datetimes
     klobuchar: Mapping[str, np.ndarray]
     leap_seconds: int | None
-    passed_over: Mapping[str, int]
+    skipped: Mapping[str, int]
 
 
 def assembled(subframes: Subframes, time: Datetimes, state: Unfinished | None = None) -> tuple[Assembled, Unfinished]:
@@ -94,7 +94,7 @@ def assembled(subframes: Subframes, time: Datetimes, state: Unfinished | None = 
         complete_at=np.array(builder.times, dtype="datetime64[ns]"),
         klobuchar=builder.klobuchar,
         leap_seconds=builder.leap_seconds,
-        passed_over=counts,
+        skipped=counts,
     )
     return result, Unfinished(latest=builder.latest, issued=builder.issued)
 
@@ -127,7 +127,7 @@ def assembled_rtcm(
         complete_at=np.array(builder.times, dtype="datetime64[ns]"),
         klobuchar={},
         leap_seconds=None,
-        passed_over=counts,
+        skipped=counts,
     )
     return result, Unfinished(latest=builder.latest, issued=builder.issued)
 
@@ -152,7 +152,7 @@ def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigat
         glonass=glonass_records([r for r in parts.records if r.system == "R"]),
         klobuchar=klobuchar,
         leap_seconds=parts.leap_seconds,
-        passed_over=dict(parts.passed_over),
+        skipped=dict(parts.skipped),
         sources=sources,
     )
 
@@ -337,12 +337,12 @@ def merged(parts: list[Assembled]) -> Assembled:
     for part in parts:
         klobuchar |= part.klobuchar
         leap = part.leap_seconds if part.leap_seconds is not None else leap
-        for what, number in part.passed_over.items():
+        for what, number in part.skipped.items():
             _count(counts, what, number)
     return Assembled(
         records=tuple(record for part in parts for record in part.records),
         complete_at=np.concatenate([part.complete_at for part in parts]) if parts else np.zeros(0, "datetime64[ns]"),
         klobuchar=klobuchar,
         leap_seconds=leap,
-        passed_over=counts,
+        skipped=counts,
     )

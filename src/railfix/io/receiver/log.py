@@ -82,7 +82,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     raw = ubx.rawx_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
     msm = _without(frames) if np.isnat(time) else rtcm.msm_measurements(frames, time)
-    parts = [part for part in (raw, msm) if len(part.time) or part.passed_over]
+    parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
     records, subframes, messages = _ephemerides(frames, raw, time, state)
     last = measurements.time[-1] if len(measurements.time) else time
@@ -102,8 +102,8 @@ def _without(frames: Frames) -> Measurements:
     empty = rtcm.msm_measurements(_none(frames), np.datetime64("NaT", "ns"))
     count = len(frames.of("rtcm3", *rtcm.MSM_NUMBERS))
     return Measurements(
-        **{name: getattr(empty, name) for name in Measurements.__dataclass_fields__ if name != "passed_over"},
-        passed_over={"RTCM 3 observations without a date": count} if count else {},
+        **{name: getattr(empty, name) for name in Measurements.__dataclass_fields__ if name != "skipped"},
+        skipped={"RTCM 3 observations without a date": count} if count else {},
     )
 
 
@@ -176,11 +176,11 @@ def scan_receiver_log(
     for piece in scan_pieces(path, date=date, progress=progress):
         observations, tracking = observations_of(piece.measurements, tracking)
         frames_seen += piece.bytes - piece.skipped_bytes
-        undated += piece.measurements.passed_over.get("RTCM 3 observations without a date", 0)
+        undated += piece.measurements.skipped.get("RTCM 3 observations without a date", 0)
         counts = {"bytes outside messages": piece.skipped_bytes, "messages with a bad checksum": piece.bad_checksums}
-        passed_over = {**observations.passed_over, **{what: n for what, n in counts.items() if n}}
+        skipped = {**observations.skipped, **{what: n for what, n in counts.items() if n}}
         epochs += len(observations)
-        yield replace(observations, passed_over=passed_over)
+        yield replace(observations, skipped=skipped)
     if not frames_seen:
         raise InputFileError(path, "holds no UBX, RTCM 3, SBF or NMEA message with a valid checksum")
     if not epochs:

@@ -38,7 +38,7 @@ class Measurements:
         Frequency channel where the satellite is of GLONASS.
     leap_seconds : int or None
     receiver : str
-    passed_over : mapping of str to int
+    skipped : mapping of str to int
     """
 
     time: Datetimes
@@ -55,7 +55,7 @@ class Measurements:
     glonass_channel: Integers
     leap_seconds: int | None = None
     receiver: str = ""
-    passed_over: Mapping[str, int] = field(default_factory=dict)
+    skipped: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,13 +114,13 @@ def observations_of(measurements: Measurements, tracking: Tracking | None = None
     lock, polarity = np.vstack([before[:, 0], lock]), np.vstack([before[:, 1], polarity])
     slipped = slips(lock, polarity)[1:]
     indicator = _SLIP * slipped + _HALF_CYCLE * half
-    passed_over = dict(measurements.passed_over)
+    skipped = dict(measurements.skipped)
     for what, count in (
         ("epochs not after the one before", int(np.count_nonzero(~rising))),
         ("measurements of unknown signals", int(np.count_nonzero(~known))),
     ):
         if count:
-            passed_over[what] = passed_over.get(what, 0) + count
+            skipped[what] = skipped.get(what, 0) + count
     satellite, signal = channels.astype("<U3"), np.array([name[3:] for name in channels.tolist()], dtype="<U2")
     observations = Observations(
         time=measurements.time[rising],
@@ -133,7 +133,7 @@ def observations_of(measurements: Measurements, tracking: Tracking | None = None
         loss_of_lock=np.where(np.isnan(phase), 0, indicator).astype(np.uint8),
         break_before=np.zeros(shape[0], dtype=bool),
         header=_header(measurements, satellite, signal),
-        passed_over=passed_over,
+        skipped=skipped,
     )
     return observations, _tracking_after(observations, tracking, channels, lock, polarity)
 
@@ -201,7 +201,7 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
     arrays = "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel"
     counts: dict[str, int] = {}
     for part in parts:
-        for what, number in part.passed_over.items():
+        for what, number in part.skipped.items():
             counts[what] = counts.get(what, 0) + number
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
     return Measurements(
@@ -210,5 +210,5 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays.split()},
         leap_seconds=leap[-1] if leap else None,
         receiver=next((part.receiver for part in parts if part.receiver), ""),
-        passed_over=counts,
+        skipped=counts,
     )

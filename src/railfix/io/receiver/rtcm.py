@@ -80,14 +80,14 @@ def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
-    broken = sum(int(rows_.passed_over.get("broken MSM", 0)) for _, rows_ in parts)
+    broken = sum(int(rows_.skipped.get("broken MSM", 0)) for _, rows_ in parts)
     counts["broken MSM"] = broken
     return Measurements(
         **{name: getattr(rows, name) for name in _ROW_NAMES},
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
-        passed_over={what: number for what, number in counts.items() if number},
+        skipped={what: number for what, number in counts.items() if number},
     )
 
 

@@ -144,8 +144,8 @@ def rawx_measurements(frames: Frames) -> Measurements:
     chosen, length = chosen[length >= 16], length[length >= 16]
     whole = length == 16 + 32 * header["count"].astype(np.int64)
     plausible = whole & (header["week"] > 0) & (header["tow"] >= 0) & (header["tow"] < 604_800)
-    passed_over = {"broken RXM-RAWX": int(np.count_nonzero(~whole)), "RXM-RAWX without time": 0}
-    passed_over["RXM-RAWX without time"] = int(np.count_nonzero(whole & ~plausible))
+    skipped = {"broken RXM-RAWX": int(np.count_nonzero(~whole)), "RXM-RAWX without time": 0}
+    skipped["RXM-RAWX without time"] = int(np.count_nonzero(whole & ~plausible))
     chosen, header = chosen[plausible], header[plausible]
     count = header["count"].astype(np.int64)
     epoch = np.repeat(np.arange(len(chosen)), count)
@@ -171,7 +171,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
         glonass_channel=rows["channel"].astype(np.int64) - 7,
         leap_seconds=int(leap[-1]) if len(leap) else None,
         receiver="u-blox",
-        passed_over={k: v for k, v in passed_over.items() if v},
+        skipped={k: v for k, v in skipped.items() if v},
     )
 
 

@@ -15,12 +15,12 @@ from railfix.core.files import ByteStream
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.rinex.observations_signals import SYSTEMS, Column, columns_of
 
-#: Time systems of TIME OF FIRST OBS, and what a file of one constellation means without one.
+#: Time systems of TIME OF FIRST OBS, and the default of files without one by constellation.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-#: Key of the types of a RINEX 2 file, which are those of every constellation.
+#: Key of the types of a RINEX 2 file, which hold for all constellations.
 ALL: Final = ""
-#: A header is never longer; a file that goes on has none.
+#: Longest header; a longer file without END OF HEADER is no RINEX file.
 _MAX_HEADER_BYTES: Final = 4 << 20
 _FILE_TYPES: Final = {
     "N": "a RINEX navigation file; give it with --nav",
@@ -37,7 +37,7 @@ _FILE_TYPES: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class RinexHeader:
-    """What is needed to read the lines after the header.
+    """Contents of the header needed to read the lines after it.
 
     Attributes
     ----------
@@ -46,11 +46,11 @@ class RinexHeader:
     time_system : str
         One of `TIME_SYSTEMS`.
     types : mapping of str to tuple of str
-        Announced types by constellation letter; RINEX 2 has one entry, `ALL`.
+        Declared types by constellation letter; RINEX 2 has one entry, `ALL`.
     scale : mapping of (str, str) to float
         SYS / SCALE FACTOR by constellation and type.
     public : ObservationHeader
-        What is handed on.
+        The part that becomes `Observations.header`.
     """
 
     version: float
@@ -61,16 +61,16 @@ class RinexHeader:
     public: ObservationHeader = field(default_factory=ObservationHeader)
 
     def types_of(self, system: str) -> tuple[str, ...] | None:
-        """Announced types of a constellation, None when it is not announced."""
+        """Return the declared types of a constellation, None for an undeclared one."""
         return self.types.get(ALL if self.version < 3.0 else system)
 
     def columns(self, system: str) -> tuple[Column, ...]:
-        """Wanted columns of the satellites' lines of a constellation."""
+        """Return the columns of the satellite lines of a constellation."""
         return columns_of(self.types_of(system) or (), system=system, version=self.version, scale=self.scale)
 
 
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
-    """Lines of the header up to END OF HEADER, and the bytes read after it.
+    """Read the lines of the header up to END OF HEADER, and the bytes read after it.
 
     Raises
     ------
@@ -109,22 +109,22 @@ def _check_kind(path: str, line: str) -> None:
 
 
 def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
-    """The header of an observation file.
+    """Parse the header of an observation file.
 
     Parameters
     ----------
     path : str
         For error messages.
     lines : sequence of str
-        Up to END OF HEADER.
+        Lines up to END OF HEADER.
     notes : list of str, optional
-        Where given, records that do not change how the file is read and cannot be read themselves
-        (INTERVAL, APPROX POSITION XYZ, ...) are noted there and passed over instead of raised.
+        If given, unreadable records that do not affect how the file is read (INTERVAL, APPROX POSITION
+        XYZ, ...) are noted here and skipped instead of raised.
 
     Raises
     ------
     InputFileError
-        Version not supported, types missing or miscounted, a number is none.
+        Version not supported, types missing or miscounted, or an invalid number.
     """
     version = _version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
@@ -138,8 +138,8 @@ def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = N
     )
     header = apply_records(path, start, lines[1:], first_line=2, notes=notes)
     if not header.types:
-        wanted = "# / TYPES OF OBSERV" if version < 3.0 else "SYS / # / OBS TYPES"
-        raise InputFileError(path, f"the header has no {wanted} record; the observations cannot be told apart")
+        label = "# / TYPES OF OBSERV" if version < 3.0 else "SYS / # / OBS TYPES"
+        raise InputFileError(path, f"the header has no {label} record; the observations cannot be told apart")
     return header
 
 
@@ -157,7 +157,7 @@ def _version(path: str, line: str) -> float:
 def apply_records(
     path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, notes: list[str] | None = None
 ) -> RinexHeader:
-    """The header after further header records, as epoch flags 2 to 4 bring them in the middle.
+    """Apply further header records, as epoch flags 2 to 4 bring them in the middle of a file.
 
     Parameters are those of `parse_header`; `first_line` is the 1-based number of ``lines[0]``.
     """
@@ -168,7 +168,7 @@ def apply_records(
 
 
 class _Records:
-    """Header records one by one, into a copy of a header."""
+    """Reader of header records into a copy of a header."""
 
     def __init__(self, path: str, header: RinexHeader, notes: list[str] | None) -> None:
         self._path = path
@@ -179,13 +179,13 @@ class _Records:
         self._scale = dict(header.scale)
         self._channels = dict(header.public.glonass_channel)
         self._changes: dict[str, Any] = {}
-        self._announced: dict[str, tuple[int, int]] = {}
+        self._declared: dict[str, tuple[int, int]] = {}
         self._current = ALL
         self._fresh: set[str] = set()
         self._scaling: tuple[str, float, int] | None = None
 
     def read(self, line: str, number: int) -> None:
-        """One line."""
+        """Read one line."""
         self._line = number
         label = line[60:80].strip()
         text = f"{line[:60]:<60}"
@@ -198,15 +198,15 @@ class _Records:
                 message = f"{label}: '{text.strip()}' cannot be read as the numbers expected"
                 if self._notes is None:
                     raise InputFileError(self._path, message, line=number) from error
-                self._notes.append(f"{self._path}, line {number}: {message}; the record was passed over")
+                self._notes.append(f"{self._path}, line {number}: {message}; the record was skipped")
 
     def finish(self) -> RinexHeader:
-        """The header with all records applied."""
-        for system, (count, line) in self._announced.items():
-            found = len(self._types[system])
-            if found != count:
+        """Return the header with all records applied."""
+        for system, (count, line) in self._declared.items():
+            listed = len(self._types[system])
+            if listed != count:
                 of = f"of {system} " if system else ""
-                message = f"{count} observation types {of}are announced, {found} are listed"
+                message = f"{count} observation types {of}are declared, {listed} are listed"
                 raise InputFileError(self._path, message, line=line)
         changes = dict(self._changes)
         time_system = str(changes.pop("time_system", self._header.time_system))
@@ -230,9 +230,9 @@ class _Records:
     def types_2(self, text: str) -> None:
         """# / TYPES OF OBSERV."""
         if text[:6].strip():
-            self._announced[ALL] = (self._count(text[:6], "# / TYPES OF OBSERV"), self._line)
+            self._declared[ALL] = (self._count(text[:6], "# / TYPES OF OBSERV"), self._line)
             self._types[ALL] = ()
-        elif ALL not in self._announced:
+        elif ALL not in self._declared:
             raise self._fail("# / TYPES OF OBSERV: the number of types is missing")
         self._extend(ALL, [text[k : k + 6].strip() for k in range(6, 60, 6)], r"[CPLDSTX][0-9A-D]")
 
@@ -240,9 +240,9 @@ class _Records:
         """SYS / # / OBS TYPES."""
         if text[0] != " ":
             self._current = text[0]
-            self._announced[text[0]] = (self._count(text[3:6], "SYS / # / OBS TYPES"), self._line)
+            self._declared[text[0]] = (self._count(text[3:6], "SYS / # / OBS TYPES"), self._line)
             self._types[text[0]] = ()
-        elif self._current not in self._announced:
+        elif self._current not in self._declared:
             raise self._fail("SYS / # / OBS TYPES: the constellation letter is missing")
         self._extend(self._current, [text[k : k + 3].strip() for k in range(7, 59, 4)], r"[CLDSXI][0-9][A-Z]?")
 

@@ -1,4 +1,4 @@
-"""Header records of the RINEX files that are written."""
+"""Header records of written RINEX files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ PROGRAM = "railfix"
 
 
 def header_line(text: str, label: str) -> str:
-    """One header record of 80 columns with its line end.
+    """Format one header record of 80 columns with its line end.
 
     Raises
     ------
@@ -21,7 +21,7 @@ def header_line(text: str, label: str) -> str:
 
 
 def program_line(run_by: str, created: np.datetime64 | None) -> str:
-    """PGM / RUN BY / DATE; the date, in UTC, stays blank without `created`."""
+    """Format PGM / RUN BY / DATE; the date, in UTC, is blank without `created`."""
     date = ""
     if created is not None:
         date = (

@@ -18,7 +18,7 @@ import numpy as np
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, read_text_lines
 from railfix.gnss.navigation import Navigation
-from railfix.io.rinex.navigation_header import Gathered, read_header
+from railfix.io.rinex.navigation_header import NavigationContent, read_header
 from railfix.io.rinex.navigation_records import (
     FIELDS,
     RawRecord,
@@ -35,8 +35,8 @@ FilePath = str | PathLike[str]
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
 #: Classic messages by constellation as RINEX 4 names them.
 _MESSAGES: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV", "FNAV"), "C": ("D1", "D2"), "R": ("FDMA",)}
-#: Constellations whose records are known and passed over: SBAS, NavIC.
-_PASSED_OVER: Final = ("S", "I")
+#: Constellations whose records are skipped: SBAS, NavIC.
+_SKIPPED: Final = ("S", "I")
 #: Width of a number.
 _WIDTH: Final = 19
 #: ``> EPH G01 LNAV`` (RINEX 4.02, table A7).
@@ -44,49 +44,49 @@ _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z][ \d]\d) *(\S*)")
 
 
 def read_navigation(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> Navigation:
-    """All records of one or several navigation files.
+    """Read all records of one or several navigation files.
 
     Parameters
     ----------
     paths : path or sequence of paths
         Plain, gzip, compress.
     broken_lines : {"stop", "count"}
-        A broken record stops the reading, or is counted in `passed_over` and named in `notes`.
+        A broken record stops the reading, or is counted in `skipped` and described in `notes`.
 
     Returns
     -------
     Navigation
-        Without `precise` (`sp3.read_sp3` reads that, `dataclasses.replace` puts it in).
+        `precise` is None; `read_sp3` reads a precise ephemeris, `dataclasses.replace` sets it.
 
     Raises
     ------
     InputFileError
-        A file is missing, is no navigation file, or (strict) a record is broken; or no file holds
+        A file is missing, is no navigation file, or (with "stop") a record is broken; or no file has
         a usable record.
     """
     files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
     if not files:
         raise ValueError("at least one navigation file is needed")
-    gathered = Gathered(lenient=broken_lines == "count")
+    content = NavigationContent(broken_lines=broken_lines)
     for path in files:
-        _read_file(path, gathered)
-    if not gathered.records:
+        _read_file(path, content)
+    if not content.records:
         names = ", ".join(str(p) for p in files)
         raise InputFileError(names, "has no usable GPS, QZSS, Galileo, BeiDou or GLONASS record")
     return Navigation(
-        kepler=kepler_records([r for r in gathered.records if r.system != "R"]),
-        glonass=glonass_records([r for r in gathered.records if r.system == "R"]),
-        klobuchar=gathered.received_klobuchar(),
-        leap_seconds=gathered.leap_seconds,
-        passed_over=dict(gathered.passed_over),
-        notes=tuple(dict.fromkeys(gathered.notes)),
+        kepler=kepler_records([r for r in content.records if r.system != "R"]),
+        glonass=glonass_records([r for r in content.records if r.system == "R"]),
+        klobuchar=content.received_klobuchar(),
+        leap_seconds=content.leap_seconds,
+        skipped=dict(content.skipped),
+        notes=tuple(dict.fromkeys(content.notes)),
         sources=tuple(str(p) for p in files),
     )
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Lines of one record: where they stand, what names the satellite, the message (empty before RINEX 4)."""
+    """Lines of one record: first line number, satellite name, message (empty before RINEX 4), text."""
 
     line: int
     name: str
@@ -94,26 +94,26 @@ class _Block:
     text: list[str]
 
 
-def _read_file(path: FilePath, gathered: Gathered) -> None:
+def _read_file(path: FilePath, content: NavigationContent) -> None:
     lines = read_text_lines(path)
-    version, kind, begin = read_header(path, lines, gathered)
+    version, kind, begin = read_header(path, lines, content)
     if not any(line.strip() for line in lines[begin:]):
         raise InputFileError(path, "has a header but no record; the file is cut short, give the whole one")
-    blocks = _blocks_4(path, lines, begin, gathered) if version >= 4.0 else _blocks(path, lines, begin, version, kind)
+    blocks = _blocks_4(path, lines, begin, content) if version >= 4.0 else _blocks(path, lines, begin, version, kind)
     for block in blocks:
         try:
-            record = _record(path, block, version, gathered)
+            record = _record(path, block, version, content)
         except InputFileError as error:
-            gathered.refuse(error)
+            content.reject(error)
         else:
             if record is not None:
-                gathered.add(record)
+                content.add(record)
 
 
 def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
-    """Records of versions 2 and 3: they begin where a line does not begin with blanks."""
+    """Yield the records of versions 2 and 3, whose first lines do not begin with blanks."""
     starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
-    _refuse_stray(path, lines, begin, starts)
+    _reject_stray(path, lines, begin, starts)
     letter = {"N": "G", "G": "R", "H": "S"}[kind] if version < 3.0 else ""
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         text = lines[start]
@@ -121,73 +121,75 @@ def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: 
         yield _Block(start + 1, name, "", lines[start:end])
 
 
-def _refuse_stray(path: FilePath, lines: list[str], begin: int, starts: list[int]) -> None:
+def _reject_stray(path: FilePath, lines: list[str], begin: int, starts: list[int]) -> None:
     for i in range(begin, starts[0] if starts else len(lines)):
         if lines[i].strip():
-            raise InputFileError(path, f"{lines[i].strip()!r} stands before the first record", line=i + 1)
+            raise InputFileError(path, f"{lines[i].strip()!r} comes before the first record", line=i + 1)
 
 
-def _blocks_4(path: FilePath, lines: list[str], begin: int, gathered: Gathered) -> Iterator[_Block]:
-    """Ephemerides of version 4; ionosphere is kept, other records are counted."""
+def _blocks_4(path: FilePath, lines: list[str], begin: int, content: NavigationContent) -> Iterator[_Block]:
+    """Yield the ephemerides of version 4; ionosphere records are kept, others are counted."""
     starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
-    _refuse_stray(path, lines, begin, starts)
+    _reject_stray(path, lines, begin, starts)
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
         title = _TITLE.match(lines[start])
         text = lines[start + 1 : end]
         try:
             if title is None:
-                what = f"{lines[start].strip()!r} is no '> EPH G01 LNAV': record type, satellite, message"
+                what = f"{lines[start].strip()!r} is no title such as '> EPH G01 LNAV' (type, satellite, message)"
                 raise InputFileError(path, what, line=start + 1)
             kind, name, message = title.groups()
             if kind == "EPH":
                 yield _Block(start + 2, name, message, text)
             elif kind == "ION":
-                _ionosphere_4(path, name[0], message, text, start + 2, gathered)
+                _ionosphere_4(path, name[0], message, text, start + 2, content)
             else:
-                gathered.passed_over[kind] += 1
+                content.skipped[kind] += 1
         except InputFileError as error:
-            gathered.refuse(error)
+            content.reject(error)
 
 
-def _ionosphere_4(path: FilePath, letter: str, message: str, text: list[str], line: int, gathered: Gathered) -> None:
-    """Klobuchar coefficients of version 4 (RINEX 4.02, table A34); other models are counted."""
+def _ionosphere_4(
+    path: FilePath, letter: str, message: str, text: list[str], line: int, content: NavigationContent
+) -> None:
+    """Read Klobuchar coefficients of version 4 (RINEX 4.02, table A34); other models are counted."""
     if letter not in "GCJ" or message not in ("LNAV", "D1D2"):
-        gathered.passed_over[f"ION {letter} {message}"] += 1
+        content.skipped[f"ION {letter} {message}"] += 1
         return
     if len(text) < 3:
-        raise InputFileError(path, f"ionosphere record has {len(text)} lines, 3 are due; the file is cut", line=line)
+        raise InputFileError(path, f"ionosphere record has {len(text)} lines, not 3; the file is cut", line=line)
     try:
         fields = [(text[0], 23 + 19 * i) for i in range(3)] + [(text[1], 4 + 19 * i) for i in range(4)] + [(text[2], 4)]
         values = [number(row[column : column + _WIDTH]) for row, column in fields]
     except ValueError:
-        raise InputFileError(path, "ionosphere record holds no number where one is due", line=line) from None
-    gathered.keep_ionosphere(letter, "A", values[:4])
-    gathered.keep_ionosphere(letter, "B", values[4:])
+        raise InputFileError(path, "ionosphere record: a number was expected", line=line) from None
+    content.keep_ionosphere(letter, "A", values[:4])
+    content.keep_ionosphere(letter, "B", values[4:])
 
 
-def _record(path: FilePath, block: _Block, version: float, gathered: Gathered) -> RawRecord | None:
-    """One record, or None where it is of a kind that is passed over, which is counted."""
+def _record(path: FilePath, block: _Block, version: float, content: NavigationContent) -> RawRecord | None:
+    """Read one record; None for a record of a skipped kind, which is counted."""
     system, digits = block.name[:1], block.name[1:].strip()
-    if system not in (*_LINES, *_PASSED_OVER) or not (digits.isdigit() and int(digits)):
-        raise InputFileError(path, f"{block.name!r} is no satellite", line=block.line - (version >= 4.0))
+    if system not in (*_LINES, *_SKIPPED) or not (digits.isdigit() and int(digits)):
+        raise InputFileError(path, f"{block.name!r} is not a satellite name", line=block.line - (version >= 4.0))
     satellite = f"{system}{int(digits):02d}"
-    if system in _PASSED_OVER or (block.message and block.message not in _MESSAGES[system]):
-        gathered.passed_over[f"{system} {block.message}".strip()] += 1
+    if system in _SKIPPED or (block.message and block.message not in _MESSAGES[system]):
+        content.skipped[f"{system} {block.message}".strip()] += 1
         return None
     fewest, most = _LINES[system]
-    # A line of blank fields belongs to its record, one more than are due does not.
+    # Trailing blank lines belong to the record; a further line with fields does not.
     count = next((k for k in range(len(block.text), fewest, -1) if block.text[k - 1].strip()), fewest)
     count = min(count, len(block.text))
     if not fewest <= count <= most:
         fault = "the file is cut or damaged" if count < fewest else "the line that begins the next record is damaged"
         raise InputFileError(
-            path, f"record of {satellite} has {count} lines, {fewest} are due; {fault}", line=block.line
+            path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
     try:
         epoch = _epoch_2(first) if version < 3.0 else _epoch_3(first)
     except ValueError:
-        what = f"epoch {first[3 : 22 if version < 3.0 else 23].strip()!r} of {satellite} is no date and time"
+        what = f"epoch {first[3 : 22 if version < 3.0 else 23].strip()!r} of {satellite} is not a date and time"
         raise InputFileError(path, what, line=block.line) from None
     numbers = _numbers(path, block, satellite, shift=19 if version >= 3.0 else 18)
     record = RawRecord(system, satellite, block.message, epoch, numbers, version)
@@ -199,7 +201,7 @@ def _record(path: FilePath, block: _Block, version: float, gathered: Gathered) -
 
 
 def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> list[float]:
-    """Numbers of a record in the order of the file; blank is NaN."""
+    """Parse the numbers of a record in the order of the file; blank is NaN."""
     names = FIELDS[satellite[0]]
     numbers: list[float] = []
     for k, name in enumerate(names):
@@ -210,7 +212,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
         try:
             numbers.append(number(text[column : column + _WIDTH]))
         except ValueError:
-            what = f"record of {satellite}: {name} {text[column : column + _WIDTH].strip()!r} is no number"
+            what = f"record of {satellite}: {name} {text[column : column + _WIDTH].strip()!r} is not a number"
             raise InputFileError(path, what, line=block.line + row) from None
     return numbers
 

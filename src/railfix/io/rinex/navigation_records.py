@@ -1,4 +1,4 @@
-"""Raw navigation records as the arrays of `railfix.gnss.navigation`."""
+"""Conversion of raw navigation records to the arrays of `railfix.gnss.navigation`."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
 )
-#: What numbers lie between, with room to spare: clocks within a second; orbits between 10 000 and 70 000 km;
-#: angles within a turn; harmonic corrections that are small angles; time in its week.
+#: Generous limits of the numbers: clocks within a second; orbits between 10 000 and 70 000 km;
+#: angles within a turn; small angles for harmonic corrections; time within its week.
 _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
     "sqrt_a": (3.1e3, 8.4e3),
     "eccentricity": (0.0, 0.3),
@@ -49,20 +49,20 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
         for name in names.split()
     },
 }
-#: Any other number.
+#: Limits of all other numbers.
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)
 #: Distance of a satellite from the Earth's centre [km]: above its surface.
 _RADIUS_KM: Final = (6_400.0, 70_000.0)
 _BLANK: Final = float("nan")
 #: RINEX writes 0.9999E9 for a number that is not known.
 _UNKNOWN: Final = 0.99e9
-#: Transmission times further than this from toe are no transmission times [s].
+#: Transmission times further than this from toe are invalid [s].
 _TRANSMISSION_S: Final = 2 * 86_400.0
 
 
 @dataclass(frozen=True)
 class RawRecord:
-    """One record as it stands in a file: epoch in the constellation's own time, numbers in file order."""
+    """One record of a file: epoch in the time of the constellation, numbers in file order."""
 
     system: str
     satellite: str
@@ -73,42 +73,42 @@ class RawRecord:
 
 
 def number(text: str) -> float:
-    """One FORTRAN number; blank and 0.9999E9 are NaN, always the same one, so that equal records compare equal.
+    """Parse one FORTRAN number; blank and 0.9999E9 are the same NaN object, so that equal records compare equal.
 
     Raises
     ------
     ValueError
-        It is no finite number.
+        The text is not a finite number.
     """
     text = text.strip()
     if not text:
         return _BLANK
     value = float(text.replace("D", "E").replace("d", "e"))
     if not np.isfinite(value):
-        raise ValueError(f"{text!r} is no number")
+        raise ValueError(f"{text!r} is not a finite number")
     return _BLANK if _UNKNOWN < abs(value) < 1.01e9 else value
 
 
 def first_fault(record: RawRecord) -> tuple[int, str] | None:
-    """Index of the first number that cannot be, and what is wrong with it; None for a sound record."""
+    """Return index and description of the first impossible number; None for a valid record."""
     for k, (name, value) in enumerate(zip(FIELDS[record.system], record.numbers, strict=True)):
         if name in _NEEDED and np.isnan(value):
             return k, f"{name} is blank"
         low, high = _BETWEEN.get(name, _OTHERS_BETWEEN)
         if value < low or value > high:
-            return k, f"{name} is {value:g}, it lies between {low:g} and {high:g}"
+            return k, f"{name} is {value:g}; between {low:g} and {high:g} was expected"
     if record.system == "R":
         radius = float(np.linalg.norm(record.numbers[3:15:4]))
         low, high = _RADIUS_KM
         if not low <= radius <= high:
-            return 3, f"x, y, z is {radius:g} km from the Earth's centre, it lies between {low:g} and {high:g}"
+            return 3, f"x, y, z is {radius:g} km from the Earth's centre; between {low:g} and {high:g} was expected"
     return None
 
 
 def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Records of GPS, QZSS, Galileo and BeiDou.
+    """Convert records of GPS, QZSS, Galileo and BeiDou.
 
-    Rates, corrections, health and issues that are blank are 0, as RINEX has it; group delays and accuracies are NaN.
+    Blank rates, corrections, health and issues are 0, as RINEX defines; group delays and accuracies are NaN.
     """
     table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_KEPLER))
     column = dict(zip(_KEPLER, table.T, strict=True))
@@ -116,15 +116,15 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     system = satellite.astype("<U1")
     own = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
     toe = nearest_week(column["toe_sow_s"], own)
-    # The clock reference time, not the week of the file, tells the week: converted files are 1024 weeks off.
-    said = column["transmitted"]
-    usable = np.abs(np.where(np.isnan(said), np.inf, said)) < 2 * 604_800
-    sent = nearest_week(np.where(usable, said, 0.0), toe)
+    # The week follows from the clock reference time, not from the week number: converted files are 1024 weeks off.
+    sent_sow = column["transmitted"]
+    usable = np.abs(np.where(np.isnan(sent_sow), np.inf, sent_sow)) < 2 * 604_800
+    sent = nearest_week(np.where(usable, sent_sow, 0.0), toe)
     usable &= np.abs(seconds(sent - toe)) <= _TRANSMISSION_S
     beidou = system == "C"
     gps_like = np.isin(system, ["G", "J"])
     integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
-    # IODC stands where Galileo and BeiDou have their second group delay; BeiDou's AODC where GPS has the fit interval.
+    # The field of IODC is the second group delay of Galileo and BeiDou; AODC of BeiDou is in that of the fit interval.
     iodc = np.select([gps_like, beidou], [column["group_delay_2_s"], column["fit"]], column["iode"])
     return KeplerRecords(
         satellite=satellite,
@@ -155,19 +155,19 @@ def _integers(values: Floats) -> Integers:
 
 
 def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satellite: Strings) -> Strings:
-    """Message names; before RINEX 4 from the data-source bits of Galileo and the GEO numbers of BeiDou."""
+    """Return the messages; before RINEX 4 from the data-source bits of Galileo and the GEO numbers of BeiDou."""
     number = np.array([int(s[1:]) for s in satellite.tolist()], dtype=np.int64)
     geo = (number <= 5) | (number >= 59)
     fnav = ((source & 0b010) != 0) & ((source & 0b101) == 0)
     derived = np.select(
         [system == "E", (system == "C") & geo, system == "C"], [np.where(fnav, "FNAV", "INAV"), "D2", "D1"], "LNAV"
     )
-    said = np.array([r.message for r in raw], dtype="<U4")
-    return np.where(said != "", said, derived).astype("<U4")
+    written = np.array([r.message for r in raw], dtype="<U4")
+    return np.where(written != "", written, derived).astype("<U4")
 
 
 def _fit_interval(system: Strings, fit: Floats) -> Floats:
-    """Fit interval [h]: GPS in hours (0 and the flag 0 mean 4, the flag 1 six), QZSS by flag (0: 2 h, 1: 4 h)."""
+    """Compute the fit interval [h]: GPS in hours (0 means 4, flag 1 means 6), QZSS by flag (0: 2 h, 1: 4 h)."""
     fit = np.nan_to_num(fit)
     gps = np.where(fit == 0, 4.0, np.where(fit == 1, 6.0, fit))
     qzss = np.where(fit == 0, 2.0, np.where(fit == 1, 4.0, fit))
@@ -175,14 +175,14 @@ def _fit_interval(system: Strings, fit: Floats) -> Floats:
 
 
 def glonass_records(raw: Sequence[RawRecord]) -> GlonassRecords:
-    """Records of GLONASS: UTC becomes GPS time, kilometres become metres."""
+    """Convert records of GLONASS: UTC to GPS time, kilometres to metres."""
     table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_GLONASS))
     state = table[:, 3:15].reshape(-1, 3, 4)
     utc = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
     toe = utc_to_gpst(utc)
     frame = table[:, 2]
     known = np.isfinite(frame) & (np.abs(frame) < 1e6)
-    # RINEX 2 counts the seconds of the day, RINEX 3 and 4 those of the week; both are UTC.
+    # RINEX 2 writes seconds of the day, RINEX 3 and 4 seconds of the week, both in UTC.
     day = utc.astype("datetime64[D]").astype("datetime64[ns]")
     of_day = day + timedelta(np.where(known, frame % 86_400.0, 0.0))
     nearest_day = of_day + np.rint(seconds(utc - of_day) / 86_400.0).astype(np.int64).astype("timedelta64[D]")

@@ -1,13 +1,14 @@
 """Observation files of one receiver, RINEX 2, 3 and 4, as `Observations`.
 
 A log is one file or several; several are put in order of their first epochs and joined. Reading in
-pieces and reading as a whole run through the same lines: the whole is the pieces concatenated.
+pieces and reading at once run through the same code: the pieces concatenated are the log.
 
-What is broken, in "strict" ends the reading with an `InputFileError` that names file and line; in
-"lenient" it is passed over, counted and told of in `Observations.problems`:
+A broken line stops the reading with an `InputFileError` that names file and line
+(``broken_lines="stop"``), or is skipped, counted and described in `Observations.problems`
+(``broken_lines="count"``):
 
 ========================================================= =======================================
-broken                                                    passed over in lenient
+broken                                                    skipped with "count"
 ========================================================= =======================================
 epoch line; number of lines that follow it                the epoch
 time tag not after the one before, or ahead of all after  the epoch
@@ -17,7 +18,7 @@ twice, or of a constellation without announced types
 header record that does not change how the file is read   the record
 ========================================================= =======================================
 
-An error in the header that changes how the file is read is raised in both.
+An error in the header that changes how the file is read is always raised.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ import numpy as np
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, FilePath
 from railfix.gnss.observations import Observations, concatenate
-from railfix.io.rinex.observations_blocks import BlockReader, Wanted
+from railfix.io.rinex.observations_blocks import BlockReader, Selection
 from railfix.io.rinex.observations_signals import SYSTEMS
 
-#: Epochs of a piece unless asked otherwise.
+#: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
 #: A step between files is a gap when it is longer than this many intervals.
@@ -59,11 +60,11 @@ def read_observations(
     ----------
     path : path-like or sequence of path-like
         RINEX 2.10 to 2.12, 3.00 to 3.05, 4.00 to 4.02; plain, ``.gz``, ``.Z``, Hatanaka (CRX) plain
-        or in one of these, told by content. Several files are put in order of time and joined.
+        or in one of these, recognised by content. Several files are sorted by time and joined.
     broken_lines : {"stop", "count"}
-        What to do about what is broken, see above.
+        Treatment of broken lines, see above.
     systems : iterable of str, optional
-        Constellation letters wanted ("GEJ"); all by default.
+        Constellation letters to read ("GEJ"); all by default.
     start, end : datetime64 or ISO 8601 str, optional
         Epochs from `start` up to, not including, `end`, GPS time.
 
@@ -75,7 +76,7 @@ def read_observations(
     Raises
     ------
     InputFileError
-        The file cannot be read, is something else, has no epochs; in strict anything broken.
+        The file cannot be read, is of another kind, or has no epochs; with "stop" any broken line.
     MismatchError
         No epoch lies between `start` and `end`.
 
@@ -83,8 +84,8 @@ def read_observations(
     -----
     Use `scan_observations` for logs that do not fit into memory.
     """
-    wanted = _wanted(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return concatenate(list(_runs(_as_list(path), wanted)))
+    selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
+    return concatenate(list(_runs(_as_list(path), selection)))
 
 
 def scan_observations(
@@ -97,16 +98,16 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Read the observation file or files of one receiver in pieces.
+    """Read the observation file or files of one receiver piece by piece.
 
     Parameters
     ----------
     path, broken_lines, systems, start, end
-        As `read_observations`, of which this is the other form: the pieces concatenated are the whole.
+        As `read_observations`; the pieces concatenated equal its result.
     epochs : int
         Epochs of a piece; the last may have fewer.
     progress : callable, optional
-        Called with the part of the files that has been read, 0 to 1, as the reading goes on.
+        Called repeatedly with the fraction of the files that has been read, 0 to 1.
 
     Yields
     ------
@@ -116,12 +117,12 @@ def scan_observations(
     Raises
     ------
     InputFileError, MismatchError
-        As `read_observations`, when the place is reached.
+        As `read_observations`, when the faulty line is reached.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
-    wanted = _wanted(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return in_pieces(_runs(_as_list(path), wanted, progress), epochs)
+    selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
+    return in_pieces(_runs(_as_list(path), selection, progress), epochs)
 
 
 def _as_list(path: Paths) -> list[str]:
@@ -131,53 +132,58 @@ def _as_list(path: Paths) -> list[str]:
     return [str(p) for p in paths]
 
 
-def _wanted(
+def _selection(
     *,
     broken_lines: BrokenLines,
     systems: Iterable[str] | None,
     start: np.datetime64 | str | None,
     end: np.datetime64 | str | None,
-) -> Wanted:
+) -> Selection:
     if broken_lines not in get_args(BrokenLines):
         raise ValueError(f"broken_lines is '{broken_lines}', 'stop' or 'count' was expected")
     letters = None if systems is None else frozenset(systems)
     if letters is not None and (not letters or not letters <= set(SYSTEMS)):
-        raise ValueError(f"systems is {sorted(letters)}, letters out of {SYSTEMS} were expected")
+        raise ValueError(f"systems is {sorted(letters)}, letters of {SYSTEMS} were expected")
     limits = {}
     for name, time in (("start_ns", start), ("end_ns", end)):
         if time is not None:
             limits[name] = int(np.asarray(time, dtype="datetime64[ns]").astype(np.int64))
-    return Wanted(broken_lines=broken_lines, systems=letters, **limits)
+    return Selection(broken_lines=broken_lines, systems=letters, **limits)
 
 
-def _runs(paths: list[str], wanted: Wanted, progress: Callable[[float], None] | None = None) -> Iterator[Observations]:
-    """Runs of epochs of all files, in order of time; at least one, and some epoch in all."""
-    paths = paths if len(paths) == 1 else _in_order_of_time(paths, wanted)
+def _runs(
+    paths: list[str], selection: Selection, progress: Callable[[float], None] | None = None
+) -> Iterator[Observations]:
+    """Yield runs of epochs of all files in order of time; at least one run and one epoch in total."""
+    paths = paths if len(paths) == 1 else _in_order_of_time(paths, selection)
     last: Observations | None = None
     reader: BlockReader | None = None
-    found = 0
+    epochs = 0
     for k, path in enumerate(paths):
-        before, reader = reader, BlockReader(path, wanted, **({} if reader is None else {"after_ns": reader.last_ns}))
+        before, reader = (
+            reader,
+            BlockReader(path, selection, **({} if reader is None else {"after_ns": reader.last_ns})),
+        )
         joint = before is not None and before.epochs > 0
         for run in reader.blocks():
             if joint and len(run):
                 run = with_break_at_gap(last, run)
                 joint = False
-            found += len(run)
+            epochs += len(run)
             last = run if len(run) else last
             if progress is not None:
                 progress((k + reader.share) / len(paths))
             yield run
-        if not reader.epochs and wanted.broken_lines == "stop":
+        if not reader.epochs and selection.broken_lines == "stop":
             raise InputFileError(path, "has a header but no epochs; the recording is empty or cut short")
-    if reader is not None and not found:
+    if reader is not None and not epochs:
         if not reader.epochs:
-            raise InputFileError(reader.path, "has no epoch that can be used; see it with broken_lines='stop'")
-        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span asked for")
+            raise InputFileError(reader.path, "has no usable epoch; broken_lines='stop' shows the first fault")
+        raise MismatchError(f"{', '.join(paths)}: no epoch lies in the time span from start to end")
 
 
-def _in_order_of_time(paths: list[str], wanted: Wanted) -> list[str]:
-    peek = replace(wanted, broken_lines="count", systems=None, start_ns=Wanted.start_ns, end_ns=Wanted.end_ns)
+def _in_order_of_time(paths: list[str], selection: Selection) -> list[str]:
+    peek = replace(selection, broken_lines="count", systems=None, start_ns=Selection.start_ns, end_ns=Selection.end_ns)
     firsts = []
     for path in paths:
         with closing(BlockReader(path, peek, block_bytes=_PEEK_BYTES).blocks()) as runs:
@@ -186,7 +192,7 @@ def _in_order_of_time(paths: list[str], wanted: Wanted) -> list[str]:
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
-    """A break before the first epoch of a further file, unless it follows at the log's own interval."""
+    """Set `break_before` at the first epoch of a further file, unless it follows at the interval of the log."""
     if last is None:
         return run
     interval = run.header.interval_s
@@ -201,28 +207,28 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Runs cut and joined to pieces of equal length; problems go with the piece being collected."""
+    """Yield pieces of equal length from runs; problems belong to the piece being collected."""
     waiting: list[Observations] = []
     length = 0
     for run in runs:
         waiting.append(run)
         length += len(run)
         if length > epochs:
-            whole = concatenate(waiting)
-            rest = (length - 1) // epochs * epochs  # the last piece waits: what the end of the file says goes with it
+            joined = concatenate(waiting)
+            rest = (length - 1) // epochs * epochs  # keep the last piece: faults at the end of the file belong to it
             for k, first in enumerate(range(0, rest, epochs)):
-                piece = without_empty_channels(whole[first : first + epochs])
-                yield _with_problems(piece, whole) if k == 0 else piece
-            waiting, length = [without_empty_channels(whole[rest:])], length - rest
+                piece = without_empty_channels(joined[first : first + epochs])
+                yield _with_problems(piece, joined) if k == 0 else piece
+            waiting, length = [without_empty_channels(joined[rest:])], length - rest
     yield without_empty_channels(concatenate(waiting))
 
 
 def _with_problems(piece: Observations, source: Observations) -> Observations:
-    return replace(piece, problems=source.problems, problem_count=source.problem_count, passed_over=source.passed_over)
+    return replace(piece, problems=source.problems, problem_count=source.problem_count, skipped=source.skipped)
 
 
 def without_empty_channels(observations: Observations) -> Observations:
-    """Without the channels that have neither an observation nor a loss-of-lock digit."""
+    """Drop the channels that have neither an observation nor a loss-of-lock digit."""
     used = observations.loss_of_lock.any(axis=0)
     arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")
     for name in arrays:

@@ -1,4 +1,4 @@
-"""One observation file, block of text by block of text: each block gives a run of epochs."""
+"""Reader of one observation file in blocks of text, each of which gives a run of epochs."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from railfix.io.rinex.observations_decode import decode, lines_per_satellite
 from railfix.io.rinex.observations_epochs import Epochs, find_epochs
 from railfix.io.rinex.observations_lines import Lines, split_lines
 
-#: Bytes of text read at a time: enough that arrays pay off, few enough for the processor's cache.
+#: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: No line of a RINEX file is as long, not even one that a failing recorder filled with zeros.
+#: A longer line is no RINEX, not even one that a failing recorder filled with zeros.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
-    """What of a file is wanted.
+class Selection:
+    """Selection of constellations and time span, and treatment of broken lines.
 
     Attributes
     ----------
@@ -46,50 +46,50 @@ class Wanted:
 
 
 class BlockReader:
-    """Reads one file from front to back.
+    """Reader of one file from beginning to end.
 
     Parameters
     ----------
     path : path-like
-    wanted : Wanted
+    selection : Selection
     after_ns : int, optional
-        Time tags must come after this one (of the file before).
+        Time tags must be later than this one (of the file before).
     block_bytes : int, optional
 
     Attributes
     ----------
     last_ns : int
-        The last time tag read, wanted or not.
+        Last time tag read, selected or not.
     epochs : int
-        How many epochs in order were read, wanted or not.
+        Number of epochs in order that were read, selected or not.
     share : float
-        Part of the file that has been read, 0 to 1.
+        Fraction of the file that has been read, 0 to 1.
     """
 
     def __init__(
-        self, path: FilePath, wanted: Wanted, *, after_ns: int = _BEFORE_ALL, block_bytes: int = BLOCK_BYTES
+        self, path: FilePath, selection: Selection, *, after_ns: int = _BEFORE_ALL, block_bytes: int = BLOCK_BYTES
     ) -> None:
         self.path = str(path)
         self.last_ns = after_ns
         self.epochs = 0
         self.share = 0.0
         self._after_ns = after_ns
-        self._wanted = wanted
+        self._selection = selection
         self._block_bytes = block_bytes
-        self._log = FaultLog(self.path, broken_lines=wanted.broken_lines)
+        self._log = FaultLog(self.path, broken_lines=selection.broken_lines)
         self._break = False
 
     def blocks(self) -> Generator[Observations]:
-        """Runs of epochs in the order of the file; a run may be empty."""
+        """Yield runs of epochs in the order of the file; a run may be empty."""
         with open_stream(self.path) as stream:
             head, text = read_header_bytes(stream)
-            notes: list[str] | None = None if self._log.strict else []
+            notes: list[str] | None = None if self._log.stops else []
             header = parse_header(self.path, head, notes=notes)
             for note in notes or ():
                 self._log.note(note)
             number = len(head) + 1
             at_end = False
-            while not at_end and self.last_ns < self._wanted.end_ns:
+            while not at_end and self.last_ns < self._selection.end_ns:
                 block, at_end = self._read(stream)
                 text += block
                 if at_end and not text.endswith(b"\n"):
@@ -116,14 +116,14 @@ class BlockReader:
             block = stream.read(self._block_bytes)
             self.share = stream.share
         except InputFileError as error:
-            if self._log.strict:
+            if self._log.stops:
                 raise
-            self._log.note(f"{error}; what came before was read")
+            self._log.note(f"{error}; the data before it were read")
             return b"", True
         return block, not block
 
     def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[Observations, RinexHeader, int]:
-        """Epochs up to the end of the lines, or to where the observation types change."""
+        """Read the epochs up to the end of the lines, or to a change of the observation types."""
         trial = self._log.fresh()
         table, taken = self._find(lines, header, at_end=at_end, log=trial)
         after = header
@@ -134,7 +134,7 @@ class BlockReader:
             first, count = int(table.line[k]) + 1, int(table.count[k])
             after = self._event(lines[first : first + count], after)
             if after.types != header.types or after.scale != header.scale:
-                taken = first + count  # the lines after it were taken for what they are not: once more
+                taken = first + count  # the lines after it have other types: decode those before it again
                 trial = self._log.fresh()
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
                 break
@@ -148,7 +148,7 @@ class BlockReader:
 
     def _event(self, lines: Lines, header: RinexHeader) -> RinexHeader:
         records = [lines.text(i) for i in range(len(lines))]
-        notes: list[str] | None = None if self._log.strict else []
+        notes: list[str] | None = None if self._log.stops else []
         number = int(lines.number[0]) if records else 0
         changed = apply_records(self.path, header, records, first_line=number, notes=notes)
         for note in notes or ():
@@ -162,15 +162,15 @@ class BlockReader:
         epochs, breaks_at = table[seen], breaks[seen]
         time_ns = _gps_time_ns(epochs.time_ns, header.time_system)
         kept = self._in_order(lines, epochs, time_ns)
-        inside = (time_ns >= self._wanted.start_ns) & (time_ns < self._wanted.end_ns)
+        inside = (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
         kept &= inside
         epochs, breaks_at, time_ns = epochs[kept], breaks_at[kept], time_ns[kept]
         before = np.diff(breaks_at, prepend=0) > 0
         total = int(breaks[-1]) if len(breaks) else int(self._break)
         self._break = total > (int(breaks_at[-1]) if len(breaks_at) else 0)
-        dense = decode(lines, epochs, header=header, systems=self._wanted.systems, log=self._log)
+        dense = decode(lines, epochs, header=header, systems=self._selection.systems, log=self._log)
         self._log.settle()
-        problems, problem_count, passed_over = self._log.take()
+        problems, problem_count, skipped = self._log.take()
         return Observations(
             time=time_ns.astype("datetime64[ns]"),
             satellite=dense.satellite,
@@ -184,11 +184,11 @@ class BlockReader:
             header=header.public,
             problems=problems,
             problem_count=problem_count,
-            passed_over=passed_over,
+            skipped=skipped,
         )
 
     def _in_order(self, lines: Lines, epochs: Epochs, time_ns: Integers) -> Masks:
-        """Epochs whose time tag comes after those before; one that runs ahead of all others is out itself."""
+        """Flag the epochs whose time tags rise; of an outlier ahead of its successors only the outlier is dropped."""
         if not len(time_ns):
             return np.zeros(0, dtype=np.bool_)
         ahead = np.zeros(len(time_ns), dtype=np.bool_)
@@ -206,10 +206,10 @@ class BlockReader:
             k = int(np.flatnonzero(wrong)[i])
             tag = np.datetime64(int(time_ns[k]), "ns")
             if ahead[k]:
-                return f"the time tag {tag} runs ahead of the epochs after it"
+                return f"the time tag {tag} is later than those of the epochs after it"
             other = np.datetime64(int(highest[k]), "ns")
             where = " of the file before" if highest[k] == self._after_ns else ""
-            return f"the time tag {tag} does not come after {other}{where}"
+            return f"the time tag {tag} is not later than {other}{where}"
 
         self._log.faults(DUPLICATES, lines.number[epochs.line[wrong]], message)
         self.last_ns = int(highest[-1])

@@ -1,4 +1,4 @@
-"""Lines of satellites as dense arrays over epochs and channels, without a loop over either."""
+"""Decoding of satellite lines to dense arrays over epochs and channels, without loops over either."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, Column
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
-#: Satellites named on a RINEX 2 epoch line, and where the first name starts.
+#: Satellite names on a RINEX 2 epoch line, and the column of the first one.
 NAMES_PER_LINE: Final = 12
 _FIRST_NAME: Final = 32
 #: Observations on a RINEX 2 line.
@@ -61,24 +61,24 @@ class Dense:
 
 
 def lines_per_satellite(header: RinexHeader) -> int:
-    """RINEX 2: lines of observations that a satellite has."""
+    """Return the number of observation lines of a satellite: several in RINEX 2, else one."""
     return max(-(-len(header.types_of("G") or ()) // FIELDS_PER_LINE), 1) if header.version < 3.0 else 1
 
 
 def decode(
     lines: Lines, epochs: Epochs, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> Dense:
-    """Observations of epochs (flags 0 and 1) as dense arrays."""
+    """Decode the observations of epochs (flags 0 and 1) to dense arrays."""
     rows = _rows(lines, epochs, header)
     rows = _selected(lines, rows, header=header, systems=systems, log=log)
     rows = _without_repeats(lines, rows, len(epochs), log)
     parts = []
     for system in SYSTEMS:
-        mine = rows[rows.letter == ord(system)]
+        chosen = rows[rows.letter == ord(system)]
         columns = header.columns(system)
-        if len(mine.epoch) and columns:
-            mine, fields = _values(lines, mine, system, columns, header, log)
-            parts.append((system, mine, fields, columns))
+        if len(chosen.epoch) and columns:
+            chosen, fields = _values(lines, chosen, system, columns, header, log)
+            parts.append((system, chosen, fields, columns))
     return _scatter(parts, len(epochs))
 
 
@@ -108,7 +108,7 @@ def _rows(lines: Lines, epochs: Epochs, header: RinexHeader) -> Rows:
 
 
 def _selected(lines: Lines, rows: Rows, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog) -> Rows:
-    """Rows with a name, of a constellation that is known, asked for and announced."""
+    """Select rows with a valid name, of a known, selected constellation whose types the header declares."""
     broken = rows.number < 0
     log.faults(
         SATELLITES,
@@ -117,20 +117,20 @@ def _selected(lines: Lines, rows: Rows, *, header: RinexHeader, systems: frozens
     )
     known = np.isin(rows.letter, np.frombuffer(SYSTEMS.encode(), dtype=np.uint8))
     log.count(UNKNOWN_SYSTEMS, int((~known & ~broken).sum()))
-    wanted = known & ~broken
+    kept = known & ~broken
     if systems is not None:
-        asked = np.isin(rows.letter, np.frombuffer("".join(sorted(systems)).encode(), dtype=np.uint8))
-        log.count(NOT_SELECTED, int((wanted & ~asked).sum()))
-        wanted &= asked
-    announced = "".join(s for s in SYSTEMS if header.types_of(s) is not None)
-    silent = wanted & ~np.isin(rows.letter, np.frombuffer(announced.encode(), dtype=np.uint8))
+        in_selection = np.isin(rows.letter, np.frombuffer("".join(sorted(systems)).encode(), dtype=np.uint8))
+        log.count(NOT_SELECTED, int((kept & ~in_selection).sum()))
+        kept &= in_selection
+    declared = "".join(s for s in SYSTEMS if header.types_of(s) is not None)
+    undeclared = kept & ~np.isin(rows.letter, np.frombuffer(declared.encode(), dtype=np.uint8))
     log.faults(
         SATELLITES,
-        lines.number[rows.line[silent]],
-        lambda i: f"satellite {_name(rows[silent], i)}: the header announces no observation types of its constellation",
+        lines.number[rows.line[undeclared]],
+        lambda i: f"satellite {_name(rows[undeclared], i)}: the header has no observation types of its constellation",
     )
-    wanted &= ~silent
-    return rows if wanted.all() else rows[wanted]
+    kept &= ~undeclared
+    return rows if kept.all() else rows[kept]
 
 
 def _name(rows: Rows, i: int) -> str:
@@ -138,34 +138,34 @@ def _name(rows: Rows, i: int) -> str:
 
 
 def _without_repeats(lines: Lines, rows: Rows, epochs: int, log: FaultLog) -> Rows:
-    """The first row where a satellite occurs twice in an epoch."""
+    """Keep the first row of a satellite that occurs twice in an epoch."""
     key = rows.letter.astype(np.int64) * 100 + rows.number
-    places, place = np.unique(key, return_inverse=True)
+    names, name = np.unique(key, return_inverse=True)
     row = np.arange(len(key))
-    seat = np.zeros((epochs, len(places)), dtype=np.int64)
-    seat[rows.epoch, place] = row
-    if (seat[rows.epoch, place] == row).all():
+    last = np.zeros((epochs, len(names)), dtype=np.int64)
+    last[rows.epoch, name] = row
+    if (last[rows.epoch, name] == row).all():
         return rows
-    _, first = np.unique(rows.epoch * len(places) + place, return_index=True)
-    again = np.ones(len(key), dtype=np.bool_)
-    again[first] = False
+    _, first = np.unique(rows.epoch * len(names) + name, return_index=True)
+    repeated = np.ones(len(key), dtype=np.bool_)
+    repeated[first] = False
     log.faults(
         SATELLITES,
-        lines.number[rows.line[again]],
-        lambda i: f"satellite {_name(rows[again], i)} occurs twice in the epoch",
+        lines.number[rows.line[repeated]],
+        lambda i: f"satellite {_name(rows[repeated], i)} occurs twice in the epoch",
     )
-    return rows[~again]
+    return rows[~repeated]
 
 
 def _values(
     lines: Lines, rows: Rows, system: str, columns: tuple[Column, ...], header: RinexHeader, log: FaultLog
 ) -> tuple[Rows, Fields]:
-    """Values of the wanted columns, of the rows that are in order."""
+    """Parse the selected columns of the satellite lines; rows with faults are dropped and recorded."""
     count = len(header.types_of(system) or ())
     if header.version >= 3.0:
         start, length = lines.start[rows.line] + 3, lines.length[rows.line] - 3
         words = gather(lines.data, start, length, count)
-        too_long = _goes_on(lines.data, start, length, FIELD_WIDTH * count)
+        too_long = _continues(lines.data, start, length, FIELD_WIDTH * count)
     else:
         words, too_long = _gather_lines(lines, rows, count)
     if len(columns) < count:
@@ -174,7 +174,7 @@ def _values(
     log.faults(
         SATELLITES,
         lines.number[rows.line[too_long]],
-        lambda i: f"the line of {_name(rows[too_long], i)} goes on after its {count} announced observations",
+        lambda i: f"the line of {_name(rows[too_long], i)} continues after its {count} declared observations",
     )
     broken = fields.bad.any(axis=1) & ~too_long
     which = np.flatnonzero(broken)
@@ -194,8 +194,8 @@ def _values(
     return rows[fine], Fields(fields.value[fine], fields.lock[fine], fields.bad[fine])
 
 
-def _goes_on(data: Bytes, start: Integers, length: Integers, width: int) -> Masks:
-    """Whether a line has something other than blanks after its fields (one field's width is looked at)."""
+def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Masks:
+    """Flag the lines that have non-blank characters after their fields (within one field width)."""
     result = np.zeros(len(start), dtype=np.bool_)
     long = np.flatnonzero(length > width)
     if len(long):
@@ -205,19 +205,19 @@ def _goes_on(data: Bytes, start: Integers, length: Integers, width: int) -> Mask
 
 
 def _gather_lines(lines: Lines, rows: Rows, count: int) -> tuple[Words, Masks]:
-    """RINEX 2: fields of a satellite from its lines of five."""
+    """Gather the fields of a RINEX 2 satellite from its lines of five fields."""
     parts = []
     too_long = np.zeros(len(rows.line), dtype=np.bool_)
     for k, first in enumerate(range(0, count, FIELDS_PER_LINE)):
         here = rows.line + k
         fields = min(FIELDS_PER_LINE, count - first)
         parts.append(gather(lines.data, lines.start[here], lines.length[here], fields))
-        too_long |= _goes_on(lines.data, lines.start[here], lines.length[here], FIELD_WIDTH * fields)
+        too_long |= _continues(lines.data, lines.start[here], lines.length[here], FIELD_WIDTH * fields)
     return np.concatenate(parts, axis=1), too_long
 
 
 def _scatter(parts: list[tuple[str, Rows, Fields, tuple[Column, ...]]], epochs: int) -> Dense:
-    """Values into arrays over epochs and channels; channels without any observation are left out."""
+    """Fill arrays over epochs and channels; channels without any observation are dropped."""
     satellites: list[str] = []
     signals: list[str] = []
     placed = []

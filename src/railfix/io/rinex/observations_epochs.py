@@ -1,4 +1,4 @@
-"""Where the epochs of a block of lines are: which lines belong to which epoch."""
+"""Search for the epochs of a block of lines."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from railfix.core.arrays import Integers, Masks
 from railfix.io.rinex.fault_log import EPOCHS, FaultLog
 from railfix.io.rinex.observations_lines import EpochLines, Lines, epoch_width, event_line, flaw_text, read_epoch_lines
 
-#: An epoch never has more lines than its three-digit count tells, so this many are no epoch.
+#: More lines than the three-digit count of an epoch line allows.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
 
 @dataclass(frozen=True)
 class Epochs:
-    """Records of a block in the order of the file, shape (n,) each: epochs and events.
+    """Epochs and events of a block in the order of the file, shape (n,) each.
 
     Attributes
     ----------
@@ -43,16 +43,16 @@ class Epochs:
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
 ) -> tuple[Epochs, int]:
-    """Complete records of a block, and the number of lines they (and what is broken) take.
+    """Find the complete epochs and events of a block, and the number of lines they and broken lines take.
 
     Parameters
     ----------
     lines : Lines
-        Complete lines from a record's first line on.
+        Complete lines, from the first line of a record.
     version : float
         RINEX version.
     lines_per_satellite : int
-        RINEX 2: lines of five observations each that a satellite has.
+        RINEX 2: number of lines of five observations of a satellite.
     at_end : bool
         Whether the file ends with these lines; if not, the last epoch waits for the next block.
     log : FaultLog
@@ -63,7 +63,7 @@ def find_epochs(
 
 
 def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
-    """RINEX 3 and 4: epoch lines begin with ``>``."""
+    """Find epochs of RINEX 3 and 4, whose epoch lines begin with ``>``."""
     n = len(lines)
     line = np.flatnonzero(lines.data[lines.start] == ord(">"))
     before = int(line[0]) if len(line) else n
@@ -96,16 +96,16 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
     log.faults(
         EPOCHS,
         lines.number[line[wrong]],
-        lambda i: f"the epoch announces {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
+        lambda i: f"the epoch declares {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
     )
     return Epochs(line, head.flag, head.count, head.time_ns)[~broken & ~wrong], done
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[Epochs, int]:
-    """RINEX 2: an epoch line is told by the point in its seconds, and by where the one before ends.
+    """Find epochs of RINEX 2 by the decimal point of their seconds and the end of the epoch before.
 
-    Column 19 of a line of observations lies among the leading digits of its second field, so that
-    a point there is found in epoch lines only (and in records of an event, which are stepped over).
+    Column 19 of a line of observations lies among the leading digits of its second field, so that only
+    epoch lines have a point there (and records of events, which are skipped).
     """
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
@@ -127,7 +127,7 @@ def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log:
 
 
 class _Walk:
-    """Steps from record to record; epochs that follow each other without a gap are one step."""
+    """Walk from record to record; consecutive epochs without a gap are one step."""
 
     def __init__(
         self, lines: Lines, line: Integers, following: Integers, event: Masks, head: EpochLines, log: FaultLog
@@ -154,7 +154,7 @@ class _Walk:
         return self._table(), position
 
     def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
-        """Epochs from the k-th on up to the first that is not followed by another; where to go on."""
+        """Keep the epochs from the k-th to the first without a successor, and return the line to continue at."""
         later = self._breaks[np.searchsorted(self._breaks, k) :]
         last = int(later[0]) if len(later) else len(self._line) - 1
         beyond = int(np.searchsorted(self._line, stop))
@@ -181,7 +181,7 @@ class _Walk:
         return bound
 
     def _other(self, position: int, k: int, *, at_end: bool) -> int:
-        """A line where an epoch line should be and is none: an event without time, or broken."""
+        """Handle a line that is no epoch line: an event without time, or a broken line."""
         event = event_line(self._lines, position)
         if event is not None:
             end = position + 1 + event[1]

@@ -1,12 +1,12 @@
-"""Observation fields (F14.3, I1, I1) as numbers: sixteen characters at a time, as two integers.
+"""Parsing of observation fields (F14.3, I1, I1), sixteen characters at a time as two integers.
 
 A field of RINEX is sixteen characters: ten of sign and digits, a point, three decimals, the
-loss-of-lock digit and the signal-strength digit. Two 64-bit loads hold it whole, and eight digits
-in one integer become their value in three multiplications (the "SIMD within a register" of
+loss-of-lock digit and the signal-strength digit. Two 64-bit words hold it, and eight digits in
+one integer become their value in three multiplications (the "SIMD within a register" of
 L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
 doi:10.1145/360933.360994). The value is an exact integer of thousandths divided by 1000, hence
-the double nearest to the text: the same as ``float(text)``. What does not have this exact shape
-(other decimals, an exponent, letters) is marked, and read one by one with `float`.
+the double nearest to the text: the same as ``float(text)``. Fields of any other form (other
+decimals, an exponent, letters) are marked and read one at a time with `float`.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Words = NDArray[np.uint64]
 FIELD_WIDTH: Final = 16
 #: Blank characters that must follow the last character of a block, so that loads may run over it.
 PADDING: Final = 2048
-#: Fields worked on at a time: the intermediate arrays stay in the processor's cache.
+#: Fields parsed at a time, so that the intermediate arrays stay in the processor's cache.
 _CHUNK: Final = 16384
 
 _U = np.uint64
 _BLANKS: Final = _U(0x2020202020202020)
 _ZEROS: Final = _U(0x3030303030303030)
-#: As `_ZEROS`, with the decimal point at byte 2 and nothing to tell from zero after it.
+#: As `_ZEROS`, with the decimal point at byte 2.
 _ZEROS_POINT: Final = _U(0x30303030302E3030)
 _NOT_A_DIGIT: Final = _U(0x1010101010101010)
 _MINUS: Final = _U(0x0D0D0D0D0D0D0D0D)
@@ -76,7 +76,7 @@ class Fields:
     lock : ndarray of uint8, shape (n, k)
         Loss-of-lock digit, 0 where blank.
     bad : ndarray of bool, shape (n, k)
-        The field is neither blank nor a number, or a digit after it is no digit.
+        The field is neither blank nor a number, or one of its two indicators is no digit.
     """
 
     value: Floats
@@ -85,7 +85,7 @@ class Fields:
 
 
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
-    """Fields of lines as pairs of 64-bit words; what lies beyond a line's end is blank.
+    """Gather fields of lines as pairs of 64-bit words; characters beyond the end of a line are blank.
 
     Parameters
     ----------
@@ -118,14 +118,14 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
 
 
 def parse(words: Words, divisor: Floats) -> Fields:
-    """Values of fields.
+    """Parse fields.
 
     Parameters
     ----------
     words : ndarray of uint64, shape (n, k, 2)
         From `gather`.
     divisor : ndarray, shape (k,)
-        What the written value is to be divided by (SYS / SCALE FACTOR; 1 where there is none).
+        Divisor of the written value (SYS / SCALE FACTOR; 1 where there is none).
 
     Returns
     -------
@@ -146,7 +146,7 @@ def parse(words: Words, divisor: Floats) -> Fields:
         np.divide(thousandths.reshape(-1, columns), per, out=value[part])
         if odd.any():
             where = np.flatnonzero(odd)
-            read, wrong = _read_one_by_one(flat[where])
+            read, wrong = _read_slowly(flat[where])
             value[part].reshape(-1)[where] = read / divisor[where % columns]
             lock[part].reshape(-1)[where[wrong]] = 0
             bad[part].reshape(-1)[where] = wrong
@@ -154,7 +154,7 @@ def parse(words: Words, divisor: Floats) -> Fields:
 
 
 def _thousandths(flat: Words, lock: Bytes) -> tuple[Floats, Masks]:
-    """Thousandths of each field (NaN where blank), and where the field has another shape."""
+    """Compute the thousandths of each field (NaN where blank), and flag the fields of another form."""
     first = flat[:, 0]
     high = first ^ _ZEROS  # digits become 0..9, a blank 0x10, a minus 0x1D
     low = flat[:, 1] ^ _ZEROS_POINT  # as high; the point becomes 0
@@ -165,12 +165,12 @@ def _thousandths(flat: Words, lock: Bytes) -> tuple[Floats, Masks]:
     sign_low = (low ^ _NOT_A_DIGIT) & lead_low
     digits = high & ~lead_high
     decimals = low & ~lead_low & _LOW_6
-    # What is left must be digits, the point a point, and nothing but digits after the first one.
+    # The remaining characters must be digits and the point a point.
     wrong = ((digits + _OVER_NINE) | (decimals + _OVER_NINE_6)) & _HIGH_NIBBLES
     wrong |= low & _POINT
     wrong |= lead_high & (lead_high + _U(1))
     wrong |= lead_low & (lead_low + _U(1))
-    # A sign is a minus right before the digits; all that stands before it is blank.
+    # A sign is a minus directly before the digits; all characters before it are blank.
     wrong |= sign_high ^ (_sign_place(lead_high) * (sign_high != 0))
     wrong |= sign_low ^ (_sign_place(lead_low) * (sign_low != 0))
     spilled = lead_low != 0
@@ -182,22 +182,22 @@ def _thousandths(flat: Words, lock: Bytes) -> tuple[Floats, Masks]:
     tail = _TAIL[flat.view("<u2")[:, 7]]
     odd |= tail == _TAIL_WRONG
     lock.reshape(-1)[:] = tail
-    whole = _eight_digits(digits).astype(np.float64)
-    whole *= 100_000.0
-    whole += _eight_digits(((decimals & _LOW_2) << _U(24)) | ((decimals & _DECIMALS) << _U(16)))
-    np.negative(whole, out=whole, where=(sign_high | sign_low) != 0)
-    whole[blank] = np.nan
-    return whole, odd
+    thousandths = _eight_digits(digits).astype(np.float64)
+    thousandths *= 100_000.0
+    thousandths += _eight_digits(((decimals & _LOW_2) << _U(24)) | ((decimals & _DECIMALS) << _U(16)))
+    np.negative(thousandths, out=thousandths, where=(sign_high | sign_low) != 0)
+    thousandths[blank] = np.nan
+    return thousandths, odd
 
 
 def _sign_place(lead: Words) -> Words:
-    """A minus (as `high` shows it) at the last of the leading bytes."""
+    """Return a minus (as in `high`) at the last of the leading bytes."""
     place: Words = (lead ^ (lead >> _U(8))) & _MINUS
     return place
 
 
 def _eight_digits(word: Words) -> Words:
-    """Value of eight digits, the lowest byte the most significant."""
+    """Compute the value of eight digits, the lowest byte the most significant."""
     word = word * _U(10) + (word >> _U(8))
     low = (word & _PAIRS) * _U(100 + (1_000_000 << 32))
     high = ((word >> _U(16)) & _PAIRS) * _U(1 + (10_000 << 32))
@@ -205,8 +205,8 @@ def _eight_digits(word: Words) -> Words:
     return total
 
 
-def _read_one_by_one(flat: Words) -> tuple[Floats, Masks]:
-    """Fields that have another shape: any decimal number that ends where the field ends."""
+def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
+    """Read fields of another form: any decimal number that ends at the end of the field."""
     value = np.full(len(flat), np.nan)
     wrong = np.ones(len(flat), dtype=np.bool_)
     characters = flat.tobytes().decode("latin-1")

@@ -1,4 +1,4 @@
-"""A block of text as lines, and its epoch lines as numbers."""
+"""Lines of a block of text, and parsing of epoch lines."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Lines:
     Attributes
     ----------
     data : ndarray of uint8
-        The text, followed by blanks so that fixed columns may be read over the end of a line.
+        The text, padded with blanks so that fixed columns may extend beyond the end of a line.
     start, length : ndarray of int64, shape (n,)
-        Where each line starts, and its length without line end (LF or CR LF).
+        Start of each line, and its length without line end (LF or CR LF).
     stop : ndarray of int64, shape (n,)
-        Where the next line starts.
+        Start of the next line.
     number : ndarray of int64, shape (n,)
         1-based line numbers in the (decompressed) file.
     """
@@ -41,12 +41,12 @@ class Lines:
         return len(self.start)
 
     def text(self, line: int) -> str:
-        """One line as text."""
+        """Return one line as text."""
         first = int(self.start[line])
         return self.data[first : first + int(self.length[line])].tobytes().decode("latin-1")
 
     def columns(self, lines: Integers, width: int) -> Bytes:
-        """The first `width` characters of some lines, blank beyond their ends, shape (n, width)."""
+        """Return the first `width` characters of lines, blank beyond their ends, shape (n, width)."""
         items = np.ndarray((len(self.data) - width + 1,), dtype=f"V{width}", buffer=self.data, strides=(1,))
         text: Bytes = items[self.start[lines]].view(np.uint8).reshape(len(lines), width)
         short = np.flatnonzero(self.length[lines] < width)
@@ -56,12 +56,12 @@ class Lines:
         return text
 
     def __getitem__(self, some: slice) -> Lines:
-        """Some of the lines, of the same text."""
+        """Select lines of the same text."""
         return Lines(self.data, self.start[some], self.length[some], self.stop[some], self.number[some])
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Lines of a block that ends with a line end.
+    """Split a block that ends with a line end into lines.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
     first_number : int
         Line number of the first line.
     keep_blank : bool
-        Whether a line without any character is a line (RINEX 2: a satellite without observations).
+        Whether empty lines are kept (RINEX 2: a satellite without observations).
     """
     data = np.frombuffer(text + b" " * PADDING, dtype=np.uint8)
     end = np.flatnonzero(data == ord("\n"))
@@ -87,7 +87,7 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 
 @dataclass(frozen=True)
 class EpochLines:
-    """Epoch lines as numbers, shape (n,) each.
+    """Numbers of epoch lines, shape (n,) each.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class EpochLines:
     time_ns : ndarray of int64
         Time tag since 1970 in the file's time system; 0 where unreadable.
     flaw : ndarray of int64
-        Index into `FLAWS`, 0 where the line is in order.
+        Index into `FLAWS`, 0 for a valid line.
     """
 
     flag: Integers
@@ -122,12 +122,12 @@ _SHORT, _FLAG, _COUNT, _PLACES = 1, 2, 3, 4
 
 
 def epoch_width(version: float) -> int:
-    """Characters up to the number of satellites."""
+    """Return the number of characters up to the number of satellites."""
     return 35 if version >= 3.0 else 32
 
 
 def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochLines:
-    """Epoch lines as numbers; events (flags 2 to 5) may lack the time.
+    """Parse epoch lines; events (flags 2 to 5) may lack the time.
 
     RINEX 3 and 4 write ``> yyyy mm dd hh mm ss.sssssss  f nnn``, RINEX 2 the same without the
     mark and with a year of two digits (80 to 99 are 19xx).
@@ -175,7 +175,7 @@ def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochL
 
 
 def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
-    """What is wrong with an epoch line."""
+    """Describe the flaw of an epoch line."""
     width = epoch_width(version)
     text = f"{lines.text(line):<{width}}"
     message = FLAWS[flaw].format(width=width, flag=text[width - 4], count=text[width - 3 : width])
@@ -183,7 +183,7 @@ def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
 
 
 def _number(text: Bytes) -> tuple[Integers, Masks]:
-    """Right-aligned digits of each row as a number, and whether they are that."""
+    """Parse right-aligned digits of each row, and flag the valid rows."""
     digits = text.astype(np.int64) - _ZERO
     is_digit = (digits >= 0) & (digits <= 9)
     blank = text == _BLANK
@@ -193,14 +193,14 @@ def _number(text: Bytes) -> tuple[Integers, Masks]:
 
 
 def _fraction(text: Bytes) -> tuple[Integers, Masks]:
-    """Left-aligned decimals of each row as a number of units of the last one."""
+    """Parse left-aligned decimals of each row as a number of units of the last decimal."""
     _, fine = _number(text[:, ::-1])
     digits = np.where(text == _BLANK, 0, text.astype(np.int64) - _ZERO)
     return digits @ (10 ** np.arange(text.shape[1] - 1, -1, -1)), fine
 
 
 def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
-    """Flag and count of a RINEX 2 event line without a time; None when it is none."""
+    """Return flag and count of a RINEX 2 event line without a time; None for other lines."""
     text = f"{lines.text(line):<32}"
     flag, count = text[28], text[29:32].strip()
     if text[:26].strip() or flag not in "2345" or not count.isdigit():

@@ -1,7 +1,7 @@
-"""RINEX observation types as signals: which column of a satellite's line is what of which signal.
+"""Assignment of RINEX observation types to signals and kinds of observable.
 
 RINEX 3 and 4 name the signal themselves ("C1C" is the code of "1C"). RINEX 2 names it by band, and
-the phase of a band may have come with either of two codes; these are the signals taken (RINEX 2.11,
+the phase of a band may have come with either of two codes; the signals used are (RINEX 2.11,
 table A1; RINEX 3.05, tables 4 to 11):
 
 ======= ===== ===== ===== ===== ===== ===== ===== ===== =====
@@ -20,10 +20,10 @@ CA CB   1C 1X 1C -- -- --  -- --  1C 1X 1C -- -- --           (RINEX 2.12)
 CC CD   2X -- -- 2C -- --  -- --  2X --  -- -- -- --          (RINEX 2.12)
 ======= ===== ===== ===== ===== ===== ===== ===== ===== =====
 
-L1, D1 and S1 belong to C1's signal where C1 is announced, else to P1's; L2, D2 and S2 to P2's
-where P2 is announced (the carrier then comes from the P code or is codeless), else to C2's; where
-no code of the band is announced, to C1's and P2's. BeiDou of RINEX 3.02 calls B1I band 1 ("C1I"):
-it is taken as "2I", as are 1I and 1Q of any version, which mean nothing else.
+L1, D1 and S1 belong to C1's signal where C1 is declared, else to P1's; L2, D2 and S2 to P2's
+where P2 is declared (the carrier then comes from the P code or is codeless), else to C2's; where
+no code of the band is declared, to those of C1 and P2. BeiDou of RINEX 3.02 calls B1I band 1 ("C1I"):
+it is read as "2I", as are 1I and 1Q of any version, which have no other meaning.
 """
 
 from __future__ import annotations
@@ -47,26 +47,26 @@ _CODES_2: Final[dict[str, dict[str, str]]] = {
     "S": {"C1": "1C", "C5": "5X", "CA": "1C"},
     "I": {"C5": "5A", "C9": "9A"},
 }
-#: Codes a RINEX 2 phase, Doppler or C/N0 may belong to, the first announced one is taken.
+#: Codes that a RINEX 2 phase, Doppler or C/N0 may belong to; the first declared one is used.
 _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "C2")}
 
 
 @dataclass(frozen=True)
 class Column:
-    """One wanted column of the satellites' lines of a constellation.
+    """Column of an observation type in the satellite lines of a constellation.
 
     Attributes
     ----------
     index : int
-        Position among the announced types.
+        Position among the declared types.
     name : str
-        The type as announced, "C1C" or "P2".
+        The type as declared, "C1C" or "P2".
     kind : int
         Position in `KINDS`.
     signal : str
         "1C".
     divisor : float
-        What the written value is to be divided by.
+        Divisor of the written value.
     """
 
     index: int
@@ -76,8 +76,8 @@ class Column:
     divisor: float
 
 
-def signal_of(name: str, *, system: str, version: float, announced: Sequence[str]) -> str | None:
-    """Signal that a type belongs to; None for what is no observable of a signal (X1, T1, I1).
+def signal_of(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
+    """Return the signal of an observation type; None for types of no signal (X1, T1, I1).
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def signal_of(name: str, *, system: str, version: float, announced: Sequence[str
         Constellation letter.
     version : float
         RINEX version.
-    announced : sequence of str
+    declared : sequence of str
         All types of the header for this constellation.
     """
     if version >= 3.0:
@@ -104,18 +104,18 @@ def signal_of(name: str, *, system: str, version: float, announced: Sequence[str
     if kind not in KINDS:
         return None
     for owner in _OWNERS_2.get(band, ()):
-        if owner in announced and owner in codes:
+        if owner in declared and owner in codes:
             return codes[owner]
     return codes.get(_OWNERS_2.get(band, ("C" + band,))[0])
 
 
 def columns_of(
-    announced: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
+    declared: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
 ) -> tuple[Column, ...]:
-    """Wanted columns of a constellation; of two types that mean the same the first is taken."""
+    """Return the columns of a constellation; of two types with the same meaning the first."""
     columns: dict[tuple[int, str], Column] = {}
-    for index, name in enumerate(announced):
-        signal = signal_of(name, system=system, version=version, announced=announced)
+    for index, name in enumerate(declared):
+        signal = signal_of(name, system=system, version=version, declared=declared)
         if signal is None:
             continue
         kind = KINDS.index("C" if version < 3.0 and name[0] == "P" else name[0])

@@ -1,12 +1,10 @@
-"""Writers of RINEX 3.04 and 4.02 observation and navigation files.
+"""Writer of RINEX 3.04 and 4.02 observation files (RINEX 3.04, tables A2 and A3).
 
-Text is put together as bytes of whole blocks of epochs, never value by value, so that an hour at
-10 Hz takes seconds, and a log of any length is written piece by piece in bounded memory.
+Text is composed as byte arrays of blocks of epochs, so that an hour at 10 Hz takes seconds and a log
+of any length is written piece by piece in bounded memory.
 
-The same arrays give the same bytes: packed files carry no time of writing, and the header's date
-is blank unless `created` is given.
-
-Source: RINEX 3.04, tables A2, A3 (observations), A5 to A15 (navigation).
+Equal arrays give equal bytes: packed files carry no time of writing, and the date of the header is
+blank unless `created` is given.
 """
 
 from __future__ import annotations
@@ -24,14 +22,11 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.header_text import header_line, program_line
 from railfix.io.rinex.packing import Packing, open_target
-from railfix.io.rinex.write_navigation import RinexVersion, write_navigation
+from railfix.io.rinex.write_navigation import RinexVersion
 
-__all__ = ["write_navigation", "write_observations"]
-
-
-#: Kinds of observable, the letter before the signal, and the array that holds it.
+#: Array of each kind of observable, by the letter before the signal.
 KINDS: Final[dict[str, str]] = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
-#: Epochs that are turned into text at once.
+#: Epochs formatted at once.
 _BLOCK_EPOCHS: Final = 1024
 #: Bytes of an epoch line with its line end, and of one observation (F14.3, LLI, SSI).
 _EPOCH_WIDTH: Final = 36
@@ -53,27 +48,27 @@ def write_observations(
     run_by: str = "",
     created: np.datetime64 | None = None,
 ) -> None:
-    """Write a RINEX observation file; it appears whole or not at all.
+    """Write a RINEX observation file; a failed write leaves no file.
 
     Parameters
     ----------
     observations : Observations, or iterable of them
-        A log, or its pieces in order of time. An epoch without any observation is written with 0
-        satellites. NaN is left blank; `break_before` becomes epoch flag 1.
+        A log, or its pieces in order of time. An epoch without observations is written with 0
+        satellites, NaN as blank, `break_before` as epoch flag 1.
     path : path-like
     packing : {"plain", "gz", "crx", "crx.gz"}, optional
-        Without it the name tells: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
+        By default from the file name: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
     version : {"3.04", "4.02"}
     observables : mapping of str to sequence of str, optional
-        Columns of each constellation (``{"G": ["C1C", "L1C"]}``). Without it C, L, D and S of
-        every signal among the channels of the first piece.
+        Columns of each constellation (``{"G": ["C1C", "L1C"]}``). By default C, L, D and S of every
+        signal of the first piece.
     header : ObservationHeader, optional
-        Without it that of the first piece.
+        By default that of the first piece.
     comments : sequence of str
         Each at most 60 characters.
     run_by : str
     created : datetime64, optional
-        UTC; blank without it.
+        UTC; blank by default.
 
     Raises
     ------
@@ -95,12 +90,12 @@ def write_observations(
                 target.write(block)
 
 
-def _columns(first: Observations, asked: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
-    if asked is not None:
-        wrong = [o for names in asked.values() for o in names if len(o) != 3 or o[0] not in KINDS]
+def _columns(first: Observations, given: Mapping[str, Sequence[str]] | None) -> dict[str, tuple[str, ...]]:
+    if given is not None:
+        wrong = [o for names in given.values() for o in names if len(o) != 3 or o[0] not in KINDS]
         if wrong:
-            raise ValueError(f"observable {wrong[0]!r} is none; expected C, L, D or S and a signal, as in 'C1C'")
-        return {system: tuple(names) for system, names in asked.items()}
+            raise ValueError(f"{wrong[0]!r} is not an observable; C, L, D or S and a signal were expected, as in 'C1C'")
+        return {system: tuple(names) for system, names in given.items()}
     pairs = sorted(set(zip(first.system.tolist(), first.signal.tolist(), strict=True)))
     columns: dict[str, tuple[str, ...]] = {}
     for system, signal in pairs:
@@ -112,7 +107,7 @@ def _columns(first: Observations, asked: Mapping[str, Sequence[str]] | None) -> 
 
 
 def _calendar(time: np.datetime64) -> tuple[int, int, int, int, int, int]:
-    """Year, month, day, hour, minute and the rest in 100 ns of one instant."""
+    """Split one time into year, month, day, hour, minute and the rest in 100 ns."""
     values = _split_time(np.array([time], dtype="datetime64[ns]"))
     year, month, day, hour, minute, ticks = (int(v[0]) for v in values)
     return year, month, day, hour, minute, ticks
@@ -174,7 +169,7 @@ def _glonass_slots(channels: Mapping[str, int]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Satellites of one constellation: where each column's values stand among the channels."""
+    """Satellites of one constellation, and the channel of each of their columns."""
 
     satellites: tuple[str, ...]
     columns: tuple[str, ...]
@@ -210,7 +205,7 @@ def _text_blocks(piece: Observations, columns: Mapping[str, Sequence[str]]) -> I
 
 
 def _satellite_lines(part: Observations, row: _Rows) -> tuple[Bytes, Masks]:
-    """Lines of one constellation, shape (T, S, width), and which bytes of them are written."""
+    """Format the lines of one constellation, shape (T, S, width), and flag the bytes to write."""
     epochs, satellites, width = len(part), len(row.satellites), 3 + _FIELD_WIDTH * len(row.columns) + 1
     text = np.full((epochs, satellites, width), _BLANK, dtype=np.uint8)
     text[:, :, :3] = np.array(row.satellites, dtype="S3").view(np.uint8).reshape(satellites, 3)
@@ -234,9 +229,9 @@ def _satellite_lines(part: Observations, row: _Rows) -> tuple[Bytes, Masks]:
 
 
 def _fixed_3(value: Floats) -> Bytes:
-    """Values as F14.3, shape (..., 14); NaN is blank.
+    """Format values as F14.3, shape (..., 14); NaN is blank.
 
-    Rounded half to even on the value times 1000, as near as its own last bit allows.
+    The value times 1000 is rounded half to even.
     """
     present = np.isfinite(value)
     thousandths = np.rint(np.abs(np.where(present, value, 0.0)) * 1e3).astype(np.int64)
@@ -259,7 +254,7 @@ def _fixed_3(value: Floats) -> Bytes:
 
 
 def _split_time(time: ArrayLike) -> tuple[Integers, ...]:
-    """Year, month, day, hour, minute and the rest in 100 ns."""
+    """Split times into year, month, day, hour, minute and the rest in 100 ns."""
     tags = np.asarray(time, dtype="datetime64[ns]")
     month = tags.astype("datetime64[M]")
     day = tags.astype("datetime64[D]")
@@ -279,7 +274,7 @@ def _split_time(time: ArrayLike) -> tuple[Integers, ...]:
 
 
 def _epoch_lines(time: Datetimes, flag: Masks, count: Integers) -> Bytes:
-    """``> yyyy mm dd hh mm ss.sssssss  f nnn`` with line ends, shape (T, 36)."""
+    """Format ``> yyyy mm dd hh mm ss.sssssss  f nnn`` with line ends, shape (T, 36)."""
     year, month, day, hour, minute, ticks = _split_time(time)
     text = np.full((len(time), _EPOCH_WIDTH), _BLANK, dtype=np.uint8)
     text[:, 0], text[:, -1] = ord(">"), ord("\n")

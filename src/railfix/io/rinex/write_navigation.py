@@ -16,7 +16,7 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.header_text import header_line, program_line
 from railfix.io.rinex.packing import Packing, open_target
 
-#: What RINEX writes for a transmission time that is not known.
+#: Written for an unknown transmission time.
 UNKNOWN_TRANSMISSION_S: Final = 0.9999e9
 #: Name of a constellation's Klobuchar coefficients.
 _IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}
@@ -37,30 +37,30 @@ def write_navigation(
     run_by: str = "",
     created: np.datetime64 | None = None,
 ) -> None:
-    """Write a RINEX navigation file; it appears whole or not at all.
+    """Write a RINEX navigation file; a failed write leaves no file.
 
-    Records stand in order of clock time, then satellite. What `Navigation` does not hold (L2 code
-    and P flags, the GLONASS status words) is written as 0; NaN as blank; an unknown transmission
-    time as 0.9999E9. `precise` is not written.
+    Records are sorted by clock time, then satellite. Fields that `Navigation` does not have (L2 code
+    and P flags, the GLONASS status words) are written as 0, NaN as blank, an unknown transmission time
+    as 0.9999E9. `precise` is not written.
 
     Parameters
     ----------
     navigation : Navigation
     path : path-like
     packing : {"plain", "gz"}, optional
-        Without it the name tells (``.gz``).
+        By default from the file name (``.gz``).
     version : {"3.04", "4.02"}
         Version 4 names the message of each record, and has the ionosphere as records.
     comments : sequence of str
         Each at most 60 characters.
     run_by : str
     created : datetime64, optional
-        UTC; blank without it.
+        UTC; blank by default.
 
     Raises
     ------
     ValueError
-        Hatanaka packing, which is for observations alone; a record of an unknown message.
+        Hatanaka packing, which exists for observations only; a record of an unknown message.
     OutputError
         The file cannot be written.
     """
@@ -112,14 +112,14 @@ def _ionosphere_records(navigation: Navigation) -> str:
 
 
 def _field(values: Floats) -> Strings:
-    """D19.12, blank for NaN."""
+    """Format values as D19.12, blank for NaN."""
     return np.where(np.isfinite(values), np.char.mod("%19.12E", np.nan_to_num(values)), _BLANK)
 
 
 def _records(satellite: Strings, time: Datetimes, fields: Sequence[Floats]) -> Strings:
-    """Text of whole records: satellite, time, three clock fields, then four fields a line.
+    """Format records: satellite, time, three clock fields, then four fields a line.
 
-    Blank fields at the end of a line are left out, as receivers do.
+    Blank fields at the end of a line are omitted, as receivers do.
     """
     text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(fields):
@@ -130,7 +130,7 @@ def _records(satellite: Strings, time: Datetimes, fields: Sequence[Floats]) -> S
 
 
 def _calendar_text(time: Datetimes) -> Strings:
-    """`` yyyy mm dd hh mm ss``."""
+    """Format times as `` yyyy mm dd hh mm ss``."""
     text = np.datetime_as_string(time, unit="s")
     for mark in ("-", ":", "T"):
         text = np.char.replace(text, mark, " ")
@@ -169,8 +169,8 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
     toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
     week, sent = _week_and_transmission(records, shift, beidou)
-    # BeiDou's spare field between two others is 0: a blank there stops some readers.
-    zero, none = np.zeros(len(records)), np.full(len(records), np.nan)
+    # The spare field of BeiDou between two others is 0: some readers cannot read a blank there.
+    zero, blank = np.zeros(len(records)), np.full(len(records), np.nan)
     # QZSS writes the flag: 0 for two hours, 1 for longer.
     fit = np.where(
         letter == "J",
@@ -184,9 +184,9 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
         records.cuc, records.eccentricity, records.cus, records.sqrt_a,
         records.toe_sow_s, records.cic, records.omega0, records.cis,
         records.i0, records.crc, records.omega, records.omega_dot,
-        records.i_dot, np.where(galileo, records.data_source, zero), week, np.where(navstar, zero, none),
+        records.i_dot, np.where(galileo, records.data_source, zero), week, np.where(navstar, zero, blank),
         records.accuracy_m, records.health, first, np.where(navstar, records.iodc, second),
-        sent, np.where(navstar, fit, np.where(beidou, records.iodc, none)),
+        sent, np.where(navstar, fit, np.where(beidou, records.iodc, blank)),
     )  # fmt: skip
     return toc, [np.asarray(f, dtype=np.float64) for f in fields]
 
@@ -194,7 +194,7 @@ def _kepler_fields(records: KeplerRecords) -> tuple[Datetimes, list[Floats]]:
 def _week_and_transmission(
     records: KeplerRecords, shift: NDArray[np.timedelta64], beidou: Masks
 ) -> tuple[Floats, Floats]:
-    """Week of toe in the constellation's own count, and seconds of that week at transmission."""
+    """Compute the week of toe in the count of the constellation, and seconds of that week at transmission."""
     week, _ = to_week(records.toe + shift)
     origin = np.where(beidou, BDT_EPOCH, GPS_EPOCH)
     # Both counts of weeks begin on a Sunday.
@@ -214,7 +214,7 @@ def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
     """Time in UTC, and one array for each number of the file."""
     toe, sent = _utc(records.toe), _utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
-    place, speed, push = (
+    position, velocity, acceleration = (
         values / 1e3 for values in (records.position_ecef_m, records.velocity_ecef_mps, records.acceleration_ecef_mps2)
     )
     fields: list[Floats] = [
@@ -224,14 +224,14 @@ def _glonass_fields(records: GlonassRecords) -> tuple[Datetimes, list[Floats]]:
     ]
     last = (records.health, records.frequency_channel, records.age_days)
     for axis, extra in enumerate(last):
-        fields += [place[:, axis], speed[:, axis], push[:, axis], extra.astype(np.float64)]
+        fields += [position[:, axis], velocity[:, axis], acceleration[:, axis], extra.astype(np.float64)]
     return toe, fields
 
 
 def _utc(time: Datetimes) -> Datetimes:
-    """GPS time as UTC."""
+    """Convert GPS time to UTC."""
     known = np.where(np.isnat(time), GPS_EPOCH, time)
     leap = gpst_minus_utc(known).astype("timedelta64[s]")
-    # The table is asked in UTC: within seconds of a leap second ask again.
+    # The table is in UTC: repeat the look-up with the corrected time, for times next to a leap second.
     leap = gpst_minus_utc(known - leap).astype("timedelta64[s]")
     return np.where(np.isnat(time), np.datetime64("NaT", "ns"), known - leap)
