@@ -118,7 +118,7 @@ def dense(
 @pytest.mark.parametrize("clocks", ["own", "shared"])
 @pytest.mark.parametrize("tied", [False, True])
 def test_equals_a_dense_least_squares(limits, clocks, tied):
-    limits = replace(limits, clocks=clocks)
+    limits = limits.replaced(clocks=clocks)
     arc, time = moving(6), carrier_made.times(6)
     ranges, phases = carrier_made.observed(LINE, arc, arc_id=broken_arcs(6, 8))
     if tied:

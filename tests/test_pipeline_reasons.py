@@ -23,7 +23,6 @@ from railfix.core.reasons import CHECK_FAILED, POSITIONED, Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.pipeline.processor import AntennaResult
-from railfix.screens.cn0 import Cn0Limits
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -219,7 +218,7 @@ CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
     ),
     Reason.NO_CORRECTION: lambda: (front_alone(on_e6(), other_signals()), channel(FRONT, LONE), 0),
     Reason.CN0_FLOOR: lambda: (
-        front_alone(weak(), {"screens": ["cn0"], "cn0": {"floor_dbhz": Cn0Limits().floor_dbhz}}),
+        front_alone(weak(), {"screens": ["cn0"], "cn0": {"floor_dbhz": 30.0}}),
         AT,
         0,
     ),

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 from railfix.cli import app
 from railfix.pipeline.config import parse_config
 from railfix.report.plots import run_screens
-from railfix.report.plots.screens import ScreenPicture
 from railfix.run import RunOptions, RunSummary, run_files
+from railfix.screens import ScreenPicture
 from railfix.simulate.demonstration import demo_inputs
 
 pytestmark = pytest.mark.requirement("B7")

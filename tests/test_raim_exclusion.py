@@ -238,7 +238,7 @@ def test_fixed_limit_by_hand():
     assert got.outcome[0] == Outcome.EXCLUDED_TWO
     assert got.own_error_m[0, 4:] == pytest.approx([40.0, 30.0])
     # ... unless three must be left, or one is the most.
-    for other in (replace(limits, min_redundancy=3), replace(limits, max_excluded=1), replace(limits, max_excluded=0)):
+    for other in (limits.replaced(min_redundancy=3), limits.replaced(max_excluded=1), limits.replaced(max_excluded=0)):
         assert exclude(replace(model, misfit=misfit), limits=other).outcome[0] == Outcome.UNRESOLVED
 
 

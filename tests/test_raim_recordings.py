@@ -150,7 +150,7 @@ def test_two_faults_are_excluded_where_they_can_be_told(station):
     bias = reliability(model, scale=station.scale).minimal_detectable_bias_m
     used = np.isfinite(bias)
     # Told apart with a probability of 0.999: noncentrality of one degree of freedom against `separation`.
-    enough = noncentrality(1, limits=replace(limits, false_alarm=limits.separation_risk))
+    enough = noncentrality(1, limits=limits.replaced(false_alarm=limits.separation_risk))
     outcomes, look_alikes = np.zeros((2, len(Outcome)), dtype=int), 0
     for k, pair in enumerate(combinations(np.flatnonzero(used.any(axis=0)), 2)):
         error = np.zeros_like(bias)

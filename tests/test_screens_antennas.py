@@ -23,15 +23,16 @@ from railfix.screens import (
     AntennaPairLimits,
     AntennaPairScreened,
     AntennaSpacingLimits,
+    Screened,
     ambiguity_m,
     antenna_pair_screen,
     antenna_spacing_screen,
     expected_difference_m,
-    on_channels,
     pair_channels,
     pair_epochs,
     spacing_direction,
 )
+from railfix.screens.pairs import on_pairs
 
 START = np.datetime64("2021-01-01T00:00:00", "ns")
 NAN = np.nan
@@ -127,8 +128,9 @@ def test_pairs_of_channels_and_verdicts_on_both_antennas() -> None:
     assert a.tolist() == [0, 3]
     assert b.tolist() == [1, 0]
     verdict = np.array([[True, False], [False, True]])
-    on_front = on_channels(verdict, (3, 4), np.array([0, 2]), a)
-    on_rear = on_channels(verdict, (2, 3), np.array([0, 1]), b)
+    screened = Screened(metric=np.where(verdict, 9.0, 1.0), reject=verdict)
+    on_front = on_pairs(screened, (3, 4), np.array([0, 2]), a).reject
+    on_rear = on_pairs(screened, (2, 3), np.array([0, 1]), b).reject
     assert np.argwhere(on_front).tolist() == [[0, 0], [2, 3]]
     assert np.argwhere(on_rear).tolist() == [[0, 1], [1, 0]]
 

@@ -48,7 +48,12 @@ def test_truth_table() -> None:
     cn0, elevation, floor, curve = (np.array(column) for column in zip(*TRUTH_TABLE, strict=True))
     elevation.flags.writeable = cn0.flags.writeable = False
     result = cn0_screen(
-        cn0[:, None], elevation[:, None], satellite=np.array(["G07"]), signal=np.array(["1C"]), curve=CURVE
+        cn0[:, None],
+        elevation[:, None],
+        satellite=np.array(["G07"]),
+        signal=np.array(["1C"]),
+        curve=CURVE,
+        limits=Cn0Limits(floor_dbhz=30.0),
     )
     assert result.floor.reject[:, 0].tolist() == floor.tolist()
     assert result.curve.reject[:, 0].tolist() == curve.tolist()
@@ -60,11 +65,11 @@ def test_truth_table() -> None:
 @pytest.mark.parametrize(
     ("curve", "limits", "words"),
     [
-        (None, Cn0Limits(), ["floor"] * 3),
+        (None, Cn0Limits(floor_dbhz=30.0), ["floor"] * 3),
         (None, Cn0Limits(floor_dbhz=None), ["nothing"] * 3),
-        (CURVE, Cn0Limits(), ["curve and floor", "floor", "floor"]),
+        (CURVE, Cn0Limits(floor_dbhz=30.0), ["curve and floor", "floor", "floor"]),
         (CURVE, Cn0Limits(floor_dbhz=None), ["curve", "nothing", "nothing"]),
-        (CURVE, Cn0Limits(deficit_dbhz=None), ["floor"] * 3),
+        (CURVE, Cn0Limits(deficit_dbhz=None, floor_dbhz=30.0), ["floor"] * 3),
     ],
 )
 def test_says_what_judged(curve: Cn0Curve | None, limits: Cn0Limits, words: list[str]) -> None:

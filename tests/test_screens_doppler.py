@@ -51,7 +51,7 @@ def screened(
         array.flags.writeable = False
     return doppler_screen(
         time, code, doppler, satellite=satellite, signal=np.array(["1C"] * len(satellite)),
-        frequency_hz=np.full(len(satellite), L1), limits=limits, state=state, **more,
+        frequency_hz=np.full(len(satellite), L1), limits=limits or DopplerLimits(mode="fixed"), state=state, **more,
     )  # fmt: skip
 
 
@@ -78,7 +78,7 @@ TRUTH_TABLE = {
 def test_truth_table(error: list[float], expected: str) -> None:
     time, code, doppler = scene(8)
     code[:, 0] += error
-    result, _ = screened(time, code, doppler, limits=DopplerLimits(hold_s=0.3))
+    result, _ = screened(time, code, doppler, limits=DopplerLimits(mode="fixed", hold_s=0.3))
     assert "".join("x" if r else "." for r in result.reject[:, 0]) == expected
     assert not result.reject[:, 1:].any()
     assert not result.reject[np.isnan(result.metric)].any()
@@ -99,7 +99,7 @@ def test_exactly_at_the_limit_is_used() -> None:
 def test_without_hold_it_is_the_paper_s_test_to_the_letter() -> None:
     time, code, doppler = scene(8)
     code[3:6, 0] += 9.0
-    result, _ = screened(time, code, doppler, limits=DopplerLimits(hold_s=0.0))
+    result, _ = screened(time, code, doppler, limits=DopplerLimits(mode="fixed", hold_s=0.0))
     assert np.flatnonzero(result.reject[:, 0]).tolist() == [3, 6]
     np.testing.assert_array_equal(result.reject, np.abs(result.metric) > 1.5)
 
@@ -211,7 +211,7 @@ def test_mode_receiver_finds_the_scale_of_the_receiver() -> None:
         code = 2.2e7 + noise * rng.standard_normal((400, 12))
         result, _ = screened(
             time, code, np.zeros(code.shape), satellite=satellite,
-            limits=DopplerLimits(mode="receiver", factor=5.0, jerk_mps3=0.0),
+            limits=DopplerLimits(mode="receiver", prior_epochs=10.0, factor=5.0, jerk_mps3=0.0),
         )  # fmt: skip
         expected = max(float(doppler_limit_m(1.0)) - 1 / 12, 5.0 * np.sqrt(2.0) * noise)
         # the median of twelve, and the mean of logarithms, come out some tenth too small
@@ -328,9 +328,9 @@ RECORDINGS = {
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_recordings(recordings: Path, name: str) -> None:
     log = read_observations(recordings / name)
-    fixed, _ = rates(log, DopplerLimits())
-    letter, _ = rates(log, DopplerLimits(hold_s=0.0))
-    own, result = rates(log, DopplerLimits(mode="receiver"))
+    fixed, _ = rates(log, DopplerLimits(mode="fixed"))
+    letter, _ = rates(log, DopplerLimits(mode="fixed", hold_s=0.0))
+    own, result = rates(log, DopplerLimits(mode="receiver", prior_epochs=10.0))
     limit = float(np.nanmedian(result.limit_m))
     print(f"{name}: fixed {fixed:.4f}, without hold {letter:.4f}, receiver {own:.4f} at {limit:.2f} m")
     assert fixed <= RECORDINGS[name][0]
@@ -344,7 +344,7 @@ def test_clock_steps_of_a_real_log_trip_nothing_more_than_its_other_epochs(recor
         change = np.diff(log.code_m, axis=0)
     steps = 1 + np.flatnonzero(np.array([np.median(row[np.isfinite(row)]) for row in change]).__abs__() > 1e5)
     assert len(steps) == 2, "two steps of 4 ms, of tag and code alike"
-    _, result = rates(log, DopplerLimits())
+    _, result = rates(log, DopplerLimits(mode="fixed"))
     at_steps = np.abs(result.metric[steps])
     assert np.nanmedian(at_steps) < 2.0 * np.nanmedian(np.abs(result.metric))
 
@@ -352,9 +352,9 @@ def test_clock_steps_of_a_real_log_trip_nothing_more_than_its_other_epochs(recor
 def test_the_demonstration_s_white_noise_is_the_receiver_s_scale() -> None:
     """The made log has noise that is white from epoch to epoch: more than P1's receivers, and no multipath."""
     log = read_observations(ROOT / "data" / "demo" / "front.crx.gz")[:1000]
-    own, _ = rates(log, DopplerLimits(mode="receiver", hold_s=0.0))
+    own, _ = rates(log, DopplerLimits(mode="receiver", prior_epochs=10.0, hold_s=0.0))
     strong = np.nanmedian(log.cn0_dbhz, axis=0) > 47.0
-    _, result = rates(log, DopplerLimits(hold_s=0.0))
+    _, result = rates(log, DopplerLimits(mode="fixed", hold_s=0.0))
     high = float(result.reject[:, strong].sum() / np.isfinite(result.metric[:, strong]).sum())
     print(f"demo: receiver {own:.4f}; fixed, satellites above 47 dB-Hz {high:.4f}")
     assert high < 0.05

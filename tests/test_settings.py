@@ -13,7 +13,7 @@ from broken_bench import Bench, bench_in
 from railfix.cli import app
 from railfix.cli.settings import Choices, settings_of
 from railfix.core.errors import SettingsError
-from railfix.pipeline.config import PRESETS, SCREENS, Config, load_config, parse_config
+from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, load_config, parse_config
 
 pytestmark = pytest.mark.requirement("B7")
 
@@ -33,7 +33,7 @@ def test_p1_is_table_6_of_the_paper() -> None:
     assert config.antenna_pair.limit_m == config.antenna_spacing.limit_m == 5.0
     assert (config.raim.mode, config.raim.fixed_limit_m2, config.raim.max_excluded) == ("fixed", 100.0, 2)
     assert (config.min_satellites, config.failed_checks) == (3, "drop")
-    assert config.screens == SCREENS
+    assert config.screens == SCREEN_NAMES
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -75,13 +75,13 @@ def test_the_command_line_stands_over_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("choices", "words"),
     [
-        (Choices(screens="elevation,rain"), ["--screens elevation,rain", "'rain'", *SCREENS]),
-        (Choices(screens=""), ["--screens", *SCREENS]),
+        (Choices(screens="elevation,rain"), ["--screens elevation,rain", "'rain'", *SCREEN_NAMES]),
+        (Choices(screens=""), ["--screens", *SCREEN_NAMES]),
         (Choices(screens="raim,raim"), ["each screen once"]),
-        (Choices(without=("dopler",)), ["--without dopler", *SCREENS]),
+        (Choices(without=("dopler",)), ["--without dopler", *SCREEN_NAMES]),
         (Choices(preset="P1"), ["--preset P1", "default", "p1"]),
         (Choices(setting=("preset=p2",)), ["preset", "'p1'"]),
-        (Choices(setting=("screens=['rain']",)), ["screens", "'raim'"]),
+        (Choices(setting=("screens=['rain']",)), ["screens", "unknown screen 'rain'", "raim"]),
     ],
 )
 def test_what_is_misspelt_is_named_with_what_is_known(choices: Choices, words: list[str]) -> None:

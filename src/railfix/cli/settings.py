@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings, option, read_toml
-from railfix.pipeline.config import PRESETS, SCREENS, Config, parse_config
+from railfix.pipeline.config import PRESETS, SCREEN_NAMES, Config, parse_config
 from railfix.run.inputs import INPUTS
 
 
@@ -127,8 +127,8 @@ def _screens(option: str, text: str) -> list[str]:
     """Names of screens, with commas between them."""
     names = [name.strip() for name in text.split(",")]
     for name in names:
-        if name not in SCREENS:
-            raise SettingsError(f"{option} {text}: unknown screen {name!r}; known are {', '.join(SCREENS)}")
+        if name not in SCREEN_NAMES:
+            raise SettingsError(f"{option} {text}: unknown screen {name!r}; known are {', '.join(SCREEN_NAMES)}")
     if len(set(names)) != len(names):
         raise SettingsError(f"{option} {text}: name each screen once")
     return names

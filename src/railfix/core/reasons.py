@@ -100,6 +100,37 @@ CHECK_FAILED: Final = (Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNC
 POSITIONED: Final = (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET, *CHECK_FAILED)
 
 
+#: Reasons of screens that are added to the package, by name in lower case.
+_ADDED: dict[str, Reason] = {}
+#: First free bit, and the last one of the tables' 32-bit column.
+_FIRST_FREE_BIT: Final = 20
+_LAST_BIT: Final = 30
+
+
+def screen_reason(name: str) -> Reason:
+    """Return the reason of a screen by its name in lower case; the next free bit where `Reason` does not have it.
+
+    Raises
+    ------
+    ValueError
+        All bits are taken.
+    """
+    if name.upper() in Reason.__members__:
+        return Reason[name.upper()]
+    if name not in _ADDED:
+        bit = _FIRST_FREE_BIT + len(_ADDED)
+        if bit > _LAST_BIT:
+            raise ValueError(f"no bit is left for the reason {name}: {_LAST_BIT - _FIRST_FREE_BIT + 1} can be added")
+        _ADDED[name] = Reason(1 << bit)
+    return _ADDED[name]
+
+
+def reason_names() -> dict[int, str]:
+    """Return the name of every reason in lower case by its bit, in order of the bits; `USED` is not among them."""
+    members = {int(bit): name.lower() for name, bit in Reason.__members__.items() if bit}
+    return members | {int(bit): name for name, bit in _ADDED.items()}
+
+
 def reason_text(reason: int) -> str:
     """Join the names of the bits of one reason by ``+``; ``used`` for 0.
 
@@ -108,7 +139,7 @@ def reason_text(reason: int) -> str:
     """
     if reason == 0:
         return "used"
-    return "+".join(bit.name.lower() for bit in Reason if bit & reason and bit.name)
+    return "+".join(name for bit, name in reason_names().items() if bit & reason)
 
 
 def reason_texts(reasons: ArrayLike) -> Strings:

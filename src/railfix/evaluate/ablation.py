@@ -21,6 +21,7 @@ from railfix.evaluate.scores import Score, score
 from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import AntennaResult, State
+from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
 from railfix.run.driver import Progress, notes_of, open_inputs
@@ -30,10 +31,9 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import run_record
 from railfix.run.tally import Tally
+from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
 
-#: Screens that compare two antennas.
-_OF_TWO: Final = ("antenna_pair", "antenna_spacing")
 #: Names of the choices with all screens and with none.
 ALL, NONE = "all", "none"
 
@@ -121,15 +121,15 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Screens that are on and can judge in this run, and one sentence on each that cannot."""
-    notes = []
-    spaced = len(trajectories) > 1 and all(t.body_chainage_m is not None for t in trajectories.values())
-    for name in config.screens:
-        if name in _OF_TWO and not spaced:
-            notes.append(f"screen {name}: left out, it needs two antennas and a vehicle file")
-        if name == "cn0" and config.cn0_curve is None and config.cn0.floor_dbhz is None:
-            notes.append("screen cn0: left out, it needs a curve over elevation (cn0_curve) or a floor")
-    left_out = {note.split(":")[0].removeprefix("screen ") for note in notes}
-    return tuple(name for name in config.screens if name not in left_out), tuple(notes)
+    setup = ScreenSetup(
+        antennas=len(trajectories),
+        spacing_known=all(t.body_chainage_m is not None for t in trajectories.values()),
+        cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
+    )
+    chosen = [screen for screen in SCREENS if screen.name in config.screens]
+    unable = [screen for screen in chosen if screen.unable(getattr(config, screen.name), setup)]
+    notes = tuple(f"screen {screen.name}: left out, it needs {screen.needs}" for screen in unable)
+    return tuple(screen.name for screen in chosen if screen not in unable), notes
 
 
 def ablate_files(

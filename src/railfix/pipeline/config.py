@@ -1,6 +1,6 @@
-"""Settings of a run: one frozen model, from Python or from TOML, misspelt keys refused.
+"""Settings of a run: one frozen model, from Python or from TOML; misspelt keys are rejected.
 
-Each room owns its limits; this module only puts them side by side under the names that the
+Each package defines its own limits; this module puts them side by side under the names that the
 configuration file uses::
 
     preset = "default"
@@ -13,7 +13,7 @@ configuration file uses::
     [noise]
     model = "elevation"
 
-A preset names a set of settings; single ones stand over it.
+A preset names a set of settings; single settings override it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from pydantic import (
-    Field,
-    TypeAdapter,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, create_model, field_validator, model_validator
 
 from railfix.core.settings import Settings, load_settings, validated
 from railfix.integrity.protection import RiskBudget
-from railfix.integrity.raim import RaimLimits
 from railfix.positioning.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
@@ -44,8 +37,12 @@ from railfix.positioning.section_search import SectionLimits
 from railfix.positioning.single_point import SinglePointLimits
 from railfix.ranges.sbas import SbasLimits
 from railfix.ranges.weights import CodeNoise, NominalErrors
-from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
+from railfix.screens import SCREENS
 from railfix.tracking.limits import TrackingLimits
+
+if TYPE_CHECKING:
+    from railfix.integrity.raim import RaimLimits
+    from railfix.screens import AntennaPairLimits, AntennaSpacingLimits, Cn0Limits, DopplerLimits, ElevationLimits
 
 #: Signals near L1 in order of preference, RINEX 3 codes without the type letter.
 DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
@@ -57,38 +54,11 @@ DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
 }
 
 
-#: Names of the screens, in the order in which they are asked.
-SCREENS: Final = ("elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing")
+#: Names of the screens, in the order in which they judge.
+SCREEN_NAMES: Final = tuple(screen.name for screen in SCREENS)
 
-
-#: Settings that are the limits of a room.
-ROOMS: Final = (
-    "noise",
-    "nominal",
-    "sbas_limits",
-    "risk",
-    "elevation",
-    "cn0",
-    "doppler",
-    "antenna_pair",
-    "raim",
-    "antenna_spacing",
-    "clock_offsets",
-    "noise_scale",
-    "robust_fit",
-    "map_offset",
-    "single_point",
-    "section",
-    "constrained",
-    "slips",
-    "smoothing",
-    "continuity",
-    "phase",
-    "tracking",
-)
-
-#: Settings by the name of their preset. "strict": certainty before rate. "p1": table 6 of P1 to the
-#: letter, for geodetic receivers at 10 Hz.
+#: Settings by the name of their preset. "strict": accuracy before availability. "p1": exactly table 6
+#: of P1, for geodetic receivers at 10 Hz.
 PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
     "default": {},
     "strict": {"largest_sigma_m": 10.0, "failed_checks": "drop"},
@@ -108,15 +78,32 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
 }
 
 
-class Config(Settings):
+if TYPE_CHECKING:
+
+    class ScreenSettings(Settings):
+        """Limits of the screens, one group each; the class below has those of `railfix.screens.SCREENS`."""
+
+        elevation: ElevationLimits = ElevationLimits()
+        cn0: Cn0Limits = Cn0Limits()
+        doppler: DopplerLimits = DopplerLimits()
+        antenna_pair: AntennaPairLimits = AntennaPairLimits()
+        raim: RaimLimits = RaimLimits()
+        antenna_spacing: AntennaSpacingLimits = AntennaSpacingLimits()
+else:
+    ScreenSettings = create_model(
+        "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
+    )
+
+
+class Config(ScreenSettings):
     """Settings of the positioning, each with its default and where that comes from.
 
     Attributes
     ----------
     preset : {"default", "strict", "p1"}
-        Settings that all others stand over. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
+        Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz
         and 10 dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m, RAIM with two satellites and
-        100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not say (weights, noise, clock
+        100 m^2, antenna spacing 5 m, failed checks dropped. What P1 does not specify (weights, noise, clock
         offsets, ambiguous sections, receivers' clocks) is as in "default".
     systems : tuple of str
         Constellations used. GLONASS is left out by default: its channels have code biases of
@@ -124,23 +111,24 @@ class Config(Settings):
     signals : mapping of str to tuple of str
         Signals of each constellation in order of preference; the first one observed is used.
     screens : tuple of str
-        Screens that are on; health and validity of the satellites are no screens and always asked.
+        Screens that are on; health and validity of the satellites are always checked.
     cn0_curve : path or None
-        File of the mean C/N0 over elevation (``railfix cn0-curve``); without it the floor alone judges.
+        File of the mean C/N0 over elevation (``railfix cn0-curve``); without it only the floor is used.
     failed_checks : {"keep", "drop"}
-        Coordinates of positions that a check has failed (`reasons.CHECK_FAILED`): kept beside the
-        status that says so, or dropped as P1 does.
+        Coordinates of positions with a failed check (`reasons.CHECK_FAILED`): kept, with the status of
+        the check, or dropped as P1 does.
     largest_sigma_m : float
-        The knob between rate and certainty: a position whose own ranges vouch for less than this
-        (`AntennaResult.own_sigma_m`) is called uncertain and counts as a failed check. P4 takes a car
-        length, 20 m, as acceptable; the preset "strict" asks for 10 m and drops failed checks.
+        Availability/accuracy threshold: a position whose single-epoch sigma (`AntennaResult.own_sigma_m`)
+        exceeds it is `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position
+        is compared. P4 takes a car length, 20 m, as acceptable; the preset "strict" uses 10 m and drops failed
+        checks.
     min_satellites : int
-        Satellites asked for (P1 3.2: 3; 2 is possible and doubtful on curves).
+        Satellites that a position needs (P1 3.2: 3; 2 is possible and ambiguous on curves).
     dilution_limit : float
-        Largest along-track dilution [m/m] that still counts as a position.
+        Largest along-track dilution [m/m] of a position.
     off_map_risk : float
-        A position is called off the map when its ranges fit the line worse than the 3-D position by more than noise
-        explains with this probability, the noise judged by the 3-D fit's own residuals.
+        A position is off the map where its ranges fit the line worse than the 3-D position by more than noise explains
+        with this probability, the noise judged by the residuals of the 3-D fit.
     ionosphere : {"klobuchar", "off"}
     troposphere : {"saastamoinen", "off"}
     max_ephemeris_age_s : float or None
@@ -148,55 +136,55 @@ class Config(Settings):
     map_plan_sigma_m, map_height_sigma_m : float or None
         In place of the track's own map error (P1 4.1(3): 0.30 m and 0.60 m).
     noise_scale : NoiseScaleLimits
-        How the noise of the receiver is learnt from the residuals.
+        Estimation of the receiver's noise from the residuals.
     robust_fit : RobustFitLimits
-        Which ranges of an epoch agree with each other: what clock offsets and noise are learnt from.
+        Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
     map_offset : MapOffsetLimits
-        The test of the map against the 3-D positions of the last minutes.
+        Test of the map against the 3-D positions of the last minutes.
     sbas : tuple of path
         Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
         one are refused. None: no SBAS.
     sbas_prn : int or "best"
         GEO whose messages are used; "best" is the one with the most usable fast corrections.
     sbas_limits : SbasLimits
-        Time-outs, message type 0, what to do where degradation data are missing.
+        Time-outs, use of message type 0, treatment of missing degradation data.
     error_model : path or None
-        Errors by direction and C/N0 (``railfix error-model``): their overbounds take the place of `noise` as weights,
-        and the protection level rests on them. Without it the level rests on `noise` times the scale estimated
-        so far, which promises nothing about tails.
+        Errors by direction and C/N0 (``railfix error-model``): their overbounds replace `noise` as weights, and are
+        the basis of the protection level. Without it the level is based on `noise` times the scale estimated
+        so far, which bounds no tails.
     nominal : NominalErrors
-        What a model of local errors alone leaves out, where no SBAS tells it.
+        Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
     protection : {"on", "off"}
         Whether positions get a protection level along the line with its parts (`railfix.integrity.protection`).
     risk : RiskBudget
-        Integrity risk per hour, its shares, and the probabilities of faults that the level stands for.
+        Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
     alarm_limit_m : float
-        Protection level from which on a position is not available. P4 takes a car length, 20 m.
+        Largest protection level of an available position. P4 takes a car length, 20 m.
     raim_protection : {"on", "off"}
-        Whether positions also get P4's level: the largest slope times the bias that the test misses.
+        Whether positions also get P4's level: the largest slope times the largest undetected bias.
     noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
         Limits of the weights and the screens.
     clock_offsets, single_point, section, constrained
-        Limits of the rooms of these names.
+        Limits of these stages.
     carrier : {"off", "smoothed", "float"}
         Use of the carrier phase (A5): none; codes smoothed by it; or code and phase together with float
         ambiguities, from this and earlier epochs. On recordings smoothing helps most on a phone, float
-        ambiguities under open sky; in towns, where arcs last seconds, neither takes off large errors.
+        ambiguities under open sky; in towns, where arcs last seconds, neither removes large errors.
     phase_sigma_m : float
-        Standard deviation of a phase at the zenith, what multipath does to it included.
+        Standard deviation of a phase at the zenith, multipath included.
     filter : {"track", "off"}
         Whether epochs also go through one filter along the track (codes, Dopplers, changes of the carrier phase and
         sensors, from this and earlier epochs), into a table of its own. `railfix run` and `railfix demo` ask for it.
     tracking : TrackingLimits
         Noise of motion and measurements of that filter.
     slips, smoothing, continuity, phase
-        Limits of the rooms of the carrier phase.
+        Limits of the stages of the carrier phase.
     """
 
     preset: Literal["default", "strict", "p1"] = "default"
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    screens: tuple[Literal["elevation", "cn0", "doppler", "antenna_pair", "raim", "antenna_spacing"], ...] = SCREENS
+    screens: tuple[str, ...] = SCREEN_NAMES
     cn0_curve: Path | None = None
     failed_checks: Literal["keep", "drop"] = "keep"
     largest_sigma_m: float = Field(default=20.0, gt=0)
@@ -208,42 +196,36 @@ class Config(Settings):
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
-    noise_scale: NoiseScaleLimits = Field(default_factory=NoiseScaleLimits)
-    robust_fit: RobustFitLimits = Field(default_factory=RobustFitLimits)
-    map_offset: MapOffsetLimits = Field(default_factory=MapOffsetLimits)
-    noise: CodeNoise = Field(default_factory=CodeNoise)
-    cn0: Cn0Limits = Field(default_factory=lambda: Cn0Limits(floor_dbhz=None))
-    doppler: DopplerLimits = Field(default_factory=lambda: DopplerLimits(mode="receiver", prior_epochs=5.0))
-    antenna_pair: AntennaPairLimits = Field(default_factory=AntennaPairLimits)
-    antenna_spacing: AntennaSpacingLimits = Field(default_factory=AntennaSpacingLimits)
-    raim: RaimLimits = Field(default_factory=RaimLimits)
+    noise_scale: NoiseScaleLimits = NoiseScaleLimits()
+    robust_fit: RobustFitLimits = RobustFitLimits()
+    map_offset: MapOffsetLimits = MapOffsetLimits()
+    noise: CodeNoise = CodeNoise()
     sbas: tuple[Path, ...] = ()
     sbas_prn: int | Literal["best"] = "best"
-    sbas_limits: SbasLimits = Field(default_factory=SbasLimits)
+    sbas_limits: SbasLimits = SbasLimits()
     error_model: Path | None = None
-    nominal: NominalErrors = Field(default_factory=NominalErrors)
+    nominal: NominalErrors = NominalErrors()
     protection: Literal["on", "off"] = "on"
-    risk: RiskBudget = Field(default_factory=RiskBudget)
+    risk: RiskBudget = RiskBudget()
     alarm_limit_m: float = Field(default=20.0, gt=0)
     raim_protection: Literal["on", "off"] = "off"
     carrier: Literal["off", "smoothed", "float"] = "off"
     phase_sigma_m: float = Field(default=0.01, gt=0)
-    slips: SlipLimits = Field(default_factory=SlipLimits)
-    smoothing: SmoothingLimits = Field(default_factory=SmoothingLimits)
-    continuity: ContinuityLimits = Field(default_factory=ContinuityLimits)
-    phase: PhaseLimits = Field(default_factory=PhaseLimits)
+    slips: SlipLimits = SlipLimits()
+    smoothing: SmoothingLimits = SmoothingLimits()
+    continuity: ContinuityLimits = ContinuityLimits()
+    phase: PhaseLimits = PhaseLimits()
     filter: Literal["track", "off"] = "off"
-    tracking: TrackingLimits = Field(default_factory=TrackingLimits)
-    clock_offsets: ClockOffsetLimits = Field(default_factory=ClockOffsetLimits)
-    elevation: ElevationLimits = Field(default_factory=ElevationLimits)
-    single_point: SinglePointLimits = Field(default_factory=SinglePointLimits)
-    section: SectionLimits = Field(default_factory=SectionLimits)
-    constrained: ConstrainedLimits = Field(default_factory=ConstrainedLimits)
+    tracking: TrackingLimits = TrackingLimits()
+    clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
+    single_point: SinglePointLimits = SinglePointLimits()
+    section: SectionLimits = SectionLimits()
+    constrained: ConstrainedLimits = ConstrainedLimits()
 
     @model_validator(mode="before")
     @classmethod
     def _on_preset(cls, values: Any) -> Any:
-        """The settings given over those of the preset; an unknown preset is left to its own field to refuse."""
+        """Return the given settings over those of the preset; an unknown preset is rejected by its own field."""
         if not isinstance(values, dict):
             return values
         return _over(PRESETS.get(str(values.get("preset", "default")), {}), values)
@@ -257,32 +239,21 @@ class Config(Settings):
 
     @field_validator("screens")
     @classmethod
-    def _screens_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _known_screens_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        unknown = [name for name in value if name not in SCREEN_NAMES]
+        if unknown:
+            raise ValueError(f"unknown screen {unknown[0]!r}; known are {', '.join(SCREEN_NAMES)}")
         if len(set(value)) != len(value):
             raise ValueError("name each screen once")
-        return tuple(name for name in SCREENS if name in value)
-
-    @field_validator(*ROOMS, mode="before")
-    @classmethod
-    def _known_keys(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse misspelt settings of a room; those left out keep this model's defaults, not the room's."""
-        if isinstance(value, dict) and info.field_name:
-            default = cls.model_fields[info.field_name].get_default(call_default_factory=True)
-            known = set(type(default).model_fields if isinstance(default, Settings) else default.__dataclass_fields__)
-            unknown = sorted(set(value) - known)
-            if unknown:
-                raise ValueError(f"unknown setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
-            return {name: getattr(default, name) for name in known} | value
-        return value
+        return tuple(name for name in SCREEN_NAMES if name in value)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        plain: dict[str, Any] = TypeAdapter(Config).dump_python(self, mode="json")
-        return plain
+        """Return plain values for JSON."""
+        return self.model_dump(mode="json")
 
 
 def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings over those of a preset; groups key by key, limits given as an object whole."""
+    """Return settings over those of a preset: groups key by key, limits given as an object unchanged."""
     both = {**preset, **values}
     for name, group in preset.items():
         given = values.get(name)
@@ -292,7 +263,7 @@ def _over(preset: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any
 
 
 def parse_config(values: Mapping[str, Any], *, source: str = "settings") -> Config:
-    """A configuration from plain values.
+    """Return a configuration from plain values.
 
     Raises
     ------
@@ -303,7 +274,7 @@ def parse_config(values: Mapping[str, Any], *, source: str = "settings") -> Conf
 
 
 def load_config(path: str | PathLike[str]) -> Config:
-    """A configuration from a TOML file.
+    """Return a configuration from a TOML file.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -23,7 +23,7 @@ from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
-from railfix.screens import Screened, suspicion_sigma_m
+from railfix.screens import Screened, Verdict, suspicion_sigma_m
 
 #: Standard deviation given to raw ranges for the approximate place of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
@@ -127,14 +127,17 @@ class CorrectedRanges:
         hit = mask & ((self.reason & Reason.NOT_OBSERVED) == 0)
         return replace(self, reason=np.where(hit, self.reason | int(reason), self.reason))
 
-    def screened(self, name: str, verdict: Screened, reason: Reason) -> CorrectedRanges:
-        """Return the ranges with the verdict of a screen, its rejects carrying the reason."""
-        return replace(self.rejected(verdict.reject, reason), screens={**self.screens, name: verdict})
-
-    def suspected(self, name: str, verdict: Screened, size_m: Floats) -> CorrectedRanges:
-        """Return the ranges with the verdict of a screen, its rejects weighted down by the error that it measured."""
-        sigma = suspicion_sigma_m(verdict.reject, size_m, self.sigma_m)
-        return replace(self, sigma_m=sigma, screens={**self.screens, name: verdict})
+    def judged(self, verdicts: Iterable[Verdict]) -> CorrectedRanges:
+        """Return the ranges with the verdicts of a screen: what fails is rejected, or weighted down."""
+        ranges = self
+        for verdict in verdicts:
+            reject = verdict.screened.reject
+            if verdict.error_m is None:
+                ranges = ranges.rejected(reject, verdict.reason)
+            else:
+                ranges = replace(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
+            ranges = replace(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
+        return ranges
 
     def ranges(self) -> Ranges:
         """Return the ranges without a reason against them, ready to be fitted."""
@@ -259,7 +262,7 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
     """
     trajectory = index.trajectory
     middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
-    rough = replace(config.single_point, tolerance_m=max(ANCHOR_TOLERANCE_M, config.single_point.tolerance_m))
+    rough = config.single_point.replaced(tolerance_m=max(ANCHOR_TOLERANCE_M, config.single_point.tolerance_m))
     point = single_point(ranges, middle, limits=rough)
     anchor = point.ecef_m.copy()
     found = np.flatnonzero(np.isfinite(anchor[:, 0]))

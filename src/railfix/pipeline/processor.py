@@ -13,12 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from railfix.core.reasons import Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import AlongTrack, FilterState, along_track
-from railfix.pipeline.antenna_pair import AntennaPair, antenna_pair_screened, pair_antennas
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_phase import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
@@ -31,7 +29,8 @@ from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
 from railfix.ranges.sbas import SbasMessages
-from railfix.screens import Screened, antenna_spacing_screen, cn0_screen, doppler_screen, elevation_screen
+from railfix.screens import SCREENS, ObservationScreen, PairedEpochs, PairScreen, PositionScreen, ScreenSetup
+from railfix.screens.pairs import on_pairs, pair_antennas
 from railfix.track.trajectory import Trajectory
 
 __all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "State"]
@@ -94,7 +93,12 @@ class EpochProcessor:
         self._channels = ChannelBook(config)
         self._index = {name: SearchIndex(t) for name, t in self.trajectories.items()}
         self._error_model = error_model
-        self._cn0_curve = cn0_curve
+        self._screens = tuple((s, getattr(config, s.name)) for s in SCREENS if s.name in config.screens)
+        self._setup = ScreenSetup(
+            antennas=len(self.trajectories),
+            spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
+            cn0_curve=cn0_curve,
+        )
         self._has_coordinates = with_coordinates(config)
         self._lacking = self._unable()
 
@@ -105,24 +109,13 @@ class EpochProcessor:
 
     def _unable(self) -> tuple[str, ...]:
         """Return one sentence for each part of the settings that cannot work as asked."""
-        screens, lacking = self.config.screens, []
-        if "cn0" in screens and self._cn0_curve is None:
-            floor = self.config.cn0.floor_dbhz
-            rest = "nothing is judged" if floor is None else f"the floor of {floor:g} dB-Hz alone judges"
-            lacking.append(f"screen cn0: asked for without a curve over elevation (cn0_curve), {rest}")
-        two = len(self.trajectories) > 1
-        bodies = all(t.body_chainage_m is not None for t in self.trajectories.values())
-        for name in ("antenna_pair", "antenna_spacing"):
-            if name in screens and two and not bodies:
-                lacking.append(
-                    f"screen {name}: asked for, but without a vehicle file the spacing is unknown; not judged"
-                )
+        notes = [note for screen, limits in self._screens for note in screen.notes(limits, self._setup)]
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
-            lacking.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
+            notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
         if self.config.protection == "on" and self.config.carrier == "float":
-            lacking.append("protection level: asked for, but there is none for positions from code and phase together")
-        return tuple(lacking)
+            notes.append("protection level: asked for, but there is none for positions from code and phase together")
+        return tuple(notes)
 
     def process(
         self,
@@ -172,16 +165,16 @@ class EpochProcessor:
         for name, part in observations.items():
             ranges[name], after[name] = self._screened(name, part, received, after.get(name, AntennaState()))
         pair = self._pair(ranges)
-        if pair is not None and "antenna_pair" in self.config.screens:
-            ranges = antenna_pair_screened(pair, ranges, self.config.antenna_pair)
+        if pair is not None:
+            ranges = self._pair_screened(pair, ranges)
         predicted: Mapping[str, PredictedPlace] = {}  # by antenna; from the filter along the track, once there is one
         solutions: dict[str, Solution] = {}
         for name, corrected in ranges.items():
             ranges[name], solutions[name], after[name] = solve(
                 corrected, self._index[name], self.config, after[name], predicted=predicted.get(name)
             )
-        if pair is not None and "antenna_spacing" in self.config.screens:
-            ranges, solutions = self._spacing_screened(pair, ranges, solutions)
+        if pair is not None:
+            ranges, solutions = self._positions_screened(pair, ranges, solutions)
         results = {
             name: antenna_result(corrected, self.trajectories[name], solutions[name], self.config)
             for name, corrected in ranges.items()
@@ -207,38 +200,14 @@ class EpochProcessor:
         """Return the corrected ranges of one antenna after its own screens, and its new state."""
         channels = self._channels.of(obs, received.navigation)
         ranges = correct_ranges(obs, channels, self.config, received, self._index[name], error_model=self._error_model)
-        if "elevation" in self.config.screens:
-            verdict = elevation_screen(ranges.elevation_deg, limits=self.config.elevation)
-            ranges = ranges.screened("elevation", verdict, Reason.ELEVATION_MASK)
-        if "cn0" in self.config.screens:
-            signals = cn0_screen(
-                ranges.cn0_dbhz,
-                ranges.elevation_deg,
-                satellite=ranges.satellite,
-                signal=ranges.signal,
-                limits=self.config.cn0,
-                curve=self._cn0_curve,
-            )
-            ranges = ranges.screened("cn0_floor", signals.floor, Reason.CN0_FLOOR)
-            ranges = ranges.screened("cn0_curve", signals.curve, Reason.CN0_CURVE)
-        if "doppler" in self.config.screens:
-            changes, doppler = doppler_screen(
-                obs.time,
-                np.where((ranges.reason & Reason.IMPLAUSIBLE_CODE) == 0, ranges.code_m, np.nan),
-                ranges.doppler_hz,
-                satellite=ranges.satellite,
-                signal=ranges.signal,
-                frequency_hz=ranges.frequency_hz,
-                break_before=obs.break_before,
-                code_sigma_m=ranges.sigma_m,
-                limits=self.config.doppler,
-                state=state.screens.get("doppler"),
-            )
-            if self.config.doppler.verdict == "reject":
-                ranges = ranges.screened("doppler", changes, Reason.DOPPLER)
-            else:
-                ranges = ranges.suspected("doppler", changes, np.fmax(np.abs(changes.level_m), changes.limit_m))
-            state = replace(state, screens={**state.screens, "doppler": doppler})
+        states = dict(state.screens)
+        for screen, limits in self._screens:
+            if isinstance(screen, ObservationScreen):
+                verdicts, after = screen.judge(ranges, limits, self._setup, states.get(screen.name))
+                ranges = ranges.judged(verdicts)
+                if after is not None:
+                    states[screen.name] = after
+        state = replace(state, screens=states)
         if self.config.carrier != "off":
             before = state.carrier or CarrierState()
             ranges, carrier = with_slips(ranges, received.navigation, self.config, before)
@@ -247,43 +216,48 @@ class EpochProcessor:
             state = replace(state, carrier=carrier)
         return ranges, state
 
-    def _pair(self, ranges: Mapping[str, CorrectedRanges]) -> AntennaPair | None:
+    def _pair(self, ranges: Mapping[str, CorrectedRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
-        if len(ranges) < 2 or any(self.trajectories[name].body_chainage_m is None for name in ranges):
+        if len(ranges) < 2 or not self._setup.spacing_known:
             return None
+        front, rear = ranges["front"], ranges["rear"]
         return pair_antennas(
-            ranges["front"],
-            ranges["rear"],
+            front,
+            rear,
+            front.anchor_ecef_m,
             self.trajectories["front"],
             self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )
 
-    def _spacing_screened(
-        self, pair: AntennaPair, ranges: Mapping[str, CorrectedRanges], solutions: Mapping[str, Solution]
+    def _pair_screened(self, pair: PairedEpochs, ranges: Mapping[str, CorrectedRanges]) -> dict[str, CorrectedRanges]:
+        """Return the ranges of both antennas after the screens of their common observations."""
+        judged = dict(ranges)
+        for screen, limits in self._screens:
+            if isinstance(screen, PairScreen):
+                verdicts = screen.judge(judged["front"], judged["rear"], pair, limits)
+                judged = {name: corrected.judged(verdicts[name]) for name, corrected in judged.items()}
+        return judged
+
+    def _positions_screened(
+        self, pair: PairedEpochs, ranges: Mapping[str, CorrectedRanges], solutions: Mapping[str, Solution]
     ) -> tuple[dict[str, CorrectedRanges], dict[str, Solution]]:
-        """Compare the positions of the two antennas; both get the status where they do not fit."""
+        """Return ranges and solutions after the screens of the published positions; both antennas get the status."""
+        judged, checked = dict(ranges), dict(solutions)
         chainage = {name: self.trajectories[name].chainage_at(solution.arc_m) for name, solution in solutions.items()}
-        along = np.nan_to_num(pair.spacing.along_m)
-        verdict = antenna_spacing_screen(
-            chainage["front"][pair.front_epoch],
-            chainage["rear"][pair.rear_epoch],
-            np.abs(along),
-            facing=np.sign(along).astype(int),
-            limits=self.config.antenna_spacing,
-        )
-        new_ranges, new_solutions = dict(ranges), dict(solutions)
-        for name, epochs in (("front", pair.front_epoch), ("rear", pair.rear_epoch)):
-            solution, metric = solutions[name], np.full(len(solutions[name].status), np.nan)
-            metric[epochs] = verdict.metric
-            reject = np.zeros(len(metric), dtype=bool)
-            reject[epochs] = verdict.reject
-            doubtful = reject & self._has_coordinates[solution.status]
-            status = np.where(doubtful, Status.ANTENNAS_DISAGREE, solution.status).astype(np.int8)
-            screens = {**ranges[name].screens, "antenna_spacing": Screened(metric=metric, reject=reject)}
-            new_ranges[name] = replace(ranges[name], screens=screens)
-            new_solutions[name] = replace(solution, status=status)
-        return new_ranges, new_solutions
+        for screen, limits in self._screens:
+            if not isinstance(screen, PositionScreen):
+                continue
+            front, rear = chainage["front"][pair.front_epoch], chainage["rear"][pair.rear_epoch]
+            verdict = screen.judge(front, rear, pair, limits)
+            for name, epochs in (("front", pair.front_epoch), ("rear", pair.rear_epoch)):
+                status = checked[name].status
+                screened = on_pairs(verdict, status.shape, epochs, epochs)
+                doubtful = screened.reject & self._has_coordinates[status]
+                status = np.where(doubtful, int(screen.status), status).astype(np.int8)
+                judged[name] = replace(judged[name], screens={**judged[name].screens, screen.name: screened})
+                checked[name] = replace(checked[name], status=status)
+        return judged, checked
 
 
 def conditions_of(config: Config) -> Conditions:

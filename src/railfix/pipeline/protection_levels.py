@@ -50,7 +50,7 @@ def risk_of(config: Config) -> RiskBudget:
     """The budget in force: with SBAS the satellites' own faults are its business, what is left is local."""
     if kind_of(config) == "separation":
         return config.risk
-    return replace(config.risk, satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
+    return config.risk.replaced(satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
 
 
 def protection_levels(

@@ -20,7 +20,7 @@ from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import AlongTrack, innovations
 from railfix.pipeline.protection_levels import KINDS
 from railfix.pipeline.results import AntennaResult, Result
-from railfix.screens import DopplerScreened
+from railfix.screens import SCREENS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,15 +38,22 @@ LEVEL_STATUS_TYPE: Final = pl.Enum([s.name.lower() for s in LevelStatus])
 CSV_DECIMALS_M: Final = 4
 CSV_DECIMALS_DEG: Final = 9
 
+
+def _screen_columns(table: str) -> dict[str, str]:
+    """Return the columns of a table that the screens fill, with their meaning."""
+    return {c.name: c.meaning for screen in SCREENS for c in screen.columns if c.table == table}
+
+
 #: Columns of the table of positions, with their unit and meaning.
 POSITION_COLUMNS: Final[dict[str, str]] = {
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
-    "status": "what became of the epoch",
+    "status": "see `railfix.core.reasons.Status`",
     "chainage_m": "distance along the line from the first point of the track",
     "kilometrage_m": "the line's own marking, where the track has one",
     "along_sigma_m": "standard deviation along the line",
-    "own_sigma_m": "standard deviation that the ranges of the epoch itself vouch for; `uncertain` over its limit",
+    "own_sigma_m": "single-epoch sigma: standard deviation from the codes of the epoch alone; "
+    "`uncertain` above its limit",
     "latitude_deg": "antenna, WGS 84",
     "longitude_deg": "antenna, WGS 84",
     "height_m": "antenna, above the ellipsoid",
@@ -78,7 +85,7 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
     "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
     "the place; `alarm`: the ranges contradict the level, or a check has failed",
-    "metric_antenna_spacing_m": "screen `antenna_spacing`: distance of the two positions less that of the antennas",
+    **_screen_columns("positions"),
     "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
     "conventional_offset_m": "distance of the 3-D single point from that point",
     "conventional_x_m": "3-D single point, ECEF",
@@ -100,10 +107,7 @@ OBSERVATION_COLUMNS: Final[dict[str, str]] = {
     "cn0_dbhz": "carrier-to-noise density",
     "sigma_m": "standard deviation that the weights assume",
     "corrected_code_m": "pseudorange, satellite clock, group delay and atmosphere applied",
-    "metric_cn0_deficit_dbhz": "screen `cn0`: mean at the elevation less C/N0",
-    "metric_doppler_m": "screen `doppler`: change of the pseudorange against its Doppler since the epoch before",
-    "limit_doppler_m": "screen `doppler`: what the size of that is compared with",
-    "metric_antenna_pair_m": "screen `antenna_pair`: pseudorange rear less front, against what their spacing explains",
+    **_screen_columns("observations"),
     "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty",
     "innovation_code_m": "filter along the track: code less what earlier epochs predict",
     "innovation_phase_m": "the same of the change of the carrier phase since the epoch before",
@@ -182,14 +186,14 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
 def _raim_columns(result: AntennaResult) -> dict[str, pl.Series]:
     """Verdicts on the positions: RAIM, and the spacing of the antennas."""
     words = pl.Series(values=[o.name.lower() for o in Outcome], dtype=OUTCOME_TYPE)
-    spacing = result.screens.get("antenna_spacing")
+    screens = _screen_arrays(result, "positions")
     return {
         "raim_outcome": words.gather(pl.Series(values=result.raim.outcome.astype(np.uint32))),
         "raim_statistic": float_column(result.raim.statistic),
         "raim_threshold": float_column(result.raim.threshold),
         "raim_level_m": float_column(result.raim.protection_level_m),
         **_protection_columns(result),
-        "metric_antenna_spacing_m": float_column(np.full(len(result), np.nan) if spacing is None else spacing.metric),
+        **{name: float_column(np.full(len(result), np.nan) if v is None else v) for name, v in screens.items()},
     }
 
 
@@ -295,23 +299,20 @@ def screen_metrics(result: AntennaResult) -> dict[str, Floats]:
     dict of str to ndarray, shape (T, M)
         NaN where a screen was off or could not judge. Elevation and C/N0 themselves are columns of the result.
     """
-    doppler = result.screens.get("doppler")
-    measured = {
-        "metric_cn0_deficit_dbhz": _metric(result, "cn0_curve"),
-        "metric_doppler_m": _metric(result, "doppler"),
-        "limit_doppler_m": doppler.limit_m if isinstance(doppler, DopplerScreened) else None,
-        "metric_antenna_pair_m": _metric(result, "antenna_pair"),
-        "raim_own_error_m": result.raim.own_error_m,
-    }
-    whole = {name: np.full(result.reason.shape, np.nan) for name in measured}
+    measured = _screen_arrays(result, "observations") | {"raim_own_error_m": result.raim.own_error_m}
+    on_all_channels = {name: np.full(result.reason.shape, np.nan) for name in measured}
     for name, values in measured.items():
         if values is not None:
-            whole[name][:, result.columns] = values
-    return whole
+            on_all_channels[name][:, result.columns] = values
+    return on_all_channels
 
 
-def _metric(result: AntennaResult, screen: str) -> Floats | None:
-    return result.screens[screen].metric if screen in result.screens else None
+def _screen_arrays(result: AntennaResult, table: str) -> dict[str, Floats | None]:
+    """Return the arrays of the columns that the screens fill; None where a screen is off."""
+    columns = [c for screen in SCREENS for c in screen.columns if c.table == table]
+    return {
+        c.name: getattr(result.screens[c.verdict], c.field) if c.verdict in result.screens else None for c in columns
+    }
 
 
 def observations_table(result: Result) -> pl.DataFrame:

@@ -12,14 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.settings import Settings
 from railfix.positioning.normal_equations import NormalEquations, Ranges, inverse_3x3, normal_equations
 from railfix.track.trajectory import Trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
-class ConstrainedLimits:
+class ConstrainedLimits(Settings):
     """Limits of the iteration along the line.
 
     Attributes
@@ -30,12 +31,8 @@ class ConstrainedLimits:
         Steps, walks into a neighbouring section included.
     """
 
-    tolerance_m: float = 5.0
-    max_iterations: int = 40
-
-    def __post_init__(self) -> None:
-        if not self.tolerance_m > 0 or self.max_iterations < 1:
-            raise ValueError("tolerance_m must be positive and max_iterations at least 1")
+    tolerance_m: float = Field(default=5.0, gt=0)
+    max_iterations: int = Field(default=40, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,10 +19,12 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
+from railfix.core.settings import Settings
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
@@ -40,8 +42,7 @@ _PASSES: Final = 3
 _TELLING: Final = 2.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class DopplerSpeedLimits:
+class DopplerSpeedLimits(Settings):
     """What is used, how it is weighed, what is refused.
 
     Attributes
@@ -61,17 +62,11 @@ class DopplerSpeedLimits:
     """
 
     mask_deg: float = 10.0
-    zenith_mps: float = 0.03
-    floor_mps: float = 0.02
-    outlier: float = 3.5
-    most_rejected: int = 8
-    min_satellites: int = 4
-
-    def __post_init__(self) -> None:
-        if not min(self.zenith_mps, self.floor_mps, self.outlier) > 0.0:
-            raise ValueError("zenith_mps, floor_mps and outlier must be positive")
-        if self.min_satellites < 3 or self.most_rejected < 0:
-            raise ValueError("min_satellites must be at least 3, most_rejected not negative")
+    zenith_mps: float = Field(default=0.03, gt=0)
+    floor_mps: float = Field(default=0.02, gt=0)
+    outlier: float = Field(default=3.5, gt=0)
+    most_rejected: int = Field(default=8, ge=0)
+    min_satellites: int = Field(default=4, ge=3)
 
 
 @dataclass(frozen=True, kw_only=True)

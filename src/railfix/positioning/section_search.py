@@ -23,10 +23,12 @@ from itertools import chain
 from typing import Final
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.settings import Settings
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -39,8 +41,7 @@ _ROTATION_GRADIENT: Final = 1.1e-5
 _FAN_OUT: Final = 8
 
 
-@dataclass(frozen=True, kw_only=True)
-class SectionLimits:
+class SectionLimits(Settings):
     """When a second place counts as possible.
 
     Attributes
@@ -59,16 +60,10 @@ class SectionLimits:
         remain (`PredictedPlace`).
     """
 
-    ambiguity_risk: float = 1e-3
-    separation_m: float = 30.0
-    redundancy: int = 2
-    predicted_sigmas: float = 6.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.ambiguity_risk < 1.0:
-            raise ValueError("ambiguity_risk is a probability between 0 and 1")
-        if self.separation_m < 0.0 or self.redundancy < 0:
-            raise ValueError("separation_m and redundancy must not be negative")
+    ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
+    separation_m: float = Field(default=30.0, ge=0)
+    redundancy: int = Field(default=2, ge=0)
+    predicted_sigmas: float = Field(default=6.0, gt=0)
 
     @cached_property
     def threshold(self) -> float:

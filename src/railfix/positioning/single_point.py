@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Indices
+from railfix.core.settings import Settings
 from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
 
 
-@dataclass(frozen=True, kw_only=True)
-class SinglePointLimits:
+class SinglePointLimits(Settings):
     """When an iteration counts as settled.
 
     Attributes
@@ -25,12 +26,8 @@ class SinglePointLimits:
     max_iterations : int
     """
 
-    tolerance_m: float = 1.0
-    max_iterations: int = 12
-
-    def __post_init__(self) -> None:
-        if not self.tolerance_m > 0 or self.max_iterations < 1:
-            raise ValueError("tolerance_m must be positive and max_iterations at least 1")
+    tolerance_m: float = Field(default=1.0, gt=0)
+    max_iterations: int = Field(default=12, ge=1)
 
 
 @dataclass(frozen=True, kw_only=True)

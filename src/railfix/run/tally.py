@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from railfix.core.arrays import Masks
-from railfix.core.reasons import Reason, Status, first_reason
+from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.pipeline.processor import AntennaResult, Result
 
 _NOT_A_REFUSAL = Reason.NOT_OBSERVED
@@ -94,8 +94,7 @@ class AntennaTally:
         first = first_reason(reason)
         self.observations += reason.size
         self.used += int(np.count_nonzero(reason == 0))
-        for bit in Reason:
-            name = str(bit.name).lower()
+        for bit, name in reason_names().items():
             if count := int(np.count_nonzero(first == bit)):
                 self.first_reason[name] += count
             if count := int(np.count_nonzero(reason == bit)):
@@ -122,9 +121,8 @@ class AntennaTally:
             return np.asarray(np.count_nonzero(left, axis=1) >= self.min_satellites)
 
         so_far, undecided = 0, np.ones(len(short), dtype=bool)
-        whole = sum(Reason)
-        for bit in Reason:
-            name = str(bit.name).lower()
+        whole = sum(reason_names())
+        for bit, name in reason_names().items():
             so_far |= bit
             lost = undecided & ~enough(so_far)
             self.short_first.update({name: int(lost.sum())})

@@ -1,7 +1,7 @@
-"""One file a screen: its limits, its function, what it says.
+"""Screens: one file each, with its limits, metric, verdict, reason, columns and picture.
 
-A screen measures something in physical units and says which observations fail. It never puts an
-observation back that another one refused, and it never acts: the pipeline does.
+A screen measures one quantity in physical units and returns which observations fail. It never puts an
+observation back that another one rejected, and it only judges: the pipeline acts. `SCREENS` lists them.
 """
 
 from __future__ import annotations
@@ -12,21 +12,36 @@ from railfix.screens.antenna_pair import (
     ambiguity_m,
     antenna_pair_screen,
     expected_difference_m,
-    on_channels,
-    pair_channels,
-    pair_epochs,
     spacing_direction,
 )
 from railfix.screens.antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
+from railfix.screens.base import (
+    AntennaRanges,
+    ObservationScreen,
+    PairedEpochs,
+    PairScreen,
+    PositionScreen,
+    RunTables,
+    Screen,
+    ScreenColumn,
+    Screened,
+    ScreenPicture,
+    ScreenSetup,
+    Verdict,
+    suspicion_sigma_m,
+)
 from railfix.screens.cn0 import Cn0Limits, Cn0Screened, cn0_screen
 from railfix.screens.doppler import DopplerScreened, DopplerState, doppler_screen
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m
 from railfix.screens.elevation import ElevationLimits, elevation_screen
-from railfix.screens.result import Screened, suspicion_sigma_m
+from railfix.screens.pairs import pair_channels, pair_epochs
+from railfix.screens.registry import SCREENS
 
 __all__ = [
+    "SCREENS",
     "AntennaPairLimits",
     "AntennaPairScreened",
+    "AntennaRanges",
     "AntennaSpacingLimits",
     "Cn0Limits",
     "Cn0Screened",
@@ -34,7 +49,17 @@ __all__ = [
     "DopplerScreened",
     "DopplerState",
     "ElevationLimits",
+    "ObservationScreen",
+    "PairScreen",
+    "PairedEpochs",
+    "PositionScreen",
+    "RunTables",
+    "Screen",
+    "ScreenColumn",
+    "ScreenPicture",
+    "ScreenSetup",
     "Screened",
+    "Verdict",
     "ambiguity_m",
     "antenna_pair_screen",
     "antenna_spacing_screen",
@@ -43,7 +68,6 @@ __all__ = [
     "doppler_screen",
     "elevation_screen",
     "expected_difference_m",
-    "on_channels",
     "pair_channels",
     "pair_epochs",
     "spacing_direction",

@@ -2,43 +2,56 @@
 
 The same satellite is further from the rear antenna than from the front one by the part of their
 spacing that points to it: ``L (cos el cos(az - heading) cos gradient + sin el sin gradient)``. A
-difference that does not fit has multipath in one of the two, and which one is not known.
+difference that does not fit has multipath in one of the two, which one is unknown.
 
 Clocks. P1 runs both receivers on one frequency standard, with one-pulse-per-second: then the
 difference has no clock in it. Otherwise the clock difference is the median over the satellites of a
 constellation, and an error of that median is common to them all. A clock difference also means that
-the two receivers looked at different instants, and so does a difference of the time tags: with range
-rates given, the satellites' way in between is taken out (1 ms is up to 0.8 m).
+the two receivers measured at different instants, and so does a difference of the time tags: with range
+rates given, the satellites' motion in between is removed (1 ms is up to 0.8 m).
 
-What the angles leave open. Gradient, sway and map leave the elevation open by 3 deg and the azimuth
-relative to the car body by 3.5 deg (P1). Multipath below the difference that these make is not found.
+Ambiguity of the angles. Gradient, sway and map leave the elevation uncertain by 3 deg and the azimuth
+relative to the car body by 3.5 deg (P1). Multipath below the difference that these explain is not detected.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
+from railfix.core.arrays import Floats, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.reasons import Reason
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.screens.base import (
+    AntennaRanges,
+    PairedEpochs,
+    PairScreen,
+    RunTables,
+    ScreenColumn,
+    Screened,
+    ScreenPicture,
+    Verdict,
+)
 from railfix.screens.medians import clock_columns, enough_satellites, row_median
-from railfix.screens.result import Screened
+from railfix.screens.pairs import on_pairs, pair_channels
 
-#: What each way to treat the clocks is called in the output.
+#: Treatments of the receiver clocks, as named in the output.
 CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
     "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class AntennaPairLimits:
+class AntennaPairLimits(Settings):
     """Limits of the screen by two antennas.
 
     Attributes
@@ -58,26 +71,13 @@ class AntennaPairLimits:
         them is wrong is not known, or it is rejected on both, as P1 does.
     """
 
-    limit_m: float = 5.0
-    elevation_error_deg: float = 3.0
-    azimuth_error_deg: float = 3.5
+    limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
+    azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
     clocks: Literal["common", "median"] = "median"
-    least_satellites: int = 4
-    tag_tolerance_s: float = 0.01
+    least_satellites: int = Field(default=4, ge=3)
+    tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
     verdict: Literal["weigh", "reject"] = "weigh"
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.limit_m < np.inf:
-            raise ValueError(f"limit_m must be positive and finite, got {self.limit_m}")
-        for name in ("elevation_error_deg", "azimuth_error_deg"):
-            if not 0.0 <= getattr(self, name) <= 90.0:
-                raise ValueError(f"{name} must lie in [0, 90], got {getattr(self, name)}")
-        if self.clocks not in CLOCKS:
-            raise ValueError(f"clocks must be one of {', '.join(CLOCKS)}, got {self.clocks!r}")
-        if self.least_satellites < 3:
-            raise ValueError(f"least_satellites must be at least 3 for a median, got {self.least_satellites}")
-        if not 0.0 <= self.tag_tolerance_s < 1.0:
-            raise ValueError(f"tag_tolerance_s must lie in [0, 1), got {self.tag_tolerance_s}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class AntennaPairScreened(Screened):
     expected_m : ndarray, shape (P, C) [m]
         Pseudorange of the rear antenna less that of the front one, from the spacing.
     ambiguity_m : ndarray, shape (P, C) [m]
-        What the errors of the angles explain; within it nothing is refused, whatever the limit.
+        What the errors of the angles explain; within it nothing is rejected, whatever the limit.
     clock_m : ndarray, shape (P, C) [m]
         Clock of the rear receiver less that of the front one, as taken out; 0 where common.
     clocks : str
@@ -100,65 +100,6 @@ class AntennaPairScreened(Screened):
     ambiguity_m: Floats
     clock_m: Floats
     clocks: str
-
-
-def pair_epochs(time_front: ArrayLike, time_rear: ArrayLike, *, tolerance_s: float) -> tuple[Indices, Indices]:
-    """Epochs of two receivers that belong together.
-
-    Parameters
-    ----------
-    time_front, time_rear : array_like of datetime64[ns], shapes (F,), (R,)
-        Rising.
-    tolerance_s : float [s]
-        Largest difference of the tags.
-
-    Returns
-    -------
-    index_front, index_rear : ndarray of int, shape (P,)
-        Each epoch is in one pair at most: with the nearest of the other that has it nearest too.
-    """
-    front = np.asarray(time_front, dtype="datetime64[ns]").astype(np.int64)
-    rear = np.asarray(time_rear, dtype="datetime64[ns]").astype(np.int64)
-    if not len(front) or not len(rear):
-        return np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)
-    to_rear, to_front = _nearest(front, rear), _nearest(rear, front)
-    at = np.arange(len(front))
-    mutual = to_front[to_rear] == at
-    close = np.abs(front - rear[to_rear]) <= round(tolerance_s * 1e9)
-    index = np.flatnonzero(mutual & close)
-    return index, to_rear[index]
-
-
-def _nearest(values: Integers, among: Integers) -> Indices:
-    """Index of the nearest of rising numbers, the earlier of two equally near."""
-    after = np.clip(np.searchsorted(among, values), 1, max(len(among) - 1, 1))
-    before = after - 1
-    after = np.minimum(after, len(among) - 1)
-    return np.where(np.abs(values - among[before]) <= np.abs(among[after] - values), before, after)
-
-
-def pair_channels(
-    satellite_front: Strings,
-    signal_front: Strings,
-    satellite_rear: Strings,
-    signal_rear: Strings,
-) -> tuple[Indices, Indices]:
-    """Channels of the same satellite and signal at both receivers, in the order of the front one's."""
-    rear = {key: m for m, key in enumerate(zip(satellite_rear.tolist(), signal_rear.tolist(), strict=True))}
-    keys = enumerate(zip(satellite_front.tolist(), signal_front.tolist(), strict=True))
-    pairs = [(m, rear[key]) for m, key in keys if key in rear]
-    both = np.array(pairs, dtype=np.intp).reshape(-1, 2)
-    return both[:, 0], both[:, 1]
-
-
-def on_channels(verdict: Masks, shape: tuple[int, int], epochs: Indices, channels: Indices) -> Masks:
-    """A verdict on pairs laid on one antenna's own epochs and channels, shape `shape`.
-
-    Both antennas get it: which of the two has the multipath is not known.
-    """
-    whole = np.zeros(shape, dtype=bool)
-    whole[np.ix_(epochs, channels)] = verdict
-    return whole
 
 
 def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
@@ -260,12 +201,12 @@ def antenna_pair_screen(
     range_rate_mps: ArrayLike | None = None,
     limits: AntennaPairLimits | None = None,
 ) -> AntennaPairScreened:
-    """Refuse satellites whose two pseudoranges do not differ as the antennas' places say.
+    """Reject satellites whose two pseudoranges do not differ as the places of the antennas require.
 
     Parameters
     ----------
     code_front_m, code_rear_m : array_like, shape (P, C) [m]
-        Pseudoranges of pairs of epochs (`pair_epochs`) and channels (`pair_channels`), raw or
+        Pseudoranges of pairs of epochs (`pairs.pair_epochs`) and channels (`pairs.pair_channels`), raw or
         corrected alike; NaN where absent.
     elevation_deg, azimuth_deg : array_like, shape (P, C) [deg]
     satellite : ndarray of str, shape (C,)
@@ -280,7 +221,7 @@ def antenna_pair_screen(
     Returns
     -------
     AntennaPairScreened
-        NaN metric, and no refusal, where a pseudorange is missing at either antenna, and, with
+        NaN metric, and no rejection, where a pseudorange is missing at either antenna, and, with
         clocks "median", where fewer than `least_satellites` of the clock are there.
     """
     limits = limits or AntennaPairLimits()
@@ -324,3 +265,59 @@ def _clock_difference(raw: Floats, rate: Floats, satellite: Strings, *, least: i
         enough = enough_satellites(np.isfinite(part), satellite[columns], least)
         clock[:, columns] = np.where(enough, second, np.nan)
     return clock
+
+
+class AntennaPairScreen(PairScreen[AntennaPairLimits]):
+    """Pseudorange difference of two antennas against their spacing; a misfit is rejected on both."""
+
+    name = "antenna_pair"
+    limits = AntennaPairLimits()
+    columns = (
+        ScreenColumn(
+            name="metric_antenna_pair_m",
+            meaning="screen `antenna_pair`: pseudorange rear less front, against what their spacing explains",
+            verdict="antenna_pair",
+        ),
+    )
+
+    def judge(
+        self, front: AntennaRanges, rear: AntennaRanges, pair: PairedEpochs, limits: AntennaPairLimits
+    ) -> Mapping[str, tuple[Verdict, ...]]:
+        """Return the verdict on a chunk, the same for both antennas."""
+        at_front, at_rear = pair.front_epoch, pair.rear_epoch
+        ours, theirs = pair_channels(front.satellite, front.signal, rear.satellite, rear.signal)
+        heading, gradient, length = spacing_direction(pair.front_ecef_m, pair.rear_ecef_m)
+        here = np.ix_(at_front, ours)
+        screened = antenna_pair_screen(
+            front.corrected_code_m[here],
+            rear.corrected_code_m[np.ix_(at_rear, theirs)],
+            front.elevation_deg[here],
+            front.azimuth_deg[here],
+            satellite=front.satellite[ours],
+            heading_deg=heading,
+            gradient_permille=gradient,
+            spacing_m=length,
+            tag_difference=rear.time[at_rear] - front.time[at_front],
+            range_rate_mps=-SPEED_OF_LIGHT / front.frequency_hz[ours] * front.doppler_hz[here],
+            limits=limits,
+        )
+        verdicts = {}
+        for name, antenna, epochs, channels in (("front", front, at_front, ours), ("rear", rear, at_rear, theirs)):
+            own = on_pairs(screened, antenna.reason.shape, epochs, channels)
+            error = own.metric if limits.verdict == "weigh" else None
+            verdict = Verdict(name=self.name, reason=Reason.ANTENNA_PAIR, screened=own, error_m=error)
+            verdicts[name] = (verdict,)
+        return verdicts
+
+    def pictures(self, tables: RunTables, limits: AntennaPairLimits) -> Iterator[tuple[str, ScreenPicture]]:
+        """Yield the differences against the limit."""
+        yield (
+            "antenna_pair",
+            ScreenPicture(
+                title="pseudoranges of two antennas",
+                label="rear less front less spacing [m]",
+                metric=tables.channels("metric_antenna_pair_m"),
+                reject=tables.rejected(Reason.ANTENNA_PAIR),
+                limit=limits.limit_m,
+            ),
+        )

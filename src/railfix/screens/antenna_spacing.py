@@ -1,21 +1,24 @@
 """Positions of the two antennas against their spacing along the track (P1 2.3(5), table 6: 5 m).
 
 The two positions come from different receivers and antennas, so that their distance is a check on
-both. Where it does not fit, one of them is wrong, which one is not known, and both are dropped.
+both. Where it does not fit, one of them is wrong, which one is unknown, and both are marked.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
-from railfix.screens.result import Screened
+from railfix.core.arrays import Floats
+from railfix.core.reasons import Status
+from railfix.core.settings import Settings
+from railfix.screens.base import PairedEpochs, PositionScreen, RunTables, ScreenColumn, Screened, ScreenPicture
 
 
-@dataclass(frozen=True, kw_only=True)
-class AntennaSpacingLimits:
+class AntennaSpacingLimits(Settings):
     """Limits of the check of two positions.
 
     Attributes
@@ -24,11 +27,7 @@ class AntennaSpacingLimits:
         Largest difference from the spacing; P1 table 6: 5.
     """
 
-    limit_m: float = 5.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.limit_m < np.inf:
-            raise ValueError(f"limit_m must be positive and finite, got {self.limit_m}")
+    limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
 
 
 def antenna_spacing_screen(
@@ -39,7 +38,7 @@ def antenna_spacing_screen(
     facing: ArrayLike = 1,
     limits: AntennaSpacingLimits | None = None,
 ) -> Screened:
-    """Refuse pairs of positions that are not as far apart along the track as the antennas.
+    """Reject pairs of positions that are not as far apart along the track as the antennas.
 
     Parameters
     ----------
@@ -57,7 +56,7 @@ def antenna_spacing_screen(
     -------
     Screened
         Shapes (P,). The metric is ``facing (front - rear) - spacing`` [m], positive where they are too
-        far apart; ``|front - rear| - spacing`` where facing is 0. Refused are both positions.
+        far apart; ``|front - rear| - spacing`` where facing is 0. Both positions are rejected.
     """
     limits = limits or AntennaSpacingLimits()
     apart = np.asarray(chainage_front_m, dtype=np.float64) - np.asarray(chainage_rear_m, dtype=np.float64)
@@ -65,6 +64,45 @@ def antenna_spacing_screen(
     if not np.isin(sign, (-1, 0, 1)).all():
         raise ValueError("facing must be 1 (rising chainage), -1 (falling) or 0 (unknown)")
     if (spacing < 0.0).any():
-        raise ValueError("spacing_m must not be negative; facing tells which of the two is ahead")
+        raise ValueError("spacing_m must not be negative; facing gives the order of the two")
     metric = np.where(sign == 0, np.abs(apart), sign * apart) - spacing
     return Screened(metric=metric, reject=np.abs(metric) > limits.limit_m)
+
+
+class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
+    """Spacing of the two positions against that of the antennas."""
+
+    name = "antenna_spacing"
+    limits = AntennaSpacingLimits()
+    status = Status.ANTENNAS_DISAGREE
+    columns = (
+        ScreenColumn(
+            name="metric_antenna_spacing_m",
+            meaning="screen `antenna_spacing`: distance of the two positions less that of the antennas",
+            verdict="antenna_spacing",
+            table="positions",
+        ),
+    )
+
+    def judge(
+        self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: AntennaSpacingLimits
+    ) -> Screened:
+        """Return metric and verdict of the pairs of positions; not ordered where the spacing is unknown."""
+        along = np.nan_to_num(pair.along_m)
+        return antenna_spacing_screen(
+            front_chainage_m, rear_chainage_m, np.abs(along), facing=np.sign(along).astype(int), limits=limits
+        )
+
+    def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:
+        """Yield the differences from the spacing against the limit."""
+        spacing = tables.epochs("metric_antenna_spacing_m")
+        yield (
+            "antenna_spacing",
+            ScreenPicture(
+                title="positions of two antennas",
+                label="distance less spacing [m]",
+                metric=spacing,
+                reject=np.abs(spacing) > limits.limit_m,
+                limit=limits.limit_m,
+            ),
+        )

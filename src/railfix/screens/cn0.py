@@ -2,29 +2,41 @@
 
 Reflected, bent and shaded signals are weak. A limit that is the same for all elevations either lets
 bad signals of high satellites pass or loses good ones of low satellites, so P1 measures the mean over
-elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and refuses what
+elevation for the antenna and receiver on a day of open sky (`railfix.ranges.cn0_curve`), and rejects what
 lies 10 dB-Hz below it; and, for all satellites alike, what lies below 30 dB-Hz (table 6).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from railfix.core.arrays import Strings
+from railfix.core.reasons import Reason
+from railfix.core.settings import Settings
 from railfix.ranges.cn0_curve import Cn0Curve
-from railfix.screens.result import Screened
+from railfix.screens.base import (
+    AntennaRanges,
+    ObservationScreen,
+    RunTables,
+    ScreenColumn,
+    Screened,
+    ScreenPicture,
+    ScreenSetup,
+    Verdict,
+)
 
-#: What `Cn0Screened.judged_by` says of a channel.
+#: Values of `Cn0Screened.judged_by`.
 BY_BOTH, BY_CURVE, BY_FLOOR, BY_NOTHING = "curve and floor", "curve", "floor", "nothing"
 _WORDS: Final = np.array([BY_NOTHING, BY_FLOOR, BY_CURVE, BY_BOTH])
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cn0Limits:
+class Cn0Limits(Settings):
     """Limits of the screen of signal strength.
 
     Attributes
@@ -33,19 +45,13 @@ class Cn0Limits:
         Largest deficit against the mean at the elevation; P1 table 6: 10. None switches the
         curve off.
     floor_dbhz : float or None [dB-Hz]
-        Weakest signal used; P1 table 6: 30, for its receivers. C/N0 is measured differently by each
-        receiver: 30 refuses over half of the signals of an M8T in a city, where 20 to 25 fits. None
-        switches the floor off.
+        Weakest signal used; None, the default, switches the floor off. P1 table 6: 30, for its receivers. C/N0 is
+        measured differently by each receiver: 30 rejects over half of the signals of an M8T in a city, where 20 to 25
+        fits.
     """
 
-    deficit_dbhz: float | None = 10.0
-    floor_dbhz: float | None = 30.0
-
-    def __post_init__(self) -> None:
-        if self.deficit_dbhz is not None and not 0.0 < self.deficit_dbhz < np.inf:
-            raise ValueError(f"deficit_dbhz must be positive and finite, or None, got {self.deficit_dbhz}")
-        if self.floor_dbhz is not None and not 0.0 < self.floor_dbhz < 100.0:
-            raise ValueError(f"floor_dbhz must lie between 0 and 100, or be None, got {self.floor_dbhz}")
+    deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
+    floor_dbhz: float | None = Field(default=None, gt=0.0, lt=100.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,17 +95,17 @@ def cn0_screen(
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
 ) -> Cn0Screened:
-    """Refuse signals that are too weak.
+    """Reject signals that are too weak.
 
     Parameters
     ----------
     cn0_dbhz : array_like, shape (T, M) [dB-Hz]
-        NaN where the log does not tell: not judged.
+        NaN where the log has none: not judged.
     elevation_deg : array_like, shape (T, M) [deg]
     satellite, signal : ndarray of str, shape (M,)
     limits : Cn0Limits, optional
     curve : Cn0Curve, optional
-        Without one the floor alone judges, and `judged_by` says so.
+        Without one only the floor is applied (`judged_by`).
 
     Returns
     -------
@@ -120,3 +126,72 @@ def cn0_screen(
         curve=Screened(metric=deficit, reject=none if limits.deficit_dbhz is None else deficit > limits.deficit_dbhz),
         judged_by=_WORDS[2 * by_curve + (limits.floor_dbhz is not None)],
     )
+
+
+class Cn0Screen(ObservationScreen[Cn0Limits]):
+    """Signal strength: a floor, and a curve over elevation."""
+
+    name = "cn0"
+    limits = Cn0Limits()
+    needs = "a curve over elevation (cn0_curve) or a floor"
+    columns = (
+        ScreenColumn(
+            name="metric_cn0_deficit_dbhz",
+            meaning="screen `cn0`: mean at the elevation less C/N0",
+            verdict="cn0_curve",
+        ),
+    )
+
+    def unable(self, limits: Cn0Limits, setup: ScreenSetup) -> bool:
+        """Return whether there is neither a curve nor a floor."""
+        return setup.cn0_curve is None and limits.floor_dbhz is None
+
+    def notes(self, limits: Cn0Limits, setup: ScreenSetup) -> tuple[str, ...]:
+        """Return a note where there is no curve."""
+        if setup.cn0_curve is not None or limits.floor_dbhz is None:
+            return super().notes(limits, setup)
+        return (f"screen cn0: no curve over elevation (cn0_curve), only the floor of {limits.floor_dbhz:g} dB-Hz used",)
+
+    def judge(
+        self, antenna: AntennaRanges, limits: Cn0Limits, setup: ScreenSetup, state: Any
+    ) -> tuple[tuple[Verdict, ...], Any]:
+        """Return the verdicts of floor and curve on a chunk; the screen has no memory."""
+        result = cn0_screen(
+            antenna.cn0_dbhz,
+            antenna.elevation_deg,
+            satellite=antenna.satellite,
+            signal=antenna.signal,
+            limits=limits,
+            curve=setup.cn0_curve,
+        )
+        return (
+            Verdict(name="cn0_floor", reason=Reason.CN0_FLOOR, screened=result.floor),
+            Verdict(name="cn0_curve", reason=Reason.CN0_CURVE, screened=result.curve),
+        ), state
+
+    def pictures(self, tables: RunTables, limits: Cn0Limits) -> Iterator[tuple[str, ScreenPicture]]:
+        """Yield C/N0 against the floor, and the deficits against their limit."""
+        if limits.floor_dbhz is not None:
+            yield (
+                "cn0_floor",
+                ScreenPicture(
+                    title="signal strength, floor",
+                    label="C/N0 [dB-Hz]",
+                    metric=tables.channels("cn0_dbhz"),
+                    reject=tables.rejected(Reason.CN0_FLOOR),
+                    limit=limits.floor_dbhz,
+                    sides="below",
+                ),
+            )
+        if limits.deficit_dbhz is not None:
+            yield (
+                "cn0_curve",
+                ScreenPicture(
+                    title="signal strength against an open sky",
+                    label="mean at the elevation less C/N0 [dB]",
+                    metric=tables.channels("metric_cn0_deficit_dbhz"),
+                    reject=tables.rejected(Reason.CN0_CURVE),
+                    limit=limits.deficit_dbhz,
+                    sides="above",
+                ),
+            )

@@ -1,11 +1,11 @@
 """Change of the pseudorange against the Doppler (P1 2.3(2), figure 4, table 6: 1.5 m).
 
 Over a short interval the range changes by the mean of the two Dopplers times interval and
-wavelength. The Doppler is hardly touched by multipath, so a pseudorange that changes otherwise has
-jumped. The screen sees *changes*: a multipath error that stays is invisible to it.
+wavelength. The Doppler is little affected by multipath, so a pseudorange that changes otherwise has
+jumped. The screen detects *changes*: it cannot detect a constant multipath error.
 
 Receiver clock. A step of the clock moves all pseudoranges alike, and the median over the satellites
-of a constellation takes it out. A step also spoils the interval: time tags are told by the
+of a constellation removes it. A step also falsifies the interval: time tags are those of the
 receiver's clock, so between two tags ``dt - step`` has really passed, and 4 ms times a range rate of
 800 m/s are 3.2 m that differ from satellite to satellite. The interval is therefore corrected by the
 step that the codes themselves show, before the Doppler is applied.
@@ -13,18 +13,29 @@ step that the codes themselves show, before the Doppler is applied.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
+from railfix.screens.base import (
+    AntennaRanges,
+    ObservationScreen,
+    RunTables,
+    ScreenColumn,
+    Screened,
+    ScreenPicture,
+    ScreenSetup,
+    Verdict,
+)
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
 from railfix.screens.medians import clock_columns, enough_satellites, row_median
-from railfix.screens.result import Screened
 
 _NS: Final = 1e9
 
@@ -101,23 +112,22 @@ def doppler_screen(
     limits: DopplerLimits | None = None,
     state: DopplerState | None = None,
 ) -> tuple[DopplerScreened, DopplerState]:
-    """Refuse pseudoranges that changed otherwise than their Doppler says.
+    """Reject pseudoranges whose change differs from that of their Doppler.
 
     The metric is ``(code_k - code_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt`` less its median over the
     channels of one receiver clock (GPS and QZSS share one).
 
-    Which of the two epochs was the bad one, a single difference does not tell. A satellite that
-    jumps beyond the limit is suspected and refused, and its jumps are added up to a level. When the
-    level is back within the limit, the satellite is where it was before and is used again at once
-    (its jump back is beyond the limit, and not refused). When `hold_s` has passed without that, the
-    new level is taken as the good one. So a passing reflection costs its own epochs, and the end of a
-    reflection that was there from the first epoch on costs `hold_s` of good ones.
+    A single difference does not show which of its two epochs is faulty. A satellite that jumps beyond the
+    limit is suspected and rejected, and its jumps are summed to a level. When the level is back within the
+    limit, the satellite is used again at once (its jump back is beyond the limit, and not rejected). When
+    `hold_s` has passed without that, the new level is taken as correct. So a passing reflection costs its own
+    epochs, and the end of a reflection present from the first epoch on costs `hold_s` of good ones.
 
     Parameters
     ----------
     time : array_like of datetime64[ns], shape (T,)
     code_m, doppler_hz : array_like, shape (T, M) [m], [Hz]
-        NaN where absent. Codes that cannot be one (0, 1e9) are the caller's to leave out.
+        NaN where absent. Implausible codes (0, 1e9) must be left out by the caller.
     satellite, signal : ndarray of str, shape (M,)
     frequency_hz : array_like, shape (M,) [Hz]
         Carrier; NaN where unknown: not judged.
@@ -132,7 +142,7 @@ def doppler_screen(
     Returns
     -------
     DopplerScreened
-        NaN metric, and no refusal, where there is no epoch before within `longest_interval_s`, where
+        NaN metric, and no rejection, where there is no epoch before within `longest_interval_s`, where
         the satellite lacks code or Doppler at either epoch, and where its clock has fewer than
         `least_satellites` satellites. A suspicion ends there: the level is lost.
     DopplerState
@@ -215,7 +225,7 @@ def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *
     metric = np.full(change.shape, np.nan)
     for columns in clock_columns(satellite):
         raw = change[:, columns] - rate[:, columns] * interval[:, None]
-        # what the clock stepped by was not time that passed
+        # the receiver clock's step is not elapsed time
         passed = interval[:, None] - row_median(raw) / SPEED_OF_LIGHT
         raw = change[:, columns] - rate[:, columns] * passed
         enough = enough_satellites(np.isfinite(raw), satellite[columns], least)
@@ -240,7 +250,7 @@ def _limit_m(
 def _suspicion(
     time: Datetimes, metric: Floats, limit: Floats, before: DopplerState, *, hold_s: float
 ) -> tuple[Masks, Floats, Datetimes]:
-    """Refusals, levels, and since when the satellites suspected at the end are; a loop over jumps only.
+    """Return rejections, levels, and start of suspicion of the satellites suspected at the end; a loop over jumps only.
 
     Levels are summed from the jump on, one after the other, so that a cut between does not show.
     """
@@ -275,3 +285,60 @@ def _suspicion(
             k, old = int(starts[i]), 0.0
             start = time[k]
     return reject, level, since
+
+
+class DopplerScreen(ObservationScreen[DopplerLimits]):
+    """Change of the pseudorange against the Doppler."""
+
+    name = "doppler"
+    limits = DopplerLimits()
+    needs = "the Doppler of three satellites of a constellation at successive epochs"
+    columns = (
+        ScreenColumn(
+            name="metric_doppler_m",
+            meaning="screen `doppler`: change of the pseudorange against its Doppler since the epoch before",
+            verdict="doppler",
+        ),
+        ScreenColumn(
+            name="limit_doppler_m",
+            meaning="screen `doppler`: limit on the size of that",
+            verdict="doppler",
+            field="limit_m",
+        ),
+    )
+
+    def judge(
+        self,
+        antenna: AntennaRanges,
+        limits: DopplerLimits,
+        setup: ScreenSetup,  # noqa: ARG002
+        state: Any,
+    ) -> tuple[tuple[Verdict, ...], Any]:
+        """Return the verdict on a chunk, and the last epoch with the satellites under suspicion."""
+        screened, after = doppler_screen(
+            antenna.time,
+            np.where((antenna.reason & Reason.IMPLAUSIBLE_CODE) == 0, antenna.code_m, np.nan),
+            antenna.doppler_hz,
+            satellite=antenna.satellite,
+            signal=antenna.signal,
+            frequency_hz=antenna.frequency_hz,
+            break_before=antenna.break_before,
+            code_sigma_m=antenna.sigma_m,
+            limits=limits,
+            state=state,
+        )
+        error = np.fmax(np.abs(screened.level_m), screened.limit_m) if limits.verdict == "weigh" else None
+        return (Verdict(name="doppler", reason=Reason.DOPPLER, screened=screened, error_m=error),), after
+
+    def pictures(self, tables: RunTables, limits: DopplerLimits) -> Iterator[tuple[str, ScreenPicture]]:  # noqa: ARG002
+        """Yield the changes against their limits."""
+        yield (
+            "doppler",
+            ScreenPicture(
+                title="pseudorange against Doppler",
+                label="change of the pseudorange less Doppler [m]",
+                metric=tables.channels("metric_doppler_m"),
+                reject=tables.rejected(Reason.DOPPLER),
+                limit=tables.channels("limit_doppler_m"),
+            ),
+        )

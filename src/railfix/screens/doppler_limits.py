@@ -13,7 +13,7 @@ The jerk of satellites (below 1e-4 m/s^3) and the ionosphere (below 0.01 m/s) ar
 
 Receivers differ by more than the interval does: the changes of a geodetic receiver have a standard
 deviation of 0.1 to 0.2 m at 1 s, those of u-blox receivers in a city 0.7 to 1.2 m, those of a phone
-5 m. Three modes say what is done about it:
+5 m. There are three modes:
 
 "fixed"
     P1's limit, the same for all, widened with the interval.
@@ -29,13 +29,14 @@ deviation of 0.1 to 0.2 m at 1 s, those of u-blox receivers in a city 0.7 to 1.2
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from railfix.core.arrays import Floats
+from railfix.core.settings import Settings
 from railfix.screens.medians import row_median
 
 #: Median of the absolute value of a unit normal variable.
@@ -46,13 +47,13 @@ _FINEST_M: Final = 1e-3
 _LEAST_CHANGES: Final = 5
 
 
-@dataclass(frozen=True, kw_only=True)
-class DopplerLimits:
+class DopplerLimits(Settings):
     """Limits of the Doppler screen.
 
     Attributes
     ----------
     mode : {"fixed", "receiver", "sigma"}
+        "fixed" is P1's; see the module.
     step_m : float [m]
         Largest change against the Doppler up to `short_interval_s`; P1 table 6: 1.5.
     short_interval_s : float [s]
@@ -60,18 +61,18 @@ class DopplerLimits:
     correlation_s : float [s]
         Time over which the receiver smooths its codes. 1 s gives 2.9 m at 1 s.
     jerk_mps3 : float [m/s^3]
-        Change of acceleration of the vehicle that must not trip the screen; trains stay below 1.
+        Largest jerk of the vehicle that must not cause a rejection; trains stay below 1.
     factor : float
         Modes "receiver" and "sigma": standard deviations.
     doppler_sigma_mps : float [m/s]
         Mode "sigma": standard deviation of a range rate from the Doppler.
     prior_epochs : float
-        Mode "receiver": epochs that the fixed limit counts for while the scale is being found.
+        Mode "receiver": weight of the fixed limit in the estimate of the scale, in epochs.
     longest_interval_s : float [s]
         Over a longer interval the screen cannot judge.
     hold_s : float [s]
-        How long a satellite stays refused after a jump unless it comes back to its old level; 0
-        refuses the epoch of a jump only, and the jump back too, which is P1's test to the letter.
+        Time for which a satellite stays rejected after a jump unless it returns to its old level; 0
+        rejects only the epochs of the jumps out and back, which is exactly P1's test.
     least_satellites : int
         Satellites of one clock needed to take its step out.
     verdict : {"weigh", "reject"}
@@ -80,30 +81,18 @@ class DopplerLimits:
         the geometry without one turns a few metres into a hundred; a weight does not.
     """
 
-    mode: Literal["fixed", "receiver", "sigma"] = "fixed"
-    step_m: float = 1.5
-    short_interval_s: float = 0.2
-    correlation_s: float = 1.0
-    jerk_mps3: float = 1.0
-    factor: float = 5.0
-    doppler_sigma_mps: float = 0.1
-    prior_epochs: float = 10.0
-    longest_interval_s: float = 2.5
-    hold_s: float = 2.0
-    least_satellites: int = 3
+    mode: Literal["fixed", "receiver", "sigma"] = "receiver"
+    step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
+    short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
+    correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
+    jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
+    factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
+    prior_epochs: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    longest_interval_s: float = Field(default=2.5, gt=0.0, allow_inf_nan=False)
+    hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
+    least_satellites: int = Field(default=3, ge=3)
     verdict: Literal["weigh", "reject"] = "weigh"
-
-    def __post_init__(self) -> None:
-        if self.mode not in ("fixed", "receiver", "sigma"):
-            raise ValueError(f"mode must be 'fixed', 'receiver' or 'sigma', got {self.mode!r}")
-        for name in ("step_m", "short_interval_s", "correlation_s", "factor", "longest_interval_s", "prior_epochs"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)}")
-        for name in ("jerk_mps3", "doppler_sigma_mps", "hold_s"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)}")
-        if self.least_satellites < 3:
-            raise ValueError(f"least_satellites must be at least 3 for a median, got {self.least_satellites}")
 
 
 def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = None) -> Floats:

@@ -2,45 +2,80 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
-from railfix.screens.result import Screened
+from railfix.core.reasons import Reason
+from railfix.core.settings import Settings
+from railfix.screens.base import (
+    AntennaRanges,
+    ObservationScreen,
+    RunTables,
+    Screened,
+    ScreenPicture,
+    ScreenSetup,
+    Verdict,
+)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ElevationLimits:
+class ElevationLimits(Settings):
     """Limits of the elevation mask.
 
     Attributes
     ----------
     mask_deg : float
-        Satellites below are refused; P1 3.3 and table 6 use 20.
+        Satellites below are rejected; P1 3.3 and table 6 use 20.
     """
 
-    mask_deg: float = 20.0
-
-    def __post_init__(self) -> None:
-        if not -90.0 <= self.mask_deg < 90.0:
-            raise ValueError(f"mask_deg must lie in [-90, 90), got {self.mask_deg}")
+    mask_deg: float = Field(default=20.0, ge=-90.0, lt=90.0)
 
 
 def elevation_screen(elevation_deg: ArrayLike, *, limits: ElevationLimits | None = None) -> Screened:
-    """Refuse satellites below the mask.
+    """Reject satellites below the mask; the metric is the elevation [deg].
 
     Parameters
     ----------
     elevation_deg : array_like, shape (T, M) [deg]
-        NaN where unknown: not judged here.
+        NaN where unknown: not judged.
     limits : ElevationLimits, optional
-
-    Returns
-    -------
-    Screened
-        The metric is the elevation [deg].
     """
     limits = limits or ElevationLimits()
     metric = np.asarray(elevation_deg, dtype=np.float64)
     return Screened(metric=metric, reject=metric < limits.mask_deg)
+
+
+class ElevationScreen(ObservationScreen[ElevationLimits]):
+    """Elevation mask."""
+
+    name = "elevation"
+    limits = ElevationLimits()
+    needs = "navigation records"
+
+    def judge(
+        self,
+        antenna: AntennaRanges,
+        limits: ElevationLimits,
+        setup: ScreenSetup,  # noqa: ARG002
+        state: Any,
+    ) -> tuple[tuple[Verdict, ...], Any]:
+        """Return the verdict on a chunk; the screen has no memory."""
+        screened = elevation_screen(antenna.elevation_deg, limits=limits)
+        return (Verdict(name="elevation", reason=Reason.ELEVATION_MASK, screened=screened),), state
+
+    def pictures(self, tables: RunTables, limits: ElevationLimits) -> Iterator[tuple[str, ScreenPicture]]:
+        """Yield the elevations against the mask."""
+        yield (
+            "elevation",
+            ScreenPicture(
+                title="elevation mask",
+                label="elevation [deg]",
+                metric=tables.channels("elevation_deg"),
+                reject=tables.rejected(Reason.ELEVATION_MASK),
+                limit=limits.mask_deg,
+                sides="below",
+            ),
+        )

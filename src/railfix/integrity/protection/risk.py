@@ -9,16 +9,17 @@ P1 2.4 sets out from 1e-7 an hour (RTCA DO-229D).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, model_validator
 from scipy.special import ndtri
 from scipy.stats import norm
 
 from railfix.core.arrays import Floats
+from railfix.core.settings import Settings
 
 #: RTCA DO-229D appendix J, horizontal, precision approach: one dimension, 2e-9 an approach.
 K_H_PA: Final = 6.0
@@ -58,8 +59,11 @@ def one_sided_k(probability: Floats) -> Floats:
     return np.asarray(-ndtri(np.clip(probability, 0.0, 1.0)))
 
 
-@dataclass(frozen=True, kw_only=True)
-class RiskBudget:
+#: A probability below 1.
+Probability = Annotated[float, Field(ge=0, lt=1)]
+
+
+class RiskBudget(Settings):
     """Integrity risk, its shares, and the probabilities of faults.
 
     Attributes
@@ -88,31 +92,23 @@ class RiskBudget:
         named has none, and the level does not cover one.
     """
 
-    risk_per_hour: float = 1e-7
-    samples_per_hour: float = 360.0
-    fault_free_share: float = 1.0 / 3.0
-    one_fault_share: float = 1.0 / 3.0
-    two_fault_share: float = 1.0 / 3.0
-    exclusion_share: float = 0.1
-    false_alarm: float = 1e-3
-    satellite_prior: Mapping[str, float] = field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    local_prior: float = 1e-5
-    constellation_prior: Mapping[str, float] = field(default_factory=dict)
+    risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
+    samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
+    fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
+    one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
+    two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
+    exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
+    false_alarm: float = Field(default=1e-3, gt=0, lt=1)
+    satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
+    local_prior: float = Field(default=1e-5, ge=0, lt=1)
+    constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for name in ("risk_per_hour", "false_alarm"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name} is a probability between 0 and 1, got {getattr(self, name)}")
-        if not 0.0 < self.samples_per_hour < np.inf:
-            raise ValueError(f"samples_per_hour must be positive, got {self.samples_per_hour}")
+    @model_validator(mode="after")
+    def _shares_up_to_one(self) -> Self:
         shares = (self.fault_free_share, self.one_fault_share, self.two_fault_share)
-        if not (min(shares) > 0.0 and sum(shares) <= 1.0 + 1e-12):
-            raise ValueError(f"the three shares must be positive and add up to 1 at most, got {shares}")
-        if not 0.0 <= self.exclusion_share < 0.5:
-            raise ValueError(f"exclusion_share lies from 0 to below 0.5, got {self.exclusion_share}")
-        priors = [self.local_prior, *self.satellite_prior.values(), *self.constellation_prior.values()]
-        if not all(0.0 <= p < 1.0 for p in priors):
-            raise ValueError("every prior is a probability from 0 to below 1")
+        if sum(shares) > 1.0 + 1e-12:
+            raise ValueError(f"the three shares must add up to 1 at most, got {shares}")
+        return self
 
     @property
     def risk_per_sample(self) -> float:

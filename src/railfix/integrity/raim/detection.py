@@ -9,20 +9,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Final, Literal
+from typing import Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, model_validator
 from scipy.stats import chi2
 
 from railfix.core.arrays import Floats, Integers, Masks
+from railfix.core.settings import Settings
 
 #: Degrees of freedom are tabulated in steps of this many.
 _TABLE_STEP: Final = 64
 
 
-@dataclass(frozen=True, kw_only=True)
-class RaimLimits:
+class RaimLimits(Settings):
     """Limits of detection, exclusion and reliability.
 
     Attributes
@@ -58,36 +59,22 @@ class RaimLimits:
     """
 
     mode: Literal["chi_square", "fixed"] = "chi_square"
-    false_alarm: float = 1e-3
-    missed_detection: float = 1e-3
-    fixed_limit_m2: float = 100.0
-    max_excluded: int = 2
-    min_redundancy: int = 1
-    separation_risk: float = 1e-3
-    same_position_m: float = 0.0
-    noise_risk: float = 1e-3
-    alarm_limit_m: float = 20.0
-    faults: int = 1
+    false_alarm: float = Field(default=1e-3, gt=0, lt=1)
+    missed_detection: float = Field(default=1e-3, gt=0, lt=1)
+    fixed_limit_m2: float = Field(default=100.0, gt=0)
+    max_excluded: int = Field(default=2, ge=0, le=2)
+    min_redundancy: int = Field(default=1, ge=1)
+    separation_risk: float = Field(default=1e-3, gt=0, le=1)
+    same_position_m: float = Field(default=0.0, ge=0)
+    noise_risk: float = Field(default=1e-3, gt=0, le=1)
+    alarm_limit_m: float = Field(default=20.0, gt=0)
+    faults: int = Field(default=1, ge=1, le=2)
 
-    def __post_init__(self) -> None:
-        if self.mode not in ("chi_square", "fixed"):
-            raise ValueError(f"mode is chi_square or fixed, got {self.mode!r}")
-        for name in ("false_alarm", "missed_detection"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise ValueError(f"{name} is a probability between 0 and 1, got {getattr(self, name)}")
+    @model_validator(mode="after")
+    def _rates_below_one(self) -> Self:
         if not self.false_alarm + self.missed_detection < 1.0:
             raise ValueError("false_alarm and missed_detection must add up to less than 1")
-        for name in ("separation_risk", "noise_risk"):
-            if not 0.0 < getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} is a probability above 0, at most 1, got {getattr(self, name)}")
-        if self.max_excluded not in (0, 1, 2):
-            raise ValueError(f"max_excluded is 0, 1 or 2, got {self.max_excluded}")
-        if self.faults not in (1, 2):
-            raise ValueError(f"faults is 1 or 2, got {self.faults}")
-        if self.min_redundancy < 1:
-            raise ValueError(f"min_redundancy must be at least 1, got {self.min_redundancy}")
-        if not (self.fixed_limit_m2 > 0.0 and self.alarm_limit_m > 0.0 and self.same_position_m >= 0.0):
-            raise ValueError("fixed_limit_m2 and alarm_limit_m must be positive, same_position_m not negative")
+        return self
 
     @cached_property
     def separation(self) -> float:

@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import (
     Linearised,
@@ -35,8 +37,7 @@ from railfix.track.trajectory import Trajectory
 FREE_AMBIGUITY_M: Final = 1e4
 
 
-@dataclass(frozen=True, kw_only=True)
-class PhaseLimits:
+class PhaseLimits(Settings):
     """How phases are trusted, and for how long.
 
     Attributes
@@ -69,25 +70,14 @@ class PhaseLimits:
     """
 
     clocks: PhaseClocks = "own"
-    drift_m: float = 0.01
-    hop_s: float = 10.0
-    correlation_s: float = 20.0
-    tolerance_m: float = 1e-4
-    max_iterations: int = 8
-    passes: int = 2
-    forget_s: float = 600.0
-    largest_sigma_m: float = 1e3
-
-    def __post_init__(self) -> None:
-        for name in ("hop_s", "tolerance_m", "forget_s", "largest_sigma_m"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if not (self.drift_m >= 0.0 and self.correlation_s >= 0.0):
-            raise ValueError("drift_m and correlation_s must not be negative")
-        if self.max_iterations < 1 or self.passes < 1:
-            raise ValueError("max_iterations and passes must be at least 1")
-        if self.clocks not in ("own", "shared"):
-            raise ValueError(f"clocks must be own or shared, got {self.clocks!r}")
+    drift_m: float = Field(default=0.01, ge=0)
+    hop_s: float = Field(default=10.0, gt=0)
+    correlation_s: float = Field(default=20.0, ge=0)
+    tolerance_m: float = Field(default=1e-4, gt=0)
+    max_iterations: int = Field(default=8, ge=1)
+    passes: int = Field(default=2, ge=1)
+    forget_s: float = Field(default=600.0, gt=0)
+    largest_sigma_m: float = Field(default=1e3, gt=0)
 
 
 def hop_of(time: Datetimes, limits: PhaseLimits) -> Integers:

@@ -11,15 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.geodesy import range_with_rotation
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
-class ContinuityLimits:
+class ContinuityLimits(Settings):
     """Limits of the test.
 
     Attributes
@@ -40,21 +41,14 @@ class ContinuityLimits:
         Longest interval that is judged.
     """
 
-    phase_m: float = 0.012
-    drift_mps: float = 0.008
-    aside_m: float = 0.02
-    across_share: float = 0.02
-    up_share: float = 0.003
-    sigmas: float = 4.5
-    refused: int = 8
-    max_gap_s: float = 31.0
-
-    def __post_init__(self) -> None:
-        for name in ("phase_m", "drift_mps", "aside_m", "across_share", "up_share", "sigmas", "max_gap_s"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        if self.refused < 0:
-            raise ValueError(f"refused must not be negative, got {self.refused}")
+    phase_m: float = Field(default=0.012, gt=0)
+    drift_mps: float = Field(default=0.008, gt=0)
+    aside_m: float = Field(default=0.02, gt=0)
+    across_share: float = Field(default=0.02, gt=0)
+    up_share: float = Field(default=0.003, gt=0)
+    sigmas: float = Field(default=4.5, gt=0)
+    refused: int = Field(default=8, ge=0)
+    max_gap_s: float = Field(default=31.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)

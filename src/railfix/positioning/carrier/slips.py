@@ -18,9 +18,11 @@ from enum import IntFlag
 from typing import Final
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Floats, Integers, Masks, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
@@ -55,8 +57,7 @@ class SlipReason(IntFlag):
     CODE = 1 << 7
 
 
-@dataclass(frozen=True, kw_only=True)
-class SlipLimits:
+class SlipLimits(Settings):
     """Limits of the tests, in metres for an interval dt in seconds.
 
     The Doppler test refuses a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
@@ -76,16 +77,11 @@ class SlipLimits:
         Limit of code less phase where Dopplers are absent, or their own limit is wider than this.
     """
 
-    max_gap_s: float = 31.0
-    doppler_m: float = 0.05
-    doppler_mps: float = 0.05
-    jerk_mps3: float = 0.5
-    code_m: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name in ("max_gap_s", "doppler_m", "doppler_mps", "jerk_mps3", "code_m"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+    max_gap_s: float = Field(default=31.0, gt=0)
+    doppler_m: float = Field(default=0.05, gt=0)
+    doppler_mps: float = Field(default=0.05, gt=0)
+    jerk_mps3: float = Field(default=0.5, gt=0)
+    code_m: float = Field(default=10.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,14 +12,15 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.positioning.carrier.recursion import linear_recursion
 
 
-@dataclass(frozen=True, kw_only=True)
-class SmoothingLimits:
+class SmoothingLimits(Settings):
     """How long codes are averaged.
 
     Attributes
@@ -34,14 +35,8 @@ class SmoothingLimits:
         with "shared"); other receivers did not lose by it.
     """
 
-    window_s: float = 100.0
+    window_s: float = Field(default=100.0, gt=0)
     clocks: Literal["own", "shared"] = "own"
-
-    def __post_init__(self) -> None:
-        if not self.window_s > 0.0:
-            raise ValueError(f"window_s must be positive, got {self.window_s}")
-        if self.clocks not in ("shared", "own"):
-            raise ValueError(f"clocks must be shared or own, got {self.clocks!r}")
 
 
 @dataclass(frozen=True, kw_only=True)

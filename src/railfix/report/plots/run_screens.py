@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,8 +14,9 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, OutputError
 from railfix.core.reasons import Reason
 from railfix.pipeline.config import Config
-from railfix.report.plots.screens import ScreenPicture, draw_screen
+from railfix.report.plots.screens import draw_screen
 from railfix.run.folder import read_parquet, read_record
+from railfix.screens import SCREENS, ScreenPicture
 
 _NEEDED: Final = ("run.json", "positions.parquet", "observations.parquet")
 
@@ -37,7 +38,7 @@ class _Grid:
         whole[self.at] = _floats(self.rows, column)
         return whole
 
-    def refused(self, reason: Reason) -> Masks:
+    def rejected(self, reason: Reason) -> Masks:
         """Observations that carry a reason."""
         whole = np.zeros(self.shape, dtype=bool)
         whole[self.at] = (self.rows["reason"].to_numpy() & int(reason)) != 0
@@ -131,8 +132,9 @@ def _read(run: Path) -> tuple[Config, pl.DataFrame, pl.DataFrame]:
             raise InputFileError(run / name, f"there is no such file; expected the folder of a railfix run{hint}")
     config = read_record(run).config
     positions, observations = (read_parquet(run / name) for name in _NEEDED[1:])
-    lacking = {"raim_statistic", "metric_antenna_spacing_m"} - set(positions.columns)
-    lacking |= {"metric_doppler_m", "limit_doppler_m", "metric_antenna_pair_m"} - set(observations.columns)
+    columns = [column for screen in SCREENS for column in screen.columns]
+    lacking = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
+    lacking |= {c.name for c in columns if c.table == "observations"} - set(observations.columns)
     if lacking:
         raise InputFileError(run, f"the tables lack {', '.join(sorted(lacking))}; run again with this railfix")
     return config, positions, observations
@@ -154,111 +156,25 @@ def _grid(positions: pl.DataFrame, observations: pl.DataFrame) -> _Grid:
 
 
 def _pictures(antenna: str, grid: _Grid, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
-    """The screens that were on, with the name of the file."""
-    on = config.screens
-    if "elevation" in on:
-        yield (
-            "elevation",
-            ScreenPicture(
-                title=f"{antenna}: elevation mask",
-                label="elevation [deg]",
-                metric=grid.channels("elevation_deg"),
-                reject=grid.refused(Reason.ELEVATION_MASK),
-                limit=config.elevation.mask_deg,
-                sides="below",
-            ),
-        )
-    if "cn0" in on and config.cn0.floor_dbhz is not None:
-        yield (
-            "cn0_floor",
-            ScreenPicture(
-                title=f"{antenna}: signal strength, floor",
-                label="C/N0 [dB-Hz]",
-                metric=grid.channels("cn0_dbhz"),
-                reject=grid.refused(Reason.CN0_FLOOR),
-                limit=config.cn0.floor_dbhz,
-                sides="below",
-            ),
-        )
-    if "cn0" in on and config.cn0.deficit_dbhz is not None:
-        yield (
-            "cn0_curve",
-            ScreenPicture(
-                title=f"{antenna}: signal strength against an open sky",
-                label="mean at the elevation less C/N0 [dB]",
-                metric=grid.channels("metric_cn0_deficit_dbhz"),
-                reject=grid.refused(Reason.CN0_CURVE),
-                limit=config.cn0.deficit_dbhz,
-                sides="above",
-            ),
-        )
-    if "doppler" in on:
-        yield (
-            "doppler",
-            ScreenPicture(
-                title=f"{antenna}: pseudorange against Doppler",
-                label="change of the pseudorange less Doppler [m]",
-                metric=grid.channels("metric_doppler_m"),
-                reject=grid.refused(Reason.DOPPLER),
-                limit=grid.channels("limit_doppler_m"),
-            ),
-        )
-    if "antenna_pair" in on:
-        yield (
-            "antenna_pair",
-            ScreenPicture(
-                title=f"{antenna}: pseudoranges of two antennas",
-                label="rear less front less spacing [m]",
-                metric=grid.channels("metric_antenna_pair_m"),
-                reject=grid.refused(Reason.ANTENNA_PAIR),
-                limit=config.antenna_pair.limit_m,
-            ),
-        )
-    yield from _pictures_of_positions(antenna, grid, config)
-
-
-def _pictures_of_positions(antenna: str, grid: _Grid, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
-    """Screens that judge an epoch: RAIM, its protection level, the antennas' spacing."""
-    if "raim" in config.screens:
-        statistic, threshold = grid.epochs("raim_statistic"), grid.epochs("raim_threshold")
-        unit = "m^2" if config.raim.mode == "fixed" else "noise variances"
-        yield (
-            "raim",
-            ScreenPicture(
-                title=f"{antenna}: RAIM, before any exclusion",
-                label=f"sum of squared residuals [{unit}]",
-                metric=np.where(np.isfinite(threshold), statistic, np.nan),
-                reject=statistic >= threshold,
-                limit=threshold,
-                sides="above",
-            ),
-        )
-    if config.protection == "on":
-        level = grid.epochs("protection_level_m")
-        level[~np.isfinite(level)] = np.nan
-        yield (
-            "protection_level",
-            ScreenPicture(
-                title=f"{antenna}: protection level along the line against the alarm limit (finite ones)",
-                label="protection level [m]",
-                metric=level,
-                reject=level > config.alarm_limit_m,
-                limit=config.alarm_limit_m,
-                sides="above",
-            ),
-        )
-    if "antenna_spacing" in config.screens:
-        spacing = grid.epochs("metric_antenna_spacing_m")
-        yield (
-            "antenna_spacing",
-            ScreenPicture(
-                title=f"{antenna}: positions of two antennas",
-                label="distance less spacing [m]",
-                metric=spacing,
-                reject=np.abs(spacing) > config.antenna_spacing.limit_m,
-                limit=config.antenna_spacing.limit_m,
-            ),
-        )
+    """Pictures of the screens that were on, and of the protection level, with the name of the file."""
+    for screen in SCREENS:
+        if screen.name in config.screens:
+            for name, picture in screen.pictures(grid, getattr(config, screen.name)):
+                yield name, replace(picture, title=f"{antenna}: {picture.title}")
+        if screen.name == "raim" and config.protection == "on":
+            level = grid.epochs("protection_level_m")
+            level = np.where(np.isfinite(level), level, np.nan)
+            yield (
+                "protection_level",
+                ScreenPicture(
+                    title=f"{antenna}: protection level along the line against the alarm limit (finite ones)",
+                    label="protection level [m]",
+                    metric=level,
+                    reject=level > config.alarm_limit_m,
+                    limit=config.alarm_limit_m,
+                    sides="above",
+                ),
+            )
 
 
 def _floats(table: pl.DataFrame, column: str) -> Floats:

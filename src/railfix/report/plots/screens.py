@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import OutputError
 from railfix.core.timescale import seconds
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
@@ -18,7 +17,7 @@ from railfix.report.plots.chart import Chart, Layer, Line, Points
 from railfix.report.plots.columns import nice_step
 from railfix.report.plots.draw import draw_chart
 from railfix.report.plots.thinning import extremes, spread, told
-from railfix.screens import Cn0Limits
+from railfix.screens import Cn0Limits, ScreenPicture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,35 +27,6 @@ if TYPE_CHECKING:
 #: Colours that stay apart for the colour-blind (Okabe and Ito).
 _MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#2f86b8"
 _COLUMNS: Final = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScreenPicture:
-    """What is drawn of one screen, T epochs by M channels (M = 1 for a screen of positions).
-
-    Attributes
-    ----------
-    title : str
-    label : str
-        What the metric is, with its unit.
-    metric : ndarray, shape (T, M)
-    reject : ndarray of bool, shape (T, M)
-    limit : ndarray or float
-        Broadcasts to (T, M).
-    sides : {"both", "above", "below"}
-        Where the screen refuses: beyond the limit to both sides, above it, or below it.
-    """
-
-    title: str
-    label: str
-    metric: Floats
-    reject: Masks
-    limit: Floats | float
-    sides: str = "both"
-
-    def __post_init__(self) -> None:
-        if self.sides not in ("both", "above", "below"):
-            raise ValueError(f"sides must be 'both', 'above' or 'below', got {self.sides!r}")
 
 
 def draw_screen(

@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Datetimes
-from railfix.core.reasons import Reason, first_reason
+from railfix.core.reasons import Reason, first_reason, reason_names
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve
 from railfix.ranges.cn0_curve.curve import satellite_kind
 from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Layer, Line, Points, SkyEpochs
@@ -174,7 +174,7 @@ def sky_epochs(
     start = (start_of(known) if len(known) else np.datetime64(0, "ns")) if start is None else start
     seconds = since(known, start)
     epoch, first = np.unique(seconds, return_index=True)
-    names = {int(bit): str(bit.name).lower() for bit in Reason if bit.name} | {0: "used"}
+    names = reason_names() | {0: "used"}
     reason = first_reason(known["reason"].to_numpy())
     return SkyEpochs(
         name="sky",

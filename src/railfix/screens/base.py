@@ -1,0 +1,326 @@
+"""Base classes of the screens: what a screen receives, what it returns, and the hooks that a screen may override.
+
+A screen is one file with one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
+`railfix.screens.registry`. The name of the screen, its group of settings, the columns of the tables, the reasons in the
+reports and its pictures follow from the class (docs/screens.md shows an example).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final, Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.reasons import Reason, Status
+from railfix.core.settings import Settings
+from railfix.ranges.cn0_curve import Cn0Curve
+
+Limits = TypeVar("Limits", bound=Settings)
+#: Sigmas of its own added to that of a suspected range at least: it keeps a fifth of its weight at most.
+LEAST_SUSPICION: Final = 2.0
+
+
+class AntennaRanges(Protocol):
+    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels (`pipeline.CorrectedRanges`)."""
+
+    @property
+    def time(self) -> Datetimes:
+        """Time tags, shape (T,)."""
+
+    @property
+    def break_before(self) -> Masks:
+        """Epochs that must not be differenced with the one before, shape (T,)."""
+
+    @property
+    def satellite(self) -> Strings:
+        """Satellite of each channel, shape (K,)."""
+
+    @property
+    def signal(self) -> Strings:
+        """Signal of each channel, shape (K,)."""
+
+    @property
+    def frequency_hz(self) -> Floats:
+        """Carrier of each channel, shape (K,) [Hz]."""
+
+    @property
+    def code_m(self) -> Floats:
+        """Raw pseudoranges, shape (T, K) [m]."""
+
+    @property
+    def doppler_hz(self) -> Floats:
+        """Doppler, shape (T, K) [Hz]."""
+
+    @property
+    def cn0_dbhz(self) -> Floats:
+        """C/N0, shape (T, K) [dB-Hz]."""
+
+    @property
+    def elevation_deg(self) -> Floats:
+        """Elevation of the satellites, shape (T, K) [deg]."""
+
+    @property
+    def azimuth_deg(self) -> Floats:
+        """Azimuth of the satellites, shape (T, K) [deg]."""
+
+    @property
+    def corrected_code_m(self) -> Floats:
+        """Pseudoranges with satellite clock, group delay and atmosphere applied, shape (T, K) [m]."""
+
+    @property
+    def sigma_m(self) -> Floats:
+        """Standard deviation assumed for them, shape (T, K) [m]."""
+
+    @property
+    def reason(self) -> Bits:
+        """`Reason` bits so far, shape (T, K)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Screened:
+    """Metric and verdict of one screen, T epochs by M channels, or P pairs of positions.
+
+    Attributes
+    ----------
+    metric : ndarray
+        Measured quantity in the unit that the screen names; NaN where it cannot judge.
+    reject : ndarray of bool
+        True = rejected. Where the metric is NaN the screen does not reject.
+    """
+
+    metric: Floats
+    reject: Masks
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """A screen's result on the channels of one antenna.
+
+    Attributes
+    ----------
+    name : str
+        Key in `AntennaResult.screens`: the screen's own name, or one a verdict where it has several.
+    reason : Reason
+        Given to the rejected observations.
+    screened : Screened
+        Shapes (T, K).
+    error_m : ndarray, shape (T, K), or None [m]
+        Size of the error that was measured: what fails is weighted down by it and not rejected. None: rejected.
+    """
+
+    name: str
+    reason: Reason
+    screened: Screened
+    error_m: Floats | None = None
+
+
+def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats:
+    """Return the standard deviation of ranges of which some are suspected, shape (T, M) [m].
+
+    The error of a suspected range, two sigmas at least, is added as another standard deviation.
+
+    Parameters
+    ----------
+    reject : ndarray of bool, shape (T, M)
+        Suspected ranges.
+    error_m : ndarray, shape (T, M) [m]
+        Size of their errors, as measured by the screen.
+    sigma_m : ndarray, shape (T, M) [m]
+        Without the suspicion.
+    """
+    extra = np.maximum(np.abs(np.nan_to_num(error_m)), LEAST_SUSPICION * sigma_m)
+    return np.where(reject, np.hypot(sigma_m, extra), sigma_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenSetup:
+    """Facts of a run that some screens need.
+
+    Attributes
+    ----------
+    antennas : int
+        Number of antennas.
+    spacing_known : bool
+        Whether a vehicle file places both antennas on one vehicle.
+    cn0_curve : Cn0Curve or None
+        Mean C/N0 over elevation of antenna and receiver.
+    """
+
+    antennas: int = 1
+    spacing_known: bool = False
+    cn0_curve: Cn0Curve | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenColumn:
+    """A column of the result tables that a screen fills.
+
+    Attributes
+    ----------
+    name : str
+        With its unit: ``metric_doppler_m``.
+    meaning : str
+    verdict : str
+        Key in `AntennaResult.screens`.
+    field : str
+        Array of that verdict: "metric", or another one of a subclass of `Screened`.
+    table : {"observations", "positions"}
+    """
+
+    name: str
+    meaning: str
+    verdict: str
+    field: str = "metric"
+    table: Literal["observations", "positions"] = "observations"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreenPicture:
+    """Data of the picture of one screen, T epochs by M channels (M = 1 for a screen of positions).
+
+    Attributes
+    ----------
+    title : str
+    label : str
+        Name of the metric, with its unit.
+    metric : ndarray, shape (T, M)
+    reject : ndarray of bool, shape (T, M)
+    limit : ndarray or float
+        Broadcasts to (T, M).
+    sides : {"both", "above", "below"}
+        Side on which the screen rejects: beyond the limit on both sides, above it, or below it.
+    """
+
+    title: str
+    label: str
+    metric: Floats
+    reject: Masks
+    limit: Floats | float
+    sides: Literal["both", "above", "below"] = "both"
+
+
+class RunTables(Protocol):
+    """Result tables of one antenna as arrays, for the pictures."""
+
+    def channels(self, column: str) -> Floats:
+        """Column of the observations, shape (T, M); NaN where not observed."""
+
+    def rejected(self, reason: Reason) -> Masks:
+        """Observations that carry a reason, shape (T, M)."""
+
+    def epochs(self, column: str) -> Floats:
+        """Column of the positions, shape (T, 1)."""
+
+
+class Screen(ABC, Generic[Limits]):
+    """One screen; use a subclass that says what it judges.
+
+    Attributes
+    ----------
+    name : str
+        In `Config.screens`, and of its group of settings.
+    limits : Limits
+        Default limits; their type has the fields of the group of settings.
+    needs : str
+        Data without which it cannot judge, for the note.
+    columns : tuple of ScreenColumn
+        Columns of the result tables.
+    """
+
+    name: ClassVar[str]
+    limits: Limits
+    needs: ClassVar[str]
+    columns: ClassVar[tuple[ScreenColumn, ...]] = ()
+
+    def unable(self, limits: Limits, setup: ScreenSetup) -> bool:  # noqa: ARG002  for screens that override it
+        """Return whether the screen can judge nothing in this run."""
+        return False
+
+    def notes(self, limits: Limits, setup: ScreenSetup) -> tuple[str, ...]:
+        """Return sentences on a screen that was asked for and cannot judge, or not fully."""
+        return (f"screen {self.name}: inactive; it needs {self.needs}",) if self.unable(limits, setup) else ()
+
+    def pictures(self, tables: RunTables, limits: Limits) -> Iterator[tuple[str, ScreenPicture]]:  # noqa: ARG002
+        """Yield name and data of each picture of the screen."""
+        yield from ()
+
+
+class ObservationScreen(Screen[Limits]):
+    """A screen of the observations of one antenna."""
+
+    @abstractmethod
+    def judge(
+        self, antenna: AntennaRanges, limits: Limits, setup: ScreenSetup, state: Any
+    ) -> tuple[tuple[Verdict, ...], Any]:
+        """Return the verdicts on a chunk, and the state for the next one.
+
+        Parameters
+        ----------
+        antenna : AntennaRanges
+        limits : Limits
+        setup : ScreenSetup
+        state : object
+            Returned with the chunk before; None at the start. Screens without memory return None.
+        """
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedEpochs:
+    """Common epochs of two antennas of one vehicle, P of them.
+
+    Attributes
+    ----------
+    front_epoch, rear_epoch : ndarray of int, shape (P,)
+        Epochs of each antenna that belong together.
+    front_ecef_m, rear_ecef_m : ndarray, shape (P, 3) [m]
+        Approximate places of the antennas on their trajectories.
+    along_m : ndarray, shape (P,) [m]
+        Chainage of the front antenna less that of the rear one: negative where the vehicle faces falling
+        chainage.
+    """
+
+    front_epoch: Indices
+    rear_epoch: Indices
+    front_ecef_m: Floats
+    rear_ecef_m: Floats
+    along_m: Floats
+
+
+class _OfTwoAntennas(Screen[Limits]):
+    """A screen that needs two antennas of one vehicle."""
+
+    needs = "two antennas and a vehicle file, which places them on one vehicle"
+
+    def unable(self, limits: Limits, setup: ScreenSetup) -> bool:  # noqa: ARG002
+        """Return whether there are no two antennas with a known spacing."""
+        return setup.antennas < 2 or not setup.spacing_known
+
+
+class PairScreen(_OfTwoAntennas[Limits]):
+    """A screen of the observations of two antennas of one vehicle."""
+
+    @abstractmethod
+    def judge(
+        self, front: AntennaRanges, rear: AntennaRanges, pair: PairedEpochs, limits: Limits
+    ) -> Mapping[str, tuple[Verdict, ...]]:
+        """Return the verdicts on a chunk by antenna, "front" and "rear"."""
+
+
+class PositionScreen(_OfTwoAntennas[Limits]):
+    """A screen of the positions of two antennas of one vehicle.
+
+    Attributes
+    ----------
+    status : Status
+        Given to the epochs of both antennas whose positions are rejected.
+    """
+
+    status: ClassVar[Status]
+
+    @abstractmethod
+    def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:
+        """Return metric and verdict of the P pairs of positions, chainages of shape (P,) [m]."""
