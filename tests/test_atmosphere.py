@@ -140,3 +140,22 @@ def test_chunks_give_the_same_bits() -> None:
         part = klobuchar_delay_m(time[p], latitude[p], longitude[p], elevation[p], azimuth[p], COEFFICIENTS, frequency)
         np.testing.assert_array_equal(part, ion[p])
         np.testing.assert_array_equal(saastamoinen_delay_m(latitude[p], height[p], elevation[p]), trop[p])
+
+
+@pytest.mark.requirement("A7")
+def test_the_period_of_the_ionosphere_is_20_hours_and_its_amplitude_0_at_least() -> None:
+    """At the equator, straight up at 16:00 local: phase 2 pi 7200/72000, cosine 0.8091; 3.0 m of amplitude."""
+    time = np.array(["2024-03-03T16:00:00"], dtype="datetime64[ns]")  # a Sunday: 57 600 s of week
+    zero, overhead = np.zeros(1), np.full((1, 1), 90.0)
+
+    def delay(alpha: float, beta: float) -> float:
+        coefficients = np.array([alpha, 0.0, 0.0, 0.0, beta, 0.0, 0.0, 0.0])
+        return float(klobuchar_delay_m(time, zero, zero, overhead, np.zeros((1, 1)), coefficients, L1)[0, 0])
+
+    phase = 2.0 * np.pi * 7200.0 / 72_000.0
+    cosine = 1.0 - phase**2 / 2.0 + phase**4 / 24.0
+    slant = 1.0 + 16.0 * 0.03**3
+    assert delay(1e-8, 0.0) == pytest.approx(SPEED_OF_LIGHT * slant * (5e-9 + 1e-8 * cosine))
+    assert delay(1e-8, 5e4) == delay(1e-8, 0.0)
+    assert delay(1e-8, 1.5e5) > delay(1e-8, 0.0) > delay(-1e-8, 0.0)
+    assert delay(-1e-8, 0.0) == pytest.approx(SPEED_OF_LIGHT * slant * 5e-9)

@@ -23,6 +23,7 @@ from railfix.ranges.error_model import (
     fit_bins,
     gaussian_overbound,
     read_error_model,
+    summary,
     write_error_model,
 )
 
@@ -239,3 +240,24 @@ def test_conditions_are_compared_field_by_field(changes: dict[str, object], expe
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"no\.toml"):
         read_error_model(tmp_path / "no.toml")
+
+
+def test_the_summary_pools_mean_and_variance_over_the_bins() -> None:
+    """30 samples of +1 +- 2 m and 10 of -3 +- 1 m: mean 0, variance 0.75 (4 + 1) + 0.25 (1 + 9) = 6.25."""
+    bins = ErrorBins(elevation_deg=(0.0, 45.0, 90.0), sectors=1, cn0_dbhz=(0.0, 60.0))
+
+    def column(low: float, high: float) -> np.ndarray:
+        return np.array([low, high]).reshape(bins.shape)
+
+    counts = column(30, 10).astype(np.int64)
+    statistics = BinStatistics(
+        count=counts, blocks=counts, bias_m=column(1.0, -3.0), sigma_m=column(2.0, 1.0),
+        bound_bias_m=column(0.0, 0.0), bound_sigma_m=column(4.0, 2.5), pooled=counts * 0,
+    )  # fmt: skip
+    empty = replace(statistics, count=counts * 0)
+    rows = {
+        row.name: row.cells for row in summary(ErrorModel(bins=bins, before=statistics, after=empty, covers="local"))
+    }
+    assert rows["C/N0 0-60"] == ("40", "+0.00", "2.50", "2.5-4.0", "0", "-", "-", "-")
+    assert rows["elevation 45-90"][:4] == ("10", "-3.00", "1.00", "2.5-2.5")
+    assert "all round" in rows

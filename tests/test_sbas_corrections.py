@@ -544,3 +544,15 @@ def test_misspelt_limits_are_refused() -> None:
         SbasLimits(mode="pa")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="max_udrei\n  Input should be less than or equal to 13"):
         SbasLimits(max_udrei=15)
+
+
+def test_a_satellite_of_sbas_needs_no_long_term_correction_and_gets_none_of_another() -> None:
+    rows = [(1.0, 0, made.mask(1, [1, 129])), (2.0, 0, made.fast(2, [1.0, 2.0], [3, 3]))]
+    rows.append((3.0, 0, made.long_term(3, [(1, 40, (8.0, 4.0, 2.0), 100.0)])))
+    engine = SbasCorrections(made.made(rows), prn=137, limits=SbasLimits(range_rate="off", incomplete="inflate"))
+    time = made.START + np.array([5], dtype="timedelta64[s]").astype("timedelta64[ns]")
+    found = engine.satellites(time, np.array(["G01", "S29"]))
+    assert found.state.tolist() == [[SatelliteState.OK, SatelliteState.OK]]
+    assert found.position_m[0].tolist() == [[8.0, 4.0, 2.0], [0.0, 0.0, 0.0]]
+    assert (found.clock_s[0, 0], found.clock_s[0, 1]) == (100.0 * 2.0**-31, 0.0)
+    assert found.iode.tolist() == [[40, -1]]

@@ -129,7 +129,7 @@ def test_three_points_do_if_they_are_around_the_place(
         assert (found.state.item(), found.points.item()) == (OK, 3)
         assert found.delay_m.item() == pytest.approx(np.dot(weights, [1.0, 2.0, 3.0, 5.0]), abs=1e-9)
         assert found.sigma_uire_m.item() == pytest.approx(np.sqrt(np.dot(weights, VARIANCE)), abs=1e-9)
-        assert overhead(rows, *outside).state.item() == otherwise
+        assert (overhead(rows, *outside).state.item(), overhead(rows, *outside).points.item()) == (otherwise, 0)
     for place in (inside, outside):
         found = overhead(grid(square(*forbidden)), *place)
         assert found.state.item() == IonosphereState.DO_NOT_USE

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from railfix.ranges.sbas.grid import Spans, distinct_lookups, looked_up
+from railfix.ranges.sbas.tables import Series, _with_other
 
 pytestmark = pytest.mark.requirement("C1")
 START = np.datetime64("2025-02-15T12:00:00", "ns")
@@ -41,3 +42,24 @@ def test_each_combination_is_asked_once_and_answered_everywhere() -> None:
     first, which = distinct_lookups(spans.number(time), point, 2664)
     np.testing.assert_array_equal(point[first][which], point)
     np.testing.assert_array_equal(spans.number(time)[first][which], spans.number(time))
+
+
+def test_rows_of_a_series_are_looked_up_by_the_newest_that_was_received() -> None:
+    table = Series.of(np.array([5, 3, 5, -1]), at(7.0, 1.0, 2.0, 0.0), {"value": np.array([70, 10, 20, 0])})
+    assert table.series.tolist() == [3, 5, 5]
+    instants = at(0.9, 1.0, 2.0, 6.999, 7.0)
+    assert table.newest(5, instants).tolist() == [-1, -1, 1, 1, 2]
+    assert table.newest(np.array([[3], [4], [-1]]), instants).tolist() == [[-1, 0, 0, 0, 0], [-1] * 5, [-1] * 5]
+    assert table["value"][table.newest(5, instants)[2:]].tolist() == [20, 20, 70]
+    assert (table.received(np.array([-1, 2])) == np.array([np.datetime64("1980-01-06"), at(7.0)[0]])).all()
+    none = Series.of(np.zeros(0, dtype=np.int64), at()[:0], {"value": np.zeros((0, 3))})
+    assert (none.empty, table.empty) == (True, False)
+    assert (none.newest(0, instants) == -1).all()
+    assert none["value"][none.newest(0, instants)].shape == (5, 3)
+
+
+def test_the_other_issue_is_that_of_the_same_satellite() -> None:
+    """Last row with another issue of data: satellite 1 has 5, 6, 6; satellite 2 has 6, 6, 7, 6."""
+    number, iode = np.array([1, 1, 1, 2, 2, 2, 2]), np.array([5, 6, 6, 6, 6, 7, 6])
+    table = _with_other(Series.of(number, at(*range(7)), {"iode": iode}))
+    assert table["other"].tolist() == [-1, 0, 0, -1, -1, 4, 5]

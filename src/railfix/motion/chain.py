@@ -86,8 +86,8 @@ def _reduced(diagonal: Floats, upper: Floats, right: Floats) -> tuple[Floats, Fl
     """Values, covariances, and covariances of neighbours."""
     count = len(diagonal)
     if count == 1:
-        whole = np.asarray(np.linalg.inv(diagonal), dtype=np.float64)
-        return np.einsum("kij,kj->ki", whole, right), whole, np.zeros((0, *diagonal.shape[1:]))
+        covariance = np.asarray(np.linalg.inv(diagonal), dtype=np.float64)
+        return np.einsum("kij,kj->ki", covariance, right), covariance, np.zeros((0, *diagonal.shape[1:]))
     # Every odd instant has a left neighbour, and all but perhaps the last a right one.
     odd = np.arange(1, count, 2)
     inner = odd[odd + 1 < count]

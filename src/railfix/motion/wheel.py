@@ -12,13 +12,13 @@ from railfix.core.errors import MismatchError
 from railfix.core.timescale import seconds
 from railfix.io.sensor_log import Pulses
 
-#: Windows from which the distance of a pulse is estimated: how long [s], least way [m], and how many are needed.
+#: Windows that the distance of a pulse is estimated from: length [s], least distance [m], least number.
 _WINDOW_S: Final = 10.0
-_LEAST_WAY_M: Final = 30.0
+_LEAST_DISTANCE_M: Final = 30.0
 _LEAST_WINDOWS: Final = 5
-#: Speeds below it tell no direction [m/s].
+#: Lowest speed that determines a direction [m/s].
 _DIRECTION_MPS: Final = 0.3
-#: No wheel turns faster [m/s].
+#: Highest plausible speed [m/s].
 _FASTEST_MPS: Final = 150.0
 
 
@@ -39,7 +39,7 @@ class Wheel:
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading: a counter stands anywhere within a pulse, evenly [m]."""
+        """Standard deviation of a reading [m]: uniform within a pulse for a counter, 0 for a distance."""
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:
@@ -49,18 +49,18 @@ class Wheel:
         ----------
         time : ndarray of datetime64[ns], shape (N,)
         speed_hint_mps : ndarray, shape (N,) [m/s]
-            Speeds from elsewhere, for the direction of pulses that do not tell it; NaN where unknown. Where the
-            direction before differs from that after, it turns where the wheel stands longest.
+            Speeds from another source, for the direction of unsigned pulses; NaN where unknown. Where the
+            direction changes, it is taken to change at the longest standstill.
 
         Returns
         -------
         ndarray, shape (N,) [m]
-            NaN where the table says nothing, and where a turn without a stop leaves the direction open.
+            NaN where the table has no reading, and where a turn without a stop leaves the direction open.
         """
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
         if self.pulses.signed:
-            # The counter's own direction counts; which way its rise points the hints tell once.
+            # A signed counter gives the direction itself; the hints only give the sense of its sign.
             rising = np.sign(np.nansum(np.diff(run) * sign))
             return run if rising >= 0 else -run
         step = np.diff(run) * sign
@@ -68,7 +68,7 @@ class Wheel:
 
 
 def _cumulated(run: Floats, step: Floats) -> Floats:
-    """Sum of signed steps; a step that is not known leaves both of its ends' difference open (NaN between)."""
+    """Sum of signed steps; NaN where an unknown step separates an instant from the next."""
     known = np.isfinite(step)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, step, 0.0))])
     open_ = np.isnan(run)
@@ -110,7 +110,7 @@ def _turned(step: Floats, before: float, after: float) -> Floats:
 
 
 def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
-    """The distance of a pulse as given, or from fixes: the median over windows of some seconds.
+    """Tachometer with the distance of a pulse as given, or estimated from fixes: the median over windows.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def wheel_of(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floa
     Raises
     ------
     MismatchError
-        The fixes are too few to tell it, or the pulses tell speeds that no train has.
+        Too few fixes to estimate it, or pulses that imply an impossible speed.
     """
     source = "given"
     if pulses.kind == "distance":
@@ -147,11 +147,11 @@ def _estimated(pulses: Pulses, time: Datetimes, arc_m: Floats) -> float:
     start = np.flatnonzero(end < len(t))
     end = end[start]
     inside = t[end] - t[start] <= 1.5 * _WINDOW_S
-    way, turned = np.abs(arc_m[end] - arc_m[start])[inside], np.abs(count[end] - count[start])[inside]
-    usable = (way > _LEAST_WAY_M) & np.isfinite(turned) & (turned > 0)
+    distance, turned = np.abs(arc_m[end] - arc_m[start])[inside], np.abs(count[end] - count[start])[inside]
+    usable = (distance > _LEAST_DISTANCE_M) & np.isfinite(turned) & (turned > 0)
     if usable.sum() < _LEAST_WINDOWS:
         raise MismatchError(
             f"{pulses.path}: too few fixes while the train runs to tell the distance of a pulse; give it (wheel "
             "circumference and pulses a turn)"
         )
-    return float(np.median(way[usable] / turned[usable]))
+    return float(np.median(distance[usable] / turned[usable]))

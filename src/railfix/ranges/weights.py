@@ -32,7 +32,7 @@ class CodeNoise(Settings):
     model : {"cn0_elevation", "elevation"}
         "elevation" leaves the C/N0 factor out.
     zenith_sigma_m : float
-        At the zenith and the reference C/N0. Only ratios matter to the position: what it is on a
+        At the zenith and the reference C/N0. Only ratios matter to the position: its value for a
         receiver is estimated from the residuals (`pipeline.AntennaState`).
     floor_sigma_m : float
         Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.

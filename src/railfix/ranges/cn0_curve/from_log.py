@@ -85,7 +85,7 @@ def cn0_curve_from_log(
         RINEX observation files of one receiver, about a day.
     navigation : sequence of Path
     position_ecef_m : ndarray, shape (3,) [m], optional
-        Where the antenna stood, to some kilometres; by default what the header says.
+        Position of the antenna, to some kilometres; by default that of the header.
     fit : CurveFit, optional
     broken_lines : {"stop", "count"}
         What to do about broken lines of the log.
@@ -99,11 +99,11 @@ def cn0_curve_from_log(
     Raises
     ------
     InputFileError
-        A file is not what it should be; the log has no C/N0.
+        A file is missing or of another kind; the log has no C/N0.
     SettingsError
         The header has no position and none was given.
     MismatchError
-        Satellites were tracked that stand below the horizon of the position, or the navigation
+        Satellites were tracked that are below the horizon of the position, or the navigation
         files have none of them, or too few samples for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines)

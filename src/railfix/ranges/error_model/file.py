@@ -19,7 +19,7 @@
     count = [12, ...]
     bias_m = [1.25, ...]
 
-The bins stand in order of elevation, then sector, then C/N0. `pooled` counts into `model.POOLED`. Files of
+The bins are in the order of elevation, then sector, then C/N0. `pooled` counts into `model.POOLED`. Files of
 version 1, which described their conditions by a sentence, are rejected: make them anew.
 """
 

@@ -20,11 +20,11 @@ class ErrorModelFit(Settings):
     ----------
     bins : ErrorBins
     least_blocks : int
-        Independent passes below which a wider set of bins stands for a bin. 30: its largest error is then
+        Independent passes below which a bin takes the samples of a wider set of bins. 30: its largest error is then
         about the quantile of 2 standard scores, so that at least the shoulder of the tail was seen.
     block_s : float [s]
         Length of the blocks that a satellite's samples are counted in. Errors are correlated over tens of
-        seconds where a train stands.
+        seconds where a train is at rest.
     """
 
     bins: ErrorBins = Field(default_factory=ErrorBins)

@@ -1,4 +1,4 @@
-"""An error model in few rows: by elevation, by sector, by C/N0."""
+"""Summary of an error model by elevation, by sector and by C/N0."""
 
 from __future__ import annotations
 

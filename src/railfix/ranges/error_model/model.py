@@ -31,7 +31,7 @@ class ErrorBins(Settings):
     sectors : int
         Sectors of azimuth relative to the car body, the first one centred ahead, clockwise.
     cn0_dbhz : tuple of float
-        Edges, rising, C + 1 of them; what lies beyond the outer ones belongs to the outer bins. Observations
+        Edges, rising, C + 1 of them; values beyond the outer ones belong to the outer bins. Observations
         without C/N0 go into the lowest.
     """
 
@@ -85,11 +85,11 @@ class BinStatistics:
     blocks : ndarray of int
         Passes of a satellite through it, counted once a block of time: samples are correlated.
     bias_m, sigma_m : ndarray [m]
-        Mean and standard deviation of what the bin was filled from.
+        Mean and standard deviation of the samples used for the bin.
     bound_bias_m, bound_sigma_m : ndarray [m]
         `overbound.gaussian_overbound` of the same.
     pooled : ndarray of int
-        Index into `POOLED`: where the bin has too few blocks, a wider set of bins stands for it.
+        Index into `POOLED`: where the bin has too few blocks, the samples of a wider set of bins.
     """
 
     count: Integers
@@ -132,8 +132,8 @@ class ErrorModel:
     ----------
     bins : ErrorBins
     before, after : BinStatistics
-        Before and after the screens: the multipath of the line, and what is left of it. The second is what
-        weights and protection level use; the difference is what the screens bought.
+        Errors before and after the screens. Weights and protection level use those after them; the
+        difference is the effect of the screens.
     covers : {"local", "satellite_and_atmosphere"}
         "local": multipath and receiver noise alone (a reference station took the rest away).
         "satellite_and_atmosphere": these, too, as they were on those days.

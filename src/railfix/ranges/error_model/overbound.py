@@ -1,10 +1,10 @@
-"""Gaussian overbounds of samples: wide enough in both tails, and honest about a bias.
+"""Gaussian overbounds of samples, with a bias, for both tails.
 
 A normal distribution shifted by +b bounds the upper half of the errors, one shifted by -b the lower
 half: whatever probability one asks for, the bound's quantile lies further out than the sample's
 (CDF overbounding, B. DeCleene, Defining pseudorange integrity: overbounding, ION GPS 2000). Sums of
 independent errors stay bounded by the summed biases and the root of the summed squared sigmas as long
-as what is left after the shift is symmetric and has one peak (the two-step method of J. Blanch, T.
+as the distribution after the shift is symmetric and has one peak (the two-step method of J. Blanch, T.
 Walter, P. Enge, Gaussian bounds of sample distributions for integrity analysis, IEEE Trans. Aerospace
 and Electronic Systems 55(4), 2019, doi:10.1109/TAES.2018.2876583). Neither can be proven from samples.
 """
@@ -30,7 +30,7 @@ class Overbound:
     Attributes
     ----------
     bias_m : float [m]
-        They stand this far to either side of zero.
+        Distance of their means from zero, to either side.
     sigma_m : float [m]
     """
 

@@ -84,7 +84,7 @@ class SbasCorrections:
     prn : int
     limits : SbasLimits
     notes : tuple of str
-        What was asked and what was used.
+        Corrections asked for and used, one sentence each.
     span : tuple of datetime64[ns]
         Reception of the first and the last message of that GEO; NaT without messages.
     unused : mapping of str to int

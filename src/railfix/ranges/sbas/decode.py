@@ -151,7 +151,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
         "position_ecef_m": (_signed(18, 15, 2600.0), _signed(33, 15, 2600.0), _signed(48, 9, 26_000.0)),
         "velocity_ecef_mps": (_signed(57, 3, 10.0), _signed(60, 3, 10.0), _signed(63, 4, 60.0)),
     },
-    # Half of type 25 with velocity code 0: two satellites; their issue of the mask stands behind both.
+    # Half of type 25 with velocity code 0: two satellites; their issue of the mask follows both.
     "half of type 25": {"velocity_code": BitField(0, 1), "iodp": BitField(103, 2)},
     "satellite of type 25": {
         "slot": BitField(0, 6),
@@ -219,7 +219,7 @@ def rows_of(messages: SbasMessages, *types: int) -> Integers:
 
 
 def decode(messages: SbasMessages, kind: int) -> Decoded:
-    """Fields of all messages of a type that has a layout of its own, as they stand in the message."""
+    """Fields of all messages of a type, as its layout has them."""
     row = rows_of(messages, kind)
     return {"row": row, **read_fields(messages.bits[row], LAYOUTS[f"type {kind}"])}
 

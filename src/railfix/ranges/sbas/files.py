@@ -39,7 +39,7 @@ class RawMessage:
 
 
 def kind_of_file(path: str, lines: Sequence[str]) -> str:
-    """Format, told by the first line that says anything: "rtklib", "ems" or "rinex".
+    """Format by the first line that is not empty or a comment: "rtklib", "ems" or "rinex".
 
     Raises
     ------
@@ -142,8 +142,8 @@ def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | Input
             yield InputFileError(path, f"{date.strip()} {second} is no date and time", line=number)
             continue
         # Before 2004 the satellite number was the PRN less 100.
-        whole = int(prn) + (100 if int(prn) < 100 else 0)
-        yield _checked_line(path, RawMessage(number, time, whole, int(head or -1), digits))
+        number_of_geo = int(prn) + (100 if int(prn) < 100 else 0)
+        yield _checked_line(path, RawMessage(number, time, number_of_geo, int(head or -1), digits))
 
 
 def _checked_line(path: str, raw: RawMessage) -> RawMessage | InputFileError:
@@ -196,7 +196,7 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
     Parameters
     ----------
     paths : path or sequence of paths
-        RTKLIB (.sbs), EGNOS message server (.ems) or RINEX broadcast data (type B), told by their
+        RTKLIB (.sbs), EGNOS message server (.ems) or RINEX broadcast data (type B), recognised by their
         content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `refused` and
@@ -274,16 +274,16 @@ def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     )
     kept = log.take(~(wrong | stray))
     kept = kept.take(np.lexsort((kept.prn, kept.time)))
-    again = np.zeros(len(kept), dtype=bool)
-    again[1:] = (kept.time[1:] == kept.time[:-1]) & (kept.prn[1:] == kept.prn[:-1])
-    gathered.refused["duplicate"] += int(again.sum())
-    kept = kept.take(~again)
+    repeated = np.zeros(len(kept), dtype=bool)
+    repeated[1:] = (kept.time[1:] == kept.time[:-1]) & (kept.prn[1:] == kept.prn[:-1])
+    gathered.refused["duplicate"] += int(repeated.sum())
+    kept = kept.take(~repeated)
     notes = [*gathered.notes, *_parity_notes(sources, source, carried), *_order_notes(kept)]
     return replace(kept, refused=dict(gathered.refused), notes=tuple(notes))
 
 
 def _carried_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
-    """Bits of parity that each message carries: 24 in whole messages, in cut ones 6 or none.
+    """Bits of parity that each message carries: 24 in complete messages, 6 or none in cut ones.
 
     A cut message ends with 6 bits that some programs fill with zero (RTKLIB) and some leave as
     they came: in a file of the latter most of them are the first of the parity, by chance 1 in 64.

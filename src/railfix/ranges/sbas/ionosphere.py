@@ -247,7 +247,7 @@ def _weights(
 ) -> tuple[Floats, Masks]:
     """Weights of the corners (M, 4), and where they do (M,): four good ones, or three around the place.
 
-    That a corner which says do not use forbids the delay is judged apart.
+    A corner that must not be used is handled by the caller: it forbids the delay.
     """
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))

@@ -66,21 +66,21 @@ def message_parity(bits: Bytes) -> Integers:
 
 
 def carried_parity(bits: Bytes) -> Integers:
-    """The 24 bits that stand after the data bits of each message, shape (N,)."""
+    """The 24 bits after the data bits of each message, shape (N,)."""
     tail = bits[:, 28:32].astype(np.int64)
     return ((tail[:, 0] & 0x3F) << 18) | (tail[:, 1] << 10) | (tail[:, 2] << 2) | (tail[:, 3] >> 6)
 
 
 def with_parity(bits: Bytes) -> Bytes:
-    """The same messages with the parity that belongs to them, shape (N, 32); what follows it is zero."""
-    whole = np.zeros((len(bits), ROW_BYTES), dtype=np.uint8)
-    whole[:, :29] = bits[:, :29]
-    parity = message_parity(whole)
-    whole[:, 28] = (whole[:, 28] & 0xC0) | (parity >> 18).astype(np.uint8)
-    whole[:, 29] = ((parity >> 10) & 0xFF).astype(np.uint8)
-    whole[:, 30] = ((parity >> 2) & 0xFF).astype(np.uint8)
-    whole[:, 31] = ((parity << 6) & 0xFF).astype(np.uint8)
-    return whole
+    """The same messages with the parity that belongs to them, shape (N, 32); the bits after it are zero."""
+    complete = np.zeros((len(bits), ROW_BYTES), dtype=np.uint8)
+    complete[:, :29] = bits[:, :29]
+    parity = message_parity(complete)
+    complete[:, 28] = (complete[:, 28] & 0xC0) | (parity >> 18).astype(np.uint8)
+    complete[:, 29] = ((parity >> 10) & 0xFF).astype(np.uint8)
+    complete[:, 30] = ((parity >> 2) & 0xFF).astype(np.uint8)
+    complete[:, 31] = ((parity << 6) & 0xFF).astype(np.uint8)
+    return complete
 
 
 def preamble_number(bits: Bytes) -> Integers:
@@ -98,7 +98,7 @@ class SbasMessages:
     Attributes
     ----------
     time : ndarray of datetime64[ns], shape (N,)
-        GPS time at which the message had been received whole: from here on it may be used.
+        GPS time at which the message had been received completely: from here on it may be used.
     prn : ndarray of int, shape (N,)
     type : ndarray of int, shape (N,)
         0 to 63.
@@ -116,7 +116,7 @@ class SbasMessages:
     refused : mapping of str to int
         Messages left out, by reason: "parity", "preamble", "line", "duplicate".
     notes : tuple of str
-        What a reader of the results must know, one sentence each.
+        Warnings for the reader of the results, one sentence each.
     """
 
     time: Datetimes
@@ -147,7 +147,7 @@ class SbasMessages:
         return tuple(int(prn) for prn in np.unique(self.prn))
 
     def account(self) -> dict[str, int]:
-        """Every message once: decoded by type, not decoded by type and name, or refused by reason.
+        """Counts of all messages: decoded by type, not decoded by type and name, or rejected by reason.
 
         Returns
         -------
@@ -175,7 +175,7 @@ class SbasMessages:
         return cls(time=time, prn=number, type=number, bits=bits, parity_bits=number, source=number, line=number)
 
     def joined(self, later: SbasMessages) -> SbasMessages:
-        """These messages and others, in the order of reception; counts are added, a note stands once."""
+        """These messages and others, in the order of reception; counts are added, repeated notes dropped."""
         if not len(later):
             return self
         joined = {

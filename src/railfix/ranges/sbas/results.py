@@ -43,7 +43,7 @@ class IonosphereState(IntEnum):
     GEO_STOPPED = 1
     #: The mask has no cell of grid points around the pierce point.
     NO_GRID = 2
-    #: A grid point that is needed says do not use.
+    #: A grid point that is needed must not be used.
     DO_NOT_USE = 3
     #: A grid point that is needed is not monitored, or was never sent.
     NOT_MONITORED = 4

@@ -45,7 +45,7 @@ class FastInForce:
     growth_m : ndarray [m]
         Of the fast correction (A.4.5.1.1).
     rate_growth_mps, rate_span_s : ndarray
-        a Ifc / 4, or what an alarm puts in its place, and the time between the two corrections;
+        a Ifc / 4, or its replacement after an alarm, and the time between the two corrections;
         0 and infinite where the rate does not degrade (A.4.5.1.2).
     since_s : ndarray [s]
         Since the time of applicability.
@@ -188,7 +188,7 @@ def long_term_in_force(
     stop: Datetimes,
     navigation: Navigation | None,
 ) -> LongTermInForce:
-    """Newest long-term correction that a record has the issue of; satellites of SBAS itself need none.
+    """Newest long-term corrections whose issue of data a record has; satellites of SBAS itself need none.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ ALARM: Final = 3
 #: Longest time that is resolved [ms]: 278 years, all that `datetime64[ns]` reaches.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
-#: Number of the series that stands in an empty table, so that a search of it returns no row.
+#: Series of the placeholder row of an empty table, which no search asks for.
 _NO_SERIES: Final = 2**19
 
 
