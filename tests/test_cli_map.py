@@ -127,3 +127,51 @@ def test_the_commands_do_not_load_matplotlib() -> None:
 
     code = "import sys, railfix.cli.map, railfix.track, railfix.track.vehicle; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.requirement("A1")
+def test_the_check_refuses_a_point_far_from_the_line(tmp_path: Path) -> None:
+    """105 km off, as a wrong digit of the latitude makes it."""
+    track = read_track(line(tmp_path))
+    far = track.ecef_m.copy()
+    far[20] = ecef_from_geodetic(35.95, 139.0, 50.0)
+    write_track_csv(Track.from_ecef(far, name="far"), tmp_path / "far.csv")
+    code, printed = call("check", tmp_path / "far.csv")
+    assert code == 6
+    assert "gap" in printed
+    assert "a point is wrong" in printed
+
+
+def positions(folder: Path, *, outlier: bool, quality: int | None) -> Path:
+    """A run of 60 s at 10 m/s to the north as CSV."""
+    enu = np.stack([np.zeros(61), 10.0 * np.arange(61.0), np.zeros(61)], axis=1)
+    ecef = ecef_from_geodetic(35.0, 139.0, 50.0) + enu @ enu_axes(35.0, 139.0)
+    if outlier:
+        ecef[30] = ecef_from_geodetic(36.5, 139.0, 50.0)
+    rows = ["time_gpst,x_m,y_m,z_m" + ("" if quality is None else ",quality")]
+    for t, (x, y, z) in enumerate(ecef):
+        tail = "" if quality is None else f",{quality}"
+        rows.append(f"2024-03-05T03:{10 + t // 60:02d}:{t % 60:02d},{x:.4f},{y:.4f},{z:.4f}{tail}")
+    path = folder / "positions.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.requirement("A1")
+def test_an_outlier_is_dropped_and_its_map_passes_the_check(tmp_path: Path) -> None:
+    path = positions(tmp_path, outlier=True, quality=None)
+    code, printed = call("from-positions", path, "--out", tmp_path / "made.csv")
+    assert code == 0, printed
+    assert "dropped 1 out of reach of the others" in printed
+    assert read_track(tmp_path / "made.csv").chainage_m[-1] == pytest.approx(600.0, abs=0.1)
+    assert call("check", tmp_path / "made.csv")[0] == 0
+
+
+@pytest.mark.requirement("A1")
+@pytest.mark.parametrize(("quality", "plan_m"), [(1, 0.3), (2, 0.5), (5, 3.0)])
+def test_the_map_states_the_accuracy_of_its_positions(tmp_path: Path, quality: int, plan_m: float) -> None:
+    path = positions(tmp_path, outlier=False, quality=quality)
+    code, printed = call("from-positions", path, "--out", tmp_path / "made.csv", "--quality", quality)
+    assert code == 0, printed
+    assert read_track(tmp_path / "made.csv").sigma_plan_m == plan_m
+    assert "accuracy of the map" in printed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.run.driver import run_files
+from railfix.run.inputs import RunInputs
 from railfix.simulate.demo_data import demo_files
+from railfix.track import Track, read_track, write_track_csv
 from railfix.track.trajectory import Trajectory
 
 
@@ -89,3 +93,16 @@ def test_a_small_offset_is_a_term_of_the_level(right: AntennaResult, offset: dic
     assert np.nanmedian(after) > np.nanmedian(before) + 0.3
     across, up = result.map_offset.beyond_m
     assert max(np.median(np.abs(across[late])), np.median(np.abs(up[late]))) > 1.0
+
+
+@pytest.mark.requirement("C4")
+def test_a_run_on_a_map_without_the_geoid_says_so(tmp_path: Path) -> None:
+    """``railfix run`` with every height 37 m too low: a note with the size and the likely cause."""
+    files = demo_files()
+    track = read_track(files["track"])
+    lower = track.ecef_m - 37.0 * (track.ecef_m / np.linalg.norm(track.ecef_m, axis=1, keepdims=True))
+    write_track_csv(Track.from_ecef(lower, name="without geoid"), tmp_path / "low.csv")
+    inputs = RunInputs(front=(files["front"],), nav=(files["nav"],), track=(tmp_path / "low.csv",))
+    summary = run_files(inputs, out=tmp_path / "results")
+    notes = [note for note in summary.notes if "the map" in note]
+    assert any("contradicts the positions" in note and "geoid" in note for note in notes), summary.notes

@@ -220,6 +220,11 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
 def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None:
     console = console_of_tables()
     console.print(f"{rows} positions, {len(track)} points kept, {track.chainage_m[-1]:,.1f} m")
+    show_notes(console, track.provenance.notes)
+    quality = check_track(track)
+    console.print(f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s)")
+    for finding in quality.errors[:_SHOWN]:
+        console.print(f"error: {finding.sentence}; a larger --spacing smooths noisy positions", markup=False)
     for reason, count in thinned.dropped.items():
         if count:
             console.print(f"dropped {count} {reason}")

@@ -205,7 +205,8 @@ def ablate_files(
             for antenna in inputs.logs
             for name, processor in processors.items()
         )
-        notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs))
+        threshold = config.map_offset.note_threshold
+        notes = (*left_out, *notes_of(line, navigation, tallies[ALL], logs, note_statistic=threshold))
         wall = clock.perf_counter() - began
         record = run_record(
             files=[entry.result() for entry in entries],

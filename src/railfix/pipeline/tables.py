@@ -88,6 +88,11 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     **_screen_columns("positions"),
     "conventional_chainage_m": "3-D single point, moved to the nearest point of the trajectory",
     "conventional_offset_m": "distance of the 3-D single point from that point",
+    "map_offset_across_m": "mean of the 3-D positions of the last minutes, right of the line in the direction of "
+    "rising chainage; empty for the first minute",
+    "map_offset_up_m": "the same, above the line",
+    "map_offset_statistic": "square of that offset in its own sigmas (noise, satellites, atmosphere, stated error of "
+    "the map); status `map_offset` from 13.8 on",
     "conventional_x_m": "3-D single point, ECEF",
     "conventional_y_m": "3-D single point, ECEF",
     "conventional_z_m": "3-D single point, ECEF",
@@ -178,6 +183,9 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
     columns |= _raim_columns(result)
     columns["conventional_chainage_m"] = float_column(result.conventional_chainage_m)
     columns["conventional_offset_m"] = float_column(result.conventional_offset_m)
+    columns["map_offset_across_m"] = float_column(result.map_offset.across_m)
+    columns["map_offset_up_m"] = float_column(result.map_offset.up_m)
+    columns["map_offset_statistic"] = float_column(result.map_offset.statistic)
     for axis, column in enumerate(("conventional_x_m", "conventional_y_m", "conventional_z_m")):
         columns[column] = float_column(result.conventional_ecef_m[:, axis])
     return pl.DataFrame(columns)

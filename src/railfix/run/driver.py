@@ -34,6 +34,7 @@ from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
 from railfix.run.sources import Line, Log, open_line
 from railfix.run.tally import Tally
+from railfix.track import check_track
 
 
 class Progress(Protocol):
@@ -118,7 +119,10 @@ def run_files(
         check_sbas_time(processor.received.sbas, tally)
         check_positions(tally)
         sigma, found_levels = along_sigma(folder), levels(folder)
-        notes = (*notes_of(line, navigation, tally, logs), *_notes_of_levels(config, tally, found_levels))
+        notes = (
+            *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
+            *_notes_of_levels(config, tally, found_levels),
+        )
         wall = clock.perf_counter() - began
         record = run_record(
             files=[entry.result() for entry in entries],
@@ -207,16 +211,44 @@ def _position(
     return tally
 
 
-def notes_of(line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log]) -> tuple[str, ...]:
-    """Everything a reader of the results should know, each once."""
-    said = [*line.notes, *navigation.notes, *_broken_notes(logs), *tally.notes]
+def notes_of(
+    line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
+) -> tuple[str, ...]:
+    """Everything a reader of the results should know, each once.
+
+    Parameters
+    ----------
+    line : Line
+    navigation : Navigation
+    tally : Tally
+    logs : mapping of str to Log
+    note_statistic : float
+        Statistic of the test of the map from which on there is a note (`MapOffsetLimits.note_threshold`).
+    """
+    said = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.notes]
     for name, antenna in tally.antennas.items():
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
             said.append(f"{name}: satellites seen without any usable navigation record: {seen}")
-        if antenna.positioned and antenna.positioned == antenna.status["off_map"]:
-            said.append(f"{name}: every position is off the map; is this the right track?")
+        offset = antenna.map_offset
+        if offset is not None and offset.statistic > note_statistic:
+            doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"
+            said.append(f"{name}: the map {doubt}: {offset.text}")
+        off = antenna.status["off_map"]
+        if off > 0.1 * antenna.positioned:
+            which = "every position is" if off == antenna.positioned else f"{off} of {antenna.positioned} positions are"
+            said.append(f"{name}: {which} off the map; is this the right track?")
     return tuple(dict.fromkeys(said))
+
+
+def _map_notes(line: Line) -> Iterator[str]:
+    """Result of the check of the track map."""
+    quality = check_track(line.track)
+    if quality.errors:
+        yield (
+            f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s); the first error "
+            f"{quality.errors[0].sentence}; see railfix map check"
+        )
 
 
 def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:

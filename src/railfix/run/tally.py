@@ -16,6 +16,37 @@ _NOT_A_REFUSAL = Reason.NOT_OBSERVED
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 
+@dataclass(frozen=True, kw_only=True)
+class MapOffsetFound:
+    """Mean offset of the 3-D positions from the line at the end of one window.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+    across_m, up_m, across_sigma_m, up_sigma_m : float [m]
+    statistic : float
+    """
+
+    time: np.datetime64
+    across_m: float
+    up_m: float
+    across_sigma_m: float
+    up_sigma_m: float
+    statistic: float
+
+    @property
+    def text(self) -> str:
+        """Offset with its likely cause, one clause."""
+        across, up = abs(self.across_m) / self.across_sigma_m, abs(self.up_m) / self.up_sigma_m
+        causes = "heights without the geoid, or in another height system" if up > across else "another track beside it"
+        side, above = "right" if self.across_m > 0 else "left", "above" if self.up_m > 0 else "below"
+        return (
+            f"over the minutes before {str(self.time)[:19]} the 3-D positions lie {abs(self.across_m):.1f} m "
+            f"(sigma {self.across_sigma_m:.1f} m) {side} of the line and {abs(self.up_m):.1f} m (sigma "
+            f"{self.up_sigma_m:.1f} m) {above} it; likely causes: {causes}, or another reference frame"
+        )
+
+
 @dataclass(kw_only=True)
 class AntennaTally:
     """Counts of one antenna.
@@ -46,6 +77,8 @@ class AntennaTally:
         Epochs with a conventional position.
     conventional_nearest_m : float
         Least distance of a conventional position from the trajectory; NaN when there was none.
+    map_offset : MapOffsetFound or None
+        Where the 3-D positions contradicted the map most; None before there were enough.
     """
 
     min_satellites: int = 3
@@ -66,6 +99,7 @@ class AntennaTally:
     last: np.datetime64 | None = None
     conventional: int = 0
     conventional_nearest_m: float = float("nan")
+    map_offset: MapOffsetFound | None = None
 
     def add(self, result: AntennaResult) -> None:
         """Count one more chunk."""
@@ -87,6 +121,23 @@ class AntennaTally:
         self.conventional += int(np.count_nonzero(np.isfinite(offset)))
         if np.isfinite(offset).any():
             self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, np.nanmin(offset)))
+        self._add_map_offset(result)
+
+    def _add_map_offset(self, result: AntennaResult) -> None:
+        """Keep the window that contradicts the map most."""
+        found = result.map_offset
+        if not np.isfinite(found.statistic).any():
+            return
+        worst = int(np.nanargmax(found.statistic))
+        if self.map_offset is None or found.statistic[worst] > self.map_offset.statistic:
+            self.map_offset = MapOffsetFound(
+                time=result.time[worst],
+                across_m=float(found.across_m[worst]),
+                up_m=float(found.up_m[worst]),
+                across_sigma_m=float(found.across_sigma_m[worst]),
+                up_sigma_m=float(found.up_sigma_m[worst]),
+                statistic=float(found.statistic[worst]),
+            )
 
     def _add_reasons(self, result: AntennaResult) -> None:
         seen = (result.reason & _NOT_A_REFUSAL) == 0

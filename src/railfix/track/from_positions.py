@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from pydantic import Field
@@ -39,6 +41,11 @@ class ThinningLimits(Settings):
         while standing from a bend.
     jump_m : float [m]
         Neighbouring points further apart are reported, for a straight line bridges them.
+    gap_m : float [m]
+        Neighbouring points further apart are no line: the positions are refused.
+    speed_mps : float [m/s]
+        Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
+        times, those further than `gap_m` from the others.
     """
 
     spacing_m: float = Field(default=5.0, gt=0)
@@ -46,6 +53,8 @@ class ThinningLimits(Settings):
     standing_mps: float = Field(default=0.2, ge=0)
     standing_window_s: float = Field(default=3.0, gt=0)
     jump_m: float = Field(default=50.0, gt=0)
+    gap_m: float = Field(default=2000.0, gt=0)
+    speed_mps: float = Field(default=150.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +138,8 @@ def thin(
     finite = np.isfinite(ecef_m).all(axis=1)
     good = finite if usable is None else finite & usable
     rows = np.flatnonzero(good)
+    reachable = _reachable(time[rows], ecef_m[rows], limits)
+    rows, out_of_reach = rows[reachable], int(np.count_nonzero(~reachable))
     stands = standing(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=limits.standing_window_s)
     stands = _with_shuffles(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
@@ -144,6 +155,7 @@ def thin(
         dropped={
             "without a position": int((~finite).sum()),
             "of insufficient quality": int((finite & ~good).sum()),
+            "out of reach of the others": out_of_reach,
             "standing still": int(stands.sum()),
             "nearer than the spacing": len(moving) - len(kept),
         },
@@ -151,6 +163,40 @@ def thin(
         jump_m=length[jumps],
         turns=np.searchsorted(chosen, back),
     )
+
+
+def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks:
+    """Rows that one vehicle can have passed: outward from the longest piece without a jump, shape (n,).
+
+    Between neighbours of a piece the speed is possible; a further piece belongs to it where it can be reached
+    from the nearest end of what is kept.
+    """
+    if len(ecef_m) < 2:
+        return np.ones(len(ecef_m), dtype=np.bool_)
+    timed = not np.isnat(time).any()
+
+    def possible(first: int, last: int) -> bool:
+        distance = float(np.linalg.norm(ecef_m[last] - ecef_m[first]))
+        if timed:
+            lasted = float(seconds(time[last] - time[first]))
+            return distance <= limits.speed_mps * max(lasted, 1.0)
+        return distance <= limits.gap_m
+
+    step = np.linalg.norm(np.diff(ecef_m, axis=0), axis=1)
+    reach = limits.speed_mps * np.maximum(seconds(np.diff(time)), 1.0) if timed else np.full(len(step), limits.gap_m)
+    edges = [0, *(np.flatnonzero(step > reach) + 1).tolist(), len(ecef_m)]
+    pieces = list(pairwise(edges))
+    longest = max(range(len(pieces)), key=lambda i: pieces[i][1] - pieces[i][0])
+    kept = np.zeros(len(ecef_m), dtype=np.bool_)
+    low, high = pieces[longest][0], pieces[longest][1] - 1
+    kept[low : high + 1] = True
+    for first, end in pieces[longest + 1 :]:
+        if possible(high, first):
+            kept[first:end], high = True, end - 1
+    for first, end in reversed(pieces[:longest]):
+        if possible(end - 1, low):
+            kept[first:end], low = True, first
+    return kept
 
 
 def _turning_back(points: Floats) -> Indices:
@@ -264,12 +310,19 @@ def track_of(
     files: tuple[str, ...] = (),
     sigma_plan_m: float = SIGMA_PLAN_M,
     sigma_height_m: float = SIGMA_HEIGHT_M,
+    gap_m: float = 2000.0,
+    accuracy: str = "",
 ) -> Track:
     """The track of positions that `thin` chose."""
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
         raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions left, a track needs two ({dropped})")
-    notes = [ANTENNA_PATH]
+    notes = [ANTENNA_PATH, *([accuracy] if accuracy else [])]
+    if thinned.jump_m.max(initial=0.0) > gap_m:
+        raise ValueError(
+            f"the positions leave a gap of {thinned.jump_m.max():.0f} m, over {gap_m:g} m, which no straight line "
+            "bridges; give positions of one run"
+        )
     if len(thinned.jumps):
         notes.append(
             f"{len(thinned.jumps)} gap(s) between positions are bridged by a straight line, "
@@ -318,6 +371,34 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     return usable
 
 
+#: Standard deviations of positions by their quality number (RTKLIB), plan and height [m]; a fix keeps what P1 states
+#: of a surveyed map. 2: float, 3: SBAS, 4: differential, 5: single point without corrections.
+SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
+    {1: (SIGMA_PLAN_M, SIGMA_HEIGHT_M), 2: (0.5, 1.0), 3: (1.5, 3.0), 4: (1.0, 2.0), 5: (3.0, 6.0)}
+)
+
+
+def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
+    """Standard deviations in plan and height of the positions that a map is made of, and what they rest on.
+
+    The larger of what the log states and what positions of their quality have: a filter's own sigma of a single
+    point is the noise alone.
+    """
+    plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
+    stated = log.sigma_m[kept]
+    reasons = []
+    if np.isfinite(stated).all() and len(stated):
+        plan = max(plan, float(np.median(np.hypot(stated[:, 0], stated[:, 1]) / np.sqrt(2.0))))
+        height = max(height, float(np.median(stated[:, 2])))
+        reasons.append("the standard deviations of the log")
+    if log.has_quality:
+        worst = [SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[5]) for q in np.unique(log.quality[kept])]
+        plan, height = max(plan, *(w[0] for w in worst)), max(height, *(w[1] for w in worst))
+        reasons.append("the quality of the positions")
+    told = " and ".join(reasons) if reasons else "an assumption, for the log states neither quality nor sigma"
+    return plan, height, f"accuracy of the map {plan:.2f} m in plan, {height:.2f} m in height: {told}"
+
+
 def from_position_log(
     log: PositionLog,
     *,
@@ -337,7 +418,18 @@ def from_position_log(
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)
     thinned = thin(log.time, log.ecef_m, usable=usable, limits=limits)
+    plan, height, accuracy = _accuracy(log, thinned.kept)
     try:
-        return track_of(log.ecef_m, thinned, name=name or "positions", files=(log.path,)), thinned
+        track = track_of(
+            log.ecef_m,
+            thinned,
+            name=name or "positions",
+            files=(log.path,),
+            sigma_plan_m=plan,
+            sigma_height_m=height,
+            gap_m=limits.gap_m,
+            accuracy=accuracy,
+        )
+        return track, thinned
     except ValueError as error:
         raise InputFileError(log.path, str(error)) from None

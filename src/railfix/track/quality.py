@@ -30,6 +30,8 @@ class MapLimits(Settings):
         Chord from arc at the middle of a segment (P1 4.1(3): 0.30 m).
     spacing_m : float [m]
         Longest segment (P1 2.2(1): some tens of metres on straight track).
+    gap_m : float [m]
+        A segment longer than this is a point that does not belong to the line, or a missing piece of it.
     near_duplicate_m : float [m]
         Two points nearer than this are one point measured twice.
     kink_deg : float [deg]
@@ -51,6 +53,7 @@ class MapLimits(Settings):
 
     mid_chord_m: float = Field(default=0.30, gt=0)
     spacing_m: float = Field(default=50.0, gt=0)
+    gap_m: float = Field(default=2000.0, gt=0)
     near_duplicate_m: float = Field(default=0.10, gt=0)
     kink_deg: float = Field(default=3.0, gt=0)
     sharp_kink_deg: float = Field(default=15.0, gt=0)
@@ -201,7 +204,15 @@ def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator
         limit=limits.near_duplicate_m,
     )
     yield from report.runs(
-        spacing > limits.spacing_m,
+        spacing > limits.gap_m,
+        "error",
+        "gap",
+        "points {value:.0f} m apart (limit {limit:g} m); a point is wrong, or a piece of the line is missing",
+        values=spacing,
+        limit=limits.gap_m,
+    )
+    yield from report.runs(
+        (spacing > limits.spacing_m) & (spacing <= limits.gap_m),
         "warning",
         "spacing",
         "points {value:.1f} m apart (limit {limit:g} m); a curve in between would not be seen",
