@@ -119,7 +119,7 @@ def test_a_choice_is_the_run_with_these_screens(
                 assert score.mean_m == pytest.approx(chosen.mean(), abs=5e-3)
                 assert score.std_m == pytest.approx(chosen.std(), abs=5e-3)
                 assert score.max_m == pytest.approx(size.max(), abs=2e-2)
-            assert score.wrong_place == 0.0
+                assert score.wrong_place == 0.0
 
 
 def test_files_hold_the_effects(ablation: tuple[Ablation, list[int]]) -> None:
