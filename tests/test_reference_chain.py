@@ -17,10 +17,12 @@ def random_chain(count: int, unknowns: int, seed: int) -> Chain:
         step = random.normal(size=(2, count - 1, unknowns, unknowns))
         root = random.normal(size=(count - 1, unknowns, unknowns))
         weight = root @ np.swapaxes(root, 1, 2) + np.eye(unknowns)
-        chain.add_steps(step[0], step[1], random.normal(size=(count - 1, unknowns)), weight)
+        chain = chain.with_steps(step[0], step[1], random.normal(size=(count - 1, unknowns)), weight)
     for _ in range(unknowns):
         rows = np.arange(count)
-        chain.add_single(rows, random.normal(size=(count, unknowns)), random.normal(size=count), np.full(count, 0.3))
+        chain = chain.with_observations(
+            rows, random.normal(size=(count, unknowns)), random.normal(size=count), np.full(count, 0.3)
+        )
     return chain
 
 
@@ -47,9 +49,9 @@ def test_a_random_walk_between_two_fixes_is_the_brownian_bridge() -> None:
     count, q, closing = 61, 0.04, 3.0
     chain = Chain.empty(count, 1)
     one = np.ones((count - 1, 1, 1))
-    chain.add_steps(-one, one, np.full((count - 1, 1), 10.0), one / q)
+    chain = chain.with_steps(-one, one, np.full((count - 1, 1), 10.0), one / q)
     ends = np.array([0, count - 1])
-    chain.add_single(ends, np.ones(1), np.array([0.0, 600.0 + closing]), np.full(2, 1e12))
+    chain = chain.with_observations(ends, np.ones(1), np.array([0.0, 600.0 + closing]), np.full(2, 1e12))
     value, covariance = chain.solve()
     k = np.arange(count)
     np.testing.assert_allclose(value[:, 0], 10.0 * k + closing * k / 60.0, atol=1e-6)
@@ -82,16 +84,31 @@ def test_position_and_speed_as_a_forward_backward_smoother() -> None:
         x = after[k][0] + g @ (smooth[0][0] - before[k + 1][0])
         smooth.insert(0, (x, after[k][1] + g @ (smooth[0][1] - before[k + 1][1]) @ g.T))
     chain = Chain.empty(count, 2)
-    chain.add_steps(
+    chain = chain.with_steps(
         np.broadcast_to(-step, (count - 1, 2, 2)),
         np.broadcast_to(np.eye(2), (count - 1, 2, 2)),
         np.zeros((count - 1, 2)),
         np.broadcast_to(np.linalg.inv(noise), (count - 1, 2, 2)),
     )
     rows = np.flatnonzero(seen)
-    chain.add_single(rows, np.array([1.0, 0.0]), z[rows], np.full(len(rows), 25.0))
+    chain = chain.with_observations(rows, np.array([1.0, 0.0]), z[rows], np.full(len(rows), 25.0))
     for i in range(2):
-        chain.add_single(np.array([0]), np.eye(2)[i], np.zeros(1), np.full(1, 0.01))
+        chain = chain.with_observations(np.array([0]), np.eye(2)[i], np.zeros(1), np.full(1, 0.01))
     value, covariance = chain.solve()
     np.testing.assert_allclose(value, [s[0] for s in smooth], atol=1e-9)
     np.testing.assert_allclose(covariance, [s[1] for s in smooth], atol=1e-9)
+
+
+def test_a_chain_is_a_value() -> None:
+    """Terms come into a copy; the chain before them stays as it was."""
+    before = random_chain(5, 2, seed=4)
+    parts = [part.copy() for part in (before.diagonal, before.upper, before.right)]
+    step = np.ones((4, 2, 2))
+    after = before.with_observations(np.array([1, 1]), np.ones(2), np.ones(2), np.ones(2))
+    after = after.with_steps(step, step, np.ones((4, 2)), step)
+    for part, kept, changed in zip(
+        (before.diagonal, before.upper, before.right), parts, (after.diagonal, after.upper, after.right), strict=True
+    ):
+        np.testing.assert_array_equal(part, kept)
+        assert (changed != kept).any()
+    assert after.diagonal[1] == pytest.approx(before.diagonal[1] + 2.0 + 8.0)

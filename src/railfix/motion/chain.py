@@ -13,7 +13,7 @@ doi:10.1137/0714050. H. E. Rauch, F. Tung, C. T. Striebel, 1965, doi:10.2514/3.3
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from railfix.core.arrays import Floats, Indices
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """Normal equations of N instants with n unknowns each, while terms are added.
+    """Normal equations of N instants with n unknowns each; terms are added by copies.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Chain:
 
     @classmethod
     def empty(cls, instants: int, unknowns: int) -> Chain:
-        """No information yet."""
+        """Chain without information."""
         square = (unknowns, unknowns)
         return cls(
             diagonal=np.zeros((instants, *square)),
@@ -47,14 +47,25 @@ class Chain:
             right=np.zeros((instants, unknowns)),
         )
 
-    def add_single(self, rows: Indices, coefficients: Floats, value: Floats, weight: Floats) -> None:
-        """Scalar observations ``coefficients . x_row = value``, shapes (m,), (n,) or (m, n), (m,), (m,)."""
-        a = np.broadcast_to(coefficients, (len(rows), self.right.shape[1]))
-        np.add.at(self.diagonal, rows, weight[:, None, None] * a[:, :, None] * a[:, None, :])
-        np.add.at(self.right, rows, (weight * value)[:, None] * a)
+    def with_observations(self, rows: Indices, coefficients: Floats, value: Floats, weight: Floats) -> Chain:
+        """The chain with scalar observations ``coefficients . x_row = value`` added.
 
-    def add_steps(self, before: Floats, after: Floats, value: Floats, weight: Floats) -> None:
-        """Conditions ``before x_k + after x_{k+1} = value`` on every step.
+        Parameters
+        ----------
+        rows : ndarray of int, shape (m,)
+            Instants; one may come several times.
+        coefficients : ndarray, shape (n,) or (m, n)
+        value, weight : ndarray, shape (m,)
+            Weight is the inverse variance.
+        """
+        a = np.broadcast_to(coefficients, (len(rows), self.right.shape[1]))
+        diagonal, right = self.diagonal.copy(), self.right.copy()
+        np.add.at(diagonal, rows, weight[:, None, None] * a[:, :, None] * a[:, None, :])
+        np.add.at(right, rows, (weight * value)[:, None] * a)
+        return replace(self, diagonal=diagonal, right=right)
+
+    def with_steps(self, before: Floats, after: Floats, value: Floats, weight: Floats) -> Chain:
+        """The chain with conditions ``before x_k + after x_{k+1} = value`` on every step added.
 
         Parameters
         ----------
@@ -64,11 +75,12 @@ class Chain:
             Inverse covariance.
         """
         weighed_before, weighed_after = (np.swapaxes(a, 1, 2) @ weight for a in (before, after))
-        self.diagonal[:-1] += weighed_before @ before
-        self.diagonal[1:] += weighed_after @ after
-        self.upper[:] += weighed_before @ after
-        self.right[:-1] += np.einsum("kij,kj->ki", weighed_before, value)
-        self.right[1:] += np.einsum("kij,kj->ki", weighed_after, value)
+        diagonal, right = self.diagonal.copy(), self.right.copy()
+        diagonal[:-1] += weighed_before @ before
+        diagonal[1:] += weighed_after @ after
+        right[:-1] += np.einsum("kij,kj->ki", weighed_before, value)
+        right[1:] += np.einsum("kij,kj->ki", weighed_after, value)
+        return replace(self, diagonal=diagonal, upper=self.upper + weighed_before @ after, right=right)
 
     def solve(self) -> tuple[Floats, Floats]:
         """Values and covariances of every instant, shapes (N, n) and (N, n, n).
@@ -76,7 +88,7 @@ class Chain:
         Raises
         ------
         numpy.linalg.LinAlgError
-            Something is not determined.
+            An unknown is not determined.
         """
         value, covariance, _ = _reduced(self.diagonal, self.upper, self.right)
         return value, covariance

@@ -121,12 +121,14 @@ def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
     relief = np.ones(len(seen))
     for _ in range(_ROUNDS if len(seen) else 1):
         chain = Chain.empty(len(t), unknowns.count)
-        _add_motion(chain, unknowns, evidence, np.diff(t), np.diff(nominal), settings)
+        chain = _with_motion(chain, unknowns, evidence, np.diff(t), np.diff(nominal), settings)
         row = _one(unknowns, unknowns.place)
-        chain.add_single(fixed, row, (evidence.fix_m - nominal)[fixed], evidence.fix_sigma_m[fixed] ** -2.0)
-        _add_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings)
-        _add_wheel(chain, unknowns, evidence, np.diff(t), nominal, settings)
-        _add_offset(chain, unknowns, np.diff(t), settings)
+        chain = chain.with_observations(
+            fixed, row, (evidence.fix_m - nominal)[fixed], evidence.fix_sigma_m[fixed] ** -2.0
+        )
+        chain = _with_doppler(chain, unknowns, evidence, np.diff(t), seen, relief, settings)
+        chain = _with_wheel(chain, unknowns, evidence, np.diff(t), nominal, settings)
+        chain = _with_offset(chain, unknowns, np.diff(t), settings)
         value, covariance = chain.solve()
         if len(seen):
             left = np.abs(evidence.doppler_mps - value[:, unknowns.speed] - value[:, unknowns.doppler])[seen]
@@ -141,20 +143,20 @@ def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
     )
 
 
-def _add_motion(
+def _with_motion(
     chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, moved: Floats, settings: ReferenceSettings
-) -> None:
+) -> Chain:
     """Place, speed and an acceleration that lasts a while (Singer's model); and what measures its change of speed."""
     first = np.array([0])
     for unknown, sigma in ((unknowns.speed, _ANY_SPEED_MPS), (unknowns.acceleration, settings.motion_mps2)):
-        chain.add_single(first, _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
+        chain = chain.with_observations(first, _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
     turn, noise = singer(dt, settings.motion_mps2, settings.motion_s)
     before, after = np.zeros((2, len(dt), 3, unknowns.count))
     before[:, :, :3], after[:, :, :3] = -turn, np.eye(3)
     value = np.zeros((len(dt), 3))
     value[:, 0] = -moved
     noise[:, [0, 1], [0, 1]] += _LEAST_STEP_M**2
-    chain.add_steps(before, after, value, np.asarray(np.linalg.inv(noise)))
+    chain = chain.with_steps(before, after, value, np.asarray(np.linalg.inv(noise)))
     measured = np.isfinite(evidence.acceleration_mps2)
     if measured.any():
         before, after = np.zeros((2, len(dt), 1, unknowns.count))
@@ -162,7 +164,8 @@ def _add_motion(
         before[:, 0, unknowns.offset] = dt
         gained = np.where(measured, evidence.acceleration_mps2, 0.0) * dt
         weight = np.where(measured, 1.0 / (settings.acceleration_mps2**2 * dt), 0.0)
-        chain.add_steps(before, after, gained[:, None], weight[:, None, None])
+        chain = chain.with_steps(before, after, gained[:, None], weight[:, None, None])
+    return chain
 
 
 def singer(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
@@ -199,7 +202,7 @@ def singer(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]
     return step, noise
 
 
-def _add_doppler(
+def _with_doppler(
     chain: Chain,
     unknowns: _Unknowns,
     evidence: Evidence,
@@ -207,24 +210,29 @@ def _add_doppler(
     seen: Indices,
     relief: Floats,
     settings: ReferenceSettings,
-) -> None:
+) -> Chain:
     """Doppler speed = speed + lasting error + noise; the lasting error is a first-order Gauss-Markov process."""
     if unknowns.doppler < 0:
-        return
+        return chain
     kept = np.exp(-dt / settings.doppler_bias_s)
     variance = settings.doppler_bias_mps**2
-    chain.add_single(np.array([0]), _one(unknowns, unknowns.doppler), np.zeros(1), np.full(1, 1.0 / variance))
-    _add_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
+    chain = chain.with_observations(
+        np.array([0]), _one(unknowns, unknowns.doppler), np.zeros(1), np.full(1, 1.0 / variance)
+    )
+    chain = _with_walk(chain, unknowns.doppler, kept, 1.0 / (variance * (1.0 - kept**2)))
     row = _one(unknowns, unknowns.speed) + _one(unknowns, unknowns.doppler)
-    chain.add_single(seen, row, evidence.doppler_mps[seen], relief * evidence.doppler_sigma_mps[seen] ** -2.0)
+    chain = chain.with_observations(
+        seen, row, evidence.doppler_mps[seen], relief * evidence.doppler_sigma_mps[seen] ** -2.0
+    )
+    return chain
 
 
-def _add_wheel(
+def _with_wheel(
     chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, nominal: Floats, settings: ReferenceSettings
-) -> None:
+) -> Chain:
     """Reading = place + difference; the difference changes with the way by the scale, and by slip."""
     if unknowns.difference < 0:
-        return
+        return chain
     read = np.flatnonzero(np.isfinite(evidence.wheel_m))
     way = np.diff(evidence.wheel_m)
     known = np.isfinite(way)
@@ -232,30 +240,33 @@ def _add_wheel(
     row = _one(unknowns, unknowns.place) + _one(unknowns, unknowns.difference)
     start = evidence.wheel_m[read[0]] - nominal[read[0]]
     weight = np.full(len(read), max(evidence.wheel_sigma_m, _LEAST_READING_M) ** -2)
-    chain.add_single(read, row, evidence.wheel_m[read] - start - nominal[read], weight)
+    chain = chain.with_observations(read, row, evidence.wheel_m[read] - start - nominal[read], weight)
     for unknown, sigma in ((unknowns.difference, _ANY_DISTANCE_M), (unknowns.scale, settings.wheel_scale)):
-        chain.add_single(np.array([0]), _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
+        chain = chain.with_observations(np.array([0]), _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
     before, after = np.zeros((2, len(way), 1, unknowns.count))
     after[:, 0, unknowns.difference], before[:, 0, unknowns.difference] = 1.0, -1.0
     before[:, 0, unknowns.scale] = -way
     variance = np.where(known, settings.slip_m**2 * np.abs(way) + _LEAST_STEP_M**2, _ANY_DISTANCE_M**2)
-    chain.add_steps(before, after, np.zeros((len(way), 1)), (1.0 / variance)[:, None, None])
-    _add_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
+    chain = chain.with_steps(before, after, np.zeros((len(way), 1)), (1.0 / variance)[:, None, None])
+    chain = _with_walk(chain, unknowns.scale, np.ones(len(dt)), 1.0 / (_SCALE_DRIFT**2 * dt))
+    return chain
 
 
-def _add_offset(chain: Chain, unknowns: _Unknowns, dt: Floats, settings: ReferenceSettings) -> None:
+def _with_offset(chain: Chain, unknowns: _Unknowns, dt: Floats, settings: ReferenceSettings) -> Chain:
     """The accelerometer's offset, a random walk."""
     if unknowns.offset >= 0:
         prior = np.full(1, settings.acceleration_bias_mps2**-2)
-        chain.add_single(np.array([0]), _one(unknowns, unknowns.offset), np.zeros(1), prior)
-        _add_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
+        chain = chain.with_observations(np.array([0]), _one(unknowns, unknowns.offset), np.zeros(1), prior)
+        chain = _with_walk(chain, unknowns.offset, np.ones(len(dt)), 1.0 / (_OFFSET_DRIFT_MPS2**2 * dt))
+    return chain
 
 
-def _add_walk(chain: Chain, unknown: int, kept: Floats, weight: Floats) -> None:
+def _with_walk(chain: Chain, unknown: int, kept: Floats, weight: Floats) -> Chain:
     """``x_{k+1} = kept x_k`` with noise, for one unknown."""
     before, after = np.zeros((2, len(kept), 1, chain.right.shape[1]))
     after[:, 0, unknown], before[:, 0, unknown] = 1.0, -kept
-    chain.add_steps(before, after, np.zeros((len(kept), 1)), weight[:, None, None])
+    chain = chain.with_steps(before, after, np.zeros((len(kept), 1)), weight[:, None, None])
+    return chain
 
 
 def _one(unknowns: _Unknowns, unknown: int) -> Floats:
