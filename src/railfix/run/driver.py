@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
@@ -167,7 +169,9 @@ def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Lin
     navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
     if inputs.sp3:
         navigation = replace(navigation, precise=read_sp3(inputs.sp3))
-    line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track)
+    line = open_line(
+        inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, at=time_of(navigation)
+    )
     logs = {
         name: Log(
             paths=paths,
@@ -179,6 +183,14 @@ def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Lin
         for name, paths in inputs.logs.items()
     }
     return navigation, line, logs
+
+
+def time_of(navigation: Navigation) -> np.datetime64 | None:
+    """A time within days of the records, for the epoch of reference frames."""
+    clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
+    if navigation.precise is not None:
+        clocks = navigation.precise.time
+    return None if not len(clocks) else np.sort(clocks)[len(clocks) // 2]
 
 
 def _position(

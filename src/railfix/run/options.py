@@ -20,6 +20,10 @@ class TrackReading(Settings):
     ----------
     crs, height_datum, geoid : str or None
         Where the track's own file does not say; see `railfix.track.read_track`.
+    map_epoch : float or None [year]
+        Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).
+    plate : str or None
+        Plate that moves such coordinates to the time of the log; see `railfix.track.frames.track_at`.
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
         See `railfix.track.vehicle.antenna_trajectory`.
     """
@@ -31,6 +35,14 @@ class TrackReading(Settings):
         None,
         metavar="MODEL",
     )
+    map_epoch: float | None = option(
+        "Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).",
+        None,
+        metavar="YEAR",
+        gt=1980.0,
+        lt=2100.0,
+    )
+    plate: str | None = option("Plate that moves such coordinates to the time of the log.", None, metavar="NAME")
     reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
 
 

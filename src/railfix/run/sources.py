@@ -18,6 +18,7 @@ from railfix.io.logs import scan_observations
 from railfix.run.inputs import Antenna
 from railfix.run.options import TrackReading
 from railfix.track import Track, read_track
+from railfix.track.frames import FrameShift, track_at
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
 
@@ -31,17 +32,20 @@ class Line:
     track : Track
     vehicle : Vehicle or None
     trajectories : dict of str to Trajectory
+    frame : FrameShift or None
+        How the track was moved to the frame of the satellites; None where no time was given.
     """
 
     track: Track
     vehicle: Vehicle | None
     trajectories: dict[str, Trajectory]
+    frame: FrameShift | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What the map, the vehicle and the trajectories have to say, each once."""
         said = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
-        return tuple(dict.fromkeys([*said, *self.track.provenance.notes]))
+        return tuple(dict.fromkeys([*said, *self.track.provenance.notes, *(self.frame.notes if self.frame else ())]))
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -56,6 +60,7 @@ class Line:
                 "sigma_plan_m": track.sigma_plan_m,
                 "sigma_height_m": track.sigma_height_m,
                 "crs": provenance.crs,
+                "frame": None if self.frame is None else self.frame.facts,
                 "height_datum_asked": provenance.height_datum_asked,
                 "height_datum_used": provenance.height_datum_used,
                 "geoid": provenance.geoid,
@@ -66,9 +71,17 @@ class Line:
 
 
 def open_line(
-    track: tuple[Path, ...], vehicle: Path | None, *, antennas: tuple[Antenna, ...], reading: TrackReading
+    track: tuple[Path, ...],
+    vehicle: Path | None,
+    *,
+    antennas: tuple[Antenna, ...],
+    reading: TrackReading,
+    at: np.datetime64 | None = None,
 ) -> Line:
-    """Read the track and the vehicle, and work out the path of each antenna.
+    """Read the track and the vehicle, and compute the path of each antenna.
+
+    With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it
+    the coordinates stay in the map's own frame.
 
     Raises
     ------
@@ -76,18 +89,22 @@ def open_line(
         A file is not what it should be, or track and vehicle do not fit.
     """
     centreline = read_track(track, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
+    shift = None
+    if at is not None:
+        centreline, shift = track_at(centreline, at, epoch=reading.map_epoch, plate=reading.plate)
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
                 f"the chainage of {reading.reference} was asked for, which only a vehicle file can give; name one"
             )
         path = Trajectory.from_track(centreline)
-        return Line(track=centreline, vehicle=None, trajectories=dict.fromkeys(antennas, path))
+        return Line(track=centreline, vehicle=None, trajectories=dict.fromkeys(antennas, path), frame=shift)
     body = read_vehicle(vehicle)
     return Line(
         track=centreline,
         vehicle=body,
         trajectories={n: antenna_trajectory(centreline, body, n, reference=reading.reference) for n in antennas},
+        frame=shift,
     )
 
 

@@ -6,7 +6,7 @@ from os import PathLike
 from typing import Final
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from railfix.core.arrays import Floats
@@ -14,9 +14,10 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import write_whole
 from railfix.core.spelling import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
+from railfix.track.frames import frame_degrees, older_datum_note
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
 from railfix.track.segment import Segment
-from railfix.track.track import Track
+from railfix.track.track import UNNAMED, Track
 
 #: Column of the file, attribute of the track, factor, and what an empty cell means.
 OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
@@ -71,7 +72,7 @@ def read_csv_segment(
     if duplicates == "refuse":
         _refuse_duplicates(table, latitude, longitude, heights)
     crs = crs if crs is not None else table.metadata.get("crs")
-    latitude, longitude = _to_wgs84(crs, latitude, longitude, path=table.path)
+    latitude, longitude, frame = _in_frame(crs, latitude, longitude, path=table.path)
     if geoid is None and datum == "orthometric" and "geoid_m" not in table:
         geoid = table.metadata.get("geoid")
     height, model = ellipsoidal_heights(
@@ -94,11 +95,12 @@ def read_csv_segment(
         latitude_deg=latitude,
         longitude_deg=longitude,
         height_m=height,
-        crs=crs or "EPSG:4979",
+        crs=crs or UNNAMED,
+        frame=frame,
         height_datum=datum,
         geoid=model,
         metadata={key: value for key, value in table.metadata.items() if key in KNOWN_METADATA},
-        notes=notes,
+        notes=(*notes, *older_datum_note(crs)),
         **attributes,
     )
 
@@ -159,10 +161,10 @@ def _refuse_duplicates(table: NamedColumns, latitude: Floats, longitude: Floats,
         )
 
 
-def _to_wgs84(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats]:
-    """Degrees of another geographic system as WGS 84."""
+def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> tuple[Floats, Floats, str]:
+    """Degrees of a geographic system, and the modern frame they are in."""
     if crs is None:
-        return latitude, longitude
+        return latitude, longitude, "EPSG:4979"
     try:
         system = CRS.from_user_input(crs)
     except CRSError:
@@ -172,9 +174,7 @@ def _to_wgs84(crs: str | None, latitude: Floats, longitude: Floats, *, path: str
             f"{path}: {crs} is {system.name}, but the columns are latitude and longitude; "
             "projected coordinates are read from GeoJSON"
         )
-    transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
-    lon, lat = transformer.transform(longitude, latitude)
-    return np.asarray(lat, np.float64), np.asarray(lon, np.float64)
+    return frame_degrees(crs, longitude, latitude)
 
 
 def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
@@ -201,7 +201,7 @@ def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
                 columns[column] = ["nan" if np.isnan(v) else f"{v:.10g}" for v in values]
     lines = [
         f"# name: {track.name}",
-        "# crs: EPSG:4979",
+        f"# crs: {track.provenance.frame}",
         "# height_datum: ellipsoidal",
         f"# sigma_plan_m: {track.sigma_plan_m:g}",
         f"# sigma_height_m: {track.sigma_height_m:g}",

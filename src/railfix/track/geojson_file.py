@@ -8,7 +8,7 @@ from os import PathLike
 from typing import Any, Final
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from railfix.core.arrays import Floats
@@ -16,6 +16,7 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import read_text
 from railfix.core.spelling import misspelt
 from railfix.track.csv_file import OPTIONAL_COLUMNS, straight_radius
+from railfix.track.frames import frame_degrees, older_datum_note
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
 from railfix.track.segment import Segment
 
@@ -133,8 +134,8 @@ def _crs(path: str, crs: str) -> CRS:
         raise SettingsError(f"{path}: the CRS {crs!r} is unknown; give for example EPSG:4326 or EPSG:6677") from None
 
 
-def _to_wgs84(path: str, crs: str, values: Floats) -> tuple[Floats, Floats]:
-    """Latitude and longitude of coordinates in easting-northing or longitude-latitude order."""
+def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]:
+    """Latitude, longitude and frame of coordinates in easting-northing or longitude-latitude order."""
     system = _crs(path, crs)
     if system.is_geographic:
         over = np.abs(values[:, 1]) > 90.0
@@ -145,11 +146,10 @@ def _to_wgs84(path: str, crs: str, values: Floats) -> tuple[Floats, Floats]:
                 f"{crs}: [{point[0]:g}, {point[1]:g}] is no [longitude, latitude]; are they swapped, or is the CRS a "
                 "projected one (give --crs)?",
             )
-    transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
-    lon, lat = (np.asarray(v, np.float64) for v in transformer.transform(values[:, 0], values[:, 1]))
+    lat, lon, frame = frame_degrees(crs, values[:, 0], values[:, 1])
     if not (np.isfinite(lon).all() and np.isfinite(lat).all()):
         raise InputFileError(path, f"some coordinates lie outside the CRS {crs}; is it the right one?")
-    return lat, lon
+    return lat, lon, frame
 
 
 def read_geojson_segments(
@@ -205,7 +205,7 @@ def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None,
             f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
             "'railfix map check' lists them all"
         )
-    latitude, longitude = _to_wgs84(line.source, crs, line.coordinates)
+    latitude, longitude, frame = _in_frame(line.source, crs, line.coordinates)
     geoid_m = line.array("geoid_m", blank=np.nan) if datum == "orthometric" else None
     if geoid is None and datum == "orthometric" and geoid_m is None:
         geoid = line.text("geoid")
@@ -225,11 +225,13 @@ def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None,
         longitude_deg=longitude,
         height_m=height,
         crs=crs,
+        frame=frame,
         height_datum=datum,
         geoid=model,
         kilometrage_m=attributes["kilometrage_m"],
         cant_m=attributes["cant_m"],
         radius_m=attributes["radius_m"],
         gradient_permille=attributes["gradient_permille"],
+        notes=older_datum_note(crs),
         metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties},
     )

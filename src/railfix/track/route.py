@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.segment import ATTRIBUTES, Segment
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
@@ -97,12 +97,22 @@ def join(
         provenance=Provenance(
             files=_unique(piece.file for piece in pieces),
             crs=", ".join(_unique(piece.crs for piece in pieces)),
+            frame=_one_frame(pieces),
             height_datum_asked=height_datum_asked or "",
             height_datum_used=", ".join(_unique(piece.height_datum for piece in pieces)),
             geoid=", ".join(_unique(piece.geoid for piece in pieces if piece.geoid)),
             notes=_unique(note for piece in pieces for note in piece.notes),
         ),
     )
+
+
+def _one_frame(pieces: Sequence[Segment]) -> str:
+    """The frame of all pieces; pieces in two frames would be joined with a step of up to 2 m."""
+    frames = {piece.frame: piece.source for piece in pieces}
+    if len(frames) > 1:
+        what = "; ".join(f"{source} in {frame}" for frame, source in frames.items())
+        raise MismatchError(f"the pieces of the route are in different reference frames: {what}; convert them to one")
+    return pieces[0].frame
 
 
 def _unique(values: Iterable[str]) -> tuple[str, ...]:

@@ -25,6 +25,8 @@ class Segment:
         NaN where not given.
     crs, height_datum, geoid : str
         What the file was in, and the geoid that was used.
+    frame : str
+        Geographic CRS of the coordinates here.
     metadata : dict of str
         Name and accuracy, where the file tells them.
     notes : tuple of str
@@ -43,6 +45,7 @@ class Segment:
     height_datum: str
     geoid: str
     metadata: dict[str, str]
+    frame: str = "EPSG:4979"
     notes: tuple[str, ...] = ()
 
     def reversed(self) -> Segment:
@@ -58,6 +61,7 @@ class Segment:
             radius_m=-self.radius_m[::-1],
             gradient_permille=-self.gradient_permille[::-1],
             crs=self.crs,
+            frame=self.frame,
             height_datum=self.height_datum,
             geoid=self.geoid,
             metadata=self.metadata,

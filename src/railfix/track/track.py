@@ -22,6 +22,8 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 SIGMA_PLAN_M = 0.30
 #: Standard deviation of its height [m]: about twice the plan's (P1 4.1(3)).
 SIGMA_HEIGHT_M = 0.60
+#: Name of the reference system of a map that names none.
+UNNAMED = "not named (WGS 84 assumed)"
 #: Kilometrage that disagrees with the length of a segment by more than this, plus a twentieth of
 #: the length, is a break in the marking [m]: files carry it rounded to the metre.
 KILOMETRAGE_BREAK_M = 1.0
@@ -35,7 +37,9 @@ class Provenance:
     ----------
     files : tuple of str
     crs : str
-        Coordinate reference system of the files.
+        Coordinate reference system of the files; `UNNAMED` where none is named.
+    frame : str
+        Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
     height_datum_asked, height_datum_used : str
         ``"ellipsoidal"`` or ``"orthometric"``; empty where nothing was asked for.
     geoid : str
@@ -46,6 +50,7 @@ class Provenance:
 
     files: tuple[str, ...] = ()
     crs: str = "EPSG:4979"
+    frame: str = "EPSG:4979"
     height_datum_asked: str = ""
     height_datum_used: str = "ellipsoidal"
     geoid: str = ""

@@ -1,0 +1,197 @@
+"""Frames of maps: against PROJ's own pipelines at named places and epochs, and in a run of a static station."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+from typer.testing import CliRunner
+
+from railfix.cli import app
+from railfix.core.errors import MismatchError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
+from railfix.track import Track, read_track
+from railfix.track.frames import WORKING_FRAME, decimal_year, frame_degrees, kind_of_frame, track_at
+from railfix.track.track import Provenance
+
+pytestmark = pytest.mark.requirement("A9")
+RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
+
+#: PROJ's steps by hand: geocentric ETRF2014, NAD83(2011), GDA2020 to ITRF2014 and to ITRF2020. The 14 parameters are
+#: those of the EPSG entries named; signs as PROJ's position-vector convention has them.
+PLACES = {
+    "EPSG:9069": [(35.0 + 1.7 * k, -9.0 + 1.9 * k, 50.0 * k) for k in range(20)],  # ETRF2014
+    "EPSG:7931": [(35.0 + 1.7 * k, -9.0 + 1.9 * k, 50.0 * k) for k in range(20)],  # ETRF2000
+    "EPSG:6319": [(26.0 + 1.1 * k, -123.0 + 2.7 * k, 40.0 * k) for k in range(20)],  # NAD83(2011)
+    "EPSG:7843": [(-43.0 + 1.6 * k, 115.0 + 1.9 * k, 20.0 * k) for k in range(20)],  # GDA2020
+}
+GEOCENTRIC = {"EPSG:9069": "EPSG:8401", "EPSG:7931": "EPSG:7930", "EPSG:6319": "EPSG:6317", "EPSG:7843": "EPSG:7842"}
+
+
+def line_at(places: list[tuple[float, float, float]], frame: str) -> Track:
+    latitude, longitude, height = np.array(places).T
+    return Track.from_geodetic(latitude, longitude, height, provenance=Provenance(crs=frame, frame=frame))
+
+
+@pytest.mark.parametrize("frame", PLACES)
+@pytest.mark.parametrize("year", [2010, 2021, 2026])
+def test_shifts_are_those_of_proj(frame: str, year: int) -> None:
+    """20 places of each frame at three epochs, within 2 cm of PROJ's steps over ITRF2014."""
+    time = np.datetime64(f"{year}-07-02T12:00:00")
+    track = line_at(PLACES[frame], frame)
+    moved, shift = track_at(track, time)
+    at = np.full(len(track), decimal_year(time))
+    source = Transformer.from_crs(frame, GEOCENTRIC[frame], always_xy=False)
+    x, y, z = source.transform(track.latitude_deg, track.longitude_deg, track.height_m)
+    to_2014 = Transformer.from_crs(GEOCENTRIC[frame], "EPSG:7789", allow_ballpark=False)
+    to_2020 = Transformer.from_crs("EPSG:7789", "EPSG:9988", allow_ballpark=False)
+    x, y, z, _ = to_2014.transform(x, y, z, at)
+    x, y, z, _ = to_2020.transform(x, y, z, at)
+    assert np.linalg.norm(moved.ecef_m - np.stack([x, y, z], axis=-1), axis=1).max() < 0.02
+    size = np.linalg.norm(moved.ecef_m - track.ecef_m, axis=1)
+    assert size.min() > 0.05
+    assert size.max() < 2.0
+    assert np.hypot(np.hypot(shift.east_m, shift.north_m), shift.up_m) == pytest.approx(size[len(track) // 2], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frame", "place", "size"),
+    [
+        ("EPSG:4258", (50.85, 4.35, 100.0), (0.85, 0.97)),  # Brussels
+        ("EPSG:6319", (39.74, -104.99, 1600.0), (1.2, 1.75)),  # Denver, height included
+        ("EPSG:7843", (-33.87, 151.21, 50.0), (0.33, 0.45)),  # Sydney
+    ],
+)
+def test_known_sizes_in_2026(frame: str, place: tuple[float, float, float], size: tuple[float, float]) -> None:
+    latitude, longitude, height = place
+    track = line_at([place, (latitude + 0.01, longitude, height)], frame)
+    _, shift = track_at(track, np.datetime64("2026-07-01"))
+    assert size[0] < float(np.linalg.norm([shift.east_m, shift.north_m, shift.up_m])) < size[1]
+
+
+def test_plate_motion_by_hand() -> None:
+    """ITRF2020 rotation of the Eurasian plate (Altamimi et al. 2023, table 2): -0.085, -0.519, 0.753 mas a year."""
+    track = line_at([(50.85, 4.35, 0.0), (50.86, 4.35, 0.0)], WORKING_FRAME)
+    moved, shift = track_at(track, np.datetime64("2030-01-01"), epoch=2020.0, plate="EURA")
+    rate = np.radians(np.array([-0.085, -0.519, 0.753]) / 3.6e6)
+    expected = np.cross(rate, track.ecef_m) * 10.0
+    assert np.abs(moved.ecef_m - track.ecef_m - expected).max() < 0.002
+    assert "EURA" in shift.method
+    same, shift = track_at(track, np.datetime64("2030-01-01"), epoch=2020.0)
+    assert np.abs(same.ecef_m - track.ecef_m).max() < 1e-6
+    assert "not moved" in shift.notes[0]
+
+
+def test_japan_moves_with_its_plate_and_says_so() -> None:
+    track = line_at([(35.68, 139.76, 60.0), (35.69, 139.76, 60.0)], "EPSG:6667")
+    _, shift = track_at(track, np.datetime64("2026-07-01"))
+    assert 0.2 < np.hypot(shift.east_m, shift.north_m) < 0.6
+    assert "left out" in shift.notes[0]
+
+
+def test_a_map_without_a_frame_names_its_doubt(tmp_path: Path) -> None:
+    path = tmp_path / "line.csv"
+    path.write_text("latitude_deg,longitude_deg,height_m\n50.85,4.35,100\n50.86,4.35,100\n")
+    track = read_track([path])
+    same, shift = track_at(track, np.datetime64("2026-07-01"))
+    assert same is track
+    assert "0.89 m off" in shift.notes[0]
+    assert "ETRS89" in shift.notes[0]
+    path.write_text("# crs: EPSG:4979\nlatitude_deg,longitude_deg,height_m\n50.85,4.35,100\n50.86,4.35,100\n")
+    assert track_at(read_track([path]), np.datetime64("2026-07-01"))[1].notes == ()
+
+
+def test_kinds_and_older_datums() -> None:
+    kinds = {crs: kind_of_frame(crs) for crs in ("EPSG:4326", "EPSG:25831", "EPSG:9989", "EPSG:31370", "EPSG:6677")}
+    assert list(kinds.values()) == ["wgs84", "moves with its plate", "dynamic", "older datum", "moves with its plate"]
+    # Belgian Lambert 72 goes to ETRS89, so that the rest of the way to the ITRF follows.
+    latitude, longitude, frame = frame_degrees("EPSG:31370", np.array([150_000.0]), np.array([170_000.0]))
+    assert frame == "EPSG:4937"
+    assert (latitude[0], longitude[0]) == (pytest.approx(50.84, abs=0.02), pytest.approx(4.37, abs=0.02))
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    track = line_at([(50.85, 4.35, 100.0), (50.86, 4.35, 100.0)], "EPSG:4258")
+    with pytest.raises(SettingsError, match="takes no epoch"):
+        track_at(track, np.datetime64("2026-07-01"), epoch=2020.0)
+    with pytest.raises(SettingsError, match="plate 'ATLANTIS'"):
+        track_at(
+            line_at([(1.0, 1.0, 0.0), (1.1, 1.0, 0.0)], WORKING_FRAME), np.datetime64("2026-07-01"), plate="ATLANTIS"
+        )
+    for name, crs, first in (("a", "EPSG:4258", 50.85), ("b", "EPSG:4326", 50.86)):
+        rows = f"{first},4.35,100\n{first + 0.01},4.35,100\n"
+        (tmp_path / f"{name}.csv").write_text(f"# crs: {crs}\nlatitude_deg,longitude_deg,height_m\n{rows}")
+    with pytest.raises(MismatchError, match="different reference frames"):
+        read_track([tmp_path / "a.csv", tmp_path / "b.csv"])
+
+
+def test_a_station_on_a_line_in_its_own_frame(recordings: Path, tmp_path: Path) -> None:
+    """ESBC (Esbjerg) known in the ITRF: a line in ETRS89 named rightly gives the error of one in WGS 84; named
+    wrongly the along-track error changes by the shift."""
+    folder = recordings / "static" / "ESBC_2020177"
+    observations = next(folder.glob("*MO.*"))
+    navigation = next(folder.glob("*MN.*"))
+    import railfix
+
+    station = railfix.read_observations(observations, end="2020-06-25T00:10").header.approximate_ecef_m
+    latitude, longitude, height = (float(v) for v in geodetic_from_ecef(station))
+    axes = enu_axes(latitude, longitude)
+    along = np.arange(-1000.0, 1001.0, 5.0)
+    direction = np.sin(np.radians(45.0)) * axes[0] + np.cos(np.radians(45.0)) * axes[1]
+    points = geodetic_from_ecef(station + along[:, None] * direction)
+    line = Track.from_geodetic(points[0], points[1], np.full(len(along), height))
+    itrf = replace(line, provenance=Provenance(frame=WORKING_FRAME))
+    back = Transformer.from_crs(WORKING_FRAME, "EPSG:9069", always_xy=True)
+    at = np.full(len(along), 2020.4809)
+    lon, lat, up, _ = back.transform(itrf.longitude_deg, itrf.latitude_deg, itrf.height_m, at)
+    lines = {
+        "itrf": (itrf, "EPSG:4979"),
+        "etrs89": ((lat, lon, up), "EPSG:9069"),
+        "wrong": ((lat, lon, up), "EPSG:4979"),
+    }
+    errors, shifts = {}, {}
+    for name, (coordinates, crs) in lines.items():
+        path = tmp_path / f"{name}.csv"
+        values = (
+            (coordinates.latitude_deg, coordinates.longitude_deg, coordinates.height_m)
+            if isinstance(coordinates, Track)
+            else coordinates
+        )
+        rows = [f"{a:.10f},{b:.10f},{c:.4f}" for a, b, c in zip(*values, strict=True)]
+        path.write_text(f"# crs: {crs}\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
+        words = ["run", "--front", str(observations), "--nav", str(navigation), "--track", str(path)]
+        words += ["--end", "2020-06-25T02:00:00", "--set", "protection=off", "--out", str(tmp_path / name)]
+        done = RUNNER.invoke(app, words)
+        assert done.exit_code == 0, done.output
+        import polars as pl
+
+        chainage = pl.read_parquet(tmp_path / name / "positions.parquet")["chainage_m"].to_numpy()
+        errors[name] = chainage - 1000.0
+        record = json.loads((tmp_path / name / "run.json").read_text())
+        shifts[name] = find(record, "shift_east_north_up_m")
+    assert np.nanmax(np.abs(errors["itrf"] - errors["etrs89"])) < 0.02
+    east, north, _ = shifts["etrs89"]
+    expected = np.sin(np.radians(45.0)) * east + np.cos(np.radians(45.0)) * north
+    assert expected > 0.6
+    assert np.nanmedian(errors["wrong"] - errors["itrf"]) == pytest.approx(expected, abs=0.03)
+    assert shifts["wrong"] == [0.0, 0.0, 0.0]
+
+
+def find(value: object, key: str) -> list[float]:
+    """The first value of a key anywhere in JSON."""
+    if isinstance(value, dict):
+        if key in value:
+            return list(value[key])
+        for item in value.values():
+            if (found := find(item, key)) is not None:
+                return found
+    return None  # type: ignore[return-value]
+
+
+def test_epochs_as_years() -> None:
+    assert decimal_year(np.datetime64("2024-07-02T00:00")) == pytest.approx(2024.5, abs=0.001)
+    assert ecef_from_geodetic(0.0, 0.0, 0.0)[0] == pytest.approx(6_378_137.0)
