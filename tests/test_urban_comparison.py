@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from urban_comparison import Sample, cn0_by_elevation, figures, simulated, weighted_median
+from urban_comparison import Sample, city, cn0_by_elevation, figures, simulated, weighted_median
 from urban_comparison import recordings as recorded_cities
 
 pytestmark = pytest.mark.requirement("D4")
@@ -55,6 +55,20 @@ def test_it_is_the_class_of_the_recorded_cities(urban: Sample, recordings: Path)
         assert 0.5 < theirs.over_20_m / ours.over_20_m < 2.0
         assert 0.5 < theirs.p95_m / ours.p95_m < 2.5
         assert theirs.late_over_20_m > 8.0 * theirs.early_over_20_m
+
+
+def test_the_city_is_as_bad_as_the_recordings_that_it_is_calibrated_on(recordings: Path) -> None:
+    """Tails, faults beyond 5 sigma and C/N0 within 25 % of the mean of both receivers in Hong Kong."""
+    sample, theirs = city(), recorded_cities(recordings)[:2]
+    ours, both = figures(sample), [figures(recorded) for recorded in theirs]
+    for name in ("p95_m", "p99_m", "over_20_m", "over_50_m", "beyond_5_sigma"):
+        middle = np.mean([getattr(f, name) for f in both])
+        assert getattr(ours, name) == pytest.approx(middle, rel=0.25), name
+    assert ours.correlation_1_s > 0.9
+    assert 0.8 < ours.pair_ratio < 1.6
+    # Mean and both ends of C/N0 from 10 to 70 deg.
+    recorded_cn0 = np.mean([cn0_by_elevation(recorded) for recorded in theirs], axis=0)[1:7]
+    assert np.abs(cn0_by_elevation(sample)[1:7] / recorded_cn0 - 1.0).max() < 0.25
 
 
 def test_the_weighted_median_is_the_middle_by_weight() -> None:

@@ -5,5 +5,5 @@ from __future__ import annotations
 from typing import Final
 
 CN0_HORIZON_DBHZ: Final = 34.0
-CN0_RISE_DBHZ: Final = 16.0
+CN0_RISE_DB: Final = 16.0
 CN0_SECOND_DB: Final = -3.0

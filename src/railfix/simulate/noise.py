@@ -58,6 +58,43 @@ class _FirstOrder:
         return np.asarray(series)
 
 
+class CodeSmoothing:
+    """Filter of first order on the code errors of a receiver's channels, restarted after each loss of lock.
+
+    ``y[k] = y[k-1] + (1 - exp(-interval / time)) (x[k] - y[k-1])``, y = x at the first epoch of a lock. The state is
+    carried from chunk to chunk.
+
+    Parameters
+    ----------
+    time_s : float
+        Time constant; 0: no filter.
+    channels : int
+    interval_s : float
+        Of the epochs.
+    """
+
+    def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
+        self._keep = float(np.exp(-interval_s / time_s)) if time_s > 0.0 else 0.0
+        self._state = np.full(channels, np.nan)
+
+    def next(self, error_m: Floats, lost: Masks) -> Floats:
+        """Filtered errors of the next epochs, shape (T, M); unchanged where lost."""
+        if self._keep == 0.0:
+            return error_m
+        smoothed, keep = error_m.copy(), self._keep
+        locked = np.zeros((len(error_m) + 2, error_m.shape[1]), dtype=np.int8)
+        locked[1:-1] = ~lost
+        change = np.diff(locked, axis=0)
+        for channel in np.flatnonzero((~lost).any(axis=0)):
+            starts, ends = (np.flatnonzero(change[:, channel] == sign) for sign in (1, -1))
+            for first, last in zip(starts.tolist(), ends.tolist(), strict=True):
+                x = error_m[first:last, channel]
+                before = self._state[channel] if first == 0 and np.isfinite(self._state[channel]) else x[0]
+                smoothed[first:last, channel] = lfilter([1.0 - keep], [1.0, -keep], x, zi=[keep * before])[0]
+        self._state = np.where(lost[-1], np.nan, smoothed[-1])
+        return smoothed
+
+
 @dataclass(frozen=True, kw_only=True)
 class LockState:
     """Lock state of a receiver's channels.
@@ -99,11 +136,25 @@ class Tracking:
         self._seen = np.zeros(channels, dtype=np.bool_)
         self._present = np.zeros(channels, dtype=np.bool_)
         self._losses = np.zeros(channels, dtype=np.uint64)
+        self._weak = np.zeros(channels, dtype=np.bool_)
 
     def too_weak(self, cn0_dbhz: Floats) -> Masks:
-        """Signals below the threshold."""
-        threshold = self._settings.threshold_dbhz
-        return np.zeros(cn0_dbhz.shape, dtype=np.bool_) if threshold is None else np.asarray(cn0_dbhz < threshold)
+        """Signals that have fallen below the threshold and not yet risen to the C/N0 of re-acquisition."""
+        threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
+        if threshold is None:
+            return np.zeros(cn0_dbhz.shape, dtype=np.bool_)
+        weak = cn0_dbhz < threshold
+        if again is None:
+            return np.asarray(weak)
+        # The last of both events decides; between them the state before the first epoch.
+        epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
+        fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
+        risen = np.maximum.accumulate(
+            np.where(cn0_dbhz >= max(again, threshold), epoch, np.where(self._weak, -1, 0)), axis=0
+        )
+        state = fallen > risen
+        self._weak = state[-1]
+        return np.asarray(state)
 
     def follow(self, bad: Masks) -> LockState:
         """Lock state over the next epochs of channels that cannot be tracked where `bad`, shape (T, M)."""

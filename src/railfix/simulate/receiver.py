@@ -9,8 +9,9 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.gnss.navigation import KeplerRecords
+from railfix.simulate.errors.processes import satellite_key
 from railfix.simulate.errors.settings import InterSystemSettings
-from railfix.simulate.noise import CarriedNoise, Tracking
+from railfix.simulate.noise import CarriedNoise, CodeSmoothing, Tracking
 from railfix.simulate.satellites import newest_record
 from railfix.simulate.scenario import ANTENNAS
 
@@ -20,8 +21,8 @@ if TYPE_CHECKING:
 
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
-#: Streams of random numbers: white noise, noise that goes on, cycle slips.
-_WHITE, _CARRIED, _SLIPS = 2, 3, 4
+#: Streams of random numbers: white noise, correlated noise, cycle slips, satellites' power.
+_WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
 class Receiver:
@@ -43,6 +44,11 @@ class Receiver:
         offsets = [errors.intersystem.get(name[0], InterSystemSettings()) for name, _ in channels]
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if number else 0.0) for o in offsets])
         self.offset_drift_mps = np.array([o.drift_mps for o in offsets])
+        sigma = scenario.receiver.cn0_satellite_sigma_db
+        #: Difference of each satellite's C/N0 from the mean, the same for both receivers.
+        self.cn0_offset_db = sigma * np.array(
+            [np.random.default_rng([scenario.seed, _POWER, *satellite_key(n)]).standard_normal() for n in self.names]
+        )
         self._rng = np.random.default_rng([scenario.seed, _WHITE, number])
         # Integer ambiguity of each channel.
         self.ambiguity = self._rng.integers(-2_000_000, 2_000_000, len(channels)).astype(np.float64)
@@ -51,6 +57,9 @@ class Receiver:
             key=(scenario.seed, _CARRIED, number),
             channels=len(channels),
             interval_s=simulation.interval_s,
+        )
+        self.smoothing = CodeSmoothing(
+            scenario.receiver.code_smoothing_s, channels=len(channels), interval_s=simulation.interval_s
         )
         self.tracking = Tracking(
             errors.tracking,

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.errors import SettingsError
+from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
 from railfix.simulate.disturbance import Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.errors.settings import ErrorSettings
@@ -205,6 +206,12 @@ class ReceiverSettings(ScenarioSettings):
         1 gives four observables a satellite, 2 gives eight.
     code_sigma_m, phase_sigma_m, doppler_sigma_hz, cn0_sigma_dbhz : float
         0 switches that noise off.
+    code_smoothing_s : float
+        Time constant with which the code follows its multipath error while locked, as with carrier smoothing.
+    cn0_horizon_dbhz, cn0_rise_db : float
+        C/N0 of an unobstructed signal at the horizon, and its rise in proportion to the sine of the elevation.
+    cn0_satellite_sigma_db : float
+        Constant difference of each satellite's C/N0.
     clocks : {"separate", "common"}
         Whether the two receivers run on one clock by hardware.
     clock_bias_s, clock_drift : float
@@ -219,6 +226,10 @@ class ReceiverSettings(ScenarioSettings):
     phase_sigma_m: NotNegative = 0.002
     doppler_sigma_hz: NotNegative = 0.05
     cn0_sigma_dbhz: NotNegative = 0.7
+    code_smoothing_s: NotNegative = 0.0
+    cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ
+    cn0_rise_db: Finite = CN0_RISE_DB
+    cn0_satellite_sigma_db: NotNegative = 0.0
     clocks: Literal["separate", "common"] = "separate"
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
     clock_drift: Finite = 2.0e-7

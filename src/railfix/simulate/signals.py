@@ -18,7 +18,7 @@ from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.body_motion import BodyMotion
-from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ, CN0_SECOND_DB
+from railfix.simulate.clear_sky import CN0_SECOND_DB
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
 from railfix.simulate.disturbance import Disturbances, Geometry
@@ -101,7 +101,12 @@ class Simulation:
         self.line: Alignment = build_alignment(scenario.line)
         self.motion: Motion = build_motion(self.line, scenario)
         self.body: BodyMotion = BodyMotion(scenario, self.motion)
-        self.environment = Environment(scenario.environment, line_length_m=self.line.length_m, seed=scenario.place_seed)
+        self.environment = Environment(
+            scenario.environment,
+            line_length_m=self.line.length_m,
+            seed=scenario.place_seed,
+            clear_cn0_dbhz=(scenario.receiver.cn0_horizon_dbhz, scenario.receiver.cn0_rise_db),
+        )
         place = () if scenario.environment.empty else (self.environment,)
         self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
         self.navigation: Navigation = simulated_navigation(scenario)
@@ -360,7 +365,8 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     doppler = -(path_rate[:, column] - scale * ionosphere_rate[:, column] + drift) / wavelength
     noise = receiver.white(len(time))
     sine = np.sin(np.radians(np.maximum(geometry.elevation_deg, 1.0)))
-    cn0 = CN0_HORIZON_DBHZ + CN0_RISE_DBHZ * sine + CN0_SECOND_DB * receiver.second
+    cn0 = settings.cn0_horizon_dbhz + settings.cn0_rise_db * sine + CN0_SECOND_DB * receiver.second
+    cn0 = cn0 + receiver.cn0_offset_db
     cn0 = cn0 + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
     added_code, added_phase, added_doppler = np.zeros((3, *code.shape))
     for source in simulation.disturbances:
@@ -373,6 +379,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     grown = weak if scenario.errors.noise.weak_signals == "all" else 1.0
     bad = ~_tracked(now.elevation_deg, scenario)[:, column] | np.isnan(added_code) | receiver.tracking.too_weak(cn0)
     tracked = receiver.tracking.follow(bad)
+    added_code = receiver.smoothing.next(added_code, tracked.lost)
     phase = path - ionosphere + added_phase + settings.phase_sigma_m * grown * noise[:, :, 1]
     doppler = doppler + added_doppler + settings.doppler_sigma_hz * grown * noise[:, :, 2]
     observations = Observations(

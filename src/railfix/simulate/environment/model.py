@@ -10,23 +10,33 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Complexes, Floats, Indices, Masks, Strings
 from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.timescale import seconds
 from railfix.gnss.signals import carrier_frequency_hz
-from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DBHZ
+from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
 from railfix.simulate.disturbance import Disturbance, Geometry
+from railfix.simulate.environment.antenna import received_amplitude
 from railfix.simulate.environment.correlator import Tracked, tracked
 from railfix.simulate.environment.diffraction import edge_amplitude, roughness_loss
 from railfix.simulate.environment.masts import Electrification
+from railfix.simulate.environment.second_reflections import second_reflection
 from railfix.simulate.environment.section_kinds import drawn_sections
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.environment.structures import build_structures
+from railfix.simulate.environment.side_streets import side_streets, street_reflections
+from railfix.simulate.environment.structures import BEYOND_M, build_structures, tree_rows
+from railfix.simulate.environment.trees import foliage
+from railfix.simulate.environment.vehicles import equipment_amplitude, neighbour_clearance, neighbour_reflection
 from railfix.simulate.environment.walls import FREE_V, Rays, reflections, roof_amplitude, shadow
 
 #: Chips over C/A's, by constellation and band; all others are C/A's (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
+#: Antennas of the vehicle.
+ANTENNAS: Final = ("front", "rear")
 #: Weaker fields are neglected.
 _NO_FIELD: Final = 0.01
 #: Height of a station's platforms over the rails [m].
 PLATFORM_M: Final = 1.1
+#: Harmonics of the gain ripple over azimuth.
+_HARMONICS: Final = 4
 #: Signals computed at once, so that their arrays stay in the processor's cache.
 _BLOCK: Final = 8192
 #: Lowest elevation that is computed [deg].
@@ -58,6 +68,8 @@ class Environment:
     ----------
     settings : EnvironmentSettings
     line_length_m : float
+    clear_cn0_dbhz : (float, float)
+        C/N0 of an unobstructed signal at the horizon, and its rise to the zenith.
     seed : int
         The same seed gives the same structures and, where they are drawn, the same sections.
 
@@ -69,14 +81,34 @@ class Environment:
     structures : Structures
     """
 
-    def __init__(self, settings: EnvironmentSettings, *, line_length_m: float, seed: int) -> None:
+    def __init__(
+        self,
+        settings: EnvironmentSettings,
+        *,
+        line_length_m: float,
+        seed: int,
+        clear_cn0_dbhz: tuple[float, float] = (CN0_HORIZON_DBHZ, CN0_RISE_DB),
+    ) -> None:
         self.settings = settings
+        self._clear_cn0_dbhz = clear_cn0_dbhz
         self.sections = settings.sections
         if settings.shares:
             self.sections = drawn_sections(
                 settings.shares, line_length_m, section_length_m=settings.section_length_m, seed=seed
             )
         self.structures = build_structures(self.sections, line_length_m, seed)
+        self._trees = tree_rows(settings.trees, line_length_m, seed)
+        ends = {"first_m": -BEYOND_M, "last_m": line_length_m + BEYOND_M}
+        streets = settings.side_streets
+        self._streets = (
+            None
+            if streets is None
+            else (
+                side_streets(streets, seed=seed, side=0, **ends),
+                side_streets(streets, seed=seed, side=1, **ends),
+            )
+        )
+        self._ripple = _GainRipple(seed)
         self._conductors = None if settings.electrification is None else Electrification(settings.electrification)
 
     def label_at(self, chainage_m: ArrayLike) -> Strings:
@@ -94,6 +126,7 @@ class Environment:
         code[inside], cn0[inside] = np.nan, -99.0
         epoch, channel = np.nonzero((geometry.elevation_deg > _LEAST_ELEVATION_DEG) & ~inside[:, None])
         platform = label == "station"
+        clock_s = seconds(geometry.time - geometry.time.astype("datetime64[D]"))
         wavelength = SPEED_OF_LIGHT / carrier_frequency_hz(geometry.satellite, geometry.signal)
         names = zip(geometry.satellite.tolist(), geometry.signal.tolist(), strict=True)
         ratio = np.array([CHIP_RATIO.get(name[0] + signal[:1], 1.0) for name, signal in names])
@@ -102,17 +135,19 @@ class Environment:
         for first in range(0, len(epoch), _BLOCK):
             e, c = epoch[first : first + _BLOCK], channel[first : first + _BLOCK]
             rays = _rays(geometry, e, c, wavelength, self.settings.antenna_height_m)
-            got = self._tracked(rays, platform[e], geometry.speed_mps[e], chip[c])
-            clear = CN0_HORIZON_DBHZ + CN0_RISE_DBHZ * rays.z
+            got = self._tracked(rays, platform[e], geometry.speed_mps[e], chip[c], clock_s[e])
+            clear = self._clear_cn0_dbhz[0] + self._clear_cn0_dbhz[1] * rays.z
             lost = clear + got.gain_db < receiver.tracking_cn0_dbhz
             code[e, c] = np.where(lost, np.nan, got.code_m)
             phase[e, c] = got.phase_m
             doppler[e, c] = -got.rate_mps / rays.wavelength_m
             cn0[e, c] = got.gain_db
+            if self.settings.antenna is not None and self.settings.antenna.ripple_sigma_db > 0.0:
+                cn0[e, c] += self.settings.antenna.ripple_sigma_db * self._ripple.at(rays, geometry.antenna)
         return Disturbance(code_m=code, phase_m=phase, doppler_hz=doppler, cn0_db=cn0)
 
-    def _tracked(self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats) -> Tracked:
-        receiver, paths = self.settings.receiver, self._paths(rays, platform)
+    def _tracked(self, rays: Rays, platform: Masks, speed_mps: Floats, chip_m: Floats, clock_s: Floats) -> Tracked:
+        receiver, paths = self.settings.receiver, self._paths(rays, platform, clock_s)
         return tracked(
             paths.field,
             paths.extra_m,
@@ -124,9 +159,9 @@ class Environment:
             carrier_loop_hz=receiver.carrier_loop_hz,
         )
 
-    def _paths(self, rays: Rays, platform: Masks) -> Paths:
-        """Direct path, ground reflection, scattering by masts and beams, and one reflection for each row of walls."""
-        field, delay = self._direct(rays)
+    def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> Paths:
+        """Direct path, and the paths reflected and scattered by ground, masts, walls, streets, vehicles and trees."""
+        field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = [(field, delay, nothing)]
         if self.settings.ground_reflection > 0.0:
@@ -134,13 +169,39 @@ class Environment:
         if self._conductors is not None:
             rows += [(-amplitude, extra, growth) for amplitude, extra, growth in self._conductors.scattered(rays)]
         rows += [self._reflection(r, rays) for r in range(len(self.structures.walls))]
+        rows += self._further(rays, clock_s)
+        for trees in self._trees:
+            left, scatter, extra = foliage(trees, rays)
+            rows[0] = (rows[0][0] * left, *rows[0][1:])
+            rows.append((scatter * np.abs(rows[0][0]), extra, rays.x - 0.5))
         return Paths(
             field=np.stack([row[0].astype(np.complex128) for row in rows]),
             extra_m=np.stack([row[1] for row in rows]),
             growth=np.stack([row[2] for row in rows]),
         )
 
-    def _direct(self, rays: Rays) -> tuple[Complexes, Floats]:
+    def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
+        """Reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
+        settings, antenna = self.settings, self.settings.antenna
+        rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
+        if settings.side_streets is not None and self._streets is not None:
+            streets = settings.side_streets
+            for amplitude, extra, growth, cosine in street_reflections(
+                self._streets, rays, candidates=streets.candidates, roughness_m=streets.roughness_m
+            ):
+                gain = 1.0 if antenna is None else received_amplitude(cosine, rays.z, antenna)
+                rows.append((-amplitude * gain, extra, growth))
+        if settings.second_reflections == "opposite" and self.structures.walls:
+            rows.append(second_reflection(self.structures.walls, rays, antenna))
+        for neighbour in settings.neighbours:
+            side = 1.0 if neighbour.side == "right" else -1.0
+            amplitude, extra, growth = neighbour_reflection(neighbour, rays, clock_s, side=side)
+            # Metal: all of it is left-handed but at grazing incidence.
+            gain = 1.0 if antenna is None else 10.0 ** (-antenna.cross_polar_horizon_db / 20.0)
+            rows.append((-amplitude * gain, extra, growth))
+        return rows
+
+    def _direct(self, rays: Rays, clock_s: Floats) -> tuple[Complexes, Floats]:
         """Direct field, and the excess of the diffracted path.
 
         Of several walls one behind the other the one that obstructs most counts.
@@ -148,7 +209,12 @@ class Environment:
         v = np.full(len(rays.x), FREE_V)
         for row in self.structures.walls:
             v = np.maximum(v, shadow(row, rays))
+        for neighbour in self.settings.neighbours:
+            side = 1.0 if neighbour.side == "right" else -1.0
+            v = np.maximum(v, neighbour_clearance(neighbour, rays, clock_s, side=side))
         amplitude = edge_amplitude(v)
+        if self.settings.equipment:
+            amplitude = amplitude * equipment_amplitude(self.settings.equipment, rays)
         for roofs in self.structures.roofs:
             amplitude = amplitude * roof_amplitude(roofs, rays)
         field = amplitude.astype(np.complex128)
@@ -170,6 +236,8 @@ class Environment:
         """
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()
+        if self.settings.antenna is not None:
+            amplitude *= received_amplitude(image.cosine, rays.z, self.settings.antenna)
         kept = np.flatnonzero(amplitude > _NO_FIELD)
         if len(kept):
             some = rays.take(kept)
@@ -192,6 +260,27 @@ class Environment:
                 open_above = open_above * roof_amplitude(roofs, back)
             amplitude[kept] *= edge_amplitude(v) * open_above
         return -amplitude, image.extra_m, image.rate
+
+
+class _GainRipple:
+    """Gain of the antennas over azimuth, of standard deviation 1 at the horizon.
+
+    Parameters
+    ----------
+    seed : int
+    """
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng([seed, 7106])
+        self._phase = dict(zip(ANTENNAS, rng.uniform(0.0, 2.0 * np.pi, (len(ANTENNAS), _HARMONICS)), strict=True))
+
+    def at(self, rays: Rays, antenna: str) -> Floats:
+        """Gain over the mean [standard deviations at the horizon], shape (N,)."""
+        azimuth = np.arctan2(rays.y, rays.x)
+        level = np.sqrt(np.maximum(1.0 - rays.z**2, 0.0))
+        order = np.arange(1, _HARMONICS + 1)[:, None]
+        waves = np.cos(order * azimuth + self._phase[antenna][:, None])
+        return np.asarray(level * np.sqrt(2.0 / _HARMONICS) * waves.sum(axis=0))
 
 
 def _rays(geometry: Geometry, epoch: Indices, channel: Indices, wavelength_m: Floats, height_m: float) -> Rays:

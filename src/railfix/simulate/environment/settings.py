@@ -212,6 +212,126 @@ class CorrelatorSettings(ScenarioSettings):
     backward_db: Finite = 15.0
 
 
+class AntennaSettings(ScenarioSettings):
+    """Polarisation of the antenna and material of the walls.
+
+    A wall's `reflection` then multiplies the reflection coefficient of its material.
+
+    Attributes
+    ----------
+    cross_polar_zenith_db, cross_polar_horizon_db : float
+        Gain for left-handed below that for right-handed signals, at the zenith and at the horizon.
+    wall_permittivity : float
+        Relative permittivity of the walls: about 6 for concrete and glass.
+    ripple_sigma_db : float
+        Gain variation over azimuth at the horizon, less by the cosine of the elevation above it; each antenna its own.
+    """
+
+    cross_polar_zenith_db: NotNegative = 15.0
+    cross_polar_horizon_db: NotNegative = 4.0
+    wall_permittivity: float = Field(default=6.0, gt=1.0)
+    ripple_sigma_db: NotNegative = 0.0
+
+
+class SideStreetSettings(ScenarioSettings):
+    """Side streets with walls square to the line, uniform between the limits.
+
+    Attributes
+    ----------
+    spacing_m, width_m : tuple of float
+        From one street to the next, and between its walls.
+    front_m, depth_m : tuple of float
+        Distance of the mouth from the track's axis, and length of the street's walls.
+    height_m, opposite_m : tuple of float
+        Height of the walls that reflect, and of those across the street, over the rails.
+    reflection : tuple of float
+        As `RowSettings`.
+    roughness_m : float
+    candidates : int
+        Number of streets that can reflect one satellite at a time.
+    """
+
+    spacing_m: Between = (50.0, 150.0)
+    width_m: Between = (8.0, 25.0)
+    front_m: Between = (12.0, 25.0)
+    depth_m: Between = (20.0, 80.0)
+    height_m: Between = (15.0, 60.0)
+    opposite_m: Between = (5.0, 40.0)
+    reflection: Between = (0.3, 1.0)
+    roughness_m: NotNegative = 0.01
+    candidates: int = Field(default=2, ge=1, le=6)
+
+
+class TreeSettings(ScenarioSettings):
+    """A row of trees along the line, uniform between the limits.
+
+    Attributes
+    ----------
+    sides : {"left", "right", "both"}
+    distance_m : tuple of float
+        From the track's axis to the trunks.
+    height_m, crown_m : tuple of float
+        Top and lower edge of the crowns over the rails.
+    length_m, gap_m : tuple of float
+        Width of a crown, and distance to the next.
+    share : float
+        Share of the places with a tree.
+    attenuation_db_per_m, most_db, scatter : float
+        Specific attenuation, largest loss, and share of the lost amplitude that is scattered forward.
+    """
+
+    sides: Sides = "both"
+    distance_m: Between = (6.0, 12.0)
+    height_m: Between = (8.0, 16.0)
+    crown_m: Between = (2.5, 4.0)
+    length_m: Between = (4.0, 9.0)
+    gap_m: Between = (0.0, 6.0)
+    share: Share = 1.0
+    attenuation_db_per_m: NotNegative = 1.0
+    most_db: NotNegative = 12.0
+    scatter: Share = 0.5
+
+
+class NeighbourSettings(ScenarioSettings):
+    """Vehicles on a parallel track or lane, following each other at constant speed.
+
+    Attributes
+    ----------
+    side : {"left", "right"}
+    lateral_m, height_m : float
+        Distance of their side from the track's axis, and their top over the rails.
+    length_m, spacing_m : float
+        Of a vehicle, and from front to front.
+    speed_mps : float
+        Toward rising chainage.
+    reflection : float
+        Amplitude that their sides reflect.
+    """
+
+    side: Literal["left", "right"] = "right"
+    lateral_m: Positive = 2.5
+    height_m: Positive = 4.3
+    length_m: Positive = 100.0
+    spacing_m: Positive = 5000.0
+    speed_mps: Finite = -20.0
+    reflection: Share = 0.8
+
+
+class RoofEquipment(ScenarioSettings):
+    """Equipment on the vehicle's roof near the antenna: air conditioning, pantograph well.
+
+    Attributes
+    ----------
+    ahead_m : float
+        Distance of its nearest edge in front of the antenna, negative behind.
+    above_antenna_m, half_width_m : float
+    """
+
+    ahead_m: Finite
+    above_antenna_m: Positive
+    half_width_m: Positive = 1.0
+
+
 class EnvironmentSettings(ScenarioSettings):
     """Structures along the line that block, reflect and scatter signals; by default none.
 
@@ -230,6 +350,17 @@ class EnvironmentSettings(ScenarioSettings):
         Amplitude reflection coefficient of the ballast; 0 for none.
     ground_roughness_m : float
     receiver : CorrelatorSettings
+    antenna : AntennaSettings or None
+        None: walls reflect with the amplitude `reflection`, whatever the polarisation.
+    second_reflections : {"none", "opposite"}
+        "opposite": signals reflected by both nearest rows, one after the other.
+    side_streets : SideStreetSettings or None
+        All along the line.
+    trees : tuple of TreeSettings
+        All along the line.
+    neighbours : tuple of NeighbourSettings
+    equipment : tuple of RoofEquipment
+        Of both antennas.
     """
 
     electrification: ElectrificationSettings | None = None
@@ -240,6 +371,12 @@ class EnvironmentSettings(ScenarioSettings):
     ground_reflection: Share = 0.5
     ground_roughness_m: NotNegative = 0.05
     receiver: CorrelatorSettings = CorrelatorSettings()
+    antenna: AntennaSettings | None = None
+    second_reflections: Literal["none", "opposite"] = "none"
+    side_streets: SideStreetSettings | None = None
+    trees: tuple[TreeSettings, ...] = ()
+    neighbours: tuple[NeighbourSettings, ...] = ()
+    equipment: tuple[RoofEquipment, ...] = ()
 
     @field_validator("sections")
     @classmethod
@@ -275,4 +412,6 @@ class EnvironmentSettings(ScenarioSettings):
     @property
     def empty(self) -> bool:
         """Whether there is no structure along the line."""
-        return self.electrification is None and not self.sections and not self.shares
+        parts = (self.electrification, self.side_streets)
+        lists = (self.sections, self.shares, self.trees, self.neighbours, self.equipment)
+        return all(part is None for part in parts) and not any(lists)

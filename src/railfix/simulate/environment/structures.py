@@ -10,7 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Strings
 from railfix.simulate.environment.section_kinds import ROOFS, ROWS, TUNNEL_CROWN
-from railfix.simulate.environment.settings import RoofSettings, RowSettings, SectionSettings
+from railfix.simulate.environment.settings import RoofSettings, RowSettings, SectionSettings, TreeSettings
 from railfix.simulate.setting_types import Between
 
 #: The first and the last section go on so far beyond the line [m].
@@ -122,6 +122,23 @@ def build_structures(sections: Sequence[SectionSettings], line_length_m: float, 
         borders_m=np.array([x for section in sections for x in (section.from_m, section.to_m)]),
         kinds=np.array([*kinds, "open"]),
     )
+
+
+def tree_rows(settings: Sequence[TreeSettings], line_length_m: float, seed: int) -> tuple[Strips, ...]:
+    """Rows of trees along all of a line, with `distance_m`, `height_m`, `crown_m` and the values of the settings."""
+    reach = 4.0 * (line_length_m + 2.0 * BEYOND_M)
+    names = ("distance_m", "height_m", "crown_m", "attenuation_db_per_m", "most_db", "scatter")
+    rows = []
+    for number, row in enumerate(settings):
+        sides: list[list[list[float]]] = [[], []]
+        for s, side in enumerate(SIDES):
+            rng = np.random.default_rng([seed, 7105, number, s])
+            for start, end in _spans(row.length_m, row.gap_m, -BEYOND_M, line_length_m + BEYOND_M, rng):
+                drawn = [rng.uniform(*pair) for pair in (row.distance_m, row.height_m, row.crown_m)]
+                if rng.uniform() < row.share and row.sides in (side, "both"):
+                    sides[s].append([start, end, *drawn, row.attenuation_db_per_m, row.most_db, row.scatter])
+        rows.append(_strips(sides, names, reach))
+    return tuple(rows)
 
 
 def _spans(

@@ -54,7 +54,7 @@ class Rays:
         )
 
 
-def _met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
+def wall_met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats, lateral: Floats) -> Indices:
     """Index of the wall that a horizontal ray meets, from (x0, lateral0) in direction (along, lateral).
 
     Walls stand at various distances, so the search is repeated: with the distance of the wall
@@ -68,7 +68,7 @@ def _met(row: Strips, side: Indices, x0: Floats, lateral0: Floats, along: Floats
     return wall
 
 
-def _in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
+def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m: Floats, across: Floats) -> Floats:
     """Fresnel parameter of a ray at a wall: positive inside its outline.
 
     `across` is the lateral component of the ray's direction; the top edge is horizontal, the ends are vertical.
@@ -95,13 +95,13 @@ def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | fl
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
     begin = np.where(rays.y > 0.0, 1.0, -1.0) * y0
     start = rays.chainage_m + x0
-    wall = _met(row, side, start, begin, rays.x, lateral)
+    wall = wall_met(row, side, start, begin, rays.x, lateral)
     slope = row.value["slope"][wall]
     middle = 0.5 * (row.start_m[wall] + row.end_m[wall])
     far = (row.value["distance_m"][wall] + (start - middle) * slope - begin) / np.maximum(
         lateral - rays.x * slope, _LEAST_LATERAL
     )
-    v = _in_front(row, wall, rays, start + far * rays.x, far * rays.z, far, lateral)
+    v = in_front(row, wall, rays, start + far * rays.x, far * rays.z, far, lateral)
     return np.where(far > 0.0, np.maximum(v, FREE_V), FREE_V)
 
 
@@ -122,7 +122,9 @@ class Reflections:
     back_x, back_y : ndarray
         Horizontal direction of arrival.
     far_m : ndarray [m]
-        From the antenna to the place of reflection.
+        From the antenna to the point of reflection.
+    cosine : ndarray
+        Of the angle of incidence from the wall's normal.
     """
 
     amplitude: Floats
@@ -133,6 +135,7 @@ class Reflections:
     back_x: Floats
     back_y: Floats
     far_m: Floats
+    cosine: Floats
 
 
 def reflections(row: Strips, rays: Rays) -> Reflections:
@@ -143,7 +146,7 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
     """
     sign = np.where(rays.y > 0.0, -1.0, 1.0)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)
-    wall = _met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
+    wall = wall_met(row, (sign > 0.0).astype(np.intp), rays.chainage_m, np.zeros_like(lateral), rays.x, lateral)
     slope = row.value["slope"][wall]
     cosine = 1.0 / np.sqrt(1.0 + slope**2)
     sine = slope * cosine
@@ -155,7 +158,7 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
     back = -lateral + 2.0 * facing * cosine
     seen = (distance > 0.5) & (facing > 0.01) & (back > 0.01)
     far = np.where(seen, distance / np.maximum(facing, 0.01), 1.0)
-    v = _in_front(row, wall, rays, rays.chainage_m + far * back_x, far * rays.z, far, back)
+    v = in_front(row, wall, rays, rays.chainage_m + far * back_x, far * rays.z, far, back)
     strength = row.value["reflection"][wall] * roughness_loss(row.value["roughness_m"][wall], facing, rays.wavelength_m)
     return Reflections(
         amplitude=np.where(seen, strength * edge_amplitude(-v), 0.0),
@@ -166,6 +169,7 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
         back_x=back_x,
         back_y=sign * back,
         far_m=far,
+        cosine=np.maximum(facing, 0.0),
     )
 
 

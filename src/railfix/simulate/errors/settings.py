@@ -152,6 +152,8 @@ class TrackingSettings(ScenarioSettings):
     ----------
     threshold_dbhz : float or None
         A signal weaker than this is lost; None: no signal is too weak.
+    reacquisition_dbhz : float or None
+        A signal lost below the threshold is tracked again from this C/N0 on; None: from the threshold on.
     reacquisition_s : float
         A lost signal is absent for this time after it could be tracked again.
     slips : {"none", "after_loss"}
@@ -160,6 +162,7 @@ class TrackingSettings(ScenarioSettings):
     """
 
     threshold_dbhz: NotNegative | None = None
+    reacquisition_dbhz: NotNegative | None = None
     reacquisition_s: NotNegative = 0.0
     slips: Literal["none", "after_loss"] = "none"
 
