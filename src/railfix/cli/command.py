@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import select
 import signal
 import sys
 from collections import Counter
@@ -17,7 +18,7 @@ from typing import Any, ClassVar, Final, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from railfix.core.errors import InputFileError, OutputError, RailfixError
+from railfix.core.errors import InputFileError, OutputError, RailfixError, SettingsError
 
 #: Words that are given to switches by mistake.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
@@ -69,14 +70,8 @@ class Commands(TyperGroup):
             return super().invoke(ctx)
         except RailfixError as error:
             _end(error)
-        except BrokenPipeError:
-            _discard_output()
-            raise typer.Exit(SIGNALLED + signal.SIGPIPE) from None
-        except OSError as error:
-            if error.filename is not None or error.errno not in _FULL:
-                raise
-            _discard_output()
-            _end(OutputError(f"the standard output cannot be written ({error.strerror}); free space, or redirect it"))
+        except MemoryError:
+            _end(SettingsError("this needs more memory than there is; give a shorter time or fewer epochs at a time"))
         except RuntimeError as error:
             loop = _LOOP.match(str(error))
             if loop is None:
@@ -126,31 +121,39 @@ def loaded(name: str) -> Any:
 
 def run_program(app: typer.Typer) -> NoReturn:
     """Run the program: signals that end it clean up first, and a reader that stops reading is no error."""
-    for name in ("SIGTERM", "SIGHUP"):
+    for name, handler in (("SIGTERM", _raise_exit), ("SIGHUP", _raise_exit), ("SIGPIPE", _end_at_closed_pipe)):
         if number := getattr(signal, name, None):
-            signal.signal(number, _raise_exit)
+            signal.signal(number, handler)
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
-        app(standalone_mode=True)
-        code = 0
+        try:
+            app(standalone_mode=True)
+        finally:
+            sys.stdout.flush()
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 1
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        _discard_output()
-        code = code or SIGNALLED + signal.SIGPIPE
     except OSError as error:
-        _discard_output()
+        if error.filename is not None or error.errno not in _FULL:
+            raise
         typer.echo(f"railfix: error: the standard output cannot be written ({error.strerror})", err=True)
-        code = code or OutputError.exit_code
+        code = OutputError.exit_code
+    _discard_output()
     sys.exit(code)
 
 
-def _raise_exit(number: int, _frame: object) -> NoReturn:
-    """End by way of an exception, so that what is half done is removed."""
+def _raise_exit(number: int, _frame: object) -> None:
+    """End by way of an exception, so that staging folders are removed."""
     signal.signal(number, signal.SIG_IGN)
     raise SystemExit(SIGNALLED + number)
+
+
+def _end_at_closed_pipe(number: int, _frame: object) -> None:
+    """End where the reader of the standard output has closed it; other pipes report their own errors."""
+    poll = select.poll()
+    poll.register(1, 0)
+    if any(event & select.POLLERR for _, event in poll.poll(0)):
+        _discard_output()
+        raise SystemExit(SIGNALLED + number)
 
 
 def _end(error: RailfixError) -> NoReturn:

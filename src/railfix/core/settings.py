@@ -22,7 +22,7 @@ from railfix.core.spelling import misspelt
 class Settings(BaseModel):
     """Base of all settings: frozen, validated on construction, unknown names rejected."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def replaced(self, **changes: Any) -> Self:
         """Return a validated copy with some settings changed.

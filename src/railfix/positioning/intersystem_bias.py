@@ -39,7 +39,7 @@ class ClockOffsetLimits(Settings):
         nothing, and a receiver that starts anew, or an error learnt unnoticed, is forgotten.
     """
 
-    stability_m: float = Field(default=1.0, gt=0)
+    stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
     correlation_s: float = Field(default=30.0, gt=0)
     window_s: float = Field(default=1800.0, gt=0)
 

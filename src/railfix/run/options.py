@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Literal, Self
+from typing import Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from railfix.core.files import BrokenLines
 from railfix.core.settings import Settings, option
 from railfix.run.output import Overwrite
 from railfix.track.vehicle import Reference
+
+#: Last whole year of times to the nanosecond in 64 bits.
+LAST_YEAR: Final = 2261
 
 
 class TrackReading(Settings):
@@ -78,6 +81,13 @@ class RunOptions(Settings):
         "Epochs in memory at a time; the results do not depend on it.", 3000, name="--chunk", metavar="EPOCHS", ge=1
     )
     track: TrackReading = Field(default_factory=TrackReading)
+
+    @field_validator("start", "end")
+    @classmethod
+    def _within_gps_time(cls, value: datetime | None) -> datetime | None:
+        if value is not None and not 1980 <= value.year <= LAST_YEAR:
+            raise ValueError(f"a GPS time from 1980 to {LAST_YEAR} was expected")
+        return value
 
     @model_validator(mode="after")
     def _start_before_end(self) -> Self:

@@ -13,6 +13,8 @@ from railfix.simulate.setting_types import Between, Finite, NotNegative, Positiv
 #: Length of the pattern of P1's test line [m], and of a generated line, where none is given.
 PATTERN_LENGTH_M: Final = 756.0
 GENERATED_LENGTH_M: Final = 36_000.0
+#: Longest line, and longest element of one [m].
+LONGEST_LINE_M: Final = 1e7
 
 
 class Element(ScenarioSettings):
@@ -30,8 +32,8 @@ class Element(ScenarioSettings):
     """
 
     kind: Literal["straight", "transition", "curve"]
-    length_m: Positive
-    radius_m: float = math.inf
+    length_m: float = Field(gt=0.0, le=LONGEST_LINE_M)
+    radius_m: float = Field(default=math.inf, allow_inf_nan=True)
     cant_m: float = Field(default=0.0, ge=0.0, le=0.3)
 
     @model_validator(mode="after")
@@ -140,7 +142,7 @@ class LineFile(ScenarioSettings):
 
     path: str
     from_m: NotNegative = 0.0
-    to_m: float = math.inf
+    to_m: float = Field(default=math.inf, allow_inf_nan=True)
     crs: str = ""
     height_datum: str = ""
     geoid: str = ""
@@ -217,7 +219,7 @@ class LineSettings(ScenarioSettings):
     curve_spacing_m: Positive = 2.32
     elements: tuple[Element, ...] = ()
     gradients: tuple[Gradient, ...] = ()
-    length_m: float = Field(default_factory=_length_m)
+    length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
     generated: GeneratedLine = GeneratedLine()
     file: LineFile | None = None
     map_error: MapError = MapError()
@@ -232,6 +234,8 @@ class LineSettings(ScenarioSettings):
             raise ValueError(f"file goes with kind 'file', got kind {self.kind!r}")
         if self.kind != "generated" and self.generated != GeneratedLine():
             raise ValueError(f"generated goes with kind 'generated', got {self.kind!r}")
+        if self.length_m > LONGEST_LINE_M:
+            raise ValueError(f"length_m is {self.length_m:g}, expected at most {LONGEST_LINE_M:g}")
         if self.kind == "file" and not math.isnan(self.length_m):
             raise ValueError("length_m is the file's own; use from_m and to_m of the file for a part")
         if self.kind == "elements" and abs(self.length_m - total) > 1e-6:

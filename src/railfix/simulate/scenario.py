@@ -34,6 +34,8 @@ from railfix.simulate.setting_types import (
 
 #: Antennas of the vehicle, in the order in which they are written.
 ANTENNAS: Final = ("front", "rear")
+#: Longest run, a hundred days; more epochs than this are many runs [s].
+LONGEST_S: Final = 8.64e6
 
 
 class Station(ScenarioSettings):
@@ -263,8 +265,8 @@ class Scenario(ScenarioSettings):
 
     seed: Seed = 20_240_305
     start: GpsTime = np.datetime64("2024-03-05T03:10:00", "ns")
-    duration_s: Positive = 200.0
-    rate_hz: Positive = 10.0
+    duration_s: float = Field(default=200.0, gt=0.0, le=LONGEST_S)
+    rate_hz: float = Field(default=10.0, gt=0.0, le=1000.0)
     line: LineSettings = LineSettings()
     run: RunSettings = RunSettings()
     vehicle: VehicleSettings = VehicleSettings()
