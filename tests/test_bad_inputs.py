@@ -12,8 +12,6 @@ from typer.testing import CliRunner
 from bad_inputs import CASES, COMMANDS, FAULTS, Desk, desk_in
 from railfix.cli import app
 
-pytestmark = pytest.mark.requirement("D3")
-
 #: Faults that leave nothing to be read.
 UNREADABLE = ("missing", "folder", "dangling_link", "link_to_itself", "empty", "zeros", "gzip_cut", "zip_archive")
 #: An empty TOML file is one without settings; without Parquet the CSV file of the positions is read.

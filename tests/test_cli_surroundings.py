@@ -15,8 +15,6 @@ from typer.testing import CliRunner
 from bad_inputs import Desk, desk_in
 from railfix.cli import app
 
-pytestmark = pytest.mark.requirement("B8")
-
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
 PROGRAM: Final = (sys.executable, "-m", "railfix")
 NARROW: Final = {**os.environ, "COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"}

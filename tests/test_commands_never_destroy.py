@@ -23,8 +23,6 @@ from railfix.core.errors import OutputError
 from railfix.run import read_record
 from railfix.run.output import OutputFolder, check_output_file
 
-pytestmark = pytest.mark.requirement("D3")
-
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
 
 _LOG: Final = "--front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv"
