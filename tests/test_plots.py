@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from io import BytesIO
 from typing import Any
@@ -17,8 +18,9 @@ from railfix.integrity.stanford import stanford as sorted_epochs
 from railfix.report import plots
 from railfix.report.plots.chart import Band, Bars, Cells, Chart, Line, Marks, Points, Ranges, SkyEpochs
 from railfix.report.plots.columns import nice_step
-from railfix.report.plots.thinning import extremes, one_a_cell, spread
+from railfix.report.plots.thinning import extremes, one_per_cell, spread
 from railfix.screens import Cn0Limits
+from railfix.track import Track
 
 pytestmark = pytest.mark.requirement("D3")
 
@@ -218,8 +220,8 @@ def test_plan_in_metres(positions: pl.DataFrame) -> None:
     sized = plots.plan(positions, error_m=np.array([0.1, -1.5, 3.0, np.nan, -80.0]))
     counts = {one.label for one in sized.layers if isinstance(one, Points)}
     assert counts == {
-        "conventional", "no reference (1)", "from 0 to 1 m (1)", "from 1 to 2 m (1)", "from 2 to 5 m (1)",
-        "10 m and more (1)",
+        "conventional", "no reference (1)", "error 0 to 1 m (1)", "error 1 to 2 m (1)",
+        "error 2 to 5 m (1)", "error 10 m and more (1)",
     }  # fmt: skip
     nowhere = positions.with_columns(pl.lit(None, dtype=pl.Float64).alias(f"{axis}_m") for axis in "xyz")
     assert plots.plan(nowhere).empty
@@ -311,14 +313,59 @@ def test_thinning_keeps_the_extremes(thin: Callable[..., np.ndarray]) -> None:
     np.testing.assert_array_equal(few, np.flatnonzero(np.isfinite(y[:100])))
 
 
-def test_one_a_cell_leaves_no_cell_empty() -> None:
+def test_thinning_keeps_the_density() -> None:
+    """Two populations, 1 : 4, interleaved with the period of the channels: no stripes, no preference."""
+    random = np.random.default_rng(9)
+    x = np.repeat(np.arange(5000.0), 10)
+    y = np.where(random.uniform(size=50_000) < 0.2, random.normal(20.0, 1.0, 50_000), random.normal(0.0, 1.0, 50_000))
+    rows = spread(x, y)
+    kept = rows[~np.isin(rows, extremes(x, y, points=1200))]
+    assert np.mean(y[kept] > 10.0) == pytest.approx(0.2, abs=0.02)
+    columns = np.bincount(rows % 10, minlength=10)
+    assert columns.max() < 1.2 * columns.min()
+    pieces = np.histogram(x[kept], bins=50)[0]
+    assert pieces.min() > 0.8 * pieces.mean()
+
+
+def test_the_line_is_drawn_in_the_tunnel_over_its_background(positions: pl.DataFrame) -> None:
+    """The track goes on where there is no position; the background is cut to the surroundings."""
+    latitude = 35.0 + np.arange(9) * 5.0 / 110_941.0
+    ecef = ecef_from_geodetic(latitude, np.full(9, 135.0), np.full(9, 50.0))
+    street = np.array([[135.0001, 34.9999], [135.0001, 35.0005], [136.0, 36.0], [137.0, 36.0]])
+    chart = plots.plan(
+        positions.filter(pl.col("chainage_m") != 20.0),
+        track=Track.from_ecef(ecef),
+        tunnels_m=[(15.0, 25.0)],
+        background=[street, street + 10.0],
+    )
+    line, tunnel, below = (layer(chart, Line, name) for name in ("line", "tunnel", "background"))
+    assert np.isfinite(line.y).all()
+    assert np.ptp(line.y) == pytest.approx(40.0, abs=0.2)
+    np.testing.assert_allclose([tunnel.y[0], tunnel.y[-1]], [-5.0, 5.0], atol=0.1)
+    assert np.isfinite(below.x).sum() == 3  # two points inside, and the next, so that the line reaches the edge
+    levels = plots.plan(positions, level_m=np.array([3.0, 7.0, 15.0, np.nan, np.inf]))
+    labels = {one.label for one in levels.layers if isinstance(one, Points)}
+    assert {"level 0 to 5 m (1)", "level 5 to 10 m (1)", "level 40 m and more (1)", "no level (1)"} <= labels
+
+
+def test_functions_that_plot_say_that_they_return_a_figure(errors: pl.DataFrame) -> None:
+    for name in plots.__all__:
+        if name.startswith("plot_"):
+            function = getattr(plots, name)
+            assert function.__name__ == name
+            assert inspect.signature(function).return_annotation == "Figure"
+            assert "Chart" not in function.__doc__.partition("Returns")[2]
+    assert isinstance(plots.plot_error_over_time(errors), Figure)
+
+
+def test_one_per_cell_leaves_no_cell_empty() -> None:
     random = np.random.default_rng(8)
     x, y = random.uniform(-5.0, 5.0, (2, 20_000))
-    rows = one_a_cell(x, y, cell=1.0, points=150)
+    rows = one_per_cell(x, y, cell=1.0, points=150)
     assert 100 <= len(rows) <= 150
     cells = {(int(a), int(b)) for a, b in zip((x[rows] - x.min()) // 1.0, (y[rows] - y.min()) // 1.0, strict=True)}
     assert len(cells) == len(rows) == 100
-    assert len(one_a_cell(np.array([np.nan]), np.array([1.0]), cell=1.0)) == 0
+    assert len(one_per_cell(np.array([np.nan]), np.array([1.0]), cell=1.0)) == 0
 
 
 @pytest.mark.parametrize(("rough", "nice"), [(0.9, 1.0), (1.0, 1.0), (1.1, 2.0), (23.0, 50.0), (0.03, 0.05)])

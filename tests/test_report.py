@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 from railfix.cli import app
 from railfix.pipeline.config import parse_config
 from railfix.report import read_runs, report_page, write_report
+from railfix.report.content import number, share
 from railfix.report.encode import packed, script_json
 from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, NO_TIMES
-from railfix.report.html import number, share, table
 from railfix.report.protection import NO_LEVELS
 from railfix.run import RunOptions, RunSummary, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -64,7 +64,8 @@ def unpacked(text: str) -> np.ndarray:
 
 def chart(page: Page, name: str, at: int = 0) -> dict[str, Any]:
     """Numbers behind a picture."""
-    figure = [found for found in page.figures if found["data-name"] == name][at]
+    overview = {"plan", "error-chainage", "levels-chainage"} & {name}  # the first stands at the top of the page
+    figure = [found for found in page.figures if found["data-name"] == name][at + bool(overview)]
     loaded: dict[str, Any] = json.loads(page.text[figure["data-chart"]])
     return loaded
 
@@ -109,8 +110,10 @@ def test_the_sky_in_the_page_is_that_of_the_observations(page: Page, folder: Pat
 
 def test_every_picture_of_the_paper_is_there(page: Page) -> None:
     names = [figure["data-name"] for figure in page.figures]
-    both = ("plan", "error-time", "error-chainage", "interval-chainage", "interval-distribution", "satellites", "sky")
+    both = ("error-time", "interval-chainage", "interval-distribution", "satellites", "sky")
     assert all(names.count(name) == 2 for name in both)
+    assert names[:2] == ["plan", "error-chainage"]
+    assert names.count("plan") == names.count("error-chainage") == 3  # the first antenna at the top, too
     assert names.count("error-ranges") == names.count("processing-time") == 1
     assert names.count("cn0-g-1c") == 2
     # doppler, antenna pair, RAIM, its level, spacing, elevation and C/N0 floor, each over time and over chainage
@@ -201,8 +204,8 @@ def test_errors_over_their_level_are_listed(folder: Path, tmp_path: Path) -> Non
         pl.col("status").cast(pl.String) == "ok", pl.col("protection_status").cast(pl.String) != "alarm"
     )
     assert len(over) > 20
-    assert f"Errors over their level: {len(over):,}, of them {len(usable):,} usable; the 20 furthest" in document
-    listed = document.split("Errors over their level")[1].split("</table>")[0]
+    assert f"Errors above their level: {len(over):,}, of them {len(usable):,} usable; the 20 largest" in document
+    listed = document.split("Errors above their level")[1].split("</table>")[0]
     assert listed.count("<tr>") == 1 + 20
     worst = over.select(size=(pl.col("chainage_m") - pl.col("true_m")).abs()).max().item()
     assert f"{worst:.2f}</td>" in listed.split("<tr>")[2]
@@ -213,7 +216,7 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_pa
     runs, _ = read_runs([folder])
     document = report_page(runs, None)
     names = [figure["data-name"] for figure in Page(document).figures]
-    assert names.count("levels") == names.count("levels-chainage") == 2
+    assert (names.count("levels"), names.count("levels-chainage")) == (2, 3)
     assert "stanford" not in names
     positions = pl.read_parquet(folder / "positions.parquet").filter(pl.col("antenna").cast(pl.String) == "front")
     within = positions.filter(
@@ -221,7 +224,7 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_pa
         pl.col("protection_status").cast(pl.String) != "alarm",
         pl.col("protection_level_m") <= 20.0,
     )
-    section = document.split("<h3>Protection level</h3>")[1].split("<h3>")[0]
+    section = document.split("<summary>Protection level</summary>")[1].split("</details>")[0]
     row = next(line for line in section.split("<tr>") if "front" in line and "usable" in line and ">20<" in line)
     assert f"{100 * len(within) / len(positions):.2f} %" in row
     shutil.copy(folder / "run.json", tmp_path)
@@ -234,6 +237,76 @@ def test_levels_without_a_reference_and_runs_without_levels(folder: Path, tmp_pa
     bare = report_page(runs, evaluation)
     assert NO_LEVELS in bare
     assert not {"levels", "stanford"} & {figure["data-name"] for figure in Page(bare).figures}
+
+
+def test_the_top_of_the_page_compares_like_with_like(folder: Path, tmp_path: Path) -> None:
+    """Both kinds of position at the same epochs, the conventional ones of unscreened ranges."""
+    first = pl.read_csv(demo_truth(), try_parse_dates=True)["time_gpst"][0]
+    options = RunOptions(end=first + timedelta(seconds=60))
+    run_files(demo_inputs(), parse_config({"screens": ["elevation"]}), out=tmp_path / "unscreened", options=options)
+    runs, evaluation = read_runs([folder], [demo_truth()], conventional=[tmp_path / "unscreened"])
+    assert evaluation is not None
+    top = report_page(runs, evaluation).split('<section class="overview"')[1].split("</section>")[0]
+    assert top.count("<dt>") == 5
+    assert "unscreened ranges, as in P1" in top
+    truth = pl.read_csv(demo_truth(), schema_overrides={"time_gpst": pl.Datetime("ns")}).filter(antenna="front")
+    keys = ["time_gpst", "antenna"]
+    screened, unscreened = (
+        pl.read_parquet(path / "positions.parquet").select(*keys, "chainage_m", "conventional_chainage_m")
+        for path in (folder, tmp_path / "unscreened")
+    )
+    both = truth.select(*keys, true_m="chainage_m").join(screened.drop("conventional_chainage_m"), on=keys)
+    both = both.join(unscreened.drop("chainage_m"), on=keys).drop_nulls()
+    for column in ("chainage_m", "conventional_chainage_m"):
+        size = (both[column] - both["true_m"]).abs()
+        assert f"{size.max():.2f} m" in top
+        assert f"{size.quantile(0.95, 'linear'):.2f} m" in top
+    plain = report_page(*read_runs([folder], [demo_truth()]))
+    assert "unscreened" not in plain
+    assert "the same screened ranges" in plain
+
+
+def test_a_larger_error_on_the_map_is_explained(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "run"
+    shutil.copytree(folder, mine)
+    table = pl.read_parquet(mine / "positions.parquet").with_row_index("row")
+    row = table.filter(pl.col("antenna") == "front", pl.col("conventional_chainage_m").is_not_null())["row"][50]
+    table = table.with_columns(
+        chainage_m=pl.when(pl.col("row") == row).then(pl.col("chainage_m") + 99.0).otherwise(pl.col("chainage_m")),
+        status=pl.when(pl.col("row") == row).then(pl.lit("inconsistent")).otherwise(pl.col("status").cast(pl.String)),
+    )
+    table.drop("row").write_parquet(mine / "positions.parquet")
+    document = report_page(*read_runs([mine], [demo_truth()]))
+    assert "The largest error on the map exceeds the conventional one: " in document
+    assert "railfix had marked this position as inconsistent; positions that passed every check are within" in document
+
+
+def test_a_background_is_drawn_below_the_plan(folder: Path, tmp_path: Path) -> None:
+    streets = tmp_path / "streets.geojson"
+    line = {"type": "LineString", "coordinates": [[135.44, 35.04], [135.452, 35.0523], [135.46, 35.06]]}
+    streets.write_text(json.dumps({"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": line}]}))
+    arguments = ["report", str(folder), "--background", str(streets), "--out", str(tmp_path / "page.html")]
+    assert RUNNER.invoke(app, arguments).exit_code == 0
+    page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    assert len(unpacked(layer_of(chart(page, "plan", -1), "background")["x"])) > 0
+    for wrong in ("{", '{"type": "Topology"}', '{"type": "LineString", "coordinates": [[1e6, 2e6], [1e6, 2e6]]}', "[]"):
+        streets.write_text(wrong)
+        result = RUNNER.invoke(app, arguments)
+        assert result.exit_code == 3, result.output
+        assert "GeoJSON" in result.output or "WGS 84" in result.output
+
+
+def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "run"
+    shutil.copytree(folder, mine)
+    columns = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
+    train = pl.read_parquet(mine / "positions.parquet").select(columns).with_columns(status=pl.lit("tracking"))
+    train.write_parquet(mine / "train.parquet")
+    runs, evaluation = read_runs([mine], [demo_truth()])
+    page = Page(report_page(runs, evaluation))
+    values = chart(page, "error-chainage")
+    on_map, filtered = (unpacked(layer_of(values, name)["y"]) for name in ("on the map", "filtered along the track"))
+    np.testing.assert_allclose(filtered, on_map, atol=1e-6)
 
 
 def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:
@@ -303,7 +376,7 @@ def test_several_runs_have_a_summary_and_a_part_each(folder: Path, tmp_path: Pat
     assert ranges["layers"][0]["names"][-1] == "other, rear, conventional"
     assert {"run0", "run1", "run0-0", "run1-1"} <= {found.get("id") for _, found in read.elements}
     assert document.count('<th scope="row">other</th>') == 2
-    assert [figure["data-name"] for figure in read.figures].count("plan") == 4
+    assert [figure["data-name"] for figure in read.figures].count("plan") == 6
 
 
 def test_the_run_tells_how_long_its_chunks_took(summary: RunSummary, page: Page) -> None:
@@ -375,7 +448,6 @@ def test_pieces_of_html() -> None:
     assert unpacked(packed(np.array([0, 70_000]), "i")).tolist() == [0, 70_000]
     assert number(-1234.5) == "−1,234.50"
     assert number(None) == number(float("nan")) == share(None) == "–"
-    assert '<td class="n">&lt;1&gt;</td>' in table(["a", "b"], [["x", "<1>"]], right=[1])
 
 
 def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> None:
@@ -388,9 +460,7 @@ def test_the_demonstration_ends_with_numbers_and_the_page(tmp_path: Path) -> Non
     assert result.output.count("protection level (separation), ") == 2
     assert "within the alarm limit of 20 m at" in result.output
     written = sorted(path.name for path in (tmp_path / "demo").iterdir())
-    assert written == [
-        "observations.parquet", "positions.csv", "positions.parquet", "report.html", "run.json", "train.csv",
-        "train.parquet",
-    ]  # fmt: skip
+    tables = ["observations.parquet", "positions.csv", "positions.parquet"]
+    assert written == [*tables, "report.html", "run.json", "train.csv", "train.parquet", "unscreened"]
     names = [figure["data-name"] for figure in Page((tmp_path / "demo" / "report.html").read_text()).figures]
     assert names.count("error-time") == 2

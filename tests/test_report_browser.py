@@ -74,6 +74,51 @@ EXERCISE = """
 })();
 </script></body>"""
 
+#: Zooms one chart and notes which others follow; takes the CSV of every table.
+TOGETHER = """
+<script>
+(function () {
+  const said = document.createElement("div");
+  said.id = "together";
+  document.body.append(said);
+  const start = figure => figure.plot.chart.start || 0;
+  const span = figure => figure.plot.box.x.map(v => (v + start(figure)).toFixed(2)).join(" ");
+  for (const figure of document.querySelectorAll("figure[data-chart]")) figure.plot.draw();
+  const timed = [...document.querySelectorAll('figure[data-zoom="run0-time"]')], first = timed[1].plot;
+  const middle = (first.box.x[0] + first.box.x[1]) / 2;
+  first.zoom({ x: [middle, middle + 5], y: first.box.y });
+  said.dataset.timed = timed.length;
+  said.dataset.spans = new Set(timed.map(span)).size;
+  first.zoom(null);
+  said.dataset.back = timed.filter(figure => figure.plot.view).length;
+  const texts = [], taken = [];
+  URL.createObjectURL = blob => { texts.push(blob); return "#"; };
+  HTMLAnchorElement.prototype.click = function () { taken.push(this.download); };
+  document.querySelectorAll("button.download").forEach(button => button.click());
+  said.dataset.files = taken.join(" ");
+  const at = taken.indexOf("figures-of-merit.csv");
+  texts[at].text().then(text => { said.dataset.csv = text; });
+})();
+</script></body>"""
+
+#: Shows a page in a frame as wide as a telephone and notes what is wider.
+NARROW = """<!DOCTYPE html><html><body>
+<iframe id="phone" style="width:390px;height:3000px;border:0" src="PAGE"></iframe><script>
+document.getElementById("phone").addEventListener("load", function () {
+  const inner = this.contentDocument, said = document.createElement("div");
+  inner.querySelectorAll("details").forEach(part => { part.open = true; });
+  for (const figure of inner.querySelectorAll("figure[data-chart]")) figure.plot.draw();
+  said.id = "narrow";
+  said.dataset.window = this.contentWindow.innerWidth;
+  said.dataset.page = inner.documentElement.scrollWidth;
+  const wide = e => !e.closest(".scroll") && e.getBoundingClientRect().right > 391;
+  said.dataset.over = [...inner.querySelectorAll("body *")].filter(wide)
+    .map(e => e.tagName + "." + e.className).join(" ");
+  said.dataset.errors = inner.getElementById("railfix-errors").textContent;
+  document.body.append(said);
+});
+</script></body></html>"""
+
 #: Opens what is folded and says which tables are wider than the page.
 WIDE = """
 <script>
@@ -113,7 +158,9 @@ def test_it_opens_with_its_first_pictures_and_without_an_error(page: Path) -> No
 
 @pytest.mark.slow
 def test_every_picture_is_drawn_in_a_window_that_holds_them_all(page: Path) -> None:
-    read = Page(opened(page, height=30_000))
+    copy = page.with_name("open.html")
+    copy.write_text(page.read_text(encoding="utf-8").replace("<details", "<details open"), encoding="utf-8")
+    read = Page(opened(copy, height=40_000))
     assert read.text.get("railfix-errors", "") == ""
     assert {figure["data-name"]: int(figure.get("data-drawn", 0)) > 0 for figure in read.figures} == {
         figure["data-name"]: True for figure in read.figures
@@ -135,6 +182,49 @@ def test_pictures_can_be_pointed_at_enlarged_and_clicked(page: Path, tmp_path: P
     assert int(said["data-zooms"]) == len(charts)
     # the first click on each antenna's sky leaves its first epoch, later ones may meet the one that is shown
     assert 2 <= int(said["data-skies"]) <= len(linked)
+
+
+def test_charts_zoom_together_and_tables_can_be_downloaded(page: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "together.html"
+    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", TOGETHER), encoding="utf-8")
+    read = Page(opened(copy))
+    assert read.text.get("railfix-errors", "") == ""
+    said = read.by_id("together")
+    assert int(said["data-timed"]) > 10
+    assert (said["data-spans"], said["data-back"]) == ("1", "0")
+    assert {"summary.csv", "settings.csv", "inputs.csv", "epochs.csv"} <= set(said["data-files"].split())
+    rows = pl.read_csv(said["data-csv"].encode(), infer_schema_length=0)
+    assert rows["antenna"].to_list()[:2] == ["front", "rear"]
+    assert rows["largest"].cast(pl.Float64).min() > 0.0
+
+
+def test_nothing_is_wider_than_a_telephone(page: Path) -> None:
+    frame = page.with_name("frame.html")
+    frame.write_text(NARROW.replace("PAGE", page.name), encoding="utf-8")
+    said = Page(run_browser(frame, "--window-size=1000,3000", "--allow-file-access-from-files", "--dump-dom")).by_id(
+        "narrow"
+    )
+    assert (said["data-window"], said["data-page"]) == ("390", "390")
+    assert (said["data-over"], said["data-errors"]) == ("", "")
+
+
+def test_a_dark_page_is_dark(page: Path, tmp_path: Path) -> None:
+    """The charts follow the preference of the reader, and print stays light."""
+    probe = """<script>
+    const said = document.createElement("div"), figure = document.querySelector("figure[data-chart]");
+    figure.plot.draw();
+    said.id = "dark";
+    said.dataset.chart = figure.querySelector("canvas").getContext("2d").getImageData(2, 2, 1, 1).data.join(" ");
+    said.dataset.page = getComputedStyle(document.body).backgroundColor;
+    document.body.append(said);</script></body>"""
+    copy = tmp_path / "dark.html"
+    copy.write_text(page.read_text(encoding="utf-8").replace("</body>", probe), encoding="utf-8")
+    seen = {
+        name: Page(run_browser(copy, "--window-size=1280,900", "--dump-dom", *options)).by_id("dark")
+        for name, options in (("light", ()), ("dark", ("--blink-settings=preferredColorScheme=0",)))
+    }
+    assert (seen["light"]["data-chart"], seen["light"]["data-page"]) == ("255 255 255 255", "rgb(255, 255, 255)")
+    assert (seen["dark"]["data-chart"], seen["dark"]["data-page"]) == ("20 24 28 255", "rgb(20, 24, 28)")
 
 
 @pytest.mark.slow
@@ -171,6 +261,7 @@ def test_it_prints_whole(page: Path, tmp_path: Path) -> None:
     paper = tmp_path / "report.pdf"
     run_browser(page, f"--print-to-pdf={paper}")
     assert paper.read_bytes().startswith(b"%PDF")
+    assert paper.stat().st_size < 5_000_000
     if shutil.which("pdftotext") is None or shutil.which("pdfinfo") is None:
         pytest.skip("no pdftotext and pdfinfo to look into the printed page")
 

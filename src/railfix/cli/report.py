@@ -20,22 +20,34 @@ def report(
         list[Path] | None,
         typer.Option(
             metavar="REF",
-            help="Reference positions: of railfix reference, ground truth of a simulation, a log of good positions. "
-            "One for all runs, or repeated, one for each run in order.",
+            help="Reference trajectory: a reference file, a simulator's ground truth, or a log of positions. One for "
+            "all runs, or repeated, one for each run in order.",
         ),
+    ] = None,
+    conventional: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN",
+            help="Another run on the same log, whose conventional positions are shown: one with `--screens elevation` "
+            "gives unscreened ones, as in P1. Repeated, one for each run in order.",
+        ),
+    ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option(metavar="GEOJSON", help="Streets, buildings or the like to draw below the plan (WGS 84)."),
     ] = None,
     title: Annotated[str, typer.Option(metavar="TEXT", help="Heading of the page.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
     """Make one page of one or several runs, to open in a browser.
 
-    The page shows what was run and with which settings, what became of every epoch and pseudorange,
-    the line in plan, the positioning interval, the processing time; with `--reference` the errors
-    along the line on the map and conventional, figures of merit and Stanford diagrams; with
-    observations (`railfix run --observations`) the sky at an epoch that is clicked on, C/N0 over
-    elevation, and each screen's metric against its limit. It says what it leaves out, and why.
+    At the top: one sentence, five key figures, the line in plan coloured by error, and the error over
+    chainage beside the conventional one. Below, folded: figures of merit, counts, protection levels,
+    settings and inputs, each table with a CSV download. Then the charts of each antenna: errors,
+    protection levels, intervals and, with `railfix run --observations`, sky, C/N0 and screens. The page
+    names what it leaves out, with the reason. Errors need `--reference`.
 
-    The page holds all that it shows: it opens without a network and can be sent and printed.
+    The page contains everything it shows: it opens without a network and can be sent and printed.
 
     Example:
 
@@ -46,6 +58,14 @@ def report(
     8 the page cannot be written; 1 a defect of railfix.
     """
     in_runs = [path for run in runs if run.is_dir() for path in run.iterdir() if path.suffix != ".html"]
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[*(reference or ()), *in_runs])
-    page = write_report(runs, out, references=tuple(reference or ()), title=title)
+    inputs = [*(reference or ()), *in_runs, *([] if background is None else [background])]
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=inputs)
+    page = write_report(
+        runs,
+        out,
+        references=tuple(reference or ()),
+        conventional=tuple(conventional or ()),
+        background=background,
+        title=title,
+    )
     typer.echo(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -1,8 +1,9 @@
-"""Errors along the line of one antenna: by chainage, or along the trajectory from the reference's place."""
+"""Errors along the line of one antenna: by chainage, or along the trajectory."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -22,24 +23,23 @@ from railfix.track import Track, read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-#: Chainages of the reference and of the run that differ from their places by more than this, at the median, are
-#: not of one map [m].
+#: Largest median difference between chainages and coordinates of run and reference on the same map [m].
 SAME_MAP_M: Final = 1.0
-#: Answers further than this from the trajectory at their chainage show that it is not that of the run [m].
+#: Largest distance of a position from the trajectory of its run [m].
 SAME_TRAJECTORY_M: Final = 0.01
-#: Points of one vehicle lie within this of each other along the line [m].
+#: Largest distance between two points of a vehicle along the line [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: Chainages may lie beyond the ends by their rounding [m].
+#: Rounding of chainages at the ends of the line [m].
 _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Track and vehicle in place of those that ``run.json`` names, and how to read the track.
+    """Files that replace those named in ``run.json``, and options for reading the track.
 
     Attributes
     ----------
     track : tuple of Path
-        Empty: those of the run.
+        Empty: the files of the run.
     vehicle : Path or None
     reading : TrackReading
         Its `reference` is not used: the run's own is.
@@ -56,12 +56,12 @@ class TrackFiles(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Answers of one antenna and the reference at their times, T epochs.
+    """Positions of one antenna, and the reference at their times, T epochs.
 
     Attributes
     ----------
     chainage_m, conventional_chainage_m : ndarray, shape (T,) [m]
-        NaN where there is none.
+        NaN without a position.
     ecef_m : ndarray, shape (T, 3) [m]
     reference_chainage_m : ndarray, shape (T,) [m]
     reference_ecef_m : ndarray, shape (T, 3) [m]
@@ -88,9 +88,9 @@ class Errors:
         Straight distance between the position on the map and the reference: its point on the map where the
         trajectory is read, else its own position.
     reference_chainage_m : ndarray, shape (T,) [m]
-        Of the reference, for places; from the map where the reference has none.
+        Of the reference; from the map where the reference has no chainage.
     files : tuple of Path
-        Track and vehicle, where they were read.
+        Track and vehicle, if they were read.
     notes : tuple of str
     """
 
@@ -113,13 +113,13 @@ def errors_of(
 ) -> Errors:
     """Errors of one antenna of a run.
 
-    By chainage where the reference has it at every epoch, the run's is that of the antenna, and both
-    agree with the distance of the places to `SAME_MAP_M` at the median; otherwise along the trajectory.
+    By chainage if the reference has one at every epoch, the run's chainage is that of the antenna, and both
+    agree with the coordinates to `SAME_MAP_M` at the median; otherwise along the trajectory.
 
     Raises
     ------
     MismatchError
-        `method` is "chainage" and it cannot be taken, or the track is not that of the run.
+        `method` is "chainage" and not applicable, or the track is not that of the run.
     InputFileError
         The track or the vehicle cannot be read.
     """
@@ -138,7 +138,7 @@ def errors_of(
         notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory: {against}",)
     else:
         notes = (f"{antenna}: errors are along the trajectory, as asked",)
-    trajectory, used, said = find_trajectory(run, antenna, answers, files)
+    trajectory, used, more = find_trajectory(run, antenna, answers, files)
     arc, other = (_arc(trajectory, c) for c in (answers.chainage_m, answers.conventional_chainage_m))
     place = answers.reference_chainage_m
     if not trusted:
@@ -150,12 +150,12 @@ def errors_of(
         distance_m=straight_distance(arc, answers.reference_ecef_m, trajectory),
         reference_chainage_m=place,
         files=used,
-        notes=(*notes, *said),
+        notes=(*notes, *more),
     )
 
 
 def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[str | None, bool]:
-    """Why differences of chainage cannot be taken, None where they can; and whether it tells places all the same."""
+    """Reason against differences of chainage, or None; and whether the reference chainage is usable for places."""
     known = np.isfinite(answers.reference_ecef_m[:, 0])
     with_chainage = np.isfinite(answers.reference_chainage_m)
     if not with_chainage.any():
@@ -176,7 +176,7 @@ def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[s
 
 
 def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
-    """Arcs at chainages that may lie beyond the ends by their rounding."""
+    """Arc lengths at chainages, tolerating rounding at the ends of the line."""
     first, last = trajectory.chainage_m[0], trajectory.chainage_m[-1]
     near = (chainage_m > first - _ROUNDING_M) & (chainage_m < last + _ROUNDING_M)
     return trajectory.arc_at_chainage(np.where(near, np.clip(chainage_m, first, last), chainage_m))
@@ -185,12 +185,12 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, answers: Answers, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """The trajectory that the run had, from its track and vehicle; with the files and what is to be said.
+    """Trajectory that the run used, from its track and vehicle; with the files and notes.
 
     Raises
     ------
     MismatchError
-        The answers do not lie on it: another track, vehicle, or reading of them.
+        The positions do not lie on it: another track or vehicle, or other reading options.
     InputFileError
         The files cannot be read.
     """
@@ -219,21 +219,40 @@ def find_trajectory(
         farthest.append(float(off.max()))
     if not farthest:
         raise faults[0]
-    told = f"{min(farthest):.2f} m" if np.isfinite(min(farthest)) else "the line's whole length"
+    distance = f"{min(farthest):.2f} m" if np.isfinite(min(farthest)) else "the length of the line"
     raise MismatchError(
-        f"{tracks[0]}: is not the track of {run.path}, whose positions of the {antenna} antenna lie up to {told} from "
-        "it; give the run's own --track and --vehicle, and its --crs, --height-datum and --geoid where it had them"
+        f"{tracks[0]}: is not the track of {run.path}, whose positions of the {antenna} antenna lie up to {distance} "
+        "from it; give the run's own --track and --vehicle, and its --crs, --height-datum and --geoid where it had them"
     )
 
 
 def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, str | None, str | None]]:
-    """Ways to read the track: as told; else as the file says, then as the run's record says."""
-    told = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
-    if any(told):
-        return [told]
+    """Options for reading the track: those given; else those of the file, then those in ``run.json``."""
+    given = (files.reading.crs, files.reading.height_datum, files.reading.geoid)
+    if any(given):
+        return [given]
     facts = run.track_facts
     recorded = tuple(facts.get(name) or None for name in ("crs", "height_datum_asked", "geoid"))
-    return [told, (recorded[0], recorded[1], recorded[2])]
+    return [given, (recorded[0], recorded[1], recorded[2])]
+
+
+def track_of(run: RunFolder, files: TrackFiles | None = None) -> Track:
+    """Track that the run used.
+
+    Raises
+    ------
+    RailfixError
+        The files cannot be read.
+    """
+    files = files or TrackFiles()
+    paths = list(files.track) or run.located("track")
+    if not paths:
+        raise InputFileError(run.path / "run.json", "names no track; give it with --track")
+    *first, last = _readings(run, files)
+    for crs, datum, geoid in first:
+        with suppress(RailfixError):
+            return read_track(paths, crs=crs, height_datum=datum, geoid=geoid)
+    return read_track(paths, crs=last[0], height_datum=last[1], geoid=last[2])
 
 
 def _trajectory(run: RunFolder, antenna: str, track: Track, vehicles: Sequence[Path]) -> Trajectory:

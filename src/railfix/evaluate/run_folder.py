@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
@@ -242,5 +243,7 @@ def _table(file: Path) -> pl.DataFrame:
 
 
 def floats(table: pl.DataFrame, name: str) -> Floats:
-    """A column as numbers, null as NaN."""
+    """A column as numbers, NaN where it is null or the table has no such column."""
+    if name not in table.columns:
+        return np.full(len(table), np.nan)
     return table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy()

@@ -1,4 +1,4 @@
-"""The report on runs: one page of HTML with every table and picture, that opens without a network."""
+"""Report on runs: one HTML page with its tables and charts, readable without a network."""
 
 from railfix.report.page import report_page, write_page, write_report
 from railfix.report.runs import ReportedRun, read_runs

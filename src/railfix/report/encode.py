@@ -13,12 +13,12 @@ from railfix.core.timescale import seconds
 from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-#: Of whole numbers packed in 16 bits: unknown.
+#: Unknown value of an unsigned 16-bit number.
 _UNKNOWN: Final = 65535
 
 
 def script_json(value: Any) -> str:
-    """JSON that cannot end the script element it stands in.
+    """JSON text that is safe inside a script element.
 
     Parameters
     ----------
@@ -56,13 +56,13 @@ def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict
     ----------
     chart : Chart
     epochs_from : datetime64[ns], optional
-        From when ``epoch_s`` of its points counts, in place of `Chart.start`.
+        Origin of ``epoch_s`` of its points, if not `Chart.start`.
 
     Returns
     -------
     dict
     """
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         "title": chart.title,
         "x_label": chart.x_label,
         "y_label": chart.y_label,
@@ -72,13 +72,14 @@ def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict
         "x_range": chart.x_range,
         "y_range": chart.y_range,
         "equal": chart.equal,
+        "axis": chart.shared_axis,
         "layers": [_layer(layer) for layer in chart.layers],
     }
     if chart.start is not None:
-        found["start"] = since_1970(chart.start)
+        values["start"] = since_1970(chart.start)
     if epochs_from is not None:
-        found["epoch0"] = since_1970(epochs_from)
-    return found
+        values["epoch0"] = since_1970(epochs_from)
+    return values
 
 
 def since_1970(time: np.datetime64) -> float:
@@ -114,7 +115,7 @@ def _layer(layer: Layer) -> dict[str, Any]:
 
 
 def _cells(layer: Cells) -> dict[str, Any]:
-    """Cells that are not empty; the page takes them as equally wide."""
+    """Cells that are not empty; all have equal widths."""
     column, row = np.nonzero(layer.counts)
     return {
         "kind": "cells",
@@ -132,7 +133,7 @@ def _cells(layer: Cells) -> dict[str, Any]:
 
 
 def sky_values(sky: SkyEpochs) -> dict[str, Any]:
-    """Satellites over an antenna as plain values; angles and C/N0 in hundredths."""
+    """Satellites in view as plain values; angles and C/N0 in hundredths."""
     values: dict[str, Any] = {
         "start": since_1970(sky.start),
         "epoch": packed(sky.epoch_s),

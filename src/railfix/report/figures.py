@@ -1,8 +1,8 @@
-"""Which charts a run gets, in which order, and why one is not there."""
+"""Charts of a run in the order of the page, and the reasons for missing ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,24 +18,24 @@ from railfix.report.plots.columns import floats, start_of
 from railfix.report.plots.errors import error_over_chainage, error_over_time, good_errors
 from railfix.report.plots.levels import levels_over_chainage, levels_over_time, stanford
 from railfix.report.plots.line import interval_distribution, interval_over_chainage, plan, satellites_over_time
-from railfix.report.plots.run_screens import screens_of
+from railfix.report.plots.run_screens import missing_columns, screens_of
 from railfix.report.plots.screens import screen_over_chainage, screen_over_time
-from railfix.report.plots.signals import SKY_EPOCHS, cn0_over_elevation, sky_epochs
+from railfix.report.plots.signals import CN0_COLUMNS, SKY_COLUMNS, SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.report.plots.timing import processing_time
 from railfix.report.protection import NO_LEVELS
 from railfix.report.runs import ReportedRun
 
-#: Largest errors whose epochs are surely among those of the sky.
+#: Number of largest errors whose epochs are among those of the sky plot.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
-    "No reference was given (--reference), so there are no pictures of errors, no figures of merit and no Stanford "
-    "diagram; intervals between positions are those of the positions themselves."
+    "No reference was given (--reference), so there are no errors, figures of merit and Stanford diagrams; intervals "
+    "are those between the positions themselves."
 )
 NO_OBSERVATIONS: Final = (
-    "The run wrote no observations (railfix run --observations), so there are no pictures of the sky, of C/N0 and of "
+    "The run wrote no observations (railfix run --observations), so there are no charts of the sky, of C/N0 and of "
     "the screens."
 )
-NO_TIMES: Final = "run.json tells no times of chunks, so there is no picture of the processing time."
+NO_TIMES: Final = "run.json has no processing times, so there is no chart of them."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +47,9 @@ class Group:
     title : str
     charts : tuple of Chart or SkyEpochs
     start : datetime64[ns]
-        From when `Points.epoch_s` of the charts counts.
+        Origin of `Points.epoch_s` of the charts.
     absent : tuple of str
-        What is not there, and why.
+        Reasons for missing charts.
     """
 
     title: str
@@ -58,7 +58,39 @@ class Group:
     absent: tuple[str, ...] = ()
 
 
-def antenna_groups(run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS) -> Iterator[Group]:
+def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) -> Group:
+    """Plan of the line and errors over chainage of one antenna: the picture at the top of the page.
+
+    Without a reference, protection levels or intervals stand beside the plan.
+    """
+    positions, errors = run.positions_of(antenna), run.errors_of(antenna)
+    if errors is not None:
+        beside = error_over_chainage(errors, filtered=run.filtered_of(antenna))
+    else:
+        beside = levels_over_chainage(positions, _alarm_limit(run))
+        beside = interval_over_chainage(positions) if beside.empty else beside
+    charts = _kept(_plan(run, antenna, background), beside)
+    return Group(title="", charts=charts, start=start_of(positions))
+
+
+def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart:
+    """Plan, coloured by error, by protection level without a reference, or by status without either."""
+    positions, errors = run.positions_of(antenna), run.errors_of(antenna)
+    level = floats(positions, "protection_level_m")
+    return plan(
+        positions,
+        error_m=None if errors is None else _aligned(positions, errors),
+        level_m=level if np.isfinite(level).any() else None,
+        track=run.track,
+        tunnels_m=_tunnels(errors),
+        background=background,
+        title=f"Plan of the line, {antenna} antenna",
+    )
+
+
+def antenna_groups(
+    run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS, background: Sequence[Floats] = ()
+) -> Iterator[Group]:
     """Charts of one antenna of a run.
 
     Parameters
@@ -66,22 +98,24 @@ def antenna_groups(run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS) -> 
     run : ReportedRun
     antenna : str
     sky : int
-        Epochs of the sky at most.
+        Largest number of epochs of the sky plot.
+    background : sequence of ndarray, shape (P, 2) [deg]
+        Longitude and latitude of lines to draw below the plan.
 
     Yields
     ------
     Group
     """
-    positions, errors, observations = run.positions_of(antenna), run.errors_of(antenna), run.observations_of(antenna)
+    positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     start = start_of(positions)
-    along = None if errors is None else _aligned(positions, errors)
-    yield Group(title="The line", charts=_kept(plan(positions, error_m=along)), start=start)
+    yield Group(title="The line", charts=_kept(_plan(run, antenna, background)), start=start)
     if errors is not None:
-        over = _kept(error_over_time(errors), error_over_chainage(errors))
+        filtered = run.filtered_of(antenna)
+        over = _kept(error_over_time(errors, filtered=filtered), error_over_chainage(errors, filtered=filtered))
         yield Group(title="Errors", charts=over, start=start_of(errors))
     else:
         yield Group(title="Errors", charts=(), start=start, absent=(NO_REFERENCE,))
-    limit = run.folder.alarm_limit_m or run.config.alarm_limit_m
+    limit = _alarm_limit(run)
     levels = _kept(levels_over_time(positions, limit), levels_over_chainage(positions, limit))
     if levels and errors is not None:
         levels = _kept(*_stanford(run, errors, limit)) + levels
@@ -90,40 +124,45 @@ def antenna_groups(run: ReportedRun, antenna: str, *, sky: int = SKY_EPOCHS) -> 
     table = positions if errors is None else errors
     charts = (interval_over_chainage(table), interval_distribution(table), satellites_over_time(positions))
     yield Group(title="Positioning interval and satellites", charts=_kept(*charts), start=start)
-    if observations is None:
+    if run.observations is None:
         yield Group(title="Signals", charts=(), start=start, absent=(NO_OBSERVATIONS,))
         return
-    seen = sky_epochs(observations, wanted=_worst(errors), epochs=sky, title=f"Sky over the {antenna} antenna")
-    yield Group(title="Sky", charts=() if seen.empty else (seen,), start=start)
+    observations = run.observations.filter(pl.col("antenna") == antenna)
+    in_view = sky_epochs(
+        observations.select(SKY_COLUMNS), wanted=_worst(errors), epochs=sky, title=f"Sky over the {antenna} antenna"
+    )
+    yield Group(title="Sky", charts=() if in_view.empty else (in_view,), start=start)
     curves = cn0_over_elevation(
-        observations,
+        observations.select(CN0_COLUMNS).collect(),
         limits=run.config.cn0 if "cn0" in run.config.screens else None,
         curve=run.curve,
         mask_deg=run.config.elevation.mask_deg if "elevation" in run.config.screens else None,
     )
-    absent = () if curves else ("No observation has both an elevation and a C/N0, so there is no picture of them.",)
+    absent = () if curves else ("No observation has both an elevation and a C/N0, so there is no chart of them.",)
     yield Group(title="C/N0 over elevation", charts=_kept(*curves), start=start, absent=absent)
     yield _screens(run, antenna, positions, observations, start)
 
 
+def _alarm_limit(run: ReportedRun) -> float:
+    return run.folder.alarm_limit_m or run.config.alarm_limit_m
+
+
 def _screens(
-    run: ReportedRun, antenna: str, positions: pl.DataFrame, observations: pl.DataFrame, start: np.datetime64
+    run: ReportedRun, antenna: str, positions: pl.DataFrame, observations: pl.LazyFrame, start: np.datetime64
 ) -> Group:
-    lacking = {"raim_statistic", "metric_antenna_spacing_m"} - set(positions.columns)
-    lacking |= {"metric_doppler_m", "limit_doppler_m", "metric_antenna_pair_m"} - set(observations.columns)
-    if lacking:
-        why = f"The tables lack {', '.join(sorted(lacking))}, so there are no pictures of the screens; run again."
-        return Group(title="Screens", charts=(), start=start, absent=(why,))
+    if missing := missing_columns(positions, observations):
+        reason = f"The tables lack {', '.join(missing)}, so there are no charts of the screens; run again."
+        return Group(title="Screens", charts=(), start=start, absent=(reason,))
     charts: list[Chart] = []
     for screen in screens_of(run.config, positions, observations):
         charts.append(screen_over_time(screen.picture, screen.time))
         charts.append(screen_over_chainage(screen.picture, screen.chainage_m))
-    absent = () if charts else (f"No screen of the {antenna} antenna was on that had anything to judge.",)
+    absent = () if charts else (f"No active screen of the {antenna} antenna tested anything.",)
     return Group(title="Screens: each metric against its limit", charts=_kept(*charts), start=start, absent=absent)
 
 
 def run_group(run: ReportedRun) -> Group:
-    """Charts of a run as a whole."""
+    """Charts of all antennas of a run together."""
     chunks = run.record.get("chunks") or {}
     start = start_of(run.folder.positions)
     if not all(chunks.get(name) for name in ("first_epoch_gpst", "epochs", "positioning_s")):
@@ -141,17 +180,17 @@ def _kept(*charts: Chart) -> tuple[Chart, ...]:
 
 
 def _stanford(run: ReportedRun, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
-    """The diagram of the levels that the run usable, and of all."""
+    """Stanford diagrams of the usable levels, and of all levels."""
     kind = run.folder.level_kind
     if kind is None:
         return
-    for levels_of, words in zip(LEVELS_OF, ("usable levels", "levels alone"), strict=True):
+    for levels_of, words in zip(LEVELS_OF, ("usable levels", "all levels"), strict=True):
         diagram = epochs_diagram(errors, kind, alarm_limit_m=limit_m, levels_of=levels_of, options=EvaluationOptions())
         yield stanford(diagram, title=f"Stanford diagram, {words} ({kind})")
 
 
 def _aligned(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
-    """Errors row by row of the positions."""
+    """Errors at the rows of the positions."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")
@@ -162,8 +201,20 @@ def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
     if errors is None:
         return None
     times = errors["time_gpst"].to_numpy()
-    found = []
+    worst = []
     for column in ("error_m", "conventional_error_m"):
         size = np.nan_to_num(np.abs(floats(errors, column)), nan=-1.0)
-        found.append(times[np.argsort(-size, kind="stable")[:_WORST]])
-    return np.concatenate(found)
+        worst.append(times[np.argsort(-size, kind="stable")[:_WORST]])
+    return np.concatenate(worst)
+
+
+def _tunnels(errors: pl.DataFrame | None) -> list[tuple[float, float]]:
+    """Chainages between which the reference's environment is a tunnel [m]."""
+    if errors is None:
+        return []
+    known = errors.filter(pl.col("chainage_m").is_not_null()).sort("chainage_m")
+    inside = (known["environment"] == "tunnel").to_numpy()
+    edges = np.flatnonzero(np.diff(inside.astype(np.int8), prepend=0, append=0))
+    chainage = known["chainage_m"].to_numpy()
+    pairs = zip(edges[::2], edges[1::2], strict=True)
+    return [(float(chainage[first]), float(chainage[last - 1])) for first, last in pairs if last - first > 1]

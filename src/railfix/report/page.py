@@ -1,34 +1,98 @@
-"""The report: one page of HTML that needs nothing else."""
+"""The report: one HTML page with all it shows."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
 from itertools import count
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from railfix import __version__
+from railfix.core.arrays import Floats
 from railfix.core.files import write_whole
 from railfix.evaluate import Evaluation
 from railfix.report import tables
+from railfix.report.background import read_background
+from railfix.report.content import Absent, Block, Folded
 from railfix.report.encode import chart_values, script_json, sky_values
-from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, run_group
-from railfix.report.html import absent, text
+from railfix.report.figures import NO_OBSERVATIONS, NO_REFERENCE, Group, antenna_groups, overview, run_group
+from railfix.report.headline import Headline, headline
 from railfix.report.plots.chart import Chart, Points, SkyEpochs
 from railfix.report.plots.errors import error_ranges
 from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.protection import protection
 from railfix.report.runs import ReportedRun, read_runs
 
-#: Epochs of the sky that every antenna has.
+#: Fewest epochs of the sky plot of an antenna.
 _LEAST_SKY: Final = 200
-#: Nothing is fetched: what the page may load, said to the browser.
+#: Content security policy of the page: it loads nothing.
 _POLICY: Final = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
-def write_report(runs: Sequence[Path], out: Path, *, references: Sequence[Path] = (), title: str = "") -> Path:
+@dataclass(frozen=True, kw_only=True)
+class _Figure:
+    """A chart or sky plot in the page."""
+
+    number: int
+    chart: Chart | SkyEpochs
+    json: Markup
+    width: str
+    sky: str
+    zoomed_with: str
+
+    @property
+    def is_sky(self) -> bool:
+        """Whether it is a sky plot."""
+        return isinstance(self.chart, SkyEpochs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """Figures under a heading."""
+
+    title: str
+    figures: Sequence[_Figure]
+    absent: Sequence[str] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _AntennaPart:
+    """Charts of one antenna."""
+
+    name: str
+    anchor: str
+    parts: Sequence[_Part]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _RunPart:
+    """Everything on one run."""
+
+    name: str
+    anchor: str
+    antenna: str
+    headline: Headline
+    overview: _Part
+    tables: Sequence[Folded]
+    timing: _Part
+    antennas: Sequence[_AntennaPart]
+
+
+def write_report(
+    runs: Sequence[Path],
+    out: Path,
+    *,
+    references: Sequence[Path] = (),
+    conventional: Sequence[Path] = (),
+    background: Path | None = None,
+    title: str = "",
+) -> Path:
     """Write the report on runs.
 
     Parameters
@@ -36,9 +100,11 @@ def write_report(runs: Sequence[Path], out: Path, *, references: Sequence[Path] 
     runs : sequence of Path
         Folders that `railfix run` wrote.
     out : Path
-        The page; it appears whole or not at all, in place of an earlier one.
-    references : sequence of Path
-        None, one for all runs, or one for each (`railfix.io.reference_log.read_reference`).
+        The page; an existing file is replaced, by the complete page or not at all.
+    references, conventional : sequence of Path
+        See `railfix.report.read_runs`.
+    background : Path, optional
+        GeoJSON file with lines to draw below the plan (`railfix.report.background`).
     title : str
 
     Returns
@@ -53,158 +119,175 @@ def write_report(runs: Sequence[Path], out: Path, *, references: Sequence[Path] 
     OutputError
         The page cannot be written.
     """
-    reported, evaluation = read_runs(runs, references)
-    return write_page(reported, evaluation, out, title=title)
+    reported, evaluation = read_runs(runs, references, conventional=conventional)
+    lines = () if background is None else read_background(background)
+    return write_page(reported, evaluation, out, background=lines, title=title)
 
 
-def write_page(runs: Sequence[ReportedRun], evaluation: Evaluation | None, out: Path, *, title: str = "") -> Path:
-    """Write the report on runs that are read already; see `write_report`."""
-    write_whole(out, report_page(runs, evaluation, title=title), what="report")
+def write_page(
+    runs: Sequence[ReportedRun],
+    evaluation: Evaluation | None,
+    out: Path,
+    *,
+    background: Sequence[Floats] = (),
+    title: str = "",
+) -> Path:
+    """Write the report on runs that have been read; see `write_report`."""
+    write_whole(out, report_page(runs, evaluation, background=background, title=title), what="report")
     return out
 
 
-def report_page(runs: Sequence[ReportedRun], evaluation: Evaluation | None, *, title: str = "") -> str:
-    """The page as text.
+def report_page(
+    runs: Sequence[ReportedRun],
+    evaluation: Evaluation | None,
+    *,
+    background: Sequence[Floats] = (),
+    title: str = "",
+) -> str:
+    """HTML of the report.
 
     Parameters
     ----------
     runs : sequence of ReportedRun
     evaluation : Evaluation or None
+    background : sequence of ndarray, shape (P, 2) [deg]
+        Longitude and latitude of lines to draw below the plan.
     title : str
     """
     numbers = count()
-    # together the antennas of many runs weigh no more in this than those of a few
-    epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // max(sum(len(r.folder.antennas) for r in runs), 1)))
-    names = ", ".join(run.name for run in runs)
-    heading = title or f"railfix report: {names}"
-    when = datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
-    parts = [
-        f"<h1>{text(heading)}</h1>",
-        f'<p class="lead">Positions along the line from satellite ranges and a track map. Made on {when} by railfix '
-        f"{text(__version__)}; all that it shows is in this file.</p>",
-        _navigation(runs),
-        _overview(runs, evaluation, numbers),
-        *(_run(run, evaluation, number, numbers, sky=epochs) for number, run in enumerate(runs)),
-    ]
-    return "\n".join(
-        [
-            "<!DOCTYPE html>",
-            '<html lang="en"><head><meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{text(heading)}</title>",
-            f"<style>\n{_resource('page.css')}</style></head><body>",
-            '<div id="railfix-errors" hidden></div><div id="railfix-timing" hidden></div>',
-            f"<script>\n{_resource('errors.js')}</script>",
-            "<noscript>"
-            + absent("The pictures of this page are drawn by a script, which this browser does not run.")
-            + "</noscript>",
-            *parts,
-            f"<script>\n{_resource('page.js')}</script>",
-            "</body></html>",
-            "",
-        ]
-    )
-
-
-def _navigation(runs: Sequence[ReportedRun]) -> str:
-    links = ['<a href="#summary">Summary</a>']
-    for k, run in enumerate(runs):
-        links.append(f'<a href="#run{k}">{text(run.name)}</a>')
-        links += [f'<a href="#run{k}-{i}">{text(a)} antenna</a>' for i, a in enumerate(run.folder.antennas)]
-    return f"<nav>{''.join(links)}</nav>"
-
-
-def _overview(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> str:
-    parts = ['<h2 id="summary" class="first">Summary</h2>', tables.summary(runs, evaluation)]
-    parts.append(
-        '<p class="caption screen-only">In the pictures: point for values, drag to enlarge, double-click to see all '
-        "again, click on a name below to hide it; a click on a position or an error shows the satellites then. "
-        "With the keyboard: + and −, arrows, 0.</p>"
-    )
-    if evaluation is None:
-        parts.append(absent(NO_REFERENCE))
-    else:
-        series = {}
-        for run in runs:
-            for antenna in run.folder.antennas:
-                errors = run.errors_of(antenna)
-                if errors is not None:
-                    series[f"{run.name}, {antenna}"] = errors
-        chart = error_ranges(series)
-        if not chart.empty:
-            parts.append(f'<div class="charts">{_figure(chart, next(numbers), "", None)}</div>')
-    if any(run.observations is None for run in runs):
-        lacking = ", ".join(run.name for run in runs if run.observations is None)
-        parts.append(absent(f"{lacking}: {NO_OBSERVATIONS}" if len(runs) > 1 else NO_OBSERVATIONS))
-    return "\n".join(parts)
-
-
-def _run(run: ReportedRun, evaluation: Evaluation | None, k: int, numbers: Iterator[int], *, sky: int) -> str:
-    parts = [f'<h2 id="run{k}">Run {text(run.name)}</h2>', tables.what_was_run(run), tables.settings(run)]
-    parts += ["<h3>What became of epochs and pseudoranges</h3>", tables.budget(run)]
-    if evaluation is not None:
-        parts += ["<h3>Figures of merit</h3>", tables.merits(run, evaluation)]
-    parts += ["<h3>Protection level</h3>", protection(run, evaluation)]
-    parts.append(_group(run_group(run), numbers, ""))
-    for i, antenna in enumerate(run.folder.antennas):
-        parts.append(f'<h2 id="run{k}-{i}">{text(run.name)}: {text(antenna)} antenna</h2>')
-        place = f"sky{k}-{i}" if run.observations is not None else ""
-        parts += [_group(group, numbers, place) for group in antenna_groups(run, antenna, sky=sky)]
-    return "\n".join(parts)
-
-
-def _group(group: Group, numbers: Iterator[int], sky: str) -> str:
-    figures = []
-    for chart in group.charts:
-        number = next(numbers)
-        if isinstance(chart, SkyEpochs):
-            figures.append(_sky(chart, number, sky))
-        else:
-            figures.append(_figure(chart, number, sky, group))
-    body = "".join(absent(sentence) for sentence in group.absent)
-    if figures:
-        body += f'<div class="charts">{"".join(figures)}</div>'
-    return f"<h3>{text(group.title)}</h3>\n{body}"
-
-
-def _figure(chart: Chart, number: int, sky: str, group: Group | None) -> str:
-    clickable = any(isinstance(layer, Points) and layer.epoch_s is not None for layer in chart.layers)
-    linked = f' data-sky="{sky}"' if sky and clickable else ""
-    values = chart_values(chart, group.start if group is not None and clickable else None)
+    antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
+    # many antennas share the size that two have
+    epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
     return (
-        f'<figure class="{chart.width}" data-chart="c{number}" data-name="{text(chart.name)}"{linked}>'
-        f"<h4>{text(chart.title)}</h4>"
-        f'<div class="plot"><canvas role="img" tabindex="0" aria-label="{text(f"{chart.title}. {chart.caption}")}">'
-        '</canvas><div class="tip" hidden></div></div><div class="legend"></div>'
-        f'<figcaption class="caption">{text(chart.caption)}</figcaption></figure>'
-        f'<script type="application/json" id="c{number}">{script_json(values)}</script>'
-    )
-
-
-def _sky(sky: SkyEpochs, number: int, name: str) -> str:
-    heads = "".join(
-        f'<th scope="col"{" class=n" if right else ""}>{head}</th>'
-        for head, right in (
-            ("satellite", 0),
-            ("signal", 0),
-            ("elevation", 1),
-            ("azimuth", 1),
-            ("C/N0, dB-Hz", 1),
-            ("reason", 0),
+        _environment()
+        .get_template("page.html.j2")
+        .render(
+            title=title or f"railfix report: {', '.join(run.name for run in runs)}",
+            created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            version=__version__,
+            policy=_POLICY,
+            style=_resource("page.css"),
+            scripts=(_resource("errors.js"), _resource("page.js")),
+            runs=[
+                _run(run, evaluation, number, numbers, sky=epochs, background=background)
+                for number, run in enumerate(runs)
+            ],
+            summary=_summary(runs, evaluation),
+            ranges=_ranges(runs, evaluation, numbers),
         )
     )
-    return (
-        f'<figure class="wide skyplot" id="{name}" data-chart="c{number}" data-name="sky"><h4>{text(sky.title)}</h4>'
-        '<div class="sky"><label class="pick"><span>Epoch</span>'
-        f'<input type="range" min="0" max="{len(sky.epoch_s) - 1}" value="0"><output></output></label>'
-        f'<div><canvas role="img" aria-label="{text(sky.title)}"></canvas></div>'
-        f"<table><thead><tr>{heads}</tr></thead><tbody></tbody></table></div>"
-        '<figcaption class="caption">Dots are used, crosses refused; the number is C/N0, the table tells the first '
-        f"reason. {text(sky.caption)} The slider or a click on an error chooses one.</figcaption></figure>"
-        f'<script type="application/json" id="c{number}">{script_json(sky_values(sky))}</script>'
+
+
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("railfix.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
 
 
-def _resource(name: str) -> str:
-    return files("railfix.report").joinpath(name).read_text(encoding="utf-8")
+def _resource(name: str) -> Markup:
+    return Markup(files("railfix.report").joinpath("templates", name).read_text(encoding="utf-8"))
+
+
+def _summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> list[Block]:
+    """Table of all runs, and what the page lacks."""
+    blocks: list[Block] = [tables.summary(runs, evaluation)]
+    if evaluation is None:
+        blocks.append(Absent(NO_REFERENCE))
+    without = [run.name for run in runs if run.observations is None]
+    if without:
+        blocks.append(Absent(NO_OBSERVATIONS if len(runs) == 1 else f"{', '.join(without)}: {NO_OBSERVATIONS}"))
+    return blocks
+
+
+def _ranges(runs: Sequence[ReportedRun], evaluation: Evaluation | None, numbers: Iterator[int]) -> _Part:
+    """Range of the errors of all runs."""
+    if evaluation is None:
+        return _Part(title="", figures=())
+    series = {
+        f"{run.name}, {antenna}": errors
+        for run in runs
+        for antenna in run.folder.antennas
+        if (errors := run.errors_of(antenna)) is not None
+    }
+    chart = error_ranges(series)
+    return _Part(title="", figures=() if chart.empty else (_figure(chart, numbers),))
+
+
+def _run(
+    run: ReportedRun,
+    evaluation: Evaluation | None,
+    number: int,
+    numbers: Iterator[int],
+    *,
+    sky: int,
+    background: Sequence[Floats],
+) -> _RunPart:
+    anchor, first = f"run{number}", run.folder.antennas[0]
+    merits = [] if evaluation is None else [Folded("Figures of merit", tables.merits(run, evaluation))]
+
+    def place(i: int) -> str:
+        return f"sky{number}-{i}" if run.observations is not None else ""
+
+    return _RunPart(
+        name=run.name,
+        anchor=anchor,
+        antenna=first,
+        headline=headline(run, first, evaluation),
+        overview=_part(overview(run, first, background), numbers, place(0), anchor, width="half"),
+        tables=(
+            *merits,
+            Folded("Epochs and pseudoranges", tables.budget(run)),
+            Folded("Protection level", protection(run, evaluation)),
+            Folded("Run, inputs and notes", tables.provenance(run)),
+            Folded("Settings asked for and used", tables.settings(run)),
+        ),
+        timing=_part(run_group(run), numbers, "", anchor),
+        antennas=[
+            _AntennaPart(
+                name=antenna,
+                anchor=f"{anchor}-{i}",
+                parts=[
+                    _part(group, numbers, place(i), anchor)
+                    for group in antenna_groups(run, antenna, sky=sky, background=background)
+                ],
+            )
+            for i, antenna in enumerate(run.folder.antennas)
+        ],
+    )
+
+
+def _part(group: Group, numbers: Iterator[int], sky: str, anchor: str, *, width: str = "") -> _Part:
+    figures = [_figure(chart, numbers, group=group, sky=sky, anchor=anchor, width=width) for chart in group.charts]
+    return _Part(title=group.title, figures=figures, absent=group.absent)
+
+
+def _figure(
+    chart: Chart | SkyEpochs,
+    numbers: Iterator[int],
+    *,
+    group: Group | None = None,
+    sky: str = "",
+    anchor: str = "",
+    width: str = "",
+) -> _Figure:
+    values: dict[str, Any]
+    if isinstance(chart, SkyEpochs):
+        values, linked, axis, width = sky_values(chart), sky, "", "wide"
+    else:
+        clickable = any(isinstance(layer, Points) and layer.epoch_s is not None for layer in chart.layers)
+        values = chart_values(chart, group.start if group is not None and clickable else None)
+        linked = sky if clickable else ""
+        axis = f"{anchor}-{chart.shared_axis}" if chart.shared_axis else ""
+        width = width or chart.width
+    return _Figure(
+        number=next(numbers),
+        chart=chart,
+        json=Markup(script_json(values)),
+        width=width,
+        sky=linked,
+        zoomed_with=axis,
+    )

@@ -1,52 +1,73 @@
-"""What a report is made from: folders of runs, and their errors where there is a reference."""
+"""Input of a report: folders of runs, and their errors where there is a reference."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import polars as pl
+from polars.exceptions import PolarsError
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.evaluate import Evaluation, RunAndReference, evaluate_runs
-from railfix.evaluate.run_folder import RunFolder, read_run
+from railfix.evaluate.evaluation import short_names
+from railfix.evaluate.place import track_of
+from railfix.evaluate.run_folder import POSITIONS_TABLE, RunFolder, read_run, tables_of
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
-from railfix.run.folder import read_parquet
+from railfix.track import Track
+
+_OBSERVATIONS: Final = "observations.parquet"
+_NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedRun:
-    """One run with all that its part of the report shows.
+    """One run with the content of its part of the report.
 
     Attributes
     ----------
     name : str
-        The folder's, with as many of those above it as tell the runs apart.
+        Of the folder, with as many parent folders as are needed to tell the runs apart.
     folder : RunFolder
     config : Config
-        Settings that were in force.
-    observations : polars.DataFrame or None
+        Settings that were used.
+    observations : polars.LazyFrame or None
         None where the run wrote none.
-    errors : polars.DataFrame or None
-        `railfix.evaluate.EPOCH_COLUMNS` of this run; None without a reference.
+    errors, filtered : polars.DataFrame or None
+        `railfix.evaluate.EPOCH_COLUMNS` of the single-epoch positions, and of the filter along the track; None
+        without a reference or without a filter.
     reference : str
-        The file; empty without.
+        Path of the reference; empty without one.
+    conventional : Path or None
+        Run that the conventional positions come from, where it is another one.
+    track : Track or None
+        None where its files cannot be read.
     curve : Cn0Curve or None
     notes : tuple of str
-        What the report itself has to say of the run.
     """
 
     name: str
     folder: RunFolder
     config: Config
-    observations: pl.DataFrame | None
+    observations: pl.LazyFrame | None
     errors: pl.DataFrame | None
+    filtered: pl.DataFrame | None
     reference: str
+    conventional: Path | None
+    track: Track | None
     curve: Cn0Curve | None
     notes: tuple[str, ...]
+
+    def name_in(self, evaluation: Evaluation) -> str:
+        """Name of its single-epoch positions in the tables of an evaluation."""
+        return next(
+            run.name
+            for run in evaluation.runs
+            if run.table == POSITIONS_TABLE and run.path.resolve() == self.folder.path.resolve()
+        )
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -55,21 +76,21 @@ class ReportedRun:
 
     def positions_of(self, antenna: str) -> pl.DataFrame:
         """Rows of one antenna in order of time."""
-        return self.folder.positions.filter(pl.col("antenna") == antenna)
-
-    def observations_of(self, antenna: str) -> pl.DataFrame | None:
-        """Rows of one antenna, None where the run wrote none."""
-        return None if self.observations is None else self.observations.filter(pl.col("antenna") == antenna)
+        return self.folder.positions.filter(antenna=antenna)
 
     def errors_of(self, antenna: str) -> pl.DataFrame | None:
         """Rows of one antenna, None without a reference."""
-        return None if self.errors is None else self.errors.filter(pl.col("antenna") == antenna)
+        return None if self.errors is None else self.errors.filter(antenna=antenna)
+
+    def filtered_of(self, antenna: str) -> pl.DataFrame | None:
+        """Rows of the filter along the track, None without."""
+        return None if self.filtered is None else self.filtered.filter(antenna=antenna)
 
 
 def read_runs(
-    paths: Sequence[Path], references: Sequence[Path] = ()
+    paths: Sequence[Path], references: Sequence[Path] = (), *, conventional: Sequence[Path] = ()
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
-    """Read runs, and set them against their references.
+    """Read runs, and evaluate them where there is a reference.
 
     Parameters
     ----------
@@ -77,6 +98,9 @@ def read_runs(
         Folders that `railfix run` wrote.
     references : sequence of Path
         None, one for all runs, or one for each in order.
+    conventional : sequence of Path
+        None, or for each run in order another run on the same log, whose conventional positions are shown: one with
+        the screens of elevation and C/N0 alone gives the unscreened ones of P1.
 
     Returns
     -------
@@ -89,72 +113,96 @@ def read_runs(
     InputFileError, MismatchError
         A file is not what it should be, or a reference is not that of the run.
     SettingsError
-        As many references as runs, or one, were expected; or a run is given twice.
+        The number of references or of conventional runs does not fit, or a run is given twice.
     """
     if not paths:
         raise SettingsError("no run to report on; name the folders that railfix run wrote")
     if len(references) not in (0, 1, len(paths)):
         raise SettingsError(
-            f"{len(references)} references for {len(paths)} runs; give one for all runs, or one for each in their order"
+            f"{len(references)} references for {len(paths)} runs; give one for all runs, or one for each in order"
         )
-    whole = [path.resolve() for path in paths]
-    if len(set(whole)) < len(whole):
-        again = next(path for path in whole if whole.count(path) > 1)
-        raise SettingsError(f"{again}: the run is given twice; give each run once")
-    folders = [read_run(path) for path in paths]
+    if len(conventional) not in (0, len(paths)):
+        raise SettingsError(f"{len(conventional)} conventional runs for {len(paths)} runs; give one for each, or none")
+    resolved = [path.resolve() for path in paths]
+    if len(set(resolved)) < len(resolved):
+        twice = next(path for path in resolved if resolved.count(path) > 1)
+        raise SettingsError(f"{twice}: the run is given twice; give each run once")
+    beside: Sequence[Path | None] = conventional or [None] * len(paths)
+    folders = [read_run(path, conventional=other) for path, other in zip(paths, beside, strict=True)]
     evaluation = None
     if references:
         each = references if len(references) == len(paths) else [references[0]] * len(paths)
-        pairs = [RunAndReference(run=run, reference=ref) for run, ref in zip(paths, each, strict=True)]
-        evaluation = evaluate_runs(pairs)
-    names = _names(whole)
-    return tuple(_reported(name, folder, evaluation) for name, folder in zip(names, folders, strict=True)), evaluation
+        evaluation = evaluate_runs(
+            [
+                RunAndReference(run=path, reference=reference, table=table, conventional=other)
+                for path, reference, other in zip(paths, each, beside, strict=True)
+                for table in tables_of(path)
+            ]
+        )
+    reported = tuple(
+        _reported(name, folder, evaluation, other)
+        for name, folder, other in zip(short_names(resolved), folders, beside, strict=True)
+    )
+    return reported, evaluation
 
 
-def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None) -> ReportedRun:
+def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None, conventional: Path | None) -> ReportedRun:
     config = folder.config
     curve, notes = _curve(folder, config)
-    errors, reference = None, ""
+    track, track_notes = _track(folder)
+    notes += track_notes
+    tables: dict[str, pl.DataFrame] = {}
+    reference = ""
     if evaluation is not None:
-        mine = next(run for run in evaluation.runs if run.path.resolve() == folder.path.resolve())
-        errors = evaluation.epochs.filter(pl.col("run") == mine.name)
-        reference = mine.reference
-        notes += mine.notes
+        for run in evaluation.runs:
+            if run.path.resolve() == folder.path.resolve():
+                tables[run.table] = evaluation.epochs.filter(run=run.name)
+                if run.table == POSITIONS_TABLE:
+                    reference = run.reference
+                    notes += run.notes
     return ReportedRun(
         name=name,
         folder=folder,
         config=config,
-        observations=_observations(folder.path / "observations.parquet"),
-        errors=errors,
+        observations=_observations(folder.path / _OBSERVATIONS),
+        errors=tables.get(POSITIONS_TABLE),
+        filtered=tables.get("train"),
         reference=reference,
+        conventional=conventional,
+        track=track,
         curve=curve,
         notes=notes,
     )
 
 
-def _observations(path: Path) -> pl.DataFrame | None:
+def _observations(path: Path) -> pl.LazyFrame | None:
     if not path.is_file():
         return None
-    table = read_parquet(path)
-    needed = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
-    if lacking := sorted(needed - set(table.columns)):
-        raise InputFileError(path, f"has no column {lacking[0]}; run again with this railfix")
+    try:
+        table = pl.scan_parquet(path)
+        columns = set(table.collect_schema())
+    except (PolarsError, OSError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputFileError(path, f"cannot be read as a table ({reason}); run railfix run again") from error
+    if missing := sorted(_NEEDED - columns):
+        raise InputFileError(path, f"has no column {missing[0]}; run railfix run again with this version")
     return table
 
 
 def _curve(folder: RunFolder, config: Config) -> tuple[Cn0Curve | None, tuple[str, ...]]:
-    """The curve that the run used, or a note on why it is not drawn."""
+    """C/N0 curve that the run used, or a note on why it is not drawn."""
     if config.cn0_curve is None:
         return None, ()
     path = next(iter(folder.located("cn0_curve")), Path(config.cn0_curve))
     try:
         return read_cn0_curve(path), ()
     except RailfixError as error:
-        return None, (f"the curve of C/N0 over elevation that the run used is not drawn: {error}",)
+        return None, (f"the C/N0 curve over elevation that the run used is not drawn: {error}",)
 
 
-def _names(paths: Sequence[Path]) -> list[str]:
-    depth = 1
-    while len({path.parts[-depth:] for path in paths}) < len(paths):
-        depth += 1
-    return ["/".join(path.parts[-depth:]) for path in paths]
+def _track(folder: RunFolder) -> tuple[Track | None, tuple[str, ...]]:
+    """Track that the run used, or a note on why the line is drawn from the positions."""
+    try:
+        return track_of(folder), ()
+    except RailfixError as error:
+        return None, (f"the line is drawn where there are positions, because the track cannot be read: {error}",)

@@ -1,4 +1,4 @@
-"""Tables of the report: what was run, what came of it, what it came to against the reference."""
+"""Tables of the report: inputs and settings, counts of epochs and pseudoranges, figures of merit."""
 
 from __future__ import annotations
 
@@ -11,60 +11,54 @@ import polars as pl
 
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import flattened
-from railfix.report.html import absent, items, number, share, table, text
+from railfix.report.content import Absent, Block, Command, Folded, Notes, Sentence, Table, number, share
 from railfix.report.runs import ReportedRun
 
 _POSITION_NAMES = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
 
 
-def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> str:
-    """One row a run and antenna: rates and, with a reference, errors."""
+def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
+    """One row per run and antenna: rates and, with a reference, errors."""
     head = ["run", "antenna", "settings", "epochs", "rate", "ok", "sigma p95"]
     judged = ["mean", "std", "p95", "largest", "conventional p95", "largest"] if evaluation else []
     rows = []
     for run in runs:
         asked = flattened(run.record.get("settings_asked") or {})
-        told = [run.config.preset, *(f"{name} {_word(value)}" for name, value in asked.items() if name != "preset")]
+        chosen = [run.config.preset, *(f"{name} {_word(value)}" for name, value in asked.items() if name != "preset")]
         for antenna, facts in _antennas(run).items():
             sigma = facts.get("along_sigma_m") or {}
             row = [
                 run.name,
                 antenna,
-                "; ".join(told),
+                "; ".join(chosen),
                 number(facts.get("epochs"), 0),
                 share(facts.get("positioning_rate")),
                 share(facts.get("ok_rate")),
                 number(_plain(sigma.get("p95_m"))),
             ]
             if evaluation:
-                found = {p: _figures(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
-                row += [number(found["constrained"].get(k)) for k in ("mean_m", "std_m", "p95_m", "max_m")]
-                row += [number(found["conventional"].get(k)) for k in ("p95_m", "max_m")]
+                figures = {p: figures_of(evaluation, run, antenna, p) for p in ("constrained", "conventional")}
+                row += [number(figures["constrained"].get(k)) for k in ("mean_m", "std_m", "p95_m", "max_m")]
+                row += [number(figures["conventional"].get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
-        "settings: preset, then what was asked for; rate: positions of the epochs with observations; sigma p95: "
-        "standard deviation along the line that railfix states, in metres"
+        "settings: preset and changed settings; rate: share of the epochs with observations that have a position; "
+        "sigma p95: stated standard deviation along the line, in metres"
     )
     if evaluation:
-        caption += "; errors along the line in metres, mean and std with sign, p95 and largest of the size"
-    return table([*head, *judged], rows, caption=caption, right=range(3, len(head) + len(judged)))
+        caption += "; errors along the line in metres: mean and std of the signed error, p95 and largest of its size"
+    columns = range(3, len(head) + len(judged))
+    return Table(name="summary", head=[*head, *judged], rows=rows, caption=caption, numeric=columns)
 
 
-def _figures(evaluation: Evaluation, run: ReportedRun, antenna: str, position: str) -> dict[str, Any]:
-    name = name_in(evaluation, run)
+def figures_of(
+    evaluation: Evaluation, run: ReportedRun, antenna: str, position: str, *, epochs_of: str = "own"
+) -> dict[str, Any]:
+    """Figures of merit of one antenna and kind of position; empty where there are none."""
     rows = evaluation.figures.filter(
-        pl.col("grouping") == "all",
-        pl.col("epochs_of") == "own",
-        pl.col("run") == name,
-        pl.col("antenna") == antenna,
-        pl.col("position") == position,
+        grouping="all", epochs_of=epochs_of, run=run.name_in(evaluation), antenna=antenna, position=position
     )
     return rows.row(0, named=True) if len(rows) == 1 else {}
-
-
-def name_in(evaluation: Evaluation, run: ReportedRun) -> str:
-    """Name that the evaluation gave a run."""
-    return next(r.name for r in evaluation.runs if r.path.resolve() == run.folder.path.resolve())
 
 
 def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
@@ -72,8 +66,8 @@ def _antennas(run: ReportedRun) -> Mapping[str, Mapping[str, Any]]:
     return {name: known.get(name) or {} for name in run.folder.antennas}
 
 
-def what_was_run(run: ReportedRun) -> str:
-    """Command, versions, inputs with hashes, the line, notes."""
+def provenance(run: ReportedRun) -> list[Block]:
+    """Command, versions, inputs with hashes, line, notes."""
     record = run.record
     written = datetime.fromtimestamp((run.folder.path / "run.json").stat().st_mtime, tz=UTC)
     versions: Mapping[str, Any] = record.get("versions") or {}
@@ -89,45 +83,40 @@ def what_was_run(run: ReportedRun) -> str:
         ("epochs", "; ".join(spans)),
         ("reference", run.reference or "none given"),
         ("line", f"{run.folder.line_name}, {track.get('length_m', '?')} m, {track.get('points', '?')} points"),
-        ("vehicle", str(vehicle.get("name") or "none; the track is taken as the antenna's own path")),
+        ("vehicle", str(vehicle.get("name") or "none; the track is the trajectory of the antenna")),
         ("versions", ", ".join(f"{name} {value}" for name, value in versions.items())),
-        ("platform", str(record.get("platform", "not told"))),
+        ("platform", str(record.get("platform", "not recorded"))),
         ("wall time", f"{record.get('wall_s', '?')} s"),
     ]
-    parts = [
-        table(["", "what was run"], rows),
-        f"<pre>{text(shlex.join(str(word) for word in record.get('command') or []))}</pre>",
-        table(
-            ["input", "file", "bytes", "SHA-256"],
-            [
-                [str(f["input"]), str(f["path"]), number(f.get("bytes"), 0), str(f.get("sha256", ""))]
-                for f in record.get("inputs") or []
-            ],
-            right=[2],
-            mono=[1, 3],
-        ),
+    inputs = [
+        [str(f["input"]), str(f["path"]), number(f.get("bytes"), 0), str(f.get("sha256", ""))]
+        for f in record.get("inputs") or []
     ]
     notes = [*(str(note) for note in record.get("notes") or []), *run.notes]
-    parts.append(f"<h4>Notes</h4>{items(notes)}" if notes else "<p>The run left no notes.</p>")
-    return "\n".join(parts)
+    return [
+        Table(name="run", head=["", "run"], rows=rows),
+        Command(shlex.join(str(word) for word in record.get("command") or [])),
+        Table(name="inputs", head=["input", "file", "bytes", "SHA-256"], rows=inputs, numeric=[2], code=[1, 3]),
+        Notes("Notes", notes) if notes else Sentence("The run has no notes."),
+    ]
 
 
-def settings(run: ReportedRun) -> str:
-    """Settings asked for beside those in force."""
+def settings(run: ReportedRun) -> list[Block]:
+    """Settings asked for beside those used."""
     asked = flattened(run.record.get("settings_asked") or {})
     used = flattened(run.record.get("settings_used") or {})
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
     names += [name for name in used if name not in asked]
     rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
     count = len(asked)
-    told = f"{count} of {len(used)} settings were asked for; the rest are defaults."
-    return f"<details><summary>Settings asked for and used</summary><p>{text(told)}</p>" + (
-        table(["setting", "asked", "used"], rows, asked=range(count)) + "</details>"
-    )
+    return [
+        Sentence(f"{count} of {len(used)} settings were asked for; the others are defaults."),
+        Table(name="settings", head=["setting", "asked", "used"], rows=rows, marked=range(count)),
+    ]
 
 
-def budget(run: ReportedRun) -> str:
-    """Epochs by status, and pseudoranges by the first reason that refused them."""
+def budget(run: ReportedRun) -> list[Block]:
+    """Epochs by status, and pseudoranges by the first reason for their rejection."""
     antennas = _antennas(run)
     names = list(antennas)
     statuses = dict.fromkeys(s for facts in antennas.values() for s, n in (facts.get("status") or {}).items() if n)
@@ -149,7 +138,7 @@ def budget(run: ReportedRun) -> str:
     ]
     first, only = "observations_refused_by_first_reason", "observations_refused_by_one_reason_alone"
     reasons = dict.fromkeys(r for facts in antennas.values() for r in facts.get(first) or {})
-    head = ["", *(word for n in names for word in (n, "share", "it alone"))]
+    head = ["", *(word for n in names for word in (n, "share", "only reason"))]
     observed = {n: antennas[n].get("observations") or 0 for n in names}
 
     def cells(count: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
@@ -163,45 +152,47 @@ def budget(run: ReportedRun) -> str:
             )
         ]
 
-    told = [
+    ranges = [
         ["observed", *cells(observed, None)],
         ["used", *cells({n: antennas[n].get("observations_used") or 0 for n in names}, None)],
     ]
     for reason in reasons:
         counts = {n: (antennas[n].get(first) or {}).get(reason, 0) for n in names}
         alone = {n: (antennas[n].get(only) or {}).get(reason, 0) for n in names}
-        told.append([f"  {reason}", *cells(counts, alone)])
-    return table(["", *names], rows, caption="Epochs by status", right=range(1, 9)) + table(
-        head, told, caption="Pseudoranges by the first reason that refused them, and by it alone", right=range(1, 9)
-    )
+        ranges.append([f"  {reason}", *cells(counts, alone)])
+    caption = "Pseudoranges by the first reason for their rejection, and those with this reason only"
+    return [
+        Table(name="epochs", head=["", *names], rows=rows, caption="Epochs by status", numeric=range(1, 9)),
+        Table(name="pseudoranges", head=head, rows=ranges, caption=caption, numeric=range(1, 9)),
+    ]
 
 
-def merits(run: ReportedRun, evaluation: Evaluation) -> str:
-    """Figures of merit and intervals of one run, constrained beside conventional."""
-    name = name_in(evaluation, run)
-    figures = evaluation.figures.filter(pl.col("run") == name, pl.col("epochs_of") == "own")
-    whole = figures.filter(pl.col("grouping") == "all")
+def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
+    """Figures of merit and intervals of one run, on the map beside conventional."""
+    figures = evaluation.figures.filter(run=run.name_in(evaluation), epochs_of="own")
     confidence = f"{100 * evaluation.options.confidence:g} %"
-    head = "antenna|position|errors|rate|mean|std|p50|p95|p99|largest|over 50 m|rms / sigma".split("|")
-    parts = [
-        table(
-            head,
-            [_merit(row, "antenna") for row in whole.iter_rows(named=True)],
-            caption=f"Errors along the line in metres, + toward its end; [{confidence} limits by blocks of time]",
-            right=range(2, 12),
+    head = "antenna|position|errors|rate|mean|std|p50|p95|p99|largest|over 50 m|rms / sigma|p95 / sigma".split("|")
+    numeric = range(2, len(head))
+    blocks: list[Block] = [
+        Table(
+            name="figures-of-merit",
+            head=head,
+            rows=[_merit(row, "antenna") for row in figures.filter(grouping="all").iter_rows(named=True)],
+            caption=f"Errors along the line in metres, + toward its end; [{confidence} limits from blocks of time]",
+            numeric=numeric,
         )
     ]
     for grouping, word in (("environment", "environment"), ("speed", "speed"), ("satellites", "satellites used")):
         rows = figures.filter(pl.col("grouping") == grouping, pl.col("position") != "constrained_ok")
         if rows["group"].n_unique() > 1:
-            inside = table(
-                [word, *head[1:]],
-                [_merit(row, "group", antenna=str(row["antenna"])) for row in rows.iter_rows(named=True)],
-                right=range(2, 12),
+            grouped = Table(
+                name=f"figures-by-{grouping}",
+                head=[word, *head[1:]],
+                rows=[_merit(row, "group", antenna=str(row["antenna"])) for row in rows.iter_rows(named=True)],
+                numeric=numeric,
             )
-            parts.append(f"<details><summary>By {text(word)}</summary>{inside}</details>")
-    parts.append(_intervals(evaluation, name))
-    return "\n".join(parts)
+            blocks.append(Folded(f"By {word}", [grouped]))
+    return [*blocks, _intervals(evaluation, run.name_in(evaluation))]
 
 
 def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
@@ -219,6 +210,7 @@ def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
         number(row["max_m"]),
         number(row["wrong_places"], 0),
         number(row["normalised_rms"]),
+        number(row["normalised_p95"]),
     ]
 
 
@@ -229,14 +221,15 @@ def _limits(low: float | None, high: float | None, *, per_cent: bool = False) ->
     return f"\n[{ends[0]} to {ends[1]}]"
 
 
-def _intervals(evaluation: Evaluation, name: str) -> str:
+def _intervals(evaluation: Evaluation, name: str) -> Block:
     rows = evaluation.intervals.filter(pl.col("run") == name) if "run" in evaluation.intervals.columns else None
     if rows is None or not len(rows):
-        return absent("There are no intervals between positions to tell.")
+        return Absent("There are no two consecutive positions, so there are no intervals.")
     columns = [f"interval_{name}_m" for name in ("mean", "p50", "p95", "p99", "max")] + ["gap_p95_s", "gap_max_s"]
-    return table(
-        ["antenna", "position", "intervals", "mean", "p50", "p95", "p99", "largest", "gap p95, s", "largest, s"],
-        [
+    return Table(
+        name="intervals",
+        head=["antenna", "position", "intervals", "mean", "p50", "p95", "p99", "largest", "gap p95, s", "largest, s"],
+        rows=[
             [
                 str(r["antenna"]),
                 _POSITION_NAMES[r["position"]],
@@ -245,19 +238,20 @@ def _intervals(evaluation: Evaluation, name: str) -> str:
             ]
             for r in rows.iter_rows(named=True)
         ],
-        caption="Positioning interval: metres that the train ran from one position to the next",
-        right=range(2, 10),
+        caption="Positioning interval: distance travelled between consecutive positions, in metres",
+        numeric=range(2, 10),
     )
 
 
-def level_widths(evaluation: Evaluation, name: str) -> str:
-    """How wide the levels of a run are, and how many errors are larger."""
+def level_sizes(evaluation: Evaluation, name: str) -> list[Block]:
+    """Percentiles of the protection levels of a run, and counts of errors above them."""
     if evaluation.levels is None:
-        return ""
+        return []
     rows = evaluation.levels.filter(pl.col("run") == name) if "run" in evaluation.levels.columns else evaluation.levels
-    return table(
-        ["level", "antenna", "position", "positions", "finite", "p50", "p95", "errors", "over the level", "share"],
-        [
+    table = Table(
+        name="levels",
+        head=["level", "antenna", "position", "positions", "finite", "p50", "p95", "errors", "over the level", "share"],
+        rows=[
             [
                 str(r["level"]),
                 str(r["antenna"]),
@@ -272,9 +266,10 @@ def level_widths(evaluation: Evaluation, name: str) -> str:
             ]
             for r in rows.iter_rows(named=True)
         ],
-        caption="Protection levels in metres, and the errors that were larger",
-        right=range(3, 10),
+        caption="Protection levels in metres, and errors above them",
+        numeric=range(3, 10),
     )
+    return [table]
 
 
 def _plain(value: Any) -> float | None:

@@ -1,11 +1,10 @@
-"""What a picture shows, apart from what draws it.
+"""Charts: axes with layers of numbers, independent of the drawing program.
 
 A `Chart` is axes with layers of numbers. The functions of `railfix.report.plots` make charts from tables and
 arrays; `railfix.report.plots.draw_chart` draws one with matplotlib, and `railfix.report` puts the same one into
-a page. So a notebook and the report show the same numbers.
+a page, so a notebook and the report show the same numbers.
 
-Long series are thinned where a chart is made (`railfix.report.plots.thinning`); its caption then says from how
-many points to how many.
+Long series are thinned when a chart is made (`railfix.report.plots.thinning`); the caption has the counts.
 """
 
 from __future__ import annotations
@@ -18,14 +17,15 @@ from numpy.typing import NDArray
 
 from railfix.core.arrays import Floats, Integers, Strings
 
-#: Colours that stay apart for the colour-blind (Okabe and Ito) and stand out on white by 3 to 1 or more.
+#: Colours distinguishable with colour blindness (Okabe and Ito), with a contrast of 3 to 1 or more on white.
 BLUE, RED, GREEN, PURPLE, BLACK, GREY = "#0072b2", "#d55e00", "#00805e", "#a3487e", "#000000", "#767676"
-#: Positions on the map, and the conventional ones, in every picture.
+#: Positions on the map, of the filter along the track, and conventional, in every chart.
 CONSTRAINED: Final = BLUE
+FILTERED: Final = GREEN
 CONVENTIONAL: Final = RED
-#: From small to large: dark blue to dark red, light between, for classes in order.
+#: Ordered classes, from small (dark blue) to large (dark red).
 ORDERED: Final = ("#0b559f", "#3d8ec4", "#8a8a8a", "#e0762f", "#b30000")
-#: For what has no order.
+#: Classes without an order.
 CYCLE: Final = (BLUE, RED, GREEN, PURPLE, BLACK, "#8c6d00", "#56b4e9", GREY)
 
 Shape = Literal["dot", "square", "cross", "ring"]
@@ -46,7 +46,7 @@ class Points:
     size : float
         Width in pixels of a page.
     epoch_s : ndarray, shape (P,), or None [s]
-        When each was, from the start of the run; a click on it shows the sky then.
+        Time since the start of the run; a click on a point shows the sky at that time.
     """
 
     label: str
@@ -106,7 +106,7 @@ class Bars:
 
 @dataclass(frozen=True, kw_only=True)
 class Cells:
-    """How many points fell into each cell of a grid, the more the darker.
+    """Numbers of points in the cells of a grid; darker cells have more.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class Cells:
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """A bar from least to greatest with a mark at the mean, one a name, from the top down.
+    """A bar from minimum to maximum with a mark at the mean for each name, from the top down.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ class Ranges:
 
 @dataclass(frozen=True, kw_only=True)
 class Marks:
-    """Words at places.
+    """Text at points.
 
     Attributes
     ----------
@@ -158,9 +158,9 @@ class Marks:
     colour : str
     x, y : ndarray, shape (P,)
     words : tuple of str
-        Lines apart by line feeds.
+        Lines separated by line feeds.
     place : {"beside", "on"}
-        Beside a cross at the place; or the middle of the words on it, without a cross.
+        Beside a cross at the point, or centred on it without a cross.
     """
 
     label: str
@@ -179,14 +179,14 @@ Layer = Points | Line | Band | Bars | Cells | Ranges | Marks
 
 @dataclass(frozen=True, kw_only=True)
 class Chart:
-    """One picture.
+    """One chart.
 
     Attributes
     ----------
     name : str
         Short, for files and anchors: ``error-time``.
     title, caption : str
-        What is shown; how to read it, and what was left out.
+        Heading; explanation with the counts of points left out.
     x_label, y_label : str
     layers : tuple of Layer
         Drawn in this order.
@@ -197,7 +197,7 @@ class Chart:
         A symlog axis is linear up to here.
     x_range, y_range : (float, float) or None
     equal : bool
-        One metre is as long across as up; a scale bar and north are drawn.
+        Equal scales on both axes; a scale bar and north are drawn.
     width : {"wide", "half"}
     """
 
@@ -217,6 +217,13 @@ class Chart:
     width: Literal["wide", "half"] = "wide"
 
     @property
+    def shared_axis(self) -> Literal["time", "chainage", ""]:
+        """Quantity on the x axis that other charts share: they are zoomed together."""
+        if self.start is not None:
+            return "time"
+        return "chainage" if self.x_label.startswith("chainage") else ""
+
+    @property
     def empty(self) -> bool:
         """Whether no layer has anything to draw."""
         return not any(_drawn(layer) for layer in self.layers)
@@ -224,7 +231,7 @@ class Chart:
 
 @dataclass(frozen=True, kw_only=True)
 class SkyEpochs:
-    """Satellites over an antenna, R rows over K epochs, for pictures of the sky.
+    """Satellites in view of an antenna, R rows over K epochs, for sky plots.
 
     Attributes
     ----------
@@ -237,7 +244,7 @@ class SkyEpochs:
     satellite, signal : ndarray of str, shape (R,)
     azimuth_deg, elevation_deg, cn0_dbhz : ndarray, shape (R,)
     reason : ndarray of str, shape (R,)
-        First reason that refused it; ``used``.
+        First reason for its rejection, or ``used``.
     """
 
     name: str
@@ -260,7 +267,7 @@ class SkyEpochs:
 
 
 def _drawn(layer: Layer) -> bool:
-    """Whether a layer has anything to draw; words alone are no picture."""
+    """Whether a layer has anything to draw; text alone does not count."""
     if isinstance(layer, Marks):
         return False
     if isinstance(layer, Cells):

@@ -7,13 +7,9 @@ import polars as pl
 
 from railfix.core.arrays import Floats, Strings
 from railfix.core.timescale import seconds
+from railfix.evaluate.run_folder import floats
 
-
-def floats(table: pl.DataFrame, name: str) -> Floats:
-    """A column as floats, NaN where it is null; all NaN where the table has no such column."""
-    if name not in table.columns:
-        return np.full(len(table), np.nan)
-    return np.array(table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy())
+__all__ = ["floats", "nice_step", "points", "since", "start_of", "words"]
 
 
 def points(table: pl.DataFrame, *names: str) -> Floats:
@@ -22,12 +18,12 @@ def points(table: pl.DataFrame, *names: str) -> Floats:
 
 
 def words(table: pl.DataFrame, name: str) -> Strings:
-    """A column as words."""
+    """A text column, blank where it is null."""
     return np.array(table[name].cast(pl.String).fill_null("").to_numpy(), dtype=np.str_)
 
 
 def start_of(table: pl.DataFrame) -> np.datetime64:
-    """First time of a table.
+    """Earliest time of a table.
 
     Raises
     ------
@@ -40,7 +36,7 @@ def start_of(table: pl.DataFrame) -> np.datetime64:
 
 
 def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
-    """Times of a table [s] from a start."""
+    """Times of a table since a start [s]."""
     return seconds(table["time_gpst"].to_numpy().astype("datetime64[ns]") - start)
 
 

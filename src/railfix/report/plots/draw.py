@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from inspect import signature
 from typing import TYPE_CHECKING, Any, Final, ParamSpec
 
 import numpy as np
@@ -19,22 +20,33 @@ P = ParamSpec("P")
 
 _MARKERS: Final = {"dot": "o", "square": "s", "cross": "x", "ring": "o"}
 _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
-#: Colours of a sky picture: used, refused.
-_USED, _REFUSED = "#0072b2", "#d55e00"
+#: Colours of a sky plot: used, rejected.
+_USED, _REJECTED = "#0072b2", "#d55e00"
 
 
 def drawn(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
-    """The function that draws what another one makes a chart of."""
+    """Function that draws the charts of another function as figures, with its parameters."""
 
     @wraps(chart_of)
     def draw(*args: P.args, **kwargs: P.kwargs) -> Figure:
         return draw_figure(chart_of(*args, **kwargs))
 
+    draw.__name__ = draw.__qualname__ = f"plot_{chart_of.__name__}"
+    draw.__annotations__ = {**chart_of.__annotations__, "return": "Figure"}
+    draw.__doc__ = _returning_figure(chart_of.__doc__ or "")
+    del draw.__wrapped__
+    draw.__signature__ = signature(chart_of).replace(return_annotation="Figure")  # type: ignore[attr-defined]
     return draw
 
 
+def _returning_figure(text: str) -> str:
+    """Documentation of a function that returns a chart, for one that returns a figure of it."""
+    head, heading, _ = text.partition("    Returns\n    -------\n")
+    return f"{head}{heading}    matplotlib.figure.Figure\n" if heading else text
+
+
 def draw_figure(chart: Chart) -> Figure:
-    """Draw a chart as a figure of its own, with its caption.
+    """Draw a chart as a matplotlib figure.
 
     Parameters
     ----------
@@ -54,7 +66,7 @@ def draw_figure(chart: Chart) -> Figure:
 
 
 def draw_chart(chart: Chart, axes: Axes) -> Axes:
-    """Draw a chart into axes of matplotlib.
+    """Draw a chart into matplotlib axes.
 
     Parameters
     ----------
@@ -88,7 +100,7 @@ def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> A
     time : datetime64
         GPS time.
     axes : Axes, optional
-        Polar ones; made unless given.
+        Polar axes; created if not given.
 
     Returns
     -------
@@ -115,7 +127,7 @@ def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> A
     polar.set_rlim(90.0, 0.0)
     bearing, elevation = np.radians(sky.azimuth_deg[rows]), sky.elevation_deg[rows]
     used = sky.reason[rows] == "used"
-    for mask, colour, marker, label in ((used, _USED, "o", "used"), (~used, _REFUSED, "x", "refused")):
+    for mask, colour, marker, label in ((used, _USED, "o", "used"), (~used, _REJECTED, "x", "rejected")):
         polar.plot(bearing[mask], elevation[mask], marker, color=colour, label=label)
     for where, high, name, cn0 in zip(bearing, elevation, sky.satellite[rows], sky.cn0_dbhz[rows], strict=True):
         text = f"{name}\n{cn0:.0f}" if np.isfinite(cn0) else str(name)
@@ -151,7 +163,7 @@ def _scales(chart: Chart, axes: Axes) -> None:
 
 
 def _along(chart: Chart, x: Any) -> Any:
-    """Seconds as times where the chart is over time."""
+    """Times instead of seconds if the x axis is time."""
     return x if chart.start is None else chart.start + timedelta(x)
 
 

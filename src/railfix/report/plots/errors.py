@@ -1,9 +1,8 @@
 """Charts of the error along the line (P1 figures 7, 8, 10, 11).
 
-The tables have one row an epoch of one antenna, as `railfix.evaluate.Evaluation.epochs` has them:
-``time_gpst``, ``chainage_m`` (where the antenna was), ``error_m`` and ``conventional_error_m`` (+ toward
-the end of the line), and, as far as there are any, ``along_sigma_m``, ``reference_good`` and columns of
-protection levels.
+The tables have one row per epoch of one antenna, as `railfix.evaluate.Evaluation.epochs` has them:
+``time_gpst``, ``chainage_m`` (of the reference), ``error_m`` and ``conventional_error_m`` (+ toward the end of the
+line), and optionally ``along_sigma_m``, ``reference_good`` and columns of protection levels.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from railfix.report.plots.chart import (
     BLACK,
     CONSTRAINED,
     CONVENTIONAL,
+    FILTERED,
     GREEN,
     GREY,
     PURPLE,
@@ -30,11 +30,11 @@ from railfix.report.plots.chart import (
     Ranges,
 )
 from railfix.report.plots.columns import floats, nice_step, since, start_of
-from railfix.report.plots.thinning import spread, told
+from railfix.report.plots.thinning import counts_sentence, spread
 
 _ERROR_LABEL: Final = "error along the line [m]"
 _SIGN: Final = "+ is toward the end of the line."
-#: Pieces of the line over which the greatest sigma and level are drawn.
+#: Number of pieces of the axis; the largest sigma and level of each is drawn.
 _PIECES: Final = 600
 _SERIES: Final = (
     ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
@@ -42,13 +42,17 @@ _SERIES: Final = (
 )
 
 
-def error_over_time(errors: pl.DataFrame, *, title: str = "Error along the line over time") -> Chart:
+def error_over_time(
+    errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None, title: str = "Error along the line over time"
+) -> Chart:
     """Errors on the map and of the conventional position, with sigma and protection level (P1 figures 7, 10).
 
     Parameters
     ----------
     errors : polars.DataFrame
         Of one antenna, in order of time.
+    filtered : polars.DataFrame, optional
+        Errors of the filter along the track.
     title : str
 
     Returns
@@ -56,36 +60,49 @@ def error_over_time(errors: pl.DataFrame, *, title: str = "Error along the line 
     Chart
     """
     start = start_of(errors)
-    x = since(errors, start)
-    return _errors(errors, x, name="error-time", title=title, x_label="GPS time", start=start)
+    return _errors(errors, filtered, name="error-time", title=title, x_label="GPS time", start=start)
 
 
-def error_over_chainage(errors: pl.DataFrame, *, title: str = "Error along the line over chainage") -> Chart:
-    """The same over the place where the antenna was (P1 figure 8).
+def error_over_chainage(
+    errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None, title: str = "Error along the line over chainage"
+) -> Chart:
+    """Errors over the chainage of the reference (P1 figure 8).
 
     Parameters
     ----------
     errors : polars.DataFrame
         Of one antenna.
+    filtered : polars.DataFrame, optional
+        Errors of the filter along the track.
     title : str
 
     Returns
     -------
     Chart
     """
-    x = floats(errors, "chainage_m")
-    return _errors(errors, x, name="error-chainage", title=title, x_label="chainage of the reference [m]", start=None)
+    label = "chainage of the reference [m]"
+    return _errors(errors, filtered, name="error-chainage", title=title, x_label=label, start=None)
 
 
 def _errors(
-    errors: pl.DataFrame, x: Floats, *, name: str, title: str, x_label: str, start: np.datetime64 | None
+    errors: pl.DataFrame,
+    filtered: pl.DataFrame | None,
+    *,
+    name: str,
+    title: str,
+    x_label: str,
+    start: np.datetime64 | None,
 ) -> Chart:
+    def axis(table: pl.DataFrame) -> Floats:
+        return floats(table, "chainage_m") if start is None else since(table, start)
+
+    x = axis(errors)
     layers: list[Layer] = []
     caption = [_SIGN]
     at, sigma = _greatest(x, floats(errors, "along_sigma_m"))
     if len(at):
-        layers.append(Band(label="± sigma stated", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
-        caption.append("The band is the standard deviation that railfix states, the greatest of each short piece.")
+        layers.append(Band(label="± stated sigma", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
+        caption.append("Band: the standard deviation that railfix states, the largest of each short piece.")
     levels = []
     for column, colour in zip(level_columns(errors), (PURPLE, GREEN, BLACK, GREY), strict=False):
         level = floats(errors, column)
@@ -96,21 +113,23 @@ def _errors(
             for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
                 layers.append(Line(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
             caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
-    epoch = since(errors, start_of(errors))
-    shown = whole = 0
-    for label, column, colour, shape in _SERIES:
-        y = good_errors(errors, column)
+    series = [(*entry, errors) for entry in _SERIES]
+    if filtered is not None:
+        series.append(("filtered along the track", "error_m", FILTERED, "dot", filtered))
+    shown = total = 0
+    for label, column, colour, shape, table in series:
+        x, y, epoch = axis(table), good_errors(table, column), since(table, start_of(errors))
         rows = spread(x, y)
-        shown, whole = shown + len(rows), whole + int(np.isfinite(x + y).sum())
+        shown, total = shown + len(rows), total + int(np.isfinite(x + y).sum())
         layers.append(
             Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows], epoch_s=epoch[rows])  # type: ignore[arg-type]
         )
-    every = np.concatenate([good_errors(errors, column) for _, column, _, _ in _SERIES])
+    every = np.concatenate([good_errors(table, column) for _, column, _, _, table in series])
     scale = error_scale(every)
     if scale["y_scale"] == "symlog":
         caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
-    elif levels and np.isfinite(every).any():
-        # a few wide levels are not to press the errors flat
+    if levels and np.isfinite(every).any():
+        # scale to the errors and the median level, not to a few large levels
         top = 1.25 * max(float(np.nanmax(np.abs(every))), *(float(np.nanmedian(most)) for most in levels))
         scale["y_range"] = (-top, top)
         if max(float(np.nanmax(most)) for most in levels) > top:
@@ -118,7 +137,7 @@ def _errors(
     return Chart(
         name=name,
         title=title,
-        caption=" ".join(caption) + told(shown, whole),
+        caption=" ".join(caption) + counts_sentence(shown, total),
         x_label=x_label,
         y_label=_ERROR_LABEL,
         layers=tuple(layers),
@@ -128,21 +147,19 @@ def _errors(
 
 
 def good_errors(errors: pl.DataFrame, column: str) -> Floats:
-    """Errors of a column, NaN where the reference is worse than it must be."""
+    """Errors of a column, NaN where the standard deviation of the reference exceeds the limit."""
     values = floats(errors, column)
-    if "reference_good" in errors.columns:
-        values[~errors["reference_good"].to_numpy()] = np.nan
-    return values
+    return np.where(errors["reference_good"].to_numpy(), values, np.nan) if "reference_good" in errors else values
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
-    """Protection levels among the columns that tell any."""
+    """Names of the columns of protection levels with a finite value."""
     named = [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
     return [name for name in named if np.isfinite(floats(table, name)).any()]
 
 
 def error_scale(error_m: Floats) -> dict[str, Any]:
-    """Scale of an axis of errors: logarithmic outside where few are far larger than the rest."""
+    """Scale of an axis of errors: logarithmic beyond the usual errors where a few are far larger."""
     size = np.abs(error_m[np.isfinite(error_m)])
     if not len(size):
         return {"y_scale": "linear"}
@@ -153,7 +170,7 @@ def error_scale(error_m: Floats) -> dict[str, Any]:
 
 
 def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """The greatest y of each piece of x, NaN between pieces far apart."""
+    """Largest y of each piece of x, NaN between pieces far apart."""
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(rows):
         return np.empty(0), np.empty(0)
@@ -163,7 +180,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     most = np.full(_PIECES, np.nan)
     np.fmax.at(most, piece, y[rows])
     here = np.isfinite(most)
-    # a few empty pieces are only the spacing of the epochs
+    # a few empty pieces are due to the spacing of the epochs
     inside = np.flatnonzero(here)
     spacing = np.percentile(np.diff(inside), 98) if len(inside) > 1 else 1.0
     gap = np.flatnonzero(np.diff(inside) > 3 * spacing)
@@ -172,7 +189,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the errors") -> Chart:
-    """Least, mean and greatest error of each run, on the map and conventional (P1 figure 11).
+    """Minimum, mean and maximum error of each run, on the map and conventional (P1 figure 11).
 
     Parameters
     ----------
@@ -207,7 +224,7 @@ def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the
     return Chart(
         name="error-ranges",
         title=title,
-        caption=f"From the least to the greatest signed error; the mark is the mean. {_SIGN}",
+        caption=f"From the lowest to the highest signed error; the mark is the mean. {_SIGN}",
         x_label=_ERROR_LABEL,
         y_label="",
         layers=tuple(layers),

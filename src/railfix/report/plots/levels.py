@@ -12,7 +12,7 @@ from railfix.core.arrays import Floats
 from railfix.integrity.stanford import Region, Stanford
 from railfix.report.plots.chart import BLACK, BLUE, CYCLE, GREY, RED, Cells, Chart, Layer, Line, Marks, Points
 from railfix.report.plots.columns import floats, since, start_of, words
-from railfix.report.plots.thinning import spread, told
+from railfix.report.plots.thinning import counts_sentence, spread
 
 #: Parts of the level, and the level itself.
 _PARTS: Final = (
@@ -91,7 +91,7 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
     def place(value: float) -> float:
         return limit * min(value, 1.0) + max(value - 1.0, 0.0) * (top_m - limit)
 
-    shown = [one for one in _REGIONS if top_m > 1.2 * limit or max(one[2:]) < 1.0]
+    shown = [region for region in _REGIONS if top_m > 1.2 * limit or max(region[2:]) < 1.0]
     return Marks(
         label="",
         colour=BLACK,
@@ -142,16 +142,16 @@ def _levels(
     start: np.datetime64 | None,
 ) -> Chart:
     layers: list[Layer] = []
-    shown = whole = 0
+    shown = total = 0
     largest = alarm_limit_m
     epoch = since(positions, start_of(positions))
     for (label, column), colour in zip(_PARTS, (*CYCLE[2:6], BLUE), strict=True):
         level = floats(positions, column)
-        level[~np.isfinite(level + x)] = np.nan
+        level = np.where(np.isfinite(level + x), level, np.nan)
         rows = spread(x, level)
         if not len(rows) or not (level[rows] > 0.0).any():
             continue
-        shown, whole = shown + len(rows), whole + int(np.isfinite(level).sum())
+        shown, total = shown + len(rows), total + int(np.isfinite(level).sum())
         largest = max(largest, float(np.percentile(level[rows], 98.0)))
         layers.append(Points(label=label, colour=colour, x=x[rows], y=level[rows], size=2.5, epoch_s=epoch[rows]))
     if layers:
@@ -161,14 +161,14 @@ def _levels(
     infinite = int(np.isinf(floats(positions, "protection_level_m")).sum())
     caption = [_counted(positions), f"Values beyond {1.2 * largest:.1f} m are cut off"]
     caption[1] += f", {infinite:,} levels are infinite and not drawn." if infinite else "."
-    if any(label in {one.label for one in layers} for label, _ in _PARTS[:3]):
+    if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
             "Each part spends its share of the risk alone; the level spends the whole and can be below a part."
         )
     return Chart(
         name=name,
         title=title,
-        caption=" ".join(caption).strip() + told(shown, whole),
+        caption=" ".join(caption).strip() + counts_sentence(shown, total),
         x_label=x_label,
         y_label="protection level [m]",
         layers=tuple(layers),

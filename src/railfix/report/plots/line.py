@@ -1,14 +1,16 @@
-"""Charts of the positions on the line: in plan (P1 figure 6), their spacing (figure 12), satellites used."""
+"""Charts of the positions on the line: plan (P1 figure 6), intervals (figure 12), satellites used."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats, Masks
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Status
 from railfix.report.plots.chart import (
     BLACK,
@@ -25,24 +27,44 @@ from railfix.report.plots.chart import (
     Points,
 )
 from railfix.report.plots.columns import floats, nice_step, points, since, start_of, words
-from railfix.report.plots.thinning import one_a_cell, spread, told
+from railfix.report.plots.thinning import counts_sentence, one_per_cell, spread
+from railfix.track import Track
 
 _ECEF: Final = ("x_m", "y_m", "z_m")
-#: Classes of the size of an error [m].
-_CLASSES: Final = (0.0, 1.0, 2.0, 5.0, 10.0, np.inf)
+#: Limits between classes of error size and of protection level [m].
+_ERROR_CLASSES: Final = (1.0, 2.0, 5.0, 10.0)
+_LEVEL_CLASSES: Final = (5.0, 10.0, 20.0, 40.0)
+#: The line is drawn this far beyond the first and the last position [m].
+_BEYOND_M: Final = 30.0
 _TRACK_PIECES: Final = 1500
 _MARKS: Final = 12
 
 
-def plan(positions: pl.DataFrame, *, error_m: Floats | None = None, title: str = "The line in plan") -> Chart:
+def plan(
+    positions: pl.DataFrame,
+    *,
+    error_m: Floats | None = None,
+    level_m: Floats | None = None,
+    track: Track | None = None,
+    tunnels_m: Sequence[tuple[float, float]] = (),
+    background: Sequence[Floats] = (),
+    title: str = "Plan of the line",
+) -> Chart:
     """Positions and line in local metres, with marks of the kilometrage (P1 figure 6).
 
     Parameters
     ----------
     positions : polars.DataFrame
         Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`.
-    error_m : ndarray, shape (rows,), optional [m]
-        Errors along the line; colours the positions by their size, instead of by their status.
+    error_m, level_m : ndarray, shape (rows,), optional [m]
+        Errors along the line, or protection levels: the positions are coloured by the size of the first that is
+        given, and by their status without either.
+    track : Track, optional
+        Line to draw, also where there are no positions; without it the line is drawn through the positions.
+    tunnels_m : sequence of (float, float) [m]
+        Chainages between which the line runs in a tunnel.
+    background : sequence of ndarray, shape (P, 2) [deg]
+        Longitude and latitude of lines to draw below, see `railfix.report.background`.
     title : str
 
     Returns
@@ -55,48 +77,37 @@ def plan(positions: pl.DataFrame, *, error_m: Floats | None = None, title: str =
     name, labels = "plan", ("east [m]", "north [m]")
     if not has.any():
         return Chart(name=name, title=title, caption="", x_label=labels[0], y_label=labels[1], layers=(), equal=True)
-    origin = ecef[has].mean(axis=0)
-    latitude, longitude, _ = geodetic_from_ecef(origin)
-    axes = enu_axes(latitude, longitude)
-    here, there = (ecef - origin) @ axes.T, (conventional - origin) @ axes.T
-    cell = float(np.ptp(here[has, :2], axis=0).max()) / 3000.0 or 0.01
-    kept = one_a_cell(there[:, 0], there[:, 1], cell=cell)
-    layers: list[Layer] = [
-        Points(
-            label="conventional",
-            colour=GREY,
-            shape="cross",
-            x=there[kept, 0],
-            y=there[kept, 1],
-        ),
-        _line_of(here[has], floats(positions, "chainage_m")[has]),
-    ]
-    shown, whole = len(kept), int(np.isfinite(there[:, 0]).sum())
+    frame = _LocalFrame.around(ecef[has])
+    here, there = frame.plane(ecef), frame.plane(conventional)
+    low, high = here[has].min(axis=0), here[has].max(axis=0)
+    margin = max(0.25 * float((high - low).max()), 50.0)
+    near = ((there > low - margin) & (there < high + margin)).all(axis=1)
+    cell = float((high - low).max()) / 3000.0 or 0.01
+    kept = np.flatnonzero(near)[one_per_cell(there[near, 0], there[near, 1], cell=cell)]
+    layers: list[Layer] = [*_background(background, frame, low - margin, high + margin)]
+    layers += _line(track, frame, floats(positions, "chainage_m")[has], here[has], tunnels_m)
+    layers.append(Points(label="conventional", colour=GREY, shape="cross", x=there[kept, 0], y=there[kept, 1]))
+    shown, total = len(kept), int(np.isfinite(there[:, 0]).sum())
     epoch = since(positions, start_of(positions))
-    for label, colour, mask in _classes(positions, error_m):
+    classes, coloured = _classes(positions, error_m, level_m)
+    for label, colour, mask in classes:
         rows = np.flatnonzero(has & mask)
-        kept = rows[one_a_cell(here[rows, 0], here[rows, 1], cell=cell)]
-        shown, whole = shown + len(kept), whole + len(rows)
+        kept = rows[one_per_cell(here[rows, 0], here[rows, 1], cell=cell)]
+        shown, total = shown + len(kept), total + len(rows)
         if len(kept):
+            x, y = here[kept].T
             layers.append(
-                Points(
-                    label=f"{label} ({len(rows):,})",
-                    colour=colour,
-                    x=here[kept, 0],
-                    y=here[kept, 1],
-                    size=4.0,
-                    epoch_s=epoch[kept],
-                )
+                Points(label=f"{label} ({len(rows):,})", colour=colour, x=x, y=y, size=4.0, epoch_s=epoch[kept])
             )
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
-    where = f"{float(latitude):.5f}, {float(longitude):.5f}"
-    thinned = "" if shown == whole else f" Of positions closer together than can be seen one is drawn ({shown:,})."
-    coloured = "the size of their error" if error_m is not None else "their status"
+    thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
+    outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
+    far = f" {outside:,} conventional positions lie outside." if outside else ""
     return Chart(
         name=name,
         title=title,
-        caption=f"Positions on the map by {coloured}, the conventional ones in grey; the line as far as positions "
-        f"reach. Origin at latitude and longitude {where}.{thinned}",
+        caption=f"Positions on the map, coloured by {coloured}; conventional positions in grey.{far} Origin at "
+        f"latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}.{thinned}",
         x_label=labels[0],
         y_label=labels[1],
         layers=tuple(layers),
@@ -104,40 +115,102 @@ def plan(positions: pl.DataFrame, *, error_m: Floats | None = None, title: str =
     )
 
 
-def _classes(positions: pl.DataFrame, error_m: Floats | None) -> list[tuple[str, str, Masks]]:
-    """Label, colour and rows of each class of positions."""
-    if error_m is None:
-        status = words(positions, "status")
-        return [
-            (s.text, CYCLE[i % len(CYCLE)], status == s.text) for i, s in enumerate(Status) if (status == s.text).any()
-        ]
-    size = np.abs(error_m)
-    found = [("no reference", BLACK, np.isnan(size))]
-    for low, high, colour in zip(_CLASSES[:-1], _CLASSES[1:], ORDERED, strict=True):
-        label = f"from {low:g} to {high:g} m" if np.isfinite(high) else f"{low:g} m and more"
-        found.append((label, colour, (size >= low) & (size < high)))
-    return found
+@dataclass(frozen=True, kw_only=True)
+class _LocalFrame:
+    """East and north at a point of the line."""
+
+    origin_ecef_m: Floats
+    axes: Floats
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+
+    @classmethod
+    def around(cls, ecef_m: Floats) -> _LocalFrame:
+        """Frame at the mean of points, shape (P, 3)."""
+        origin = ecef_m.mean(axis=0)
+        latitude, longitude, height = (float(value) for value in geodetic_from_ecef(origin))
+        axes = enu_axes(latitude, longitude)
+        return cls(origin_ecef_m=origin, axes=axes, latitude_deg=latitude, longitude_deg=longitude, height_m=height)
+
+    def plane(self, ecef_m: Floats) -> Floats:
+        """East and north of points, shape (P, 2) [m]."""
+        return np.asarray((ecef_m - self.origin_ecef_m) @ self.axes[:2].T)
 
 
-def _line_of(here: Floats, chainage_m: Floats) -> Line:
-    """The line as the positions show it: the middle of each short piece, broken at wide gaps."""
+def _background(lines: Sequence[Floats], frame: _LocalFrame, low: Floats, high: Floats) -> Iterator[Layer]:
+    """Lines of the background within a box."""
+    parts: list[Floats] = []
+    gap = np.full((1, 2), np.nan)
+    for line in lines:
+        plane = frame.plane(ecef_from_geodetic(line[:, 1], line[:, 0], np.full(len(line), frame.height_m)))
+        inside = np.asarray(((plane > low) & (plane < high)).all(axis=1))
+        # neighbours outside stay, so that lines reach the edge
+        kept = inside | np.append(inside[1:], False) | np.append(False, inside[:-1])
+        if inside.any():
+            parts += [np.where(kept[:, None], plane, np.nan), gap]
+    if parts:
+        x, y = np.concatenate(parts).T
+        yield Line(label="background", colour="#a5b3a0", x=x, y=y, width=1.0)
+
+
+def _line(
+    track: Track | None, frame: _LocalFrame, chainage_m: Floats, here: Floats, tunnels_m: Sequence[tuple[float, float]]
+) -> Iterator[Line]:
+    """The line between the first and the last position, and its tunnels."""
+    if track is None:
+        yield _line_of_positions(here, chainage_m)
+        return
+    along = track.chainage_m
+    place = frame.plane(track.ecef_m)
+
+    def piece(first: float, last: float) -> tuple[Floats, Floats]:
+        inside = along[(along > first) & (along < last)]
+        at = np.concatenate([[first], inside[:: max(len(inside) // _TRACK_PIECES, 1)], [last]])
+        return np.interp(at, along, place[:, 0]), np.interp(at, along, place[:, 1])
+
+    x, y = piece(float(chainage_m.min()) - _BEYOND_M, float(chainage_m.max()) + _BEYOND_M)
+    yield Line(label="line", colour="#9a9a9a", x=x, y=y, width=4.0)
+    for number, (first, last) in enumerate(tunnels_m):
+        x, y = piece(first, last)
+        yield Line(label="" if number else "tunnel", colour=BLACK, x=x, y=y, width=4.0, dash="dotted")
+
+
+def _classes(
+    positions: pl.DataFrame, error_m: Floats | None, level_m: Floats | None
+) -> tuple[list[tuple[str, str, Masks]], str]:
+    """Label, colour and rows of each class of positions, and the quantity."""
+    if error_m is not None:
+        return _sizes(np.abs(error_m), _ERROR_CLASSES, "error", "no reference"), "the size of their error"
+    if level_m is not None:
+        return _sizes(level_m, _LEVEL_CLASSES, "level", "no level"), "their protection level"
+    status = words(positions, "status")
+    present = [s.text for s in Status if (status == s.text).any()]
+    return [(name, CYCLE[i % len(CYCLE)], status == name) for i, name in enumerate(present)], "their status"
+
+
+def _sizes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
+    """Classes of sizes, from small to large."""
+    classes = [(unknown, BLACK, np.isnan(size))]
+    for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):
+        label = f"{quantity} {low:g} to {high:g} m" if np.isfinite(high) else f"{quantity} {low:g} m and more"
+        classes.append((label, colour, (size >= low) & ((size < high) | np.isinf(high))))
+    return classes
+
+
+def _line_of_positions(here: Floats, chainage_m: Floats) -> Line:
+    """Line through the positions: the middle of each short piece, broken at wide gaps."""
     order = np.argsort(chainage_m, kind="stable")
     chainage, place = chainage_m[order], here[order]
     width = max(float(np.ptp(chainage)) / _TRACK_PIECES, 0.5)
     first = np.flatnonzero(np.r_[True, np.diff(np.floor(chainage / width)) > 0])
     x, y, at = place[first, 0], place[first, 1], chainage[first]
     gap = np.flatnonzero(np.diff(at) > 20 * width + 50.0) + 1
-    return Line(
-        label="line",
-        colour="#9a9a9a",
-        x=np.insert(x, gap, np.nan),
-        y=np.insert(y, gap, np.nan),
-        width=4.0,
-    )
+    return Line(label="line", colour="#9a9a9a", x=np.insert(x, gap, np.nan), y=np.insert(y, gap, np.nan), width=4.0)
 
 
 def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
-    """About a dozen marks at round places: the line's own marking, or the chainage where it has none."""
+    """About a dozen marks at round values of the kilometrage, or of the chainage where there is none."""
     along = floats(positions, "kilometrage_m")
     label = "kilometrage"
     if not np.isfinite(along).any():
@@ -155,27 +228,27 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 
 
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
-    """Distance from each position to the one before while the train ran.
+    """Distance from each position to the previous one while the train moved.
 
     Parameters
     ----------
     table : polars.DataFrame
-        Of one antenna, in order of time. Of an evaluation (`railfix.evaluate.EPOCH_COLUMNS`) the distances
-        of the reference are taken; of positions alone (`railfix.pipeline.tables.POSITION_COLUMNS`), their own.
-    prefix : "" or the start of the names of the conventional ones
-        Which positions.
+        Of one antenna, in order of time: of an evaluation (`railfix.evaluate.EPOCH_COLUMNS`), with distances of the
+        reference; or positions alone (`railfix.pipeline.tables.POSITION_COLUMNS`), with their own distances.
+    prefix : {"", "conventional_"}
+        Start of the names of the columns.
 
     Returns
     -------
     ndarray, ndarray, shape (P,) [m]
-        Place of each position but the first, and the distance; where the train stood there is none.
+        Chainage of each position but the first, and the distance; positions at standstill are left out.
     """
     if f"{prefix}interval_m" in table.columns:
-        place, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
-        ran = distance > 0.0
-        return place[ran], distance[ran]
-    place = floats(table, f"{prefix}chainage_m")
-    at = place[np.isfinite(place)]
+        chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
+        moved = distance > 0.0
+        return chainage[moved], distance[moved]
+    chainage = floats(table, f"{prefix}chainage_m")
+    at = chainage[np.isfinite(chainage)]
     return at[1:], np.abs(np.diff(at))
 
 
@@ -186,7 +259,7 @@ _FIXES: Final = (
 
 
 def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:
-    """Distance from each position to the one before, over the place (P1 figure 12).
+    """Distance from each position to the previous one, over chainage (P1 figure 12).
 
     Parameters
     ----------
@@ -199,29 +272,29 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
     Chart
     """
     layers: list[Layer] = []
-    shown = whole = 0
-    said = []
+    shown = total = 0
+    longest = []
     for label, prefix, colour, shape in _FIXES:
         x, y = interval(table, prefix)
         rows = spread(x, y)
-        shown, whole = shown + len(rows), whole + len(x)
+        shown, total = shown + len(rows), total + len(x)
         layers.append(Points(label=label, colour=colour, shape=shape, x=x[rows], y=y[rows]))  # type: ignore[arg-type]
         if len(y):
-            said.append(f"{label} {y.max():.2f} m")
+            longest.append(f"{label} {y.max():.2f} m")
     return Chart(
         name="interval-chainage",
         title=title,
-        caption=f"Distance along the line from each position to the one before. {_by(table)} "
-        f"The longest: {', '.join(said)}.{told(shown, whole)}",
+        caption=f"Distance along the line from each position to the previous one. {_by(table)} "
+        f"Longest: {', '.join(longest)}.{counts_sentence(shown, total)}",
         x_label="chainage [m]",
-        y_label="from the position before [m]",
+        y_label="distance from the previous position [m]",
         layers=tuple(layers),
         width="half",
     )
 
 
 def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning interval, distribution") -> Chart:
-    """How many positions are how far from the one before (P1 figure 12).
+    """Distribution of the distances from the previous position (P1 figure 12).
 
     Parameters
     ----------
@@ -233,13 +306,13 @@ def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning inte
     -------
     Chart
     """
-    found = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
-    largest = max((float(y.max()) for y in found.values() if len(y)), default=1.0)
+    distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
+    largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)
     edges = np.arange(0.0, largest + 2.0 * step, step)
     layers = []
     for side, (label, _, colour, _) in enumerate(_FIXES):
-        counts, _ = np.histogram(found[label], bins=edges)
+        counts, _ = np.histogram(distances[label], bins=edges)
         left = edges[:-1] + 0.5 * side * step
         layers.append(
             Bars(label=label, colour=colour, left=left, right=left + 0.5 * step, height=counts.astype(np.float64))
@@ -247,8 +320,8 @@ def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning inte
     return Chart(
         name="interval-distribution",
         title=title,
-        caption=f"Positions by their distance from the one before, in classes of {step:g} m. {_by(table)}",
-        x_label="from the position before [m]",
+        caption=f"Number of positions by their distance from the previous one, in classes of {step:g} m. {_by(table)}",
+        x_label="distance from the previous position [m]",
         y_label="positions",
         layers=tuple(layers),
         y_scale="log",
@@ -258,12 +331,12 @@ def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning inte
 
 def _by(table: pl.DataFrame) -> str:
     if "interval_m" in table.columns:
-        return "Distances that the train ran by the reference; where it stood there is none."
-    return "Without a reference the positions themselves tell the distance, their noise included."
+        return "Distances travelled by the reference; intervals at standstill are left out."
+    return "Without a reference the distances are those of the positions, with their noise."
 
 
 def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") -> Chart:
-    """Satellites used and refused at each epoch.
+    """Satellites used and rejected at each epoch.
 
     Parameters
     ----------
@@ -278,16 +351,16 @@ def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") 
     start = start_of(positions)
     x = since(positions, start)
     layers: list[Layer] = []
-    shown = whole = 0
-    for label, column, colour in (("refused", "n_rejected", CONVENTIONAL), ("used", "n_used", CONSTRAINED)):
+    shown = total = 0
+    for label, column, colour in (("rejected", "n_rejected", CONVENTIONAL), ("used", "n_used", CONSTRAINED)):
         y = floats(positions, column)
         rows = spread(x, y)
-        shown, whole = shown + len(rows), whole + len(x)
+        shown, total = shown + len(rows), total + len(x)
         layers.append(Points(label=label, colour=colour, x=x[rows], y=y[rows], epoch_s=x[rows]))
     return Chart(
         name="satellites",
         title=title,
-        caption=f"Satellites with a pseudorange.{told(shown, whole)}",
+        caption=f"Satellites with a pseudorange.{counts_sentence(shown, total)}",
         x_label="GPS time",
         y_label="satellites",
         layers=tuple(layers),

@@ -1,11 +1,10 @@
-"""Pictures of the screens of a run: each metric against its limit, from the files that the run wrote."""
+"""Pictures of the screens of a run: each metric against its limit."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import polars as pl
@@ -14,50 +13,42 @@ from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.errors import InputFileError, OutputError
 from railfix.core.reasons import Reason
 from railfix.pipeline.config import Config
+from railfix.report.plots.columns import floats
 from railfix.report.plots.screens import draw_screen
-from railfix.run.folder import read_parquet, read_record
+from railfix.report.runs import read_runs
 from railfix.screens import SCREENS, ScreenPicture
 
-_NEEDED: Final = ("run.json", "positions.parquet", "observations.parquet")
-
-
 @dataclass(frozen=True, kw_only=True)
-class _Grid:
-    """Observations of one antenna as arrays, T epochs by M channels, and its positions."""
+class _Rows:
+    """Positions and observations of one antenna; the observations of a column are read when it is drawn."""
 
-    time: Datetimes
-    chainage_m: Floats
     positions: pl.DataFrame
-    rows: pl.DataFrame
-    at: tuple[Indices, Indices]
-    shape: tuple[int, int]
+    observations: pl.LazyFrame
+    epoch: Indices
 
     def channels(self, column: str) -> Floats:
-        """One column of the observations, NaN where not observed."""
-        whole = np.full(self.shape, np.nan)
-        whole[self.at] = _floats(self.rows, column)
-        return whole
+        """One column of the observations, shape (N, 1)."""
+        return floats(self.observations.select(column).collect(), column)[:, None]
 
     def rejected(self, reason: Reason) -> Masks:
-        """Observations that carry a reason."""
-        whole = np.zeros(self.shape, dtype=bool)
-        whole[self.at] = (self.rows["reason"].to_numpy() & int(reason)) != 0
-        return whole
+        """Observations with a reason, shape (N, 1)."""
+        bits = self.observations.select("reason").collect()["reason"].to_numpy()
+        return np.asarray((bits & int(reason)) != 0)[:, None]
 
     def epochs(self, column: str) -> Floats:
         """One column of the positions, shape (T, 1)."""
-        return _floats(self.positions, column)[:, None]
+        return floats(self.positions, column)[:, None]
 
 
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
-    """Draw every screen of a run that judged anything, a picture an antenna.
+    """Draw every screen of a run that tested anything, one picture per antenna.
 
     Parameters
     ----------
     run : Path
         Folder that ``railfix run --observations`` wrote.
     out : Path
-        Folder for the pictures; it is made.
+        Folder for the pictures; it is created.
 
     Returns
     -------
@@ -71,15 +62,31 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
     OutputError
         A picture cannot be written.
     """
-    config, positions, observations = _read(run)
+    (reported,), _ = read_runs([run])
+    if reported.observations is None:
+        raise InputFileError(
+            run / "observations.parquet",
+            "there is no such file; expected the folder of railfix run; run again with --observations",
+        )
+    missing = missing_columns(reported.folder.positions, reported.observations)
+    if missing:
+        raise InputFileError(run, f"the tables lack {', '.join(missing)}; run again with this version of railfix")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{out}: the folder cannot be made ({error.strerror})") from None
+        raise OutputError(f"{out}: the folder cannot be created ({error.strerror})") from None
     return [
         draw_screen(out / f"{screen.antenna}_{screen.name}.png", screen.picture, screen.time, screen.chainage_m)
-        for screen in screens_of(config, positions, observations)
+        for screen in screens_of(reported.config, reported.folder.positions, reported.observations)
     ]
+
+
+def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
+    """Columns of the screens that tables of an earlier version lack."""
+    columns = [column for screen in SCREENS for column in screen.columns]
+    missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
+    missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())
+    return sorted(missing)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +99,9 @@ class RunScreen:
         ``front``, ``doppler``.
     picture : ScreenPicture
     time : ndarray of datetime64[ns], shape (T,)
+        Of each row of the picture: an epoch, or an observation.
     chainage_m : ndarray, shape (T,) [m]
-        Of the positions; NaN where there is none.
+        Of the position at that time; NaN without one.
     """
 
     antenna: str
@@ -103,14 +111,15 @@ class RunScreen:
     chainage_m: Floats
 
 
-def screens_of(config: Config, positions: pl.DataFrame, observations: pl.DataFrame) -> Iterator[RunScreen]:
-    """Every screen of a run that judged anything, antenna by antenna.
+def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
+    """Every screen of a run that tested anything, antenna by antenna.
 
     Parameters
     ----------
     config : Config
-        Settings that were in force.
-    positions, observations : polars.DataFrame
+        Settings that were used.
+    positions : polars.DataFrame
+    observations : polars.LazyFrame
         Tables of the run, columns of `railfix.pipeline.tables`.
 
     Yields
@@ -118,51 +127,25 @@ def screens_of(config: Config, positions: pl.DataFrame, observations: pl.DataFra
     RunScreen
     """
     for antenna in positions["antenna"].unique(maintain_order=True).to_list():
-        grid = _grid(positions.filter(pl.col("antenna") == antenna), observations.filter(pl.col("antenna") == antenna))
-        for name, picture in _pictures(antenna, grid, config):
+        mine = positions.filter(pl.col("antenna") == antenna)
+        seen = observations.filter(pl.col("antenna") == antenna)
+        time, chainage = mine["time_gpst"].to_numpy(), floats(mine, "chainage_m")
+        epoch = np.searchsorted(time, seen.select("time_gpst").collect()["time_gpst"].to_numpy())
+        rows = _Rows(positions=mine, observations=seen, epoch=epoch)
+        for name, picture in _pictures(antenna, rows, config):
             if np.isfinite(picture.metric).any():
-                yield RunScreen(antenna=antenna, name=name, picture=picture, time=grid.time, chainage_m=grid.chainage_m)
+                at = epoch if len(picture.metric) == len(epoch) else np.arange(len(time))
+                yield RunScreen(antenna=antenna, name=name, picture=picture, time=time[at], chainage_m=chainage[at])
 
 
-def _read(run: Path) -> tuple[Config, pl.DataFrame, pl.DataFrame]:
-    """Settings and tables of a run."""
-    for name in _NEEDED:
-        if not (run / name).is_file():
-            hint = "; run again with --observations" if name == "observations.parquet" else ""
-            raise InputFileError(run / name, f"there is no such file; expected the folder of a railfix run{hint}")
-    config = read_record(run).config
-    positions, observations = (read_parquet(run / name) for name in _NEEDED[1:])
-    columns = [column for screen in SCREENS for column in screen.columns]
-    lacking = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
-    lacking |= {c.name for c in columns if c.table == "observations"} - set(observations.columns)
-    if lacking:
-        raise InputFileError(run, f"the tables lack {', '.join(sorted(lacking))}; run again with this railfix")
-    return config, positions, observations
-
-
-def _grid(positions: pl.DataFrame, observations: pl.DataFrame) -> _Grid:
-    time = positions["time_gpst"].to_numpy()
-    names = (observations["satellite"] + " " + observations["signal"]).to_numpy().astype(np.str_)
-    channels, column = np.unique(names, return_inverse=True)
-    row = np.searchsorted(time, observations["time_gpst"].to_numpy())
-    return _Grid(
-        time=time,
-        chainage_m=_floats(positions, "chainage_m"),
-        positions=positions,
-        rows=observations,
-        at=(row.astype(np.intp), column.astype(np.intp)),
-        shape=(len(time), len(channels)),
-    )
-
-
-def _pictures(antenna: str, grid: _Grid, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
-    """Pictures of the screens that were on, and of the protection level, with the name of the file."""
+def _pictures(antenna: str, rows: _Rows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:
+    """Pictures of the active screens and of the protection level, with the names of their files."""
     for screen in SCREENS:
         if screen.name in config.screens:
-            for name, picture in screen.pictures(grid, getattr(config, screen.name)):
+            for name, picture in screen.pictures(rows, getattr(config, screen.name)):
                 yield name, replace(picture, title=f"{antenna}: {picture.title}")
         if screen.name == "raim" and config.protection == "on":
-            level = grid.epochs("protection_level_m")
+            level = rows.epochs("protection_level_m")
             level = np.where(np.isfinite(level), level, np.nan)
             yield (
                 "protection_level",
@@ -175,7 +158,3 @@ def _pictures(antenna: str, grid: _Grid, config: Config) -> Iterator[tuple[str, 
                     sides="above",
                 ),
             )
-
-
-def _floats(table: pl.DataFrame, column: str) -> Floats:
-    return np.array(table[column].cast(pl.Float64).fill_null(float("nan")).to_numpy())

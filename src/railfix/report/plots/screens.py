@@ -1,4 +1,4 @@
-"""Pictures of the screens: the C/N0 curve as P1's figure 3, and each metric against its limit."""
+"""Charts of the screens: each metric against its limit, and the C/N0 curve (P1 figure 3)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
 from railfix.report.plots.chart import Chart, Layer, Line, Points
 from railfix.report.plots.columns import nice_step
 from railfix.report.plots.draw import draw_chart
-from railfix.report.plots.thinning import extremes, spread, told
+from railfix.report.plots.thinning import counts_sentence, extremes, spread
 from railfix.screens import Cn0Limits, ScreenPicture
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-#: Colours that stay apart for the colour-blind (Okabe and Ito).
+#: Colours distinguishable with colour blindness (Okabe and Ito).
 _MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#2f86b8"
 _COLUMNS: Final = 4
 
@@ -91,37 +91,34 @@ def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats) -> Chart:
 
 def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start: np.datetime64 | None) -> Chart:
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
-    refused = int(np.count_nonzero(picture.reject))
-    share = f"{100 * refused / judged:.2f} %" if judged else "none"
+    rejected = int(np.count_nonzero(picture.reject))
+    share = f"{100 * rejected / judged:.2f} %" if judged else "none"
     where = np.broadcast_to(x[:, None], picture.metric.shape)
     layers: list[Layer] = []
-    shown = whole = 0
-    for mask, colour, label in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "refused")):
+    shown = total = 0
+    for mask, colour, label in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "rejected")):
         along, metric = where[mask], picture.metric[mask]
         rows = spread(along, metric)
-        shown, whole = shown + len(rows), whole + int(np.count_nonzero(np.isfinite(along + metric)))
+        shown, total = shown + len(rows), total + int(np.count_nonzero(np.isfinite(along + metric)))
         layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
     limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
-    finite = np.isfinite(limit).any(axis=1)
-    # one line for all channels: the tightest limit of each epoch, where channels differ
-    least = np.full(len(limit), np.nan)
-    least[finite] = np.nanmin(limit[finite], axis=1)
-    same = bool((~finite).all() or np.nanmax(limit) == np.nanmin(limit))
-    rows = extremes(x, least)
-    rows = rows[np.argsort(x[rows], kind="stable")]
+    finite = np.isfinite(limit)
+    same = not finite.any() or bool(limit[finite].min() == limit[finite].max())
+    at, least = _tightest(where[finite], limit[finite])
+    rows = extremes(at, least)
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
         label = "limit" if sign > 0 else ""
-        layers.append(Line(label=label, colour=_FLOOR, x=x[rows], y=sign * least[rows], width=1.0))
+        layers.append(Line(label=label, colour=_FLOOR, x=at[rows], y=sign * least[rows], width=1.0))
     scale: dict[str, Any] = {}
     values = np.abs(picture.metric[np.isfinite(picture.metric)])
     if finite.any() and picture.sides != "below" and len(values):
-        top = 6.0 * float(np.nanmedian(least))
+        top = 6.0 * float(np.median(least)) if len(least) else 0.0
         if top > 0.0 and values.max() > top:
             scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
     return Chart(
         name=name,
-        title=f"{picture.title}: {judged:,} judged, {refused:,} refused ({share})",
-        caption=(("" if same else "The line is the tightest limit of each epoch.") + told(shown, whole)).strip(),
+        title=f"{picture.title}: {judged:,} tested, {rejected:,} rejected ({share})",
+        caption=(("" if same else "Line: the tightest limit of each epoch.") + counts_sentence(shown, total)).strip(),
         x_label=x_label,
         y_label=picture.label,
         layers=tuple(layers),
@@ -129,6 +126,17 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
         width="half",
         **scale,
     )
+
+
+def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
+    """Smallest limit at each distinct x, in rising order of x."""
+    known = np.isfinite(x)
+    x, limit = x[known], limit[known]
+    order = np.argsort(x, kind="stable")
+    first = np.flatnonzero(np.diff(x[order], prepend=np.nan) != 0.0)
+    if not len(first):
+        return np.empty(0), np.empty(0)
+    return x[order][first], np.minimum.reduceat(limit[order], first)
 
 
 def draw_cn0_curve(

@@ -21,8 +21,11 @@ _ELEVATION_EDGES: Final = np.arange(0.0, 91.0, 1.0)
 _CN0_EDGES: Final = np.arange(10.0, 60.5, 0.5)
 #: Fewest samples of a piece of elevation to draw a mean of.
 _LEAST: Final = 10
-#: Epochs of the pictures of the sky.
+#: Largest number of epochs of the sky plot.
 SKY_EPOCHS: Final = 2000
+#: Columns of the observations that the charts use.
+CN0_COLUMNS: Final = ("satellite", "signal", "reason", "elevation_deg", "cn0_dbhz")
+SKY_COLUMNS: Final = ("time_gpst", *CN0_COLUMNS, "azimuth_deg")
 
 
 def cn0_over_elevation(
@@ -128,46 +131,46 @@ def _mean_of(rows: pl.DataFrame) -> Iterator[Layer]:
 
 
 def sky_epochs(
-    observations: pl.DataFrame,
+    observations: pl.DataFrame | pl.LazyFrame,
     *,
     wanted: Datetimes | None = None,
     epochs: int = SKY_EPOCHS,
     start: np.datetime64 | None = None,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Satellites of some epochs, for pictures of the sky.
+    """Satellites in view at some epochs, for sky plots.
 
     Parameters
     ----------
-    observations : polars.DataFrame
+    observations : polars.DataFrame or polars.LazyFrame
         Of one antenna, columns of `railfix.pipeline.tables.OBSERVATION_COLUMNS`.
     wanted : ndarray of datetime64[ns], optional
-        Epochs that must be among them, as far as there are no more than half of `epochs`.
+        Epochs to include, up to half of `epochs`.
     epochs : int
-        How many at most; they lie evenly in the run.
+        Largest number of epochs, evenly spaced.
     start : datetime64[ns], optional
-        From which times count; the first epoch unless given.
+        Origin of the times; the first epoch if not given.
     title : str
 
     Returns
     -------
     SkyEpochs
-        Each satellite once, by the signal that was taken.
+        Each satellite once, with the signal that was used.
     """
-    known = observations.filter(pl.col("elevation_deg").is_not_null(), pl.col("azimuth_deg").is_not_null())
-    known = known.filter(pl.col("elevation_deg") >= 0.0)
-    times = known["time_gpst"].unique().sort()
+    rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
+    times = rows.select(pl.col("time_gpst").unique().sort()).collect()["time_gpst"]
     if len(times) > epochs:
         extra = pl.Series([] if wanted is None else wanted[: epochs // 2], dtype=times.dtype).unique()
         extra = extra.filter(extra.is_in(times.implode()))
         even = times.gather(np.unique(np.linspace(0, len(times) - 1, epochs - len(extra)).astype(np.int64)))
         kept = pl.concat([even, extra]).unique().sort()
-        known = known.filter(pl.col("time_gpst").is_in(kept.implode()))
+        rows = rows.filter(pl.col("time_gpst").is_in(kept.implode()))
     else:
         kept = times
     other = (pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN)) != 0
     known = (
-        known.with_columns(aside=other)
+        rows.collect()
+        .with_columns(aside=other)
         .sort("time_gpst", "satellite", "aside", maintain_order=True)
         .unique(["time_gpst", "satellite"], keep="first", maintain_order=True)
     )

@@ -1,4 +1,4 @@
-"""Fewer points that look the same: the extremes of every short piece are kept."""
+"""Thin long series without changing their appearance."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 
-#: Points of one layer of a chart.
+#: Largest number of points in a layer of a chart.
 POINTS: Final = 6000
+_GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
 
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Rows that keep the least and the greatest `y` of every piece of `x`.
+    """Rows of the smallest and the largest `y` in each piece of `x`.
 
     Parameters
     ----------
@@ -44,15 +45,15 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     return np.asarray(np.unique(rows[order[np.concatenate(kept)]]), dtype=np.intp)
 
 
-def one_a_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
-    """Rows of which no two lie in one square cell; the cells grow until few enough are left.
+def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
+    """Rows of which no two lie in one square cell; the cells grow until at most `points` rows are left.
 
     Parameters
     ----------
     x, y : ndarray, shape (P,)
         Rows with NaN are left out.
     cell : float
-        Width of a cell to begin with.
+        Initial width of a cell.
     points : int
 
     Returns
@@ -72,14 +73,17 @@ def one_a_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> In
 
 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Rows that look like all: the extremes of every short piece, and one row a cell of a fine grid.
+    """Rows with the same density as all rows, and the extremes of each piece of `x`.
+
+    Rows are sampled uniformly by the golden-ratio sequence, which has no period in common with satellites or epochs;
+    a fifth of the points are extremes, so that the outline and single outliers stay.
 
     Parameters
     ----------
     x, y : ndarray, shape (P,)
         Rows with NaN are left out.
     points : int
-        How many rows at most; all, if there are no more.
+        Largest number of rows.
 
     Returns
     -------
@@ -89,16 +93,15 @@ def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
         return rows
-    outer = extremes(x, y, points=points // 3)
-    across, up = x[rows], y[rows]
-    low, high = np.percentile(up, (1.0, 99.0))
-    wide, tall = float(np.ptp(across)) or 1.0, float(high - low) or 1.0
-    inner = one_a_cell(400.0 * across / wide, 120.0 * up / tall, cell=1.0, points=points - len(outer))
-    return np.asarray(np.union1d(outer, rows[inner]), dtype=np.intp)
+    outline = extremes(x, y, points=points // 5)
+    # the rows of the smallest members of a uniform sequence in [0, 1)
+    order = (np.arange(len(rows)) * _GOLDEN) % 1.0
+    sample = rows[order < (points - len(outline)) / len(rows)]
+    return np.asarray(np.union1d(outline, sample)[:points], dtype=np.intp)
 
 
-def told(shown: int, whole: int) -> str:
-    """A sentence on what thinning left, empty if it left all."""
-    if shown == whole:
+def counts_sentence(shown: int, total: int) -> str:
+    """A sentence on the thinning, empty if there was none."""
+    if shown == total:
         return ""
-    return f" Shown are {shown:,} of {whole:,} points, the extremes of every short piece among them."
+    return f" {shown:,} of {total:,} points are shown, the extremes among them."

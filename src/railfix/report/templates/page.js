@@ -1,11 +1,22 @@
-// Draws the charts of the page: axes, layers, tips, zoom, pictures of the sky. No libraries.
+// Charts of the page: axes, layers, tips, shared zoom, sky plots, light and dark; tables as CSV files. No libraries.
 "use strict";
 (function () {
   const FONT = "12px system-ui, -apple-system, 'Segoe UI', Roboto, 'Noto Sans', Arial, sans-serif";
-  const INK = "#1b1b1b", GRID = "#e3e3e3", AXIS = "#767676";
+  const LIGHT = { ink: "#1b1b1b", grid: "#e3e3e3", axis: "#767676", paper: "#ffffff", halo: "#ffffffd9" };
+  const DARK = { ink: "#e8e8e8", grid: "#343a41", axis: "#8d959e", paper: "#14181c", halo: "#14181cd9" };
+  const darkness = window.matchMedia("(prefers-color-scheme: dark)");
+  const isDark = () => darkness.matches && !printing;
+  const theme = () => isDark() ? DARK : LIGHT;
   const PRINT_WIDTH = { wide: 760, half: 420, sky: 360 };
-  const plots = [], skies = {};
+  const plots = [], skies = {}, zoomed = {};
   let printing = false;
+
+  // Colour of a layer: lighter on a dark page.
+  function tone(colour) {
+    if (!isDark()) return colour;
+    if (colour === "#000000") return DARK.ink;
+    return "#" + [1, 3, 5].map(i => Math.round(parseInt(colour.slice(i, i + 2), 16) * 0.6 + 255 * 0.4).toString(16).padStart(2, "0")).join("");
+  }
 
   // ---- numbers: float32 or whole numbers, little endian, base 64
   function bytes(text) {
@@ -115,7 +126,9 @@
   Plot.prototype.load = function () {
     if (!this.chart) {
       this.chart = unpack(JSON.parse(document.getElementById(this.figure.dataset.chart).textContent));
-      this.whole = this.bounds();
+      this.full = this.bounds();
+      const x = zoomed[this.figure.dataset.zoom];
+      if (x) this.view = { x: x.map(v => v - (this.chart.start || 0)), y: this.full.y };
       this.legend();
       this.listen();
     }
@@ -142,20 +155,22 @@
   };
   Plot.prototype.legend = function () {
     const box = this.figure.querySelector(".legend"), self = this, seen = new Set();
+    box.textContent = "";
     for (const layer of this.chart.layers) {
       if (!layer.label || seen.has(layer.label)) continue;
       seen.add(layer.label);
       const button = document.createElement("button"), sample = document.createElement("i");
-      sample.style.background = layer.kind === "line" ? `linear-gradient(${layer.colour},${layer.colour}) center/100% 3px no-repeat` :
-        layer.kind === "band" || layer.kind === "bars" ? layer.colour + "66" : layer.colour;
+      const colour = tone(layer.colour);
+      sample.style.background = layer.kind === "line" ? `linear-gradient(${colour},${colour}) center/100% 3px no-repeat` :
+        layer.kind === "band" || layer.kind === "bars" ? colour + "66" : colour;
       const glyph = layer.kind === "marks" ? "+" : layer.shape === "cross" ? "\u00d7" : "";
       if (glyph) {
-        sample.style.cssText = `background:none;width:auto;height:auto;font-style:normal;font-weight:700;color:${layer.colour}`;
+        sample.style.cssText = `background:none;width:auto;height:auto;font-style:normal;font-weight:700;color:${colour}`;
         sample.textContent = glyph;
       } else if (layer.kind === "points") sample.style.cssText += layer.shape === "dot" ?
-        `;width:.7rem;border-radius:50%` : `;width:.7rem;background:none;border:2px solid ${layer.colour}`;
+        `;width:.7rem;border-radius:50%` : `;width:.7rem;background:none;border:2px solid ${colour}`;
       button.type = "button";
-      button.setAttribute("aria-pressed", "true");
+      button.setAttribute("aria-pressed", String(!this.hidden.has(layer.label)));
       button.append(sample, layer.label);
       button.addEventListener("click", function () {
         const off = !self.hidden.has(layer.label);
@@ -169,11 +184,23 @@
     this.back.type = "button";
     this.back.className = "whole";
     this.back.textContent = "show all again";
-    this.back.hidden = true;
+    this.back.hidden = !this.view;
     this.back.addEventListener("click", function () { self.zoom(null); });
     box.append(this.back);
   };
-  Plot.prototype.zoom = function (view) { this.view = view; this.back.hidden = !view; this.draw(); };
+  // Charts with the same x axis follow; positions on an axis of time are compared in absolute time.
+  Plot.prototype.zoom = function (view) {
+    this.show(view);
+    const group = this.figure.dataset.zoom, origin = this.chart.start || 0;
+    if (!group) return;
+    zoomed[group] = view && view.x.map(v => v + origin);
+    for (const plot of plots) if (plot !== this && plot.figure.dataset.zoom === group && plot.figure.dataset.drawn) plot.follow();
+  };
+  Plot.prototype.follow = function () {
+    const x = zoomed[this.figure.dataset.zoom], origin = this.chart.start || 0;
+    this.show(x ? { x: x.map(v => v - origin), y: this.full.y } : null);
+  };
+  Plot.prototype.show = function (view) { this.view = view; this.back.hidden = !view; this.draw(); };
   Plot.prototype.shown = function () { return this.chart.layers.filter(layer => !this.hidden.has(layer.label)); };
 
   Plot.prototype.frame = function () {
@@ -181,7 +208,8 @@
     const width = printing ? PRINT_WIDTH[half ? "half" : "wide"] : Math.max(260, this.canvas.parentNode.clientWidth);
     const names = chart.layers.find(layer => layer.kind === "ranges");
     let height = half ? 300 : 320;
-    if (chart.equal) height = Math.min(520, Math.max(300, Math.round(width * 0.5)));
+    if (chart.equal && !half) height = Math.min(520, Math.max(300, Math.round(width * 0.5)));
+    if (!printing && this.figure.closest(".overview")) height = window.innerWidth > 760 ? 350 : 280;
     if (names) height = 70 + 26 * names.names.length;
     const pen = canvasPen(this.canvas, width, height);
     const box = { left: 66, right: width - 14, top: 10, bottom: height - 42, width, height };
@@ -189,7 +217,7 @@
       const widest = Math.max.apply(null, names.names.map(name => pen.measureText(name).width));
       box.left = Math.min(widest + 16, width * 0.45);
     }
-    const view = this.view || this.whole;
+    const view = this.view || this.full;
     const fx = scale(chart.x_scale, chart.y_linear), fy = scale(chart.y_scale, chart.y_linear);
     let [x0, x1] = view.x.map(fx.to), [y0, y1] = view.y.map(fy.to);
     if (names) [y0, y1] = [y1, y0];
@@ -218,11 +246,22 @@
     const pen = canvas.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.font = FONT;
-    pen.fillStyle = "#fff";
+    pen.fillStyle = theme().paper;
     pen.fillRect(0, 0, width, height);
     return pen;
   }
 
+  // Many points on paper: as a picture, which is smaller than thousands of outlines.
+  function raster(pen, box) {
+    const picture = document.createElement("canvas"), ratio = 1.5;
+    picture.width = Math.round(box.width * ratio);
+    picture.height = Math.round(box.height * ratio);
+    const dots = picture.getContext("2d");
+    dots.scale(ratio, ratio);
+    pen.raster = (pen.raster || []).concat(picture);
+    pen.drawRaster = function () { for (const one of pen.raster) pen.drawImage(one, 0, 0, box.width, box.height); pen.raster = []; };
+    return dots;
+  }
   Plot.prototype.draw = function () {
     const chart = this.load(), [pen, box] = this.frame();
     this.box = box;
@@ -232,10 +271,11 @@
     pen.rect(box.left, box.top, box.right - box.left, box.bottom - box.top);
     pen.clip();
     let marks = 0;
-    for (const layer of this.shown()) marks += LAYERS[layer.kind](pen, box, layer);
+    for (const layer of this.shown()) marks += LAYERS[layer.kind](printing && layer.kind === "points" ? raster(pen, box) : pen, box, layer);
+    pen.drawRaster && pen.drawRaster();
     pen.restore();
     if (chart.equal) compass(pen, box);
-    pen.strokeStyle = AXIS;
+    pen.strokeStyle = theme().axis;
     pen.lineWidth = 1;
     pen.strokeRect(box.left + 0.5, box.top + 0.5, box.right - box.left - 1, box.bottom - box.top - 1);
     this.figure.dataset.drawn = marks;
@@ -247,13 +287,13 @@
       Math.max(3, Math.floor((box.right - box.left) / (chart.start === undefined ? 75 : 90))));
     const ys = names ? [] : ticks({ kind: chart.y_scale, low: box.y[0], high: box.y[1], linear: chart.y_linear },
       Math.max(3, Math.floor((box.bottom - box.top) / 38)));
-    pen.strokeStyle = GRID;
+    pen.strokeStyle = theme().grid;
     pen.lineWidth = 1;
     pen.beginPath();
     for (const [v] of xs) { const p = Math.round(box.px(v)) + 0.5; pen.moveTo(p, box.top); pen.lineTo(p, box.bottom); }
     for (const [v] of ys) { const p = Math.round(box.py(v)) + 0.5; pen.moveTo(box.left, p); pen.lineTo(box.right, p); }
     pen.stroke();
-    pen.fillStyle = INK;
+    pen.fillStyle = theme().ink;
     pen.textAlign = "center";
     pen.textBaseline = "top";
     for (const [v, text] of xs) {
@@ -285,7 +325,7 @@
   }
   function compass(pen, box) {
     const x = box.right - 22, y = box.top + 40, length = nice(120 * box.perPixel) / box.perPixel;
-    pen.strokeStyle = pen.fillStyle = INK;
+    pen.strokeStyle = pen.fillStyle = theme().ink;
     pen.lineWidth = 1.5;
     pen.beginPath();
     pen.moveTo(x, y); pen.lineTo(x, y - 22);
@@ -326,7 +366,7 @@
           pen.moveTo(x - r, y + r); pen.lineTo(x + r, y - r);
         } else { pen.moveTo(x + r, y); pen.arc(x, y, r, 0, 6.2832); }
       }
-      pen.fillStyle = pen.strokeStyle = layer.colour;
+      pen.fillStyle = pen.strokeStyle = tone(layer.colour);
       pen.lineWidth = 1;
       if (layer.shape === "dot") pen.fill(); else pen.stroke();
       return n;
@@ -334,7 +374,7 @@
     line(pen, box, layer) {
       pen.beginPath();
       const n = path(pen, box, layer.x, layer.y);
-      pen.strokeStyle = layer.colour;
+      pen.strokeStyle = tone(layer.colour);
       pen.lineWidth = layer.width;
       pen.lineJoin = "round";
       pen.setLineDash({ solid: [], dashed: [6, 4], dotted: [2, 3] }[layer.dash]);
@@ -344,7 +384,7 @@
     },
     band(pen, box, layer) {
       let n = 0;
-      pen.fillStyle = layer.colour + "40";
+      pen.fillStyle = tone(layer.colour) + "40";
       for (let i = 0; i < layer.x.length;) {
         while (i < layer.x.length && layer.x[i] !== layer.x[i]) i++;
         let j = i;
@@ -361,8 +401,8 @@
     },
     bars(pen, box, layer) {
       let n = 0;
-      pen.fillStyle = layer.colour + "88";
-      pen.strokeStyle = layer.colour;
+      pen.fillStyle = tone(layer.colour) + "88";
+      pen.strokeStyle = tone(layer.colour);
       pen.lineWidth = 1;
       for (let i = 0; i < layer.height.length; i++) {
         if (!(layer.height[i] > 0)) continue;
@@ -376,7 +416,7 @@
     cells(pen, box, layer) {
       const most = Math.log(1 + layer.most), wide = (layer.x1 - layer.x0) / layer.nx, high = (layer.y1 - layer.y0) / layer.ny;
       for (let i = 0; i < layer.n.length; i++) {
-        const grey = Math.round(215 - 195 * Math.log(1 + layer.n[i]) / most);
+        const share = Math.log(1 + layer.n[i]) / most, grey = Math.round(isDark() ? 60 + 180 * share : 215 - 195 * share);
         const x = box.px(layer.x0 + layer.a[i] * wide), y = box.py(layer.y0 + (layer.b[i] + 1) * high);
         pen.fillStyle = "rgb(" + grey + "," + grey + "," + grey + ")";
         pen.fillRect(x, y, box.px(layer.x0 + (layer.a[i] + 1) * wide) - x + 0.4, box.py(layer.y0 + layer.b[i] * high) - y + 0.4);
@@ -388,9 +428,9 @@
       for (let i = 0; i < layer.names.length; i++) {
         if (layer.mid[i] !== layer.mid[i]) continue;
         const a = box.px(layer.low[i]), b = box.px(layer.high[i]), m = box.px(layer.mid[i]), y = box.py(i);
-        pen.fillStyle = layer.colour + "70";
+        pen.fillStyle = tone(layer.colour) + "70";
         pen.fillRect(a, y - 6, Math.max(b - a, 1), 12);
-        pen.fillStyle = layer.colour;
+        pen.fillStyle = tone(layer.colour);
         pen.fillRect(m - 1.5, y - 9, 3, 18);
         n++;
       }
@@ -398,7 +438,7 @@
     },
     marks(pen, box, layer) {
       if (layer.place === "on") return wordsOn(pen, box, layer);
-      pen.strokeStyle = pen.fillStyle = layer.colour;
+      pen.strokeStyle = pen.fillStyle = tone(layer.colour);
       pen.lineWidth = 1.5;
       pen.textAlign = "left";
       pen.textBaseline = "bottom";
@@ -408,9 +448,9 @@
         pen.moveTo(x - 4, y); pen.lineTo(x + 4, y); pen.moveTo(x, y - 4); pen.lineTo(x, y + 4);
         pen.stroke();
         pen.lineWidth = 3;
-        pen.strokeStyle = "#ffffffcc";
+        pen.strokeStyle = theme().halo;
         pen.strokeText(layer.words[i], x + 5, y - 3);
-        pen.strokeStyle = layer.colour;
+        pen.strokeStyle = tone(layer.colour);
         pen.lineWidth = 1.5;
         pen.fillText(layer.words[i], x + 5, y - 3);
       }
@@ -422,8 +462,8 @@
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     pen.lineJoin = "round";
-    pen.fillStyle = layer.colour;
-    pen.strokeStyle = "#ffffffd9";
+    pen.fillStyle = tone(layer.colour);
+    pen.strokeStyle = theme().halo;
     pen.lineWidth = 4;
     for (let i = 0; i < layer.x.length; i++) {
       const lines = layer.words[i].split("\n"), x = box.px(layer.x[i]), y = box.py(layer.y[i]);
@@ -448,7 +488,7 @@
     }
     return best;
   };
-  Plot.prototype.told = function (x, y) {
+  Plot.prototype.tipText = function (x, y) {
     const chart = this.chart, box = this.box, at = v => chart.start === undefined ? short(v) : clock(chart.start + v, 1);
     const hit = this.near(x, y);
     if (hit) {
@@ -459,8 +499,8 @@
     for (const layer of this.shown()) {
       if (layer.kind === "ranges") {
         const i = Math.round(vy);
-        if (i >= 0 && i < layer.names.length && layer.mid[i] === layer.mid[i]) return layer.names[i] + "\nleast " +
-          short(layer.low[i]) + "\nmean " + short(layer.mid[i]) + "\ngreatest " + short(layer.high[i]);
+        if (i >= 0 && i < layer.names.length && layer.mid[i] === layer.mid[i]) return layer.names[i] + "\nlowest " +
+          short(layer.low[i]) + "\nmean " + short(layer.mid[i]) + "\nhighest " + short(layer.high[i]);
       } else if (layer.kind === "bars") {
         for (let i = 0; i < layer.left.length; i++) if (vx >= layer.left[i] && vx < layer.right[i] && layer.height[i] >= vy)
           return layer.label + "\n" + short(layer.left[i]) + " to " + short(layer.right[i]) + ": " + plain(layer.height[i], 0);
@@ -489,7 +529,7 @@
         pen.fillRect(from[0], from[1], x - from[0], y - from[1]);
         return;
       }
-      const text = self.told(x, y);
+      const text = self.tipText(x, y);
       self.tip.hidden = !text;
       self.tip.textContent = text;
       const right = x > self.box.width * 0.6;
@@ -555,7 +595,7 @@
       const azimuth = data.azimuth[i] / 100, elevation = data.elevation[i] / 100, cn0 = data.cn0[i] === 65535 ? NaN : data.cn0[i] / 100;
       const used = data.reason[i] === 0, turn = azimuth * Math.PI / 180, out = r * (90 - elevation) / 90;
       const x = c + out * Math.sin(turn), y = c - out * Math.cos(turn);
-      pen.strokeStyle = pen.fillStyle = used ? "#0072b2" : "#d55e00";
+      pen.strokeStyle = pen.fillStyle = tone(used ? "#0072b2" : "#d55e00");
       pen.lineWidth = 2;
       pen.beginPath();
       if (used) { pen.arc(x, y, 5, 0, 6.2832); pen.fill(); }
@@ -581,14 +621,14 @@
     const free = p => taken.every(t => p[0] > t[1] || p[0] + wide < t[0] || Math.abs(p[1] - t[2]) > 12);
     const place = places.find(free) || places[0] || [x + 8, y];
     taken.push([place[0], place[0] + wide, place[1]]);
-    pen.fillStyle = INK;
+    pen.fillStyle = theme().ink;
     pen.textAlign = "left";
     pen.textBaseline = "middle";
     pen.fillText(text, place[0], place[1]);
   }
   function grid(pen, c, r) {
-    pen.strokeStyle = AXIS;
-    pen.fillStyle = INK;
+    pen.strokeStyle = theme().axis;
+    pen.fillStyle = theme().ink;
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     for (const elevation of [0, 30, 60]) {
@@ -627,6 +667,7 @@
     for (const plot of plots) {
       if (plot.figure.dataset.drawn) continue;
       const place = plot.figure.getBoundingClientRect();
+      if (!place.width) continue; // folded
       if (place.top > window.innerHeight + 300 || place.bottom < -300) continue;
       plot.draw();
       timing("drawn");
@@ -640,7 +681,34 @@
     setTimeout(function () { waiting = false; near(); }, 60);
   }, { passive: true });
   window.addEventListener("load", () => timing("load"));
-  function again() { for (const plot of plots) if (printing || plot.figure.dataset.drawn) plot.draw(); }
+  function again() {
+    for (const plot of plots) if (printing || plot.figure.dataset.drawn) {
+      if (plot.chart) plot.legend();
+      plot.draw();
+    }
+  }
+  darkness.addEventListener("change", again);
+  document.querySelectorAll("details").forEach(part => part.addEventListener("toggle", near));
+
+  // ---- tables as CSV files
+  function csv(table) {
+    const cell = c => {
+      let text = c.textContent.trim();
+      if (c.classList.contains("n")) text = text.replace(/\u2212/g, "-").replace(/(\d),(?=\d{3})/g, "$1").replace(/^\u2013$/, "");
+      return /[",\n]/.test(text) ? '"' + text.replace(/"/g, '""') + '"' : text;
+    };
+    return [...table.rows].map(row => [...row.cells].map(cell).join(",")).join("\r\n") + "\r\n";
+  }
+  document.querySelectorAll("button.download").forEach(function (button) {
+    button.hidden = false;
+    button.addEventListener("click", function () {
+      const table = button.parentNode.querySelector("table"), link = document.createElement("a");
+      link.href = URL.createObjectURL(new Blob([csv(table)], { type: "text/csv" }));
+      link.download = table.dataset.name + ".csv";
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    });
+  });
   let wide = window.innerWidth, later = 0;
   window.addEventListener("resize", function () {
     near();
