@@ -291,7 +291,7 @@ def test_a_background_is_drawn_below_the_plan(folder: Path, tmp_path: Path) -> N
     assert len(unpacked(layer_of(chart(page, "plan", -1), "background")["x"])) > 0
     for wrong in ("{", '{"type": "Topology"}', '{"type": "LineString", "coordinates": [[1e6, 2e6], [1e6, 2e6]]}', "[]"):
         streets.write_text(wrong)
-        result = RUNNER.invoke(app, arguments)
+        result = RUNNER.invoke(app, [*arguments, "--overwrite"])
         assert result.exit_code == 3, result.output
         assert "GeoJSON" in result.output or "WGS 84" in result.output
 
@@ -394,7 +394,7 @@ def test_the_run_tells_how_long_its_chunks_took(summary: RunSummary, page: Page)
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["{run}", "--out", "{tmp}/none/report.html"], 8, "cannot be written"),
+        (["{run}", "--out", "{tmp}/none/report.html"], 8, "does not exist"),
         (["{tmp}/nowhere", "--out", "{tmp}/report.html"], 3, "there is no such folder"),
         (["{tmp}", "--out", "{tmp}/report.html"], 3, "positions"),
         (["{run}", "{run}", "--out", "{tmp}/report.html"], 4, "given twice"),
@@ -434,7 +434,7 @@ def test_observations_that_are_no_table(folder: Path, tmp_path: Path) -> None:
 def test_an_earlier_page_is_replaced_and_an_error_leaves_it(folder: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     page.write_text("old")
-    assert RUNNER.invoke(app, ["report", str(tmp_path), "--out", str(page)]).exit_code == 3
+    assert RUNNER.invoke(app, ["report", str(tmp_path), "--out", str(page), "--overwrite"]).exit_code == 3
     assert page.read_text() == "old"
     assert write_report([folder], page).read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]

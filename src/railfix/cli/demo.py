@@ -50,7 +50,7 @@ def demo(
     show_summary(summary)
     # the conventional positions of P1 use ranges that are not screened
     unscreened = Config(screens=("elevation",), protection="off")
-    run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="omit"))
+    run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
     runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])
     page = write_page(runs, evaluation, out / "report.html", title="railfix demonstration: a simulated run")
     if evaluation is not None:
