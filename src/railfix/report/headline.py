@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from railfix.core.arrays import Floats
 from railfix.evaluate import Evaluation
 from railfix.evaluate.figures import PASSED
 from railfix.evaluate.run_folder import floats
 from railfix.report.content import number, share
-from railfix.report.plots.errors import good_errors
 from railfix.report.runs import ReportedRun
 from railfix.report.tables import figures_of
 
@@ -38,44 +38,84 @@ class Headline:
 
 def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> Headline:
     """Verdict and key figures of one antenna, against the reference where there is one."""
-    if evaluation is not None:
-        common = {
-            kind: figures_of(evaluation, run, antenna, kind, epochs_of="common")
-            for kind in ("constrained", "conventional")
-        }
-        if all(figures.get("errors") for figures in common.values()):
-            return _with_errors(run, antenna, evaluation, common["constrained"], common["conventional"])
+    errors = run.errors_of(antenna)
+    if evaluation is not None and errors is not None:
+        compared = _compared(errors)
+        if len(compared.on_map_m):
+            return _with_errors(run, antenna, evaluation, compared)
     return _without_errors(run, antenna)
 
 
-def _with_errors(
-    run: ReportedRun,
-    antenna: str,
-    evaluation: Evaluation,
-    on_map: Mapping[str, Any],
-    conventional: Mapping[str, Any],
-) -> Headline:
-    own = figures_of(evaluation, run, antenna, "constrained")
-    own_conventional = figures_of(evaluation, run, antenna, "conventional")
+@dataclass(frozen=True, kw_only=True)
+class _Compared:
+    """Positions that passed every check beside the conventional ones of the same epochs.
+
+    Attributes
+    ----------
+    on_map_m, conventional_m : ndarray, shape (N,) [m]
+        Error sizes.
+    epochs : polars.DataFrame
+        Of the N epochs.
+    rate, conventional_rate : float
+        Share of the epochs with observations that have such a position.
+    marked_m : ndarray [m]
+        Error sizes of the positions that failed a check.
+    statuses : list of str
+        Their statuses.
+    """
+
+    on_map_m: Floats
+    conventional_m: Floats
+    epochs: pl.DataFrame
+    rate: float
+    conventional_rate: float
+    marked_m: Floats
+    statuses: list[str]
+
+
+def _compared(errors: pl.DataFrame) -> _Compared:
+    spanned = errors.filter("in_reference").with_columns(passed=pl.col("positioned") & pl.col("status").is_in(PASSED))
+    observed = spanned.filter("observed")
+    both = spanned.filter("passed", "conventional_positioned", "reference_good")
+    marked = spanned.filter(~pl.col("passed"), "positioned", "reference_good")
+    return _Compared(
+        on_map_m=np.abs(floats(both, "error_m")),
+        conventional_m=np.abs(floats(both, "conventional_error_m")),
+        epochs=both,
+        rate=float(np.mean(observed["passed"].to_numpy())) if len(observed) else np.nan,
+        conventional_rate=float(np.mean(observed["conventional_positioned"].to_numpy())) if len(observed) else np.nan,
+        marked_m=np.abs(floats(marked, "error_m")),
+        statuses=marked["status"].unique(maintain_order=True).to_list(),
+    )
+
+
+def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compared: _Compared) -> Headline:
+    (middle, wide), (other_middle, other_wide) = (
+        np.percentile(size, [50.0, 95.0]) for size in (compared.on_map_m, compared.conventional_m)
+    )
+    worst, other_worst = float(compared.on_map_m.max()), float(compared.conventional_m.max())
     verdict = (
-        f"At {share(own['rate'], 1)} of the epochs with satellite signals the train has a position on its line; 95 % "
-        f"of these are within {number(on_map['p95_m'], 1)} m of the true place along the line, and the worst is "
-        f"{number(on_map['max_m'], 1)} m off (conventional: {number(conventional['p95_m'], 1)} m and "
-        f"{number(conventional['max_m'], 1)} m)."
+        f"At {share(compared.rate, 1)} of the epochs with satellite signals the train has a position on its line that "
+        f"passed every check; 95 % of these are within {number(float(wide), 1)} m of the true place along the line, "
+        f"and the worst is {number(worst, 1)} m off (conventional: {number(float(other_wide), 1)} m and "
+        f"{number(other_worst, 1)} m)."
+    )
+    lengths = (
+        ("median error", middle, other_middle),
+        ("95 % of errors within", wide, other_wide),
+        ("largest error", worst, other_worst),
     )
     figures = [
-        KeyFigure(name=name, value=number(on_map[column], 2, " m"), beside=number(conventional[column], 2, " m"))
-        for name, column in (("median error", "p50_m"), ("95 % of errors within", "p95_m"), ("largest error", "max_m"))
+        KeyFigure(name=name, value=number(float(value), 2, " m"), beside=number(float(beside), 2, " m"))
+        for name, value, beside in lengths
     ]
-    figures.append(
-        KeyFigure(
-            name="epochs with a position", value=share(own["rate"], 1), beside=share(own_conventional.get("rate"), 1)
-        )
-    )
+    rates = share(compared.rate, 1), share(compared.conventional_rate, 1)
+    figures.append(KeyFigure(name="epochs with a position", value=rates[0], beside=rates[1]))
+    own = figures_of(evaluation, run, antenna, "constrained_ok")
     return Headline(
         verdict=verdict,
         figures=(*(_beside(figure) for figure in figures), _integrity_figure(run, antenna, evaluation, own)),
-        remarks=(_alike(run, on_map), *_larger_error(run, antenna, on_map, conventional)),
+        remarks=(_alike(run, compared), *_larger_error(compared), *_marked(compared)),
     )
 
 
@@ -104,34 +144,37 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     )
 
 
-def _alike(run: ReportedRun, on_map: Mapping[str, Any]) -> str:
+def _alike(run: ReportedRun, compared: _Compared) -> str:
     ranges = "unscreened ranges, as in P1" if run.conventional is not None else "the same screened ranges"
     return (
-        f"Errors along the line of the {number(on_map['errors'], 0)} epochs at which both positions exist; "
-        f"conventional: 3-D single point from {ranges}, moved to the nearest point of the line."
+        f"Errors along the line of the {len(compared.on_map_m):,} epochs at which both positions exist and the one on "
+        f"the map passed every check; conventional: 3-D single point from {ranges}, moved to the nearest point of the line."
     )
 
 
-def _larger_error(
-    run: ReportedRun, antenna: str, on_map: Mapping[str, Any], conventional: Mapping[str, Any]
-) -> list[str]:
+def _larger_error(compared: _Compared) -> list[str]:
     """A sentence on the largest error on the map where it exceeds the conventional one."""
-    errors = run.errors_of(antenna)
-    if errors is None or on_map["max_m"] <= conventional["max_m"]:
+    if compared.on_map_m.max() <= compared.conventional_m.max():
         return []
-    size = np.where(errors["conventional_positioned"].to_numpy(), np.abs(good_errors(errors, "error_m")), np.nan)
-    worst = errors.row(int(np.nanargmax(size)), named=True)
-    passed = size[errors["status"].is_in(PASSED).to_numpy()]
-    reason = (
-        f"railfix had marked this position as {str(worst['status']).replace('_', ' ')}; positions that passed every "
-        f"check are within {number(float(np.nanmax(passed)), 1)} m"
-        if worst["status"] not in PASSED and np.isfinite(passed).any()
-        else "it passed every check of railfix"
-    )
+    at = int(np.argmax(compared.on_map_m))
+    worst = compared.epochs.row(at, named=True)
     return [
-        f"The largest error on the map exceeds the conventional one: {number(size[int(np.nanargmax(size))], 1)} m at "
-        f"chainage {number(worst['chainage_m'], 0)} m ({worst['environment']}), from {number(worst['n_used'], 0)} "
-        f"satellites left after the screens, with a stated sigma of {number(worst['along_sigma_m'], 1)} m; {reason}."
+        f"The largest error on the map exceeds the conventional one: {number(float(compared.on_map_m[at]), 1)} m at "
+        f"chainage {number(worst['chainage_m'], 0)} m (environment: {worst['environment']}), from "
+        f"{number(worst['n_used'], 0)} satellites left after the screens, with a stated sigma of "
+        f"{number(worst['along_sigma_m'], 1)} m; the conventional position of that epoch, from "
+        f"all satellites, is {number(float(compared.conventional_m[at]), 1)} m off."
+    ]
+
+
+def _marked(compared: _Compared) -> list[str]:
+    """A sentence on the positions that failed a check."""
+    if not len(compared.marked_m):
+        return []
+    statuses = ", ".join(status.replace("_", " ") for status in compared.statuses)
+    return [
+        f"{len(compared.marked_m):,} further positions failed a check and carry its status ({statuses}); their largest "
+        f"error is {number(float(compared.marked_m.max()), 1)} m. They are drawn, but not counted above."
     ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import polars as pl
-from polars.exceptions import PolarsError
+from polars.exceptions import PanicException, PolarsError
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.evaluate import Evaluation, RunAndReference, evaluate_runs
@@ -181,7 +181,7 @@ def _observations(path: Path) -> pl.LazyFrame | None:
     try:
         table = pl.scan_parquet(path)
         columns = set(table.collect_schema())
-    except (PolarsError, OSError) as error:
+    except (PolarsError, PanicException, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputFileError(path, f"cannot be read as a table ({reason}); run railfix run again") from error
     if missing := sorted(_NEEDED - columns):
