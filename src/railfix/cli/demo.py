@@ -12,6 +12,7 @@ from rich.table import Table
 from railfix.cli.console import console_of_tables, progress_bar, show_summary
 from railfix.cli.options import OverwriteOption
 from railfix.evaluate import Evaluation
+from railfix.evaluate.run_folder import POSITIONS_TABLE
 from railfix.pipeline.config import Config
 from railfix.report import read_runs, write_page
 from railfix.run import RunOptions, run_files
@@ -68,12 +69,15 @@ def show_errors(evaluation: Evaluation) -> None:
         table.add_column(head, justify="left" if head in ("antenna", "position") else "right")
     rows = evaluation.figures.filter(grouping="all", epochs_of="own").sort("antenna", maintain_order=True)
     names = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
+    filtered = {run.name for run in evaluation.runs if run.table != POSITIONS_TABLE}
     for row in rows.iter_rows(named=True):
-        if row["antenna"] != "all" and row["position"] in names:
+        of_filter = row["run"] in filtered
+        if row["antenna"] != "all" and row["position"] in (("constrained",) if of_filter else names):
+            name = "filtered" if of_filter else names[row["position"]]
             lengths = (row[name] for name in ("mean_m", "std_m", "p50_m", "p95_m", "max_m"))
             cells = ("-" if value is None else f"{value:.2f}" for value in lengths)
             rate = "-" if row["rate"] is None else f"{100 * row['rate']:.2f} %"
-            table.add_row(row["antenna"], names[row["position"]], rate, *cells)
+            table.add_row(row["antenna"], name, rate, *cells)
     console.print(table)
     show_levels(evaluation, console)
 

@@ -36,11 +36,12 @@ def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
     by : list of str
         Columns whose values are kept apart.
     """
-    spanned = epochs.filter("in_reference")
     tables = []
     for level in level_columns(epochs):
         if epochs[level].null_count() == len(epochs):
             continue
+        # runs without this level, such as the filter along the track, have no row
+        spanned = epochs.filter("in_reference", pl.col(level).is_not_null().any().over("run"))
         for position in ("constrained", "constrained_ok"):
             has = positioned(position)
             tables.append(

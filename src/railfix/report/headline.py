@@ -148,7 +148,8 @@ def _alike(run: ReportedRun, compared: _Compared) -> str:
     ranges = "unscreened ranges, as in P1" if run.conventional is not None else "the same screened ranges"
     return (
         f"Errors along the line of the {len(compared.on_map_m):,} epochs at which both positions exist and the one on "
-        f"the map passed every check; conventional: 3-D single point from {ranges}, moved to the nearest point of the line."
+        f"the map passed every check; conventional: 3-D single point from {ranges}, moved to the nearest point of the "
+        "line."
     )
 
 
