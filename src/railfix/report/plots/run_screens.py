@@ -18,6 +18,7 @@ from railfix.report.plots.screens import draw_screen
 from railfix.report.runs import read_runs
 from railfix.screens import SCREENS, ScreenPicture
 
+
 @dataclass(frozen=True, kw_only=True)
 class _Rows:
     """Positions and observations of one antenna; the observations of a column are read when it is drawn."""
