@@ -1,4 +1,4 @@
-"""The 3-D track map: files in, a `Track` out; its quality; a map made from good positions (P1 2.2(1), 4.2(1))."""
+"""The 3-D track map, its quality checks, vehicles, and antenna trajectories (P1 2.2(1), 3.1(1), 4.2(1))."""
 
 from railfix.track.csv_file import write_track_csv
 from railfix.track.from_positions import Thinned, ThinningLimits, from_position_log, from_positions, thin

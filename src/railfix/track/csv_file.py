@@ -19,7 +19,7 @@ from railfix.track.heights import check_height_datum, ellipsoidal_heights
 from railfix.track.segment import Segment
 from railfix.track.track import UNNAMED, Track
 
-#: Column of the file, attribute of the track, factor, and what an empty cell means.
+#: Attribute of the track, factor, and value of an empty cell, by column of the file.
 OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "kilometrage_m": ("kilometrage_m", 1.0, np.nan),
     "cant_mm": ("cant_m", 1e-3, np.nan),
@@ -27,12 +27,12 @@ OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
 KNOWN_COLUMNS: Final = ("latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS)
-#: ``# key: value`` lines above the header that mean something; others are kept without effect.
+#: ``# key: value`` lines above the header that are used; others are ignored.
 KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
 
 
 def straight_radius(radius_m: Floats) -> Floats:
-    """Radii with 0, a common way to write straight track, as infinite."""
+    """Replace radii of 0, a common notation of straight track, by infinity."""
     return np.where(radius_m == 0.0, np.inf, radius_m)
 
 
@@ -42,9 +42,9 @@ def read_csv_segment(
     crs: str | None = None,
     height_datum: str | None = None,
     geoid: str | None = None,
-    duplicates: str = "refuse",
+    duplicates: str = "reject",
 ) -> Segment:
-    """One track map of a CSV file, as a piece of a route.
+    """Read a CSV track map as one segment of a route.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ def read_csv_segment(
     crs : str, optional
         Geographic CRS of the columns where it is not WGS 84 (``EPSG:6668``).
     height_datum : str, optional
-        Only to confirm what the column's name says.
+        Only to confirm the datum given by the column name.
     geoid : str, optional
         See `railfix.track.heights.geoid_heights`.
-    duplicates : {"refuse", "keep"}
-        Whether two equal points in a row are an error (the quality report keeps them to show them).
+    duplicates : {"reject", "keep"}
+        Equal consecutive points are an error, or kept for the quality checks.
     """
     check_height_datum(height_datum)
     table = read_named_columns(path)
@@ -69,8 +69,8 @@ def read_csv_segment(
     heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
     if len(table) < 2:
         raise InputFileError(path, f"{len(table)} point(s); a track needs at least two")
-    if duplicates == "refuse":
-        _refuse_duplicates(table, latitude, longitude, heights)
+    if duplicates == "reject":
+        _reject_duplicates(table, latitude, longitude, heights)
     crs = crs if crs is not None else table.metadata.get("crs")
     latitude, longitude, frame = _in_frame(crs, latitude, longitude, path=table.path)
     if geoid is None and datum == "orthometric" and "geoid_m" not in table:
@@ -106,7 +106,7 @@ def read_csv_segment(
 
 
 def _check_columns(table: NamedColumns) -> tuple[str, ...]:
-    """Refuse a header without coordinates or with a misspelt column; name the columns not used."""
+    """Reject a header without coordinates or with a misspelt column; return notes on unused columns."""
     close = misspelt(table.cells, KNOWN_COLUMNS)
     for wrong, right in close.items():
         if right not in table:
@@ -126,18 +126,18 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
 
 def _datum(table: NamedColumns, asked: str | None) -> str:
     datum = "ellipsoidal" if "height_m" in table else "orthometric"
-    for source, said in (("height_datum", asked), ("the line '# height_datum'", table.metadata.get("height_datum"))):
-        if said is not None and said != datum:
+    for source, stated in (("height_datum", asked), ("the line '# height_datum'", table.metadata.get("height_datum"))):
+        if stated is not None and stated != datum:
             column = "height_m" if datum == "ellipsoidal" else "elevation_m"
             message = (
-                f"{source} says {said!r}, but the column {column} is {datum}; rename the column or drop the setting"
+                f"{source} is {stated!r}, but the column {column} is {datum}; rename the column or drop the setting"
             )
             raise InputFileError(table.path, message, line=table.header_line)
     return datum
 
 
 def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floats) -> None:
-    """Refuse coordinates that cannot be degrees of latitude and longitude."""
+    """Reject coordinates that cannot be degrees of latitude and longitude."""
     outside = np.abs(latitude_deg) > 90.0
     if outside.any():
         row = int(np.argmax(outside))
@@ -150,7 +150,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
         raise table.error(0, "all coordinates lie within a few degrees of 0, 0: radians were given, degrees expected")
 
 
-def _refuse_duplicates(table: NamedColumns, latitude: Floats, longitude: Floats, height: Floats) -> None:
+def _reject_duplicates(table: NamedColumns, latitude: Floats, longitude: Floats, height: Floats) -> None:
     same = (np.diff(latitude) == 0) & (np.diff(longitude) == 0) & (np.diff(height) == 0)
     if same.any():
         row = int(np.argmax(same)) + 1
@@ -178,9 +178,9 @@ def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str
 
 
 def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
-    """Write a track as CSV with ellipsoidal heights; the file appears whole or not at all.
+    """Write a track as CSV with ellipsoidal heights; a failed write leaves no file.
 
-    Attributes that the track has nowhere are left out. What is read back equals the track to
+    Attributes without any value are omitted. The file reads back equal to the track within
     1e-10 degrees and 0.1 mm.
 
     Raises

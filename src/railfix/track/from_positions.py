@@ -1,4 +1,4 @@
-"""A track map made from good positions where no map exists (P1 4.2(1))."""
+"""Track map from accurate positions, where no map exists (P1 4.2(1))."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
-#: Said by every map of this kind.
+#: Note of every map of this kind.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 
 
 class ThinningLimits(Settings):
-    """How positions become points of a map.
+    """Limits for the selection of positions as points of a map.
 
     Attributes
     ----------
     spacing_m : float [m]
-        A point is kept when it is at least this far from the last one kept.
+        Smallest distance between consecutive points.
     standing_mps : float [m/s]
-        Slower than this over `standing_window_s`, in the horizontal, the antenna stands: the position
-        is noise or drift. Needs times; 0 keeps all.
+        Below this horizontal speed over `standing_window_s` the antenna is stationary and its positions
+        are noise or drift. Requires times; 0 keeps all.
     standing_window_s : float [s]
-        Half of the window in which the displacement is looked at.
+        Half of the window of the displacement.
     chord_m : float [m]
-        Where the positions between two points leave their chord by more, the furthest becomes a point
-        too (P1 4.1(3) keeps a map's chords within 0.30 m of the curve). Needs times, which tell noise
-        while standing from a bend.
+        Where positions between two points deviate from their chord by more, the furthest becomes a
+        point too (P1 4.1(3): chords within 0.30 m of the curve). Requires times, to distinguish a bend
+        from noise while stationary.
     jump_m : float [m]
-        Neighbouring points further apart are reported, for a straight line bridges them.
+        Neighbouring points further apart, joined by a straight line, are reported.
     gap_m : float [m]
         Neighbouring points further apart are no line: the positions are refused.
     speed_mps : float [m/s]
@@ -59,7 +59,7 @@ class ThinningLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Thinned:
-    """What became of each position.
+    """Result of the selection of positions.
 
     Attributes
     ----------
@@ -68,9 +68,9 @@ class Thinned:
     dropped : dict of int
         Number of rows by reason.
     jumps : ndarray of int, shape (j,)
-        Points after which the next is further than `ThinningLimits.jump_m`.
+        Points whose successor is further away than `ThinningLimits.jump_m`.
     jump_m : ndarray, shape (j,) [m]
-        How far.
+        Distance to the successor.
     turns : ndarray of int, shape (t,)
         Points at which the path turns back by more than 120 degrees: the vehicle reversed, or a position
         is wrong.
@@ -83,17 +83,17 @@ class Thinned:
     turns: Indices
 
 
-def standing(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
-    """Rows at which the antenna stands: it moves less than speed times window, horizontally.
+def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
+    """Flag the rows at which the antenna is stationary: its horizontal displacement is below speed times window.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (n,)
-        Rising; rows without a time never stand.
+        Rising; rows without a time are never flagged.
     ecef_m : ndarray, shape (n, 3) [m]
     speed_mps : float [m/s]
     window_s : float [s]
-        Looked at before and after each row; shorter at the ends and at gaps.
+        Before and after each row; shorter at the ends and at gaps.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def standing(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: flo
     latitude, longitude, _ = geodetic_from_ecef(ecef_m)
     moved = np.einsum("tij,tj->ti", enu_axes(latitude, longitude), ecef_m[last] - ecef_m[first])
     distance = np.hypot(moved[:, 0], moved[:, 1])
-    # half a window is needed to tell
+    # at least half of the window must have data
     known = t[last] - t[first] >= window_s
     return np.asarray(known & (distance < speed_mps * (t[last] - t[first])))
 
@@ -121,9 +121,9 @@ def thin(
 ) -> Thinned:
     """Choose the positions that become points of a map.
 
-    Jitter and drift of a standing antenna cannot draw loops: a point is kept only at full spacing
-    from the last, and rows at which the antenna stands are dropped first. The last good position is
-    kept where it goes on by at least a fifth of the spacing.
+    Noise and drift of a stationary antenna make no loops: stationary rows are dropped first, and a point
+    is kept only at full spacing from the last. The last usable position is kept where it is at least a
+    fifth of the spacing further on.
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ def thin(
     rows = np.flatnonzero(good)
     reachable = _reachable(time[rows], ecef_m[rows], limits)
     rows, out_of_reach = rows[reachable], int(np.count_nonzero(~reachable))
-    stands = standing(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=limits.standing_window_s)
-    stands = _with_shuffles(ecef_m[rows], stands, limits.spacing_m)
+    stands = stationary(time[rows], ecef_m[rows], speed_mps=limits.standing_mps, window_s=limits.standing_window_s)
+    stands = _with_short_moves(ecef_m[rows], stands, limits.spacing_m)
     moving = rows[~stands]
     chosen = _at_spacing(ecef_m[moving], limits.spacing_m)
     back = chosen[_turning_back(ecef_m[moving[chosen]])]
@@ -200,18 +200,18 @@ def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks
 
 
 def _turning_back(points: Floats) -> Indices:
-    """Points at which the path turns by more than 120 degrees."""
+    """Find the points at which the path turns by more than 120 degrees."""
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1)
     cosine = np.einsum("vi,vi->v", steps[1:], steps[:-1]) / (length[1:] * length[:-1])
     return np.flatnonzero(cosine < -0.5) + 1
 
 
-def _with_shuffles(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Rows at which the antenna stands, with the moves between two stands that stay within the spacing.
+def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
+    """Extend the stationary rows by moves between them that stay within the spacing.
 
-    Such a move ends where the next begins, so the line loses nothing; a start-up transient of the
-    reference or a wrong fix while standing does not bend it.
+    Such a move ends where the next one begins, so no part of the line is lost, and a start-up transient or
+    a wrong fix while stationary does not bend the line.
     """
     if not stands.any():
         return stands
@@ -224,7 +224,7 @@ def _with_shuffles(points: Floats, stands: Masks, spacing_m: float) -> Masks:
 
 
 def _at_spacing(points: Floats, spacing_m: float) -> Indices:
-    """Indices of points each at least the spacing from the one before; the last goes on where it can."""
+    """Select points at least the spacing apart, and the last point where it is far enough."""
     if not len(points):
         return np.zeros(0, dtype=np.intp)
     kept = [0]
@@ -239,14 +239,14 @@ def _at_spacing(points: Floats, spacing_m: float) -> Indices:
         else:
             start += block
     if kept[-1] != len(points) - 1 and len(kept) > 1:
-        onward, before = points[-1] - points[kept[-1]], points[kept[-1]] - points[kept[-2]]
-        if np.linalg.norm(onward) >= 0.2 * spacing_m and float(onward @ before) > 0:
+        last, before = points[-1] - points[kept[-1]], points[kept[-1]] - points[kept[-2]]
+        if np.linalg.norm(last) >= 0.2 * spacing_m and float(last @ before) > 0:
             kept.append(len(points) - 1)
     return np.array(kept, dtype=np.intp)
 
 
 def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
-    """The chosen points, and between two of them the one furthest from their chord, if over the limit."""
+    """Add to the chosen points the point furthest from each chord, where it exceeds the limit."""
     if len(chosen) < 2:
         return chosen
     piece = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
@@ -260,8 +260,8 @@ def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
     worst = np.zeros(len(chosen) - 1)
     np.maximum.at(worst, piece, off)
     bends = np.flatnonzero((off > chord_m) & (off == worst[piece]))
-    _, once = np.unique(piece[bends], return_index=True)
-    return np.sort(np.concatenate([chosen, inside[bends[once]]]))
+    _, first = np.unique(piece[bends], return_index=True)
+    return np.sort(np.concatenate([chosen, inside[bends[first]]]))
 
 
 def from_positions(
@@ -275,15 +275,15 @@ def from_positions(
     sigma_plan_m: float = SIGMA_PLAN_M,
     sigma_height_m: float = SIGMA_HEIGHT_M,
 ) -> Track:
-    """A track of good positions, thinned, without standing still.
+    """Create a track from positions, thinned and without stationary positions.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (n,)
-        In the order in which the vehicle went; NaT where unknown.
+        In the order of travel; NaT where unknown.
     ecef_m : ndarray, shape (n, 3) [m]
     spacing_m : float [m]
-        Not used where `limits` is given.
+        Ignored where `limits` is given.
     usable : ndarray of bool, shape (n,), optional
         False drops a row.
     limits : ThinningLimits, optional
@@ -291,7 +291,7 @@ def from_positions(
     Returns
     -------
     Track
-        Its notes say that it is the antenna's path, and where it jumps or turns back.
+        Its notes record that it is the path of the antenna, and its gaps and reversals.
 
     Raises
     ------
@@ -313,7 +313,7 @@ def track_of(
     gap_m: float = 2000.0,
     accuracy: str = "",
 ) -> Track:
-    """The track of positions that `thin` chose."""
+    """Create the track of the positions selected by `thin`."""
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
         raise ValueError(f"{len(thinned.kept)} of {len(ecef_m)} positions left, a track needs two ({dropped})")
@@ -340,15 +340,15 @@ def track_of(
 
 
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
-    """Rows of a log that are good enough.
+    """Flag the rows of a log that meet the quality limits.
 
     Parameters
     ----------
     log : PositionLog
     quality : sequence of int, optional
-        Accepted quality numbers; by default 1 (fix) where the log tells quality, else all rows.
+        Accepted quality numbers; by default 1 (fix) where the log has a quality, else all rows.
     max_sigma_m : float, optional [m]
-        Largest standard deviation in north, east and up; rows without one are refused then.
+        Largest standard deviation in north, east and up; rows without one are rejected then.
 
     Returns
     -------
@@ -357,16 +357,16 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
     Raises
     ------
     InputFileError
-        A filter was asked for that the log has no column for.
+        The log has no column for a filter that is given.
     """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
-        raise InputFileError(log.path, "a quality was asked for, but the log has no column 'quality'")
+        raise InputFileError(log.path, "a quality was given, but the log has no column 'quality'")
     if log.has_quality:
         usable &= np.isin(log.quality, (1,) if quality is None else tuple(quality))
     if max_sigma_m is not None:
         if not np.isfinite(log.sigma_m).any():
-            raise InputFileError(log.path, "a largest sigma was asked for, but the log has no standard deviations")
+            raise InputFileError(log.path, "a largest sigma was given, but the log has no standard deviations")
         usable &= log.sigma_m.max(axis=1) <= max_sigma_m
     return usable
 
@@ -393,7 +393,7 @@ def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
         reasons.append("the standard deviations of the log")
     if log.has_quality:
         worst = [SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[5]) for q in np.unique(log.quality[kept])]
-        plan, height = max(plan, *(w[0] for w in worst)), max(height, *(w[1] for w in worst))
+        plan, height = max([plan, *(w[0] for w in worst)]), max([height, *(w[1] for w in worst)])
         reasons.append("the quality of the positions")
     told = " and ".join(reasons) if reasons else "an assumption, for the log states neither quality nor sigma"
     return plan, height, f"accuracy of the map {plan:.2f} m in plan, {height:.2f} m in height: {told}"
@@ -408,12 +408,12 @@ def from_position_log(
     limits: ThinningLimits | None = None,
     name: str | None = None,
 ) -> tuple[Track, Thinned]:
-    """A track of the good positions of a log, and what became of each row.
+    """Create a track from the accurate positions of a log, and report the selection of rows.
 
     Raises
     ------
     InputFileError
-        Fewer than two points are left, or the log lacks what a filter needs.
+        Fewer than two points are left, or the log has no column for a filter.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)

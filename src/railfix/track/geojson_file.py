@@ -1,4 +1,4 @@
-"""Track maps as GeoJSON: 3-D LineString, MultiLineString, or features of them (RFC 7946)."""
+"""GeoJSON track maps: 3-D LineString, MultiLineString, or features of them (RFC 7946)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from railfix.track.frames import frame_degrees, older_datum_note
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
 from railfix.track.segment import Segment
 
-#: RFC 7946, section 4: longitude and latitude on WGS 84 where the file says nothing.
+#: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
 _DATUM_HELP: Final = (
     "give height_datum 'ellipsoidal' or 'orthometric', as an option (--height-datum) or as a member of the file"
@@ -29,7 +29,7 @@ _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_heigh
 
 
 def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_Line]:
-    """Every LineString below a GeoJSON object, with the members that apply to it."""
+    """Yield every LineString below a GeoJSON object, with the members that apply to it."""
     kind = node.get("type")
     own = {key: node[key] for key in _MEMBERS if key in node}
     if kind == "FeatureCollection":
@@ -101,7 +101,7 @@ class _Line:
         raise self.error(f"{key} is {value!r}; a text was expected")
 
     def array(self, key: str, *, blank: float) -> Floats | None:
-        """A property with one value a point; null is `blank`."""
+        """Return a property with one value per point; null is `blank`."""
         value = self.properties.get(key)
         if value is None:
             return None
@@ -109,15 +109,15 @@ class _Line:
             value = value[self.part]
         if not isinstance(value, list) or len(value) != len(self.coordinates):
             size = len(value) if isinstance(value, list) else "a single value"
-            raise self.error(f"property {key}: {size} for {len(self.coordinates)} points; give an array, one a point")
+            raise self.error(f"property {key}: {size} for {len(self.coordinates)} points; give one value per point")
         try:
             return np.array([blank if item is None else item for item in value], dtype=np.float64)
         except (TypeError, ValueError):
-            raise self.error(f"property {key} holds something that is not a number") from None
+            raise self.error(f"property {key} has a value that is not a number") from None
 
 
 def _crs_member(path: str, document: dict[str, Any]) -> str | None:
-    """CRS of the old ``crs`` member (GeoJSON 2008, section 3), still written by many programs."""
+    """Return the CRS of the old ``crs`` member (GeoJSON 2008, section 3), still written by many programs."""
     member = document.get("crs")
     if member is None:
         return None
@@ -143,7 +143,7 @@ def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]
             point = values[int(np.argmax(over))]
             raise InputFileError(
                 path,
-                f"{crs}: [{point[0]:g}, {point[1]:g}] is no [longitude, latitude]; are they swapped, or is the CRS a "
+                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; are they swapped, or is the CRS a "
                 "projected one (give --crs)?",
             )
     lat, lon, frame = frame_degrees(crs, values[:, 0], values[:, 1])
@@ -158,18 +158,18 @@ def read_geojson_segments(
     crs: str | None = None,
     height_datum: str | None = None,
     geoid: str | None = None,
-    duplicates: str = "refuse",
+    duplicates: str = "reject",
 ) -> list[Segment]:
-    """Every line of a GeoJSON file, in the file's order, as pieces of a route.
+    """Read the lines of a GeoJSON file, in their order, as segments of a route.
 
     Parameters
     ----------
     path : path
     crs : str, optional
-        Overrides nothing: it is an error where the file names another one.
+        CRS of a file without one; an error where the file names another one.
     height_datum, geoid : str, optional
-        Where the file has no such member or property.
-    duplicates : {"refuse", "keep"}
+        Used where the file has no such member or property.
+    duplicates : {"reject", "keep"}
     """
     text = read_text(path)
     try:
@@ -188,19 +188,19 @@ def read_geojson_segments(
 
 
 def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None, duplicates: str) -> Segment:
-    told = line.text("height_datum")
-    if told is not None and told not in HEIGHT_DATUMS:
-        raise line.error(f"height_datum is {told!r}; expected 'ellipsoidal' or 'orthometric'")
-    if height_datum is not None and told is not None and height_datum != told:
-        raise SettingsError(f"{line.source}: height_datum {height_datum!r} contradicts the file's own {told!r}")
-    datum = height_datum or told
+    stated = line.text("height_datum")
+    if stated is not None and stated not in HEIGHT_DATUMS:
+        raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
+    if height_datum is not None and stated is not None and height_datum != stated:
+        raise SettingsError(f"{line.source}: height_datum {height_datum!r} contradicts the file's own {stated!r}")
+    datum = height_datum or stated
     if datum is None:
-        raise line.error(f"the height datum is not said; {_DATUM_HELP}")
+        raise line.error(f"the height datum is missing; {_DATUM_HELP}")
     for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
         if right not in line.properties:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
     same = (np.diff(line.coordinates, axis=0) == 0).all(axis=1)
-    if duplicates == "refuse" and same.any():
+    if duplicates == "reject" and same.any():
         raise line.error(
             f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
             "'railfix map check' lists them all"

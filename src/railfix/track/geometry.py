@@ -1,4 +1,4 @@
-"""Numbers of a polyline that the quality report judges."""
+"""Geometry of a track map for its quality checks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.geodesy import enu_axes
 from railfix.track.track import Track
 
-#: Length over which the bend of the points is compared with the radius told [m].
+#: Length over which the curvature of the points is compared with the radius of the map [m].
 _BEND_WINDOW_M = 40.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Spacing, bends and gradients of a track of V points.
+    """Spacing, curvature and gradients of a track of V points.
 
     Attributes
     ----------
@@ -28,13 +28,13 @@ class Geometry:
         Mean length of the two segments at each point; NaN where `turn_deg` is.
     mid_chord_m : ndarray, shape (V - 1,) [m]
         Arc minus chord at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; R
-        from the map where both ends tell it, else from the circle through neighbouring points.
+        from the map where both ends have it, else from the circle through neighbouring points.
     gradient_permille : ndarray, shape (V - 1,)
-        Climb from the heights; NaN at duplicates.
+        Gradient from the heights; NaN at duplicates.
     height_spike_m : ndarray, shape (V,) [m]
         Height over the straight line between the neighbours; NaN at the ends.
-    told_curvature, bend_curvature : ndarray, shape (V,) [1/m]
-        Curvature from `Track.radius_m`, and of the points over about 40 m; positive to the right.
+    map_curvature, point_curvature : ndarray, shape (V,) [1/m]
+        Curvature from `Track.radius_m`, and from the points over about 40 m; positive to the right.
     """
 
     spacing_m: Floats
@@ -43,12 +43,12 @@ class Geometry:
     mid_chord_m: Floats
     gradient_permille: Floats
     height_spike_m: Floats
-    told_curvature: Floats
-    bend_curvature: Floats
+    map_curvature: Floats
+    point_curvature: Floats
 
 
 def geometry_of(track: Track) -> Geometry:
-    """Geometry of a track; duplicates of a point are passed over."""
+    """Compute the geometry of a track; duplicate points are skipped."""
     spacing = np.diff(track.chainage_m)
     kept = np.concatenate([[0], np.flatnonzero(spacing > 0.0) + 1])
     if len(kept) < 2:
@@ -60,12 +60,12 @@ def geometry_of(track: Track) -> Geometry:
     height = track.height_m[kept]
     share = length[:-1] / (length[:-1] + length[1:])
     spike = height[1:-1] - (height[:-2] * (1.0 - share) + height[2:] * share)
-    told = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
+    curvature_of_map = np.where(np.isinf(track.radius_m), 0.0, 1.0 / track.radius_m)
     circle = _circle_curvature(plan)
     curvature = np.where(
-        np.isnan(told[kept[:-1]] + told[kept[1:]]),
+        np.isnan(curvature_of_map[kept[:-1]] + curvature_of_map[kept[1:]]),
         np.nanmean(np.stack([circle[:-1], circle[1:]]), axis=0) if len(kept) > 2 else 0.0,
-        (told[kept[:-1]] + told[kept[1:]]) / 2.0,
+        (curvature_of_map[kept[:-1]] + curvature_of_map[kept[1:]]) / 2.0,
     )
     segments, points = kept[1:] - 1, kept[1:-1]
     return Geometry(
@@ -75,8 +75,8 @@ def geometry_of(track: Track) -> Geometry:
         mid_chord_m=_scatter(length**2 * curvature / 8.0, segments, len(spacing)),
         gradient_permille=_scatter(1e3 * climb / length, segments, len(spacing)),
         height_spike_m=_scatter(spike, points, len(track)),
-        told_curvature=told,
-        bend_curvature=_bend(track, kept, turn),
+        map_curvature=curvature_of_map,
+        point_curvature=_bend(track, kept, turn),
     )
 
 
@@ -87,7 +87,7 @@ def _scatter(values: Floats, places: Integers, size: int) -> Floats:
 
 
 def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
-    """Steps between points east and north at the middle of each, shape (n, 2), and their climb [m]."""
+    """Compute the steps between points, east and north, shape (n, 2), and their height differences [m]."""
     latitude, longitude = track.latitude_deg[kept], track.longitude_deg[kept]
     axes = enu_axes((latitude[1:] + latitude[:-1]) / 2.0, _middle_longitude(longitude))
     steps = np.einsum("nij,nj->ni", axes, np.diff(track.ecef_m[kept], axis=0))
@@ -95,13 +95,13 @@ def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
 
 
 def _middle_longitude(longitude_deg: Floats) -> Floats:
-    """Longitude midway between neighbours, also over the date line."""
+    """Compute the longitude midway between neighbours, also across the date line."""
     step = (np.diff(longitude_deg) + 180.0) % 360.0 - 180.0
     return longitude_deg[:-1] + step / 2.0
 
 
 def _turns(plan: Floats) -> tuple[Floats, Floats]:
-    """Turn to the right between neighbouring steps [rad], and their mean length [m], shapes (n - 1,)."""
+    """Compute the right turn between neighbouring steps [rad] and their mean length [m], shapes (n - 1,)."""
     cross = plan[:-1, 1] * plan[1:, 0] - plan[:-1, 0] * plan[1:, 1]
     dot = np.einsum("ni,ni->n", plan[:-1], plan[1:])
     length = np.hypot(plan[:, 0], plan[:, 1])
@@ -109,7 +109,7 @@ def _turns(plan: Floats) -> tuple[Floats, Floats]:
 
 
 def _circle_curvature(plan: Floats) -> Floats:
-    """Curvature of the circle through each point and its neighbours, shape (n + 1,) [1/m]; NaN at the ends."""
+    """Compute the curvature of the circle through each point and its neighbours, shape (n + 1,) [1/m]; NaN at ends."""
     turn, _ = _turns(plan)
     across = plan[:-1] + plan[1:]
     chord = np.hypot(across[:, 0], across[:, 1])
@@ -121,7 +121,7 @@ def _circle_curvature(plan: Floats) -> Floats:
 
 
 def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
-    """Curvature of the points over a window [1/m], shape (V,): noise of single points averages out."""
+    """Compute the curvature of the points over a window [1/m], shape (V,), to average the noise of single points."""
     along = track.chainage_m
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     middle = (along[kept][1:] + along[kept][:-1]) / 2.0
@@ -133,12 +133,12 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 
 def windowed_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
-    """Gradient that the map tells and that its heights show, over a window around each point.
+    """Compute the mean gradient of the attribute and of the heights over a window around each point.
 
     Returns
     -------
-    told_permille, seen_permille : ndarray, shape (V,)
-        NaN where a gradient is absent within the window, or less than half the window is on the track.
+    attribute_permille, height_permille : ndarray, shape (V,)
+        NaN where the window has points without a gradient, or less than half of it is on the track.
     """
     along, gradient = track.chainage_m, track.gradient_permille
     mean = (gradient[1:] + gradient[:-1]) / 2.0
@@ -151,7 +151,7 @@ def windowed_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats
     enough = (high - low >= window_m / 2.0) & (unknown[last] == unknown[first])
     width = np.where(enough, high - low, np.nan)
     order = np.concatenate([[True], np.diff(along) > 0.0])
-    told = (np.interp(high, along[order], climb[order]) - np.interp(low, along[order], climb[order])) / width
+    attribute = (np.interp(high, along[order], climb[order]) - np.interp(low, along[order], climb[order])) / width
     height = track.height_m[order]
-    seen = 1e3 * (np.interp(high, along[order], height) - np.interp(low, along[order], height)) / width
-    return told, seen
+    from_heights = 1e3 * (np.interp(high, along[order], height) - np.interp(low, along[order], height)) / width
+    return attribute, from_heights

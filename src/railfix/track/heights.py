@@ -1,6 +1,6 @@
-"""Ellipsoidal heights from orthometric ones: the geoid, always named, never silently zero.
+"""Conversion of orthometric to ellipsoidal heights with a named geoid model.
 
-Maps carry heights from levelling; satellites see the ellipsoid (P1 3.1(1)).
+Maps have heights from levelling, satellite positions refer to the ellipsoid (P1 3.1(1)).
 ``ellipsoidal = orthometric + geoid``.
 """
 
@@ -30,7 +30,7 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
-#: How to mend a file of orthometric heights that names no geoid.
+#: Advice for orthometric heights without a geoid.
 GEOID_HELP: Final = (
     "give geoid='japan' (JPGEO2024), 'gsigeo2011', a pyproj grid file or vertical CRS such as 'EPSG:5773', "
     "or a column geoid_m"
@@ -39,13 +39,13 @@ HEIGHT_DATUMS: Final = ("ellipsoidal", "orthometric")
 
 
 def check_height_datum(height_datum: str | None) -> None:
-    """Refuse a height datum that is neither ellipsoidal nor orthometric."""
+    """Raise `SettingsError` for a height datum other than ellipsoidal and orthometric."""
     if height_datum is not None and height_datum not in HEIGHT_DATUMS:
         raise SettingsError(f"height_datum {height_datum!r} is unknown; expected 'ellipsoidal' or 'orthometric'")
 
 
 def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> tuple[Floats, str]:
-    """Height of a geoid above the WGS 84 ellipsoid.
+    """Compute the height of a geoid above the WGS 84 ellipsoid.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, pa
     SettingsError
         The model is unknown or its grid is not installed.
     InputFileError
-        The map leaves the model's area.
+        Points of the map lie outside the area of the model.
     """
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:
@@ -90,7 +90,7 @@ def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, pa
 
 
 def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
-    """A pyproj transformation from heights over a geoid to the ellipsoid; no ballpark, no missing grid."""
+    """Create a pyproj transformation from geoid to ellipsoidal heights; ballpark results are not allowed."""
     grid = geoid.lower().endswith((".tif", ".tiff", ".gtx")) or Path(geoid).is_file()
     try:
         if grid:
@@ -107,7 +107,7 @@ def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
         raise SettingsError(f"geoid {geoid!r} is unknown; {GEOID_HELP}") from None
     except ProjError:
         raise SettingsError(
-            f"geoid {geoid!r}: pyproj has not got the grid; install it (projsync --file NAME) or give its path"
+            f"geoid {geoid!r}: the grid is not installed in pyproj; install it (projsync --file NAME) or give its path"
         ) from None
 
 
@@ -121,7 +121,7 @@ def ellipsoidal_heights(
     geoid_m: Floats | None,
     path: str,
 ) -> tuple[Floats, str]:
-    """Ellipsoidal heights, and the geoid that was used.
+    """Convert heights to ellipsoidal heights, and name the geoid used.
 
     Parameters
     ----------
@@ -129,9 +129,9 @@ def ellipsoidal_heights(
     datum : str
         ``"ellipsoidal"`` or ``"orthometric"``.
     geoid : str or None
-        Model, where one was asked for.
+        Model, if given.
     geoid_m : ndarray, shape (n,) or None
-        Geoid heights that the map itself carries.
+        Geoid heights of the map itself.
     path : str
         The map, for messages.
 
@@ -146,7 +146,7 @@ def ellipsoidal_heights(
         return heights_m, ""
     if geoid_m is not None:
         if geoid is not None:
-            raise SettingsError(f"{path}: geoid {geoid!r} was given, but the map carries geoid_m itself; use one")
+            raise SettingsError(f"{path}: geoid {geoid!r} was given, but the map has geoid_m itself; use one")
         return heights_m + geoid_m, "geoid_m of the map"
     if geoid is None:
         raise InputFileError(path, f"the heights are orthometric, which needs a geoid; {GEOID_HELP}")

@@ -1,4 +1,4 @@
-"""Nearest point of a polyline, exactly, for many positions at once."""
+"""Exact nearest points of a polyline for many positions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, Indices, Masks
 
-#: Samples looked at in the first round; doubled for the positions whose answer is not yet proven.
+#: Samples examined in the first round; four times as many for positions not yet proven.
 _FIRST_CANDIDATES = 6
-#: Positions times candidates in one piece of work.
+#: Positions times candidates processed at once.
 _CHUNK = 2_000_000
 
 
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
-    """Nearest point of segments: its share of the segment in [0, 1], and the distance.
+    """Find the nearest point of segments: its fraction of the segment in [0, 1], and the distance.
 
     Parameters
     ----------
@@ -30,11 +30,11 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
 
 
 class NearestOnPolyline:
-    """A polyline prepared for nearest-point questions.
+    """Search structure for nearest points of a polyline.
 
-    Samples are laid on the polyline so that each point of it lies within `reach_m` of a sample of
-    its own segment. The nearest point then belongs to a sample no further than the best distance
-    found plus `reach_m`, which proves an answer or asks for more candidates.
+    The polyline is sampled so that each of its points is within `reach_m` of a sample of the same
+    segment. The segment of the nearest point therefore has a sample within the best distance found
+    plus `reach_m`, which either proves the result or requires more candidates.
 
     Parameters
     ----------
@@ -62,26 +62,26 @@ class NearestOnPolyline:
         index = np.full(len(points), -1, dtype=np.intp)
         along = np.full(len(points), np.nan)
         offset = np.full(len(points), np.nan)
-        open_ = np.flatnonzero(np.isfinite(points).all(axis=1))
+        pending = np.flatnonzero(np.isfinite(points).all(axis=1))
         candidates = min(_FIRST_CANDIDATES, len(self._segment))
-        while open_.size:
+        while pending.size:
             unproven = []
             rows = max(1, _CHUNK // candidates)
-            for part in (open_[i : i + rows] for i in range(0, open_.size, rows)):
+            for part in (pending[i : i + rows] for i in range(0, pending.size, rows)):
                 index[part], along[part], offset[part], proven = self._among(points[part], candidates)
                 unproven.append(part[~proven])
-            open_ = np.concatenate(unproven)
+            pending = np.concatenate(unproven)
             candidates = min(candidates * 4, len(self._segment))
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Best of the nearest samples' segments, and whether no other can be better."""
-        found = self._tree.query(points, k=np.arange(1, candidates + 1))
-        distance, sample = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.intp)
+        """Find the best among the segments of the nearest samples, and whether no other can be better."""
+        nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
+        distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         segment = self._segment[sample]
         share, offset = project_on_segments(points[:, None], self._start[segment], self._step[segment])
         best = offset.min(axis=1)
-        # of equally near points the one earlier on the line, whatever order the tree gave them in
+        # of equally near points the one earlier on the line, independent of the order of the tree
         place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
         column = np.argmin(place, axis=1)[:, None]
         chosen = np.take_along_axis(segment, column, axis=1)[:, 0]

@@ -1,7 +1,7 @@
-"""What is wrong with a track map: spacing, chords against arcs, kinks, duplicates, marking, gradient, cant.
+"""Quality checks of a track map: spacing, mid-chord deviation, kinks, duplicates, kilometrage, gradient, cant.
 
-A map error is common to all satellites, so no screen of the receiver's data can find it: it must be
-found here (P1 2.2(1), 4.1(3)).
+A map error affects all satellites alike, so no screen of the observations can detect it; it must be
+detected here (P1 2.2(1), 4.1(3)).
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ class MapLimits(Settings):
     gap_m : float [m]
         A segment longer than this is a point that does not belong to the line, or a missing piece of it.
     near_duplicate_m : float [m]
-        Two points nearer than this are one point measured twice.
+        Points nearer than this are the same point measured twice.
     kink_deg : float [deg]
-        A turn at a point over this that is also sharper than `least_radius_m` is a kink.
+        A turn at a point of more than this and sharper than `least_radius_m` is a kink.
     sharp_kink_deg : float [deg]
-        A kink over this is an error, below a warning.
+        A kink of more than this is an error, else a warning.
     least_radius_m : float [m]
-        Sharper curves no railway vehicle passes.
+        Smallest radius that a railway vehicle can pass.
     gradient_permille : float
         Steepest segment.
     height_spike_m : float [m]
-        Height of a point against the line through its neighbours.
+        Largest deviation of the height of a point from the line through its neighbours.
     gradient_difference_permille : float
-        Gradient attribute against the heights, over `gradient_window_m`.
+        Largest difference of the gradient attribute from the heights, over `gradient_window_m`.
     gradient_window_m : float [m]
     cant_m : float [m]
-        Largest cant either way.
+        Largest absolute cant.
     """
 
     mid_chord_m: float = Field(default=0.30, gt=0)
@@ -67,18 +67,18 @@ class MapLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One fault of the map, at a run of neighbouring points or segments.
+    """One fault of the map at a range of neighbouring points or segments.
 
     Attributes
     ----------
     severity : {"error", "warning"}
     kind : str
     first, last : int
-        Points of the map between which it lies.
+        First and last point of the range.
     chainage_m, kilometrage_m : float [m]
-        Of the first point; the marking may be NaN.
+        Of the first point; the kilometrage may be NaN.
     value, limit : float
-        The worst value, and what it is held against; NaN where a fault has no number.
+        The worst value and its limit; NaN for faults without a number.
     sentence : str
     """
 
@@ -102,7 +102,7 @@ class TrackQuality:
     track : Track
     limits : MapLimits
     geometry : Geometry
-        Spacing, turns, mid-chord deviations and gradients that were judged.
+        Spacing, turns, mid-chord deviations and gradients that were checked.
     findings : tuple of Finding
         In order of chainage, errors first.
     """
@@ -114,22 +114,22 @@ class TrackQuality:
 
     @property
     def errors(self) -> tuple[Finding, ...]:
-        """Findings that make the map unfit."""
+        """Findings that make the map unusable."""
         return tuple(finding for finding in self.findings if finding.severity == "error")
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """Findings that a person should look at."""
+        """Findings that should be reviewed."""
         return tuple(finding for finding in self.findings if finding.severity == "warning")
 
 
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
-    """Judge a track map.
+    """Check the quality of a track map.
 
     Parameters
     ----------
     track : Track
-        Read with ``duplicates="keep"`` so that duplicates are shown instead of refused.
+        Read with ``duplicates="keep"`` so that duplicates are findings instead of an error.
     limits : MapLimits, optional
 
     Returns
@@ -151,7 +151,7 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
 
 
 class _Report:
-    """Turns masks over points or segments into findings, one for each run of neighbours."""
+    """Converter of masks over points or segments to findings, one for each range of neighbours."""
 
     def __init__(self, track: Track) -> None:
         self.track = track
@@ -166,7 +166,7 @@ class _Report:
         values: Floats | None = None,
         limit: float = np.nan,
     ) -> Iterator[Finding]:
-        """Findings for a mask over V points or V - 1 segments; ``{value}`` and ``{limit}`` stand in `text`."""
+        """Yield findings for a mask over V points or V - 1 segments; `text` may have ``{value}`` and ``{limit}``."""
         track = self.track
         edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
         over = 1 if len(mask) == len(track) - 1 else 0
@@ -215,7 +215,7 @@ def _spacing(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator
         (spacing > limits.spacing_m) & (spacing <= limits.gap_m),
         "warning",
         "spacing",
-        "points {value:.1f} m apart (limit {limit:g} m); a curve in between would not be seen",
+        "points {value:.1f} m apart (limit {limit:g} m); a curve in between would be missed",
         values=spacing,
         limit=limits.spacing_m,
     )
@@ -228,7 +228,7 @@ def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[F
             deviation > limits.mid_chord_m,
             "error",
             "mid-chord",
-            "the chord leaves the arc by {value:.3f} m (limit {limit:g} m); add points",
+            "the chord deviates from the arc by {value:.3f} m (limit {limit:g} m); add points",
             values=deviation,
             limit=limits.mid_chord_m,
         )
@@ -250,11 +250,11 @@ def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[F
 
 
 def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
-    marking = track.kilometrage_m
-    if np.isnan(marking).all():
+    kilometrage = track.kilometrage_m
+    if np.isnan(kilometrage).all():
         return
-    broken = kilometrage_breaks(track.chainage_m, marking)
-    change = np.diff(marking)
+    broken = kilometrage_breaks(track.chainage_m, kilometrage)
+    change = np.diff(kilometrage)
     yield from report.runs(
         broken,
         "warning",
@@ -266,8 +266,8 @@ def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
     known = np.flatnonzero(np.isfinite(direction))
     turned = np.zeros(len(track), dtype=np.bool_)
     turned[known[1:][np.diff(direction[known]) != 0.0]] = True
-    yield from report.runs(turned, "warning", "kilometrage reversal", "the kilometrage begins to run the other way")
-    yield from report.runs(np.isnan(marking), "warning", "kilometrage absent", "the map has no kilometrage here")
+    yield from report.runs(turned, "warning", "kilometrage reversal", "the kilometrage reverses its direction")
+    yield from report.runs(np.isnan(kilometrage), "warning", "kilometrage absent", "the map has no kilometrage here")
 
 
 def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Finding]:
@@ -277,7 +277,7 @@ def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimit
             steep,
             "warning",
             "gradient",
-            "the heights climb {value:.1f} per mille (limit {limit:g})",
+            "the gradient of the heights is {value:.1f} per mille (limit {limit:g})",
             values=geometry.gradient_permille,
             limit=limits.gradient_permille,
         )
@@ -285,12 +285,12 @@ def _heights(report: _Report, track: Track, geometry: Geometry, limits: MapLimit
             np.abs(geometry.height_spike_m) > limits.height_spike_m,
             "error",
             "height spike",
-            "the height leaves the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
+            "the height deviates from the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
             values=geometry.height_spike_m,
             limit=limits.height_spike_m,
         )
-        told, seen = windowed_gradients(track, window_m=limits.gradient_window_m)
-        difference = told - seen
+        attribute, from_heights = windowed_gradients(track, window_m=limits.gradient_window_m)
+        difference = attribute - from_heights
         yield from report.runs(
             np.abs(difference) > limits.gradient_difference_permille,
             "warning",
@@ -320,11 +320,11 @@ def _attributes(report: _Report, track: Track, geometry: Geometry, limits: MapLi
             values=np.where(np.isfinite(track.radius_m), track.radius_m, 0.0),
             limit=limits.least_radius_m,
         )
-        opposite = geometry.told_curvature * geometry.bend_curvature < 0.0
-        opposite &= (np.abs(geometry.told_curvature) > 1 / 3000) & (np.abs(geometry.bend_curvature) > 1 / 3000)
+        opposite = geometry.map_curvature * geometry.point_curvature < 0.0
+        opposite &= (np.abs(geometry.map_curvature) > 1 / 3000) & (np.abs(geometry.point_curvature) > 1 / 3000)
     yield from report.runs(
         opposite,
         "error",
         "radius side",
-        "radius_m bends the other way than the points; in the direction of the file, right is positive",
+        "radius_m has the opposite sign of the bend of the points; right is positive in the direction of the file",
     )

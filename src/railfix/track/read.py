@@ -1,4 +1,4 @@
-"""Read a track map: one file, or several that make a route."""
+"""Reading of a track map from one or several files."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ def read_track(
     max_gap_m: float = MAX_GAP_M,
     sigma_plan_m: float | None = None,
     sigma_height_m: float | None = None,
-    duplicates: str = "refuse",
+    duplicates: str = "reject",
 ) -> Track:
     """Read the centreline of a route from CSV (``.csv``) or GeoJSON (``.geojson``, ``.json``) files, plain or packed.
 
     Parameters
     ----------
     paths : path or sequence of paths
-        Several files are joined in the order given; a file may run against the route.
+        Several files are joined in the given order; each may have either direction.
     crs : str, optional
-        Coordinate reference system where the file does not say, for example ``EPSG:6677``.
+        Coordinate reference system of files without one, for example ``EPSG:6677``.
     height_datum : {"ellipsoidal", "orthometric"}, optional
-        For GeoJSON without one; for CSV the column's name says it.
+        For GeoJSON without one; for CSV the column name gives it.
     geoid : str, optional
         Geoid of orthometric heights: ``japan`` (JPGEO2024), ``gsigeo2011``, a pyproj grid or CRS.
     name : str, optional
-        Name of the route; else the file's own, else its file name.
+        Name of the route; by default that of the file, else the file name.
     max_gap_m : float [m]
         Widest gap between the ends of two segments.
     sigma_plan_m, sigma_height_m : float, optional [m]
-        Accuracy of the map; else the file's own, else 0.30 m and 0.60 m (P1 4.1(3)).
-    duplicates : {"refuse", "keep"}
-        Two equal points in a row: an error, or kept for `railfix.track.check_track` to show.
+        Accuracy of the map; by default that of the file, else 0.30 m and 0.60 m (P1 4.1(3)).
+    duplicates : {"reject", "keep"}
+        Equal consecutive points are an error, or kept for `railfix.track.check_track`.
 
     Returns
     -------
@@ -60,8 +60,8 @@ def read_track(
         An option is unknown or contradicts the file.
     """
     check_height_datum(height_datum)
-    if duplicates not in ("refuse", "keep"):
-        raise ValueError(f"duplicates is {duplicates!r}, expected 'refuse' or 'keep'")
+    if duplicates not in ("reject", "keep"):
+        raise ValueError(f"duplicates is {duplicates!r}, expected 'reject' or 'keep'")
     for key, value in (("sigma_plan_m", sigma_plan_m), ("sigma_height_m", sigma_height_m)):
         if value is not None and not value > 0.0:
             raise SettingsError(f"{key} is {value:g}; a positive number of metres was expected")

@@ -1,4 +1,4 @@
-"""A route joined from segments (P1 4.2(1))."""
+"""Joining of segments to a route (P1 4.2(1))."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.segment import ATTRIBUTES, Segment
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
-#: Ends of two segments nearer than this are one point [m].
+#: Ends of two segments nearer than this are the same point [m].
 SAME_POINT_M = 0.05
 #: Widest gap between the ends of two segments that is bridged by a straight line [m].
 MAX_GAP_M = 1.0
 
 
 def _ends(segment: Segment) -> Floats:
-    """First and last point, shape (2, 3) [m]."""
+    """Return first and last point, shape (2, 3) [m]."""
     i = [0, -1]
     return ecef_from_geodetic(segment.latitude_deg[i], segment.longitude_deg[i], segment.height_m[i])
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Segments turned so that each begins where the one before ends.
+    """Orient segments so that each begins where the one before ends.
 
     Parameters
     ----------
     segments : sequence of Segment
-        In the order of the route; the first is turned only where its start, not its end, meets the second.
+        In the order of the route; the first is reversed only where its start, not its end, meets the second.
     max_gap_m : float [m]
 
     Raises
     ------
     InputFileError
-        Two neighbours are further apart than `max_gap_m`, whichever way they are turned.
+        Two neighbours are further apart than `max_gap_m` in any orientation.
     """
     pieces = list(segments)
     if len(pieces) > 1:
@@ -68,10 +68,10 @@ def join(
     sigma_plan_m: float | None = None,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """One track of segments in the order of the route; a point that two share is kept once.
+    """Join segments in the order of the route to one track; a shared point is kept once.
 
-    The shared point keeps the marking of the earlier segment, and the later segment's attribute only
-    where the earlier has none.
+    The shared point has the attributes of the earlier segment, and those of the later one where the
+    earlier has none.
     """
     pieces = orient(segments, max_gap_m=max_gap_m)
     kept: list[dict[str, Floats]] = []
@@ -119,18 +119,18 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(values))
 
 
-def _sigma(pieces: Sequence[Segment], key: str, asked: float | None, default: float) -> float:
-    """Accuracy asked for, or the worst that the files tell, or the default of P1 4.1(3)."""
-    if asked is not None:
-        return asked
-    told: list[float] = []
+def _sigma(pieces: Sequence[Segment], key: str, given: float | None, default: float) -> float:
+    """Return the accuracy given, else the worst of the files, else the default of P1 4.1(3)."""
+    if given is not None:
+        return given
+    stated: list[float] = []
     for piece in pieces:
         if key in piece.metadata:
             try:
-                told.append(float(piece.metadata[key]))
+                stated.append(float(piece.metadata[key]))
             except ValueError:
                 message = f"{key} is {piece.metadata[key]!r}; a number in metres was expected"
                 raise InputFileError(piece.source, message) from None
-            if not 0.0 < told[-1] < np.inf:
-                raise InputFileError(piece.source, f"{key} is {told[-1]:g}; a positive number was expected")
-    return max(told, default=default)
+            if not 0.0 < stated[-1] < np.inf:
+                raise InputFileError(piece.source, f"{key} is {stated[-1]:g}; a positive number was expected")
+    return max(stated, default=default)

@@ -1,4 +1,4 @@
-"""One piece of a route as read from a file, before the pieces are joined."""
+"""One segment of a route as read from a file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from railfix.core.arrays import Floats
 
-#: Curve attributes that a map may carry at each point.
+#: Optional attributes of each point of a map.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
 
@@ -22,13 +22,13 @@ class Segment:
         The file alone.
     latitude_deg, longitude_deg, height_m : ndarray, shape (n,)
     kilometrage_m, cant_m, radius_m, gradient_permille : ndarray, shape (n,)
-        NaN where not given.
+        NaN where the file has none.
     crs, height_datum, geoid : str
-        What the file was in, and the geoid that was used.
+        Of the file, and the geoid used.
     frame : str
         Geographic CRS of the coordinates here.
     metadata : dict of str
-        Name and accuracy, where the file tells them.
+        Name and accuracy, where the file has them.
     notes : tuple of str
     """
 
@@ -49,7 +49,7 @@ class Segment:
     notes: tuple[str, ...] = ()
 
     def reversed(self) -> Segment:
-        """The same piece run the other way: right curves become left ones, climbs become falls."""
+        """Return the segment in the opposite direction; the signs of radius and gradient change."""
         return Segment(
             source=self.source,
             file=self.file,
@@ -65,5 +65,5 @@ class Segment:
             height_datum=self.height_datum,
             geoid=self.geoid,
             metadata=self.metadata,
-            notes=(*self.notes, f"{self.source} is run against the order of its points"),
+            notes=(*self.notes, f"{self.source} is used against the order of its points"),
         )

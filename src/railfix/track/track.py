@@ -1,4 +1,4 @@
-"""The centreline of a line in three dimensions, with its curve attributes (P1 2.2(1), 4.1(3)).
+"""3-D centreline of a railway line with curve attributes (P1 2.2(1), 4.1(3)).
 
 Right is positive: seen in the direction of rising chainage, a curve to the right has a positive
 radius. Cant is the height of the outer rail above the inner one, so it is positive in every
@@ -24,14 +24,14 @@ SIGMA_PLAN_M = 0.30
 SIGMA_HEIGHT_M = 0.60
 #: Name of the reference system of a map that names none.
 UNNAMED = "not named (WGS 84 assumed)"
-#: Kilometrage that disagrees with the length of a segment by more than this, plus a twentieth of
-#: the length, is a break in the marking [m]: files carry it rounded to the metre.
+#: Kilometrage that differs from the length of a segment by more than this, plus a twentieth of
+#: the length, has a break [m]; files give it rounded to the metre.
 KILOMETRAGE_BREAK_M = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Where a track map came from, as carried to every output.
+    """Origin of a track map, copied to every output.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class Provenance:
     frame : str
         Geographic CRS of the coordinates that were read; see `railfix.track.frames`.
     height_datum_asked, height_datum_used : str
-        ``"ellipsoidal"`` or ``"orthometric"``; empty where nothing was asked for.
+        ``"ellipsoidal"`` or ``"orthometric"``; the former empty where none was given.
     geoid : str
         Geoid model that turned orthometric into ellipsoidal heights; empty where none was needed.
     notes : tuple of str
-        Sentences that every result drawn from this map must carry.
+        Remarks that every result computed with this map must carry.
     """
 
     files: tuple[str, ...] = ()
@@ -69,16 +69,16 @@ class Track(NotebookTable):
     height_m : ndarray, shape (V,) [m]
         Ellipsoidal height of the middle between the rail tops.
     kilometrage_m : ndarray, shape (V,) [m]
-        The line's own marking; may jump or run backwards; NaN where the map has none.
+        Kilometrage of the line; may jump or run backwards; NaN where the map has none.
     cant_m : ndarray, shape (V,) [m]
         Outer rail above inner rail; NaN where the map has none.
     radius_m : ndarray, shape (V,) [m]
         Positive in a curve to the right in the direction of rising chainage, infinite on straight
-        track, NaN where the map says nothing.
+        track, NaN where the map has none.
     gradient_permille : ndarray, shape (V,)
         Positive where the line rises with chainage; NaN where the map has none.
     section : ndarray of int, shape (V,)
-        Which of `sections` a point belongs to.
+        Index in `sections` of each point.
     sections : tuple of str
         The files or features that were joined to the route, in order.
     sigma_plan_m, sigma_height_m : float [m]
@@ -134,7 +134,7 @@ class Track(NotebookTable):
         sigma_height_m: float = SIGMA_HEIGHT_M,
         provenance: Provenance | None = None,
     ) -> Track:
-        """Track of geodetic coordinates; attributes that are left out are NaN.
+        """Create a track from geodetic coordinates; attributes not given are NaN.
 
         Parameters
         ----------
@@ -179,7 +179,7 @@ class Track(NotebookTable):
         sigma_height_m: float = SIGMA_HEIGHT_M,
         provenance: Provenance | None = None,
     ) -> Track:
-        """Track of ECEF points, shape (V, 3) [m]; attributes that are left out are NaN."""
+        """Create a track from ECEF points, shape (V, 3) [m]; attributes not given are NaN."""
         latitude, longitude, height = geodetic_from_ecef(ecef_m)
         return cls.from_geodetic(
             latitude,
@@ -209,17 +209,17 @@ class Track(NotebookTable):
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Length of the polyline from its first point, shape (V,) [m]; not rising only at duplicate points."""
+        """Length of the polyline from its first point, shape (V,) [m]; strictly rising except at duplicate points."""
         steps = np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1)
         return read_only(np.concatenate([[0.0], np.cumsum(steps)]))
 
     def kilometrage_at(self, chainage_m: ArrayLike) -> Floats:
-        """The line's own marking at chainages; see `interpolate_kilometrage`."""
+        """Interpolate the kilometrage at chainages; see `interpolate_kilometrage`."""
         return interpolate_kilometrage(chainage_m, self.chainage_m, self.kilometrage_m)
 
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
-    """Segments in which the marking jumps.
+    """Flag the segments in which the kilometrage jumps.
 
     Parameters
     ----------
@@ -228,8 +228,8 @@ def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
     Returns
     -------
     ndarray of bool, shape (V - 1,)
-        True where the marking's change, either way, is not the segment's length within
-        `KILOMETRAGE_BREAK_M` and a twentieth; False where a marking is NaN.
+        True where the change of kilometrage, in either direction, differs from the length of the
+        segment by more than `KILOMETRAGE_BREAK_M` and a twentieth; False where it is NaN.
     """
     length = np.diff(chainage_m)
     change = np.abs(np.diff(kilometrage_m))
@@ -238,21 +238,21 @@ def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """The line's own marking at chainages.
+    """Interpolate the kilometrage at chainages.
 
-    Linear between two points. Inside a segment where the marking jumps, the marking of the nearer
-    point is carried on in the direction it runs on that side, never interpolated over the jump.
+    Linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is
+    extrapolated in its own direction, never interpolated across the jump.
 
     Parameters
     ----------
     chainage_m : array_like, any shape [m]
     known_chainage_m, known_kilometrage_m : ndarray, shape (V,) [m]
-        Rising chainage, and the marking there.
+        Rising chainage, and the kilometrage there.
 
     Returns
     -------
     ndarray, same shape as `chainage_m` [m]
-        NaN where there is no marking on the side asked for, and for NaN.
+        NaN where the nearer point has no kilometrage, and for NaN.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     index = np.clip(np.searchsorted(known_chainage_m, at, side="right") - 1, 0, len(known_chainage_m) - 2)
@@ -264,23 +264,23 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
     if not broken.any():
         return linear
     left, right = _running_direction(known_kilometrage_m, broken)
-    carried = np.where(
+    extrapolated = np.where(
         at - start < end - at,
         before + left[index] * (at - start),
         after - right[index + 1] * (end - at),
     )
-    return np.where(broken[index], carried, linear)
+    return np.where(broken[index], extrapolated, linear)
 
 
 def _running_direction(kilometrage_m: Floats, broken: Masks) -> tuple[Floats, Floats]:
-    """Direction (+1 or -1) in which the marking runs up to each point, and on from each point."""
+    """Determine the direction (+1 or -1) of the kilometrage before and after each point."""
     sign = np.sign(np.diff(kilometrage_m))
     usable = ~broken & np.isfinite(sign) & (sign != 0)
     if not usable.any():
-        ones = np.ones(len(kilometrage_m))
-        return ones, ones
+        rising = np.ones(len(kilometrage_m))
+        return rising, rising
     places = np.flatnonzero(usable)
     points = np.arange(len(kilometrage_m))
-    upto = places[np.clip(np.searchsorted(places, points, side="left") - 1, 0, len(places) - 1)]
-    onward = places[np.clip(np.searchsorted(places, points, side="left"), 0, len(places) - 1)]
-    return sign[upto], sign[onward]
+    before = places[np.clip(np.searchsorted(places, points, side="left") - 1, 0, len(places) - 1)]
+    after = places[np.clip(np.searchsorted(places, points, side="left"), 0, len(places) - 1)]
+    return sign[before], sign[after]

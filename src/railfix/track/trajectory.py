@@ -1,4 +1,4 @@
-"""The path of an antenna: what the solver constrains the position to.
+"""Trajectory of an antenna: the 3-D curve to which its position is constrained.
 
 A `Trajectory` is a polyline in ECEF with its own arc length, tied point by point to the line's
 chainage. `Trajectory.from_track` takes the track itself as the antenna's path; with a vehicle,
@@ -25,7 +25,7 @@ from railfix.track.track import (
     interpolate_kilometrage,
 )
 
-#: Said in every output of a run without a vehicle file.
+#: Note in every output of a run without a vehicle file.
 TRACK_AS_PATH = "no vehicle file: the track is taken as the antenna's own path"
 #: Rounding allowed beyond the ends of a trajectory [m].
 _END_TOLERANCE_M = 1e-6
@@ -33,34 +33,34 @@ _END_TOLERANCE_M = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Trajectory(NotebookTable):
-    """Path of one antenna, V points.
+    """Trajectory of one antenna, V points.
 
     Right is positive across the path, seen in the direction of rising chainage.
 
     Attributes
     ----------
     name : str
-        The antenna, or the track taken as its path.
+        Name of the antenna, or of the track used as its path.
     ecef_m : ndarray, shape (V, 3) [m]
     chainage_m : ndarray, shape (V,) [m]
         Chainage of the track at the reference point, strictly rising.
     kilometrage_m : ndarray, shape (V,) [m]
-        The line's own marking there; NaN where the map has none.
+        Kilometrage there; NaN where the map has none.
     cant_m : ndarray, shape (V,) [m]
         Cant of the track there; NaN where the map has none.
     roll_deg : ndarray, shape (V,) [deg]
-        Lean of the body, positive to the right; 0 where the track is taken as the path.
+        Roll of the car body, positive to the right; 0 where the track is used as the path.
     reference : str
-        The point of the vehicle whose chainage is given.
+        Point of the vehicle to which `chainage_m` refers.
     body_chainage_m : ndarray, shape (V,), or None [m]
-        Chainage of the middle between the bogies when the antenna is at the point, strictly rising: where
-        one antenna is, it tells where the other one of the same vehicle is. None without a vehicle.
+        Chainage of the middle between the bogies when the antenna is at the point, strictly rising: it
+        relates the positions of two antennas of one vehicle. None without a vehicle.
     facing : {"rising", "falling"}
-        Which way along the line the vehicle's front points; "rising" is taken where no vehicle tells.
+        Direction of the vehicle's front along the line; "rising" without a vehicle.
     sigma_plan_m, sigma_height_m : float [m]
-        Standard deviations of the map, carried into the solution.
+        Standard deviations of the map, included in the solution.
     notes : tuple of str
-        Sentences that every result must carry.
+        Remarks that every result must carry.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Trajectory(NotebookTable):
 
     @classmethod
     def from_track(cls, track: Track) -> Trajectory:
-        """The track taken as the antenna's own path, as `notes` then says."""
+        """Create a trajectory that uses the track as the antenna's path; `notes` records it."""
         return cls(
             name=track.name,
             ecef_m=track.ecef_m,
@@ -159,12 +159,12 @@ class Trajectory(NotebookTable):
 
     @cached_property
     def gradient_permille(self) -> Floats:
-        """Climb of each segment in rising chainage, shape (V - 1,)."""
+        """Gradient of each segment in rising chainage, shape (V - 1,)."""
         enu = np.einsum("vij,vj->vi", self._axes, self.tangent)
         return read_only(1e3 * enu[:, 2] / np.hypot(enu[:, 0], enu[:, 1]))
 
     def body_azimuth_deg(self, arc_m: ArrayLike) -> Floats:
-        """Azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""
+        """Compute the azimuth of the vehicle's front at arc lengths, clockwise from north [deg]; NaN for NaN."""
         heading = self.heading_deg[self.segment_at(arc_m)[0]] + (0.0 if self.facing == "rising" else 180.0)
         return np.where(np.isfinite(np.asarray(arc_m, dtype=np.float64)), heading % 360.0, np.nan)
 
@@ -173,7 +173,7 @@ class Trajectory(NotebookTable):
         return NearestOnPolyline(self.ecef_m)
 
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
-        """Segment that an arc length falls on, and the distance along it.
+        """Find the segment of each arc length, and the distance along it.
 
         Parameters
         ----------
@@ -182,8 +182,8 @@ class Trajectory(NotebookTable):
         Returns
         -------
         index : ndarray of int
-            A point that two segments share belongs to the later one; before the start, 0; beyond the
-            end and for NaN, the last.
+            A point shared by two segments belongs to the later one; 0 before the start; the last segment
+            beyond the end and for NaN.
         along_m : ndarray [m]
             From the segment's first point; negative before the start; NaN for NaN.
         """
@@ -201,21 +201,21 @@ class Trajectory(NotebookTable):
         return np.asarray((1.0 - share.reshape(shape)) * values[index] + share.reshape(shape) * values[index + 1])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
-        """Point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
         return self._interpolate(arc_m, self.ecef_m)
 
     def chainage_at(self, arc_m: ArrayLike) -> Floats:
-        """Chainage of the reference point at an arc length [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the chainage of the reference point at an arc length [m]; NaN beyond the ends and for NaN."""
         return self._interpolate(arc_m, self.chainage_m)
 
     def body_at(self, arc_m: ArrayLike) -> Floats:
-        """Chainage of the vehicle's middle when the antenna is at arcs [m]; NaN without a vehicle or off the path."""
+        """Chainage of the vehicle's middle for arc lengths of the antenna [m]; NaN without vehicle or off the path."""
         if self.body_chainage_m is None:
             return np.full(np.shape(arc_m), np.nan)
         return self._interpolate(arc_m, self.body_chainage_m)
 
     def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
-        """Where the antenna is when the vehicle's middle is at chainages [m]; NaN without a vehicle or off the path."""
+        """Arc length of the antenna for chainages of the vehicle's middle [m]; NaN without vehicle or off the path."""
         if self.body_chainage_m is None:
             return np.full(np.shape(body_chainage_m), np.nan)
         return np.interp(
@@ -223,7 +223,7 @@ class Trajectory(NotebookTable):
         )
 
     def arc_at_chainage(self, chainage_m: ArrayLike) -> Floats:
-        """Arc length at a chainage of the reference point [m]; NaN beyond the ends and for NaN."""
+        """Interpolate the arc length at a chainage of the reference point [m]; NaN beyond the ends and for NaN."""
         chainage = np.asarray(chainage_m, dtype=np.float64)
         inside = np.isfinite(chainage)
         inside &= (chainage >= self.chainage_m[0] - _END_TOLERANCE_M) & (
@@ -232,13 +232,13 @@ class Trajectory(NotebookTable):
         return np.where(inside, np.interp(chainage, self.chainage_m, self.arc_m), np.nan)
 
     def kilometrage_at(self, arc_m: ArrayLike) -> Floats:
-        """The line's own marking at an arc length [m]; never interpolated over a jump of the marking."""
+        """Interpolate the kilometrage at an arc length [m]; never across a jump."""
         return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
 
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Nearest point of the trajectory to each position.
+        """Find the nearest point of the trajectory to each position.
 
-        Exact, over all segments: a tree finds the candidates and a bound proves that none is missed.
+        Exact over all segments: a k-d tree gives the candidates, and a bound excludes all others.
 
         Parameters
         ----------
@@ -251,6 +251,6 @@ class Trajectory(NotebookTable):
             equally near points the one of smaller arc length.
         """
         index, along, offset = self._nearest(ecef_m)
-        found = index >= 0
-        arc = np.where(found, self.arc_m[np.maximum(index, 0)] + along, np.nan)
+        known = index >= 0
+        arc = np.where(known, self.arc_m[np.maximum(index, 0)] + along, np.nan)
         return arc, offset

@@ -1,8 +1,8 @@
-"""The vehicle: two bogies on the track, a roof antenna, and the path that the antenna takes (P1 3.1(1)).
+"""Vehicle with two bogies and roof antennas, and the trajectories of its antennas (P1 3.1(1)).
 
 Axes of the vehicle: origin midway between the bogie centres at the height of the rail tops;
 ``along_m`` toward the vehicle's front, ``across_m`` to the right seen toward the front, ``up_m``
-above the rail tops, square to the body's floor.
+above the rail tops, perpendicular to the floor.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from railfix.track.trajectory import Trajectory
 
 Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 
-#: Distance between the wheels' contact points beyond the gauge [m]: about the width of a rail head.
+#: Distance between the contact points of the wheels minus the gauge [m]: about the width of a rail head.
 RAIL_HEAD_M: Final = 0.070
-#: The antenna's path is subdivided until it is this straight between two points [m].
+#: Largest deviation of the antenna's path from the chord between two points [m].
 PATH_TOLERANCE_M: Final = 0.02
-#: Segments of the path are not made shorter than this [m].
+#: Shortest segment of the path [m].
 _SHORTEST_M: Final = 1.0
 _MAX_ITERATIONS: Final = 200
-_SETTLED_M: Final = 1e-7
+_CONVERGED_M: Final = 1e-7
 
 
 class AntennaOffset(Settings):
-    """Phase centre of one antenna in the axes of the vehicle [m]."""
+    """Phase centre of one antenna in the vehicle frame [m]."""
 
     model_config = ConfigDict(strict=True)
     along_m: float = Field(ge=-30.0, le=30.0)
@@ -44,16 +44,16 @@ class AntennaOffset(Settings):
 
 
 class Vehicle(Settings):
-    """A vehicle as its TOML file gives it.
+    """Vehicle dimensions and antennas, as in a vehicle file (TOML).
 
     Attributes
     ----------
     bogie_distance_m : float
-        Between the two bogie centres, as a chord.
+        Straight distance between the two bogie centres.
     gauge_m : float
-        Track gauge; cant is measured over the gauge and `RAIL_HEAD_M`.
+        Track gauge; cant is measured over the gauge plus `RAIL_HEAD_M`.
     facing : {"rising", "falling"}
-        Which way along the chainage the vehicle's front points.
+        Direction of the vehicle's front along the chainage.
     antennas : dict
         Offsets by name: ``front``, ``rear``.
     """
@@ -86,18 +86,18 @@ def read_vehicle(path: str | PathLike[str]) -> Vehicle:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """Pose of the car body at n places, seen in the direction of rising chainage.
+    """Position and attitude of the car body at n chainages, facing rising chainage.
 
     Attributes
     ----------
     lower_m, upper_m : ndarray, shape (n,) [m]
-        Chainage of the bogie centres, the lower first.
+        Chainage of the bogie centres, the lower one first.
     origin : ndarray, shape (n, 3) [m]
         Midway between the bogie centres, ECEF.
     forward, right, up : ndarray, shape (n, 3)
         Unit vectors of the body.
     roll_rad : ndarray, shape (n,)
-        Lean to the right.
+        Roll to the right.
     """
 
     lower_m: Floats
@@ -110,7 +110,7 @@ class Body:
 
 
 class _Line:
-    """The centreline as a function of chainage, with the lean that its cant gives a bogie."""
+    """Centreline and roll of a bogie by cant, as functions of chainage."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
         self.chainage = track.chainage_m
@@ -123,12 +123,12 @@ class _Line:
         cant, self.notes = _signed_cant(track)
         if (np.abs(cant) >= contact_spacing_m).any():
             raise MismatchError(
-                f"{track.name}: a cant of {np.abs(cant).max():g} m is more than the track is wide; is it in mm?"
+                f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; is it in mm?"
             )
         self.roll = np.arcsin(cant / contact_spacing_m)
 
     def at(self, chainage: Floats) -> Floats:
-        """Points, shape (n, 3); beyond the ends the first and last segments go on straight."""
+        """Return points, shape (n, 3); the first and last segments are extended straight."""
         index = np.clip(np.searchsorted(self.chainage, chainage, side="right") - 1, 0, len(self.tangent) - 1)
         return np.asarray(self.points[index] + (chainage - self.chainage[index])[:, None] * self.tangent[index])
 
@@ -137,18 +137,18 @@ class _Line:
 
 
 def _signed_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
-    """Cant, positive where the body leans to the right, and what had to be assumed.
+    """Return the cant, positive for roll to the right, and notes on assumptions.
 
-    The side is that of the curve the point is on by its radius; at a canted point that the map calls
-    straight (the foot of a ramp) that of the nearest curve; without radii that of the curve itself.
+    The side follows from the sign of the radius; at a canted point of straight track (the foot of a
+    ramp) from the nearest curve; without radii from the bend of the centreline.
     """
     cant = np.where(np.isnan(track.cant_m), 0.0, track.cant_m)
     canted = cant != 0.0
     notes: list[str] = []
     if np.isnan(track.cant_m).all():
-        notes.append("the track map has no cant: the body is taken as upright in curves")
+        notes.append("the track map has no cant: the body is assumed upright in curves")
     elif np.isnan(track.cant_m).any():
-        notes.append(f"cant is taken as 0 at {int(np.isnan(track.cant_m).sum())} points where the map has none")
+        notes.append(f"cant is assumed to be 0 at {int(np.isnan(track.cant_m).sum())} points where the map has none")
     if not canted.any():
         return cant, tuple(notes)
     with np.errstate(divide="ignore"):
@@ -165,7 +165,7 @@ def _signed_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
 
 
 def _turning_side(track: Track) -> Floats:
-    """+1 where the centreline bends to the right, -1 to the left, 0 where straight, shape (V,)."""
+    """Return +1 where the centreline bends to the right, -1 to the left, 0 where straight, shape (V,)."""
     steps = np.diff(track.ecef_m, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
     up = enu_axes(track.latitude_deg, track.longitude_deg)[1:-1, 2]
@@ -174,24 +174,24 @@ def _turning_side(track: Track) -> Floats:
 
 
 def _bogies(line: _Line, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
-    """Chainage of the bogies, equally far from `middle`, at the bogie distance as a chord."""
+    """Find the chainages of the bogies, symmetric about `middle`, at the bogie distance as a chord."""
     half = np.full(len(middle), distance_m / 2.0)
-    todo = np.arange(len(middle))
+    active = np.arange(len(middle))
     for _ in range(_MAX_ITERATIONS):
-        chord = np.linalg.norm(line.at(middle[todo] + half[todo]) - line.at(middle[todo] - half[todo]), axis=1)
+        chord = np.linalg.norm(line.at(middle[active] + half[active]) - line.at(middle[active] - half[active]), axis=1)
         missing = distance_m - chord
-        half[todo] += missing / 2.0
-        todo = todo[np.abs(missing) > _SETTLED_M]
-        if not todo.size:
+        half[active] += missing / 2.0
+        active = active[np.abs(missing) > _CONVERGED_M]
+        if not active.size:
             return middle - half, middle + half
     raise MismatchError(
-        f"{track.name}: the line turns back on itself near chainage {middle[todo[0]]:.1f} m, "
+        f"{track.name}: the line turns back on itself near chainage {middle[active[0]]:.1f} m, "
         f"where no bogie distance of {distance_m:g} m fits"
     )
 
 
 def body_pose(track: Track, vehicle: Vehicle, middle_m: Floats) -> Body:
-    """Pose of the body with its bogies equally far along the track from given chainages.
+    """Compute position and attitude of the body with its bogies symmetric about given chainages.
 
     Parameters
     ----------
@@ -238,18 +238,18 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _Line, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Chainage of the centreline point abeam the antenna: in the plane through it square to the body."""
+    """Find the chainage of the centreline point abeam the antenna: in the plane perpendicular to the body."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
         chainage -= ahead
-        if np.abs(ahead).max() < _SETTLED_M:
+        if np.abs(ahead).max() < _CONVERGED_M:
             return chainage
-    raise MismatchError("the line turns so sharply that no point of it is abeam the antenna")
+    raise MismatchError("the line bends so sharply that no point of it is abeam the antenna")
 
 
 def _refined(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
-    """Places of the body's middle: the points of the track, and more where the path bends between them."""
+    """Choose chainages of the body's middle: the points of the track, and more where the path bends between them."""
     half = _end_halves(line, track, vehicle)
     first, last = half[0], line.chainage[-1] - half[1]
     if not last - first > 0.0:
@@ -279,7 +279,7 @@ def _refined(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset)
 
 
 def _end_halves(line: _Line, track: Track, vehicle: Vehicle) -> tuple[float, float]:
-    """How far the body's middle stays from either end with both bogies on the track."""
+    """Find the distance of the body's middle from either end at which both bogies are on the track."""
     first, last = 0.0, line.chainage[-1]
     half = np.full(2, vehicle.bogie_distance_m / 2.0)
     for _ in range(_MAX_ITERATIONS):
@@ -287,7 +287,7 @@ def _end_halves(line: _Line, track: Track, vehicle: Vehicle) -> tuple[float, flo
         lower, upper = _bogies(line, middle, vehicle.bogie_distance_m, track)
         short = np.array([first - lower[0], upper[1] - last])
         half += short
-        if np.abs(short).max() < _SETTLED_M:
+        if np.abs(short).max() < _CONVERGED_M:
             break
     return float(half[0]), float(half[1])
 
@@ -299,13 +299,12 @@ def antenna_trajectory(
     *,
     reference: Reference = "antenna",
 ) -> Trajectory:
-    """Path of a roof antenna of a vehicle that runs over the track.
+    """Compute the trajectory of a roof antenna of a vehicle on the track.
 
-    Both bogie centres lie on the centreline at the bogie distance (a chord). At each bogie the
-    track leans by ``asin(cant / contact spacing)`` toward the inside of the curve; the body leans
-    by the mean of the two (P1 3.1(1)). The body's forward axis joins the bogie centres, its up axis
-    is gravity's up leant about it. The path starts and ends where a bogie reaches the end of the
-    track: nothing is invented beyond.
+    Both bogie centres are on the centreline at the bogie distance (a chord). At each bogie the track
+    rolls by ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean
+    of the two (P1 3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the
+    vertical rotated by the roll. The path begins and ends where a bogie reaches the end of the track.
 
     Parameters
     ----------
@@ -313,23 +312,23 @@ def antenna_trajectory(
     vehicle : Vehicle
     antenna : {"front", "rear"}
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
-        The point of the vehicle whose chainage is given: the centreline point abeam the antenna
-        (beyond the outer bogies the centreline goes on straight), the middle between the bogies, or a
-        bogie centre; front and rear are those of the vehicle.
+        Point of the vehicle to which the chainage refers: the centreline point abeam the antenna
+        (beyond the outer bogies the centreline is extended straight), the middle between the bogies,
+        or a bogie centre; front and rear are those of the vehicle.
 
     Returns
     -------
     Trajectory
-        With a point where the body's middle passes each point of the track, and more where the path
-        bends by over `PATH_TOLERANCE_M` in between.
+        One point where the body's middle passes each point of the track, and more where the path
+        deviates from a chord by more than `PATH_TOLERANCE_M`.
 
     Raises
     ------
     SettingsError
         The vehicle has no such antenna.
     MismatchError
-        Track and vehicle do not fit: the track is shorter than the vehicle, turns too sharply, has cant
-        whose side is unknown, or is an antenna's path itself.
+        Track and vehicle do not match: the track is shorter than the vehicle, bends too sharply, has
+        cant of unknown side, or is itself the path of an antenna.
     """
     if ANTENNA_PATH in track.provenance.notes:
         raise MismatchError(f"{track.name}: {ANTENNA_PATH}; use it without a vehicle file")
@@ -352,7 +351,7 @@ def antenna_trajectory(
     if not (np.diff(chainage) > 0).all():
         i = int(np.argmin(np.diff(chainage)))
         raise MismatchError(
-            f"{track.name}: the line turns so sharply near chainage {chainage[i]:.1f} m that the antenna runs back"
+            f"{track.name}: the line bends so sharply near chainage {chainage[i]:.1f} m that the antenna runs back"
         )
     cant = np.interp(chainage, track.chainage_m, np.where(np.isnan(track.cant_m), 0.0, track.cant_m))
     return Trajectory(
