@@ -1,0 +1,244 @@
+"""Speed, acceleration and way from the instants of a tachometer's pulses (P2 2.2), and checks of its settings.
+
+P2 measures the time between pulses instead of counting pulses: a count needs a moving average, which delays and
+blurs the acceleration. Over the pulses k0 to k the mean speed is ``(k - k0) p / (t_k - t_k0)``; where the acceleration
+is even it is the speed at the middle of the interval, and that instant is returned with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.settings import Settings
+from railfix.core.timescale import seconds, timedelta
+from railfix.motion.samples import TachometerPulses
+
+#: Ratios of a speed in a wrong unit to one in m/s, and the names of the units.
+_UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
+#: A ratio within this share of a unit's is that unit: more than a worn wheel (2 %), less than between two units.
+_UNIT_SHARE: Final = 0.05
+
+
+class TachometerLimits(Settings):
+    """Wheel and window of a tachometer.
+
+    Attributes
+    ----------
+    wheel_diameter_m : float
+    pulses_per_turn : int
+        After multiplication of edges.
+    window_s : float
+        Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth
+        take that of a whole turn.
+    least_speed_mps : float
+        Below it nothing is said: P2 1, no output at low speed; 1 km/h.
+    silence_s : float
+        Time without a pulse after which nothing is said.
+    jitter_s, resolution_s : float
+        Standard deviation of a pulse's instant, and the step of the clock that measures it.
+    """
+
+    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)
+    pulses_per_turn: int = Field(default=60, ge=1)
+    window_s: float = Field(default=0.1, gt=0)
+    least_speed_mps: float = Field(default=1.0 / 3.6, gt=0)
+    silence_s: float = Field(default=0.3, gt=0)
+    jitter_s: float = Field(default=5e-6, ge=0)
+    resolution_s: float = Field(default=1e-6, ge=0)
+
+    @property
+    def pulse_m(self) -> float:
+        """Way of one pulse [m]."""
+        return float(np.pi) * self.wheel_diameter_m / self.pulses_per_turn
+
+
+@dataclass(frozen=True, kw_only=True)
+class PulseSpeeds:
+    """Speeds at N instants asked for.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        Instant at which each speed holds, earlier than the one asked for; NaT where there is none.
+    speed_mps : ndarray, shape (N,) [m/s]
+        With the sign of the direction; NaN where the pulses say nothing.
+    sigma_mps : ndarray, shape (N,) [m/s]
+        By jitter and clock; the wheel's scale comes beside it.
+    bound_mps : ndarray, shape (N,) [m/s]
+        Size that the speed cannot exceed since the last pulse: ``p / (t - t_k)``; NaN before the first.
+    """
+
+    time: Datetimes
+    speed_mps: Floats
+    sigma_mps: Floats
+    bound_mps: Floats
+
+
+def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> PulseSpeeds:
+    """Return speeds from the intervals of pulses, each from pulses up to its instant.
+
+    Parameters
+    ----------
+    pulses : TachometerPulses
+    time : ndarray of datetime64[ns], shape (N,)
+    limits : TachometerLimits, optional
+    """
+    limits = limits or TachometerLimits()
+    last = np.searchsorted(pulses.time, time, side="right") - 1
+    some = last >= 1
+    if not len(pulses) or not some.any():
+        nothing = np.full(len(time), np.nan)
+        return PulseSpeeds(
+            time=np.full(len(time), np.datetime64("NaT", "ns")), speed_mps=nothing, sigma_mps=nothing, bound_mps=nothing
+        )
+    at = np.maximum(last, 0)
+    first = window_start(pulses.time, at, limits.window_s)
+    count = np.abs(pulses.pulse[at] - pulses.pulse[first]).astype(np.float64)
+    duration = seconds(pulses.time[at] - pulses.time[first])
+    since = seconds(time - pulses.time[at])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = count * limits.pulse_m / duration
+        spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
+        bound = np.where(last >= 0, limits.pulse_m / np.maximum(since, 1e-9), np.nan)
+    valid = some & (duration > 0) & (size >= limits.least_speed_mps) & (since <= limits.silence_s)
+    # A pulse that has not come yet bounds the speed too.
+    valid &= bound >= 0.5 * size
+    sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
+    middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
+    return PulseSpeeds(
+        time=np.where(valid, middle, np.datetime64("NaT", "ns")),
+        speed_mps=np.where(valid, sign * size, np.nan),
+        sigma_mps=np.where(valid, spread, np.nan),
+        bound_mps=bound,
+    )
+
+
+def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
+    """Return the last pulse not after a window before each pulse, at least one pulse back; the first at the start."""
+    start = np.searchsorted(time, time[last] - timedelta(np.full(len(last), window_s)), side="right") - 1
+    return np.asarray(np.maximum(np.minimum(start, last - 1), 0), dtype=np.intp)
+
+
+def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
+    """Return the difference of two speeds over that of the instants they hold at [m/s2]; NaN where one is missing."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((late.speed_mps - early.speed_mps) / seconds(late.time - early.time))
+
+
+def way_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
+    """Return the signed way run up to instants, from pulses up to each [m].
+
+    Between pulses the way goes on at the last speed, by less than one pulse. 0 before the first pulse. Where the
+    sensor has no direction every pulse counts forward.
+
+    Parameters
+    ----------
+    pulses : TachometerPulses
+    time : ndarray of datetime64[ns], shape (N,)
+    limits : TachometerLimits, optional
+    """
+    limits = limits or TachometerLimits()
+    if not len(pulses):
+        return np.zeros(len(time))
+    step = np.diff(pulses.pulse, prepend=pulses.pulse[0] - 1).astype(np.float64)
+    sign = np.where(pulses.direction == 0, 1.0, pulses.direction.astype(np.float64))
+    total = np.concatenate([[0.0], np.cumsum(np.abs(step) * sign)])
+    last = np.searchsorted(pulses.time, time, side="right") - 1
+    speed = pulse_speeds(pulses, time, limits=limits)
+    since = seconds(time - pulses.time[np.maximum(last, 0)])
+    ahead = np.clip(np.nan_to_num(speed.speed_mps * since / limits.pulse_m), -1.0, 1.0)
+    return np.asarray(limits.pulse_m * (total[last + 1] + np.where(last >= 0, ahead, 0.0)))
+
+
+def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
+    """Return pulses before which one was lost, and pulses that are one of a doubled pair, shapes (P,).
+
+    An interval of twice both neighbours holds a lost pulse (also one that `pulse` numbers show); two successive
+    intervals of together one neighbour are a doubled one.
+    """
+    count = len(pulses)
+    lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
+    if count < 5:
+        return lost, doubled
+    interval = seconds(np.diff(pulses.time))
+    before, after = interval[:-2], interval[2:]
+    even = np.abs(before - after) < 0.3 * np.minimum(before, after)
+    lost[2:-1] = even & (np.abs(interval[1:-1] / (0.5 * (before + after)) - 2.0) < 0.3)
+    lost[1:] |= np.diff(pulses.pulse) > 1
+    pair = interval[1:-2] + interval[2:-1]
+    outer = 0.5 * (interval[:-3] + interval[3:])
+    close = np.abs(interval[:-3] - interval[3:]) < 0.3 * outer
+    doubled[2:-2] = close & (np.abs(pair / outer - 1.0) < 0.2)
+    return lost, doubled
+
+
+def wheel_scale(way_gnss_m: float, way_wheel_m: float, gnss_sigma_m: float) -> tuple[float, float]:
+    """Return the ratio of the true way to the wheel's, and its standard deviation ``sqrt(2) sigma / way``."""
+    return way_gnss_m / way_wheel_m, float(np.sqrt(2.0)) * gnss_sigma_m / abs(way_wheel_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpeedCheck:
+    """A log of speeds against speeds known to be right.
+
+    Attributes
+    ----------
+    ratio : float
+        Logged over right, without the unit.
+    unit : str
+        "m/s", or the unit that the log is really in.
+    lag_s : float
+        By how much its time tags are late.
+    """
+
+    ratio: float
+    unit: str
+    lag_s: float
+
+
+def check_speeds(
+    time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats, *, largest_lag_s: float = 3.0
+) -> SpeedCheck:
+    """Return scale, unit and lag of logged speeds by the least squares of their sizes over a search of lags.
+
+    Parameters
+    ----------
+    time, speed_mps : ndarray, shape (N,)
+        As logged.
+    right_time, right_mps : ndarray, shape (M,)
+        For example by Doppler.
+    largest_lag_s : float
+
+    Raises
+    ------
+    ValueError
+        Fewer than ten speeds over 1 m/s in common.
+    """
+    known = np.isfinite(right_mps)
+    right_t = seconds(right_time[known] - right_time[0])
+    size = np.abs(right_mps[known])
+    t = seconds(time - right_time[0])
+    lags = np.arange(-largest_lag_s, largest_lag_s + 0.05, 0.1)
+    costs, ratios = np.full(len(lags), np.inf), np.full(len(lags), np.nan)
+    for k, lag in enumerate(lags.tolist()):
+        right = np.interp(t - lag, right_t, size, left=np.nan, right=np.nan)
+        use = np.isfinite(right) & np.isfinite(speed_mps) & (right > 1.0)
+        if use.sum() >= 10:
+            logged = np.abs(speed_mps[use])
+            ratios[k] = float((logged * right[use]).sum() / (right[use] ** 2).sum())
+            costs[k] = float(np.mean((logged / ratios[k] - right[use]) ** 2))
+    if not np.isfinite(costs).any():
+        raise ValueError("fewer than ten speeds over 1 m/s in common; give a longer log")
+    best = int(np.argmin(costs))
+    ratio = float(ratios[best])
+    unit = next((f for f in _UNITS if abs(ratio / f - 1.0) < _UNIT_SHARE), None)
+    return SpeedCheck(
+        ratio=ratio if unit is None else ratio / unit,
+        unit="m/s" if unit is None else _UNITS[unit],
+        lag_s=round(float(lags[best]), 3),
+    )
