@@ -113,4 +113,4 @@ def part(epochs: GnssEpochs, which: slice) -> GnssEpochs:
 def wheel(ride: Ride, *, scale: float = 0.0) -> SensorEpochs:
     """Way of a wheel too short by a share."""
     way = np.concatenate([[np.nan], np.diff(ride.arc_m)]) / (1.0 + scale)
-    return SensorEpochs(wheel_m={"wheel": way}, wheel_sigma_m={"wheel": np.full(len(way), 0.02)})
+    return SensorEpochs(wheel_m=way, wheel_sigma_m=np.full(len(way), 0.02))

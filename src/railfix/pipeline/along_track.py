@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -13,11 +13,13 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.signals import carrier_frequency_hz
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.sensor_epochs import SensorState, sensor_epochs
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Kind, Line, SensorEpochs, Tracked, TrackState, track
+from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackState, track
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
 _WEIGHED_BY_FILTER: Final = (
@@ -40,6 +42,7 @@ class FilterState:
 
     slips: SlipState | None = None
     track: TrackState | None = None
+    sensors: SensorState = field(default_factory=SensorState.empty)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +88,7 @@ def along_track(
     config: Config,
     state: FilterState,
     *,
-    sensors: SensorEpochs | None = None,
+    samples: SensorSamples | None = None,
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna, and the state to pass on.
 
@@ -99,10 +102,11 @@ def along_track(
     navigation : Navigation
     config : Config
     state : FilterState
-    sensors : SensorEpochs, optional
-        Sensor measurements at the epochs of the ranges.
+    samples : SensorSamples, optional
+        Of the sensors on board since the chunk before.
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
+    sensors, kept = sensor_epochs(samples, epochs.time, trajectory, state.sensors, limits=config.sensors)
     tracked, after = track(epochs, Line.of(trajectory), state.track, limits=config.tracking, sensors=sensors)
     arc = tracked.arc_m
     inside = np.where((arc >= 0.0) & (arc <= trajectory.arc_m[-1]), arc, np.nan)
@@ -121,7 +125,7 @@ def along_track(
         direction=direction.astype(np.int8),
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
     )
-    return result, FilterState(slips=slips, track=after)
+    return result, FilterState(slips=slips, track=after, sensors=kept)
 
 
 def gnss_epochs(

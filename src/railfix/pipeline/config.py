@@ -27,6 +27,7 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from railfix.core.settings import Settings, load_settings, validated
 from railfix.integrity.protection import RiskBudget
+from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.positioning.carrier import ContinuityLimits, PhaseLimits, SlipLimits, SmoothingLimits
 from railfix.positioning.constrained import ConstrainedLimits
 from railfix.positioning.intersystem_bias import ClockOffsetLimits
@@ -177,6 +178,8 @@ class Config(ScreenSettings):
         sensors, from this and earlier epochs), into a table of its own. `railfix run` and `railfix demo` ask for it.
     tracking : TrackingLimits
         Noise of motion and measurements of that filter.
+    sensors : SensorLimits
+        Noise of the sensors on board, and the wheel of the tachometer.
     slips, smoothing, continuity, phase
         Limits of the stages of the carrier phase.
     """
@@ -217,6 +220,7 @@ class Config(ScreenSettings):
     phase: PhaseLimits = PhaseLimits()
     filter: Literal["track", "off"] = "off"
     tracking: TrackingLimits = TrackingLimits()
+    sensors: SensorLimits = SensorLimits()
     clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()

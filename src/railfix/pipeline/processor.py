@@ -124,7 +124,7 @@ class EpochProcessor:
         *,
         navigation: Navigation | None = None,
         messages: SbasMessages | None = None,
-        sensors: SensorSamples | None = None,  # noqa: ARG002  the filter along the track will use them
+        sensors: SensorSamples | None = None,
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state to pass on with the next one.
 
@@ -140,7 +140,7 @@ class EpochProcessor:
         messages : SbasMessages, optional
             SBAS messages received since the chunk before.
         sensors : SensorSamples, optional
-            Samples of the sensors on board since the chunk before; not used yet.
+            Samples of the sensors on board since the chunk before, for the filter along the track.
 
         Raises
         ------
@@ -189,6 +189,7 @@ class EpochProcessor:
                 received.navigation,
                 self.config,
                 filters.get(name, FilterState()),
+                samples=sensors,
             )
         notes = (*received.notes, *self._lacking)
         result = Result(antennas=results, notes=notes, fusion=tracks)

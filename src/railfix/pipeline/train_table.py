@@ -33,7 +33,7 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "standstill": "slower than 1 km/h with two sigmas",
     "branch_probability": "probability of the place given against other places of the line",
     "hypotheses": "places that are possible",
-    "sources": "measurements used with a weight of more than a half: `code`, `phase`, `doppler`, `wheel`, `speed`, "
+    "sources": "measurements used with a weight of more than a half: `code`, `phase`, `doppler`, `wheel`, `radar`, "
     "`force`, `place`",
     "latitude_deg": "antenna, WGS 84",
     "longitude_deg": "antenna, WGS 84",

@@ -15,6 +15,7 @@ import numpy as np
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
+from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor, State
 from railfix.pipeline.protection_levels import level_facts, risk_of
@@ -34,6 +35,7 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
+from railfix.run.sensors import read_sensors, until
 from railfix.run.sources import Line, Log, open_line
 from railfix.run.tally import Tally
 from railfix.track import check_track
@@ -114,7 +116,8 @@ def run_files(
         entries = inputs.entries(pool, out)
         navigation, line, logs = open_inputs(inputs, options)
         processor = processor_of(config, navigation, line.trajectories)
-        tally = _position(logs, processor, folder, options, progress)
+        sensors = read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
+        tally = _position(logs, processor, sensors, folder, options, progress)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
@@ -196,15 +199,19 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
 def _position(
     logs: Mapping[Antenna, Log],
     processor: EpochProcessor,
+    sensors: SensorSamples,
     folder: OutputFolder,
     options: RunOptions,
     progress: Progress | None,
 ) -> Tally:
     """Chunk by chunk: positions, counts, rows."""
     tally, state = Tally(min_satellites=processor.config.min_satellites), State()
+    received = np.datetime64("NaT", "ns")
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
         began = clock.perf_counter()
-        result, state = processor.process(chunk, state)
+        end = max(part.time[-1] for part in chunk.values() if len(part))
+        result, state = processor.process(chunk, state, sensors=until(sensors, received, end))
+        received = end
         tally.took(result, clock.perf_counter() - began)
         tally.add(result)
         check_same_day(processor.received.navigation, tally)

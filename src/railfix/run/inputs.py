@@ -85,6 +85,8 @@ class RunInputs(InputFiles):
     track : tuple of Path
         Track map, joined to a route in this order.
     vehicle : Path or None
+    tachometer, inertial, radar : Path or None
+        Tables of the sensors on board.
     truth : Path or None
         Reference positions, for `ablate` alone.
     config : Path or None
@@ -103,6 +105,13 @@ class RunInputs(InputFiles):
     )
     sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
     vehicle: Path | None = vehicle_option()
+    tachometer: Path | None = input_option(
+        "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; its wheel "
+        "stands in the settings sensors.tachometer.",
+        None,
+    )
+    inertial: Path | None = input_option("Specific forces and rates of an inertial unit: CSV or Parquet.", None)
+    radar: Path | None = input_option("Speeds of a Doppler radar: CSV or Parquet with time_gpst, speed_mps.", None)
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -51,28 +51,31 @@ class GnssEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorEpochs:
-    """Sensor measurements at the same epochs, by name of the source, shape (T,) each; NaN where there is none.
+    """Sensor measurements at the same epochs, shape (T,) each, NaN where there is none; None without the sensor.
 
     Attributes
     ----------
-    wheel_m, wheel_sigma_m : mapping of str to ndarray [m]
-        Signed way since the epoch before.
-    speed_mps, speed_sigma_mps : mapping of str to ndarray [m/s]
-        Speed along the track, + toward rising chainage.
+    wheel_m, wheel_sigma_m : ndarray or None [m]
+        Way since the epoch before by the wheel, + toward rising chainage.
+    wheel_sign : {"measured", "unknown"}
+        "unknown": the way has no sign and takes that of the speed.
+    radar_m, radar_sigma_m : ndarray or None [m]
+        The same by the radar: over a way the swings of the body cancel (P2 3.2).
     force_mps2, force_sigma_mps2 : ndarray or None [m/s2]
-        Mean specific force along rising chainage since the epoch before, gravity included.
-    place_m, place_sigma_m : mapping of str to ndarray [m]
-        Arc length.
+        Mean specific force along rising chainage since the epoch before, gravity on the gradient included.
+    place_m, place_sigma_m : ndarray or None [m]
+        Arc length, by a feature of the line or ranges to ground units.
     """
 
-    wheel_m: Mapping[str, Floats] = field(default_factory=dict)
-    wheel_sigma_m: Mapping[str, Floats] = field(default_factory=dict)
-    speed_mps: Mapping[str, Floats] = field(default_factory=dict)
-    speed_sigma_mps: Mapping[str, Floats] = field(default_factory=dict)
+    wheel_m: Floats | None = None
+    wheel_sigma_m: Floats | None = None
+    wheel_sign: Literal["measured", "unknown"] = "measured"
+    radar_m: Floats | None = None
+    radar_sigma_m: Floats | None = None
     force_mps2: Floats | None = None
     force_sigma_mps2: Floats | None = None
-    place_m: Mapping[str, Floats] = field(default_factory=dict)
-    place_sigma_m: Mapping[str, Floats] = field(default_factory=dict)
+    place_m: Floats | None = None
+    place_sigma_m: Floats | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -172,7 +172,7 @@ def _all_rows(
     dt: float,
     noise: tuple[Floats, ...],
 ) -> Rows:
-    return joined(gnss_rows(channels, line, mean, point, dt, noise), sensor_rows(sensors, epoch, line, mean))
+    return joined(gnss_rows(channels, line, mean, point, dt, noise), sensor_rows(sensors, epoch, line, mean, dt))
 
 
 def _settled(

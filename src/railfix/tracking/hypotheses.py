@@ -102,7 +102,7 @@ def begin(
     mean[:, Unknown.PLACE] = mean[:, Unknown.BEFORE] = arc_m
     variance = np.ones((len(arc_m), width))
     variance[:, Unknown.PLACE] = variance[:, Unknown.BEFORE] = sigma_m**2
-    variance[:, Unknown.SPEED] = _ANY_SPEED_MPS**2
+    variance[:, Unknown.SPEED] = variance[:, Unknown.SPEED_BEFORE] = _ANY_SPEED_MPS**2
     variance[:, Unknown.ACCELERATION] = limits.acceleration_mps2**2
     variance[:, Unknown.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, Unknown.MAP_RIGHT] = line.sigma_plan_m**2

@@ -58,6 +58,8 @@ def predicted(mean: Floats, covariance: Floats, line: Line, dt: float, limits: T
     move[:, :3, :3] = step
     move[:, Unknown.BEFORE, :] = 0.0
     move[:, Unknown.BEFORE, Unknown.PLACE] = 1.0
+    move[:, Unknown.SPEED_BEFORE, :] = 0.0
+    move[:, Unknown.SPEED_BEFORE, Unknown.SPEED] = 1.0
     move[:, Unknown.PHASE_CLOCK, :] = 0.0
     move[:, Unknown.PHASE_CLOCK, Unknown.DRIFT] = dt
     for fresh in FRESH:
@@ -77,6 +79,7 @@ def predicted(mean: Floats, covariance: Floats, line: Line, dt: float, limits: T
     spread = move @ covariance @ np.swapaxes(move, 1, 2)
     spread[:, :3, :3] += noise
     spread[:, Unknown.PLACE, Unknown.PLACE] += _LEAST_STEP_M2
+    spread[:, Unknown.SPEED, Unknown.SPEED] += _LEAST_STEP_M2
     walk = limits.clock_walk_mps**2
     spread[:, Unknown.DRIFT, Unknown.DRIFT] += walk * dt
     spread[:, Unknown.PHASE_CLOCK, Unknown.PHASE_CLOCK] += walk * dt**3 / 3.0 + 1e-6

@@ -5,9 +5,9 @@ With u the unit vector from receiver to satellite, e the tangent, c and h the ax
     code    P = range(s + z) - u.c m_c - u.h m_h + b + o_g + sigma x_i + noise
     Doppler r = A + slope (v + w) - u.(c q_c + h q_h) / dt + d + noise
     phase   change L = range_k(s) - range_{k-1}(s') - u.(g q_a + c q_c + h q_h) + B + noise
-    wheel   W (1 + k) = s - s';  force f = a + g sin(gradient) + beta;  radar (1 + k) = v;  place = s
+    wheel   W (1 + k) = s - s', radar alike;  force f = (v - v') / dt + g sin(gradient) + beta;  place = s
 
-s' is the arc length at the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
+s' and v' are those of the epoch before, x_i the satellite's correlated error in units of its sigma, o_g the offset
 of its constellation's code clock, w the time-correlated error of Dopplers, z that of
 the codes' place over minutes, m the map's error, q the error of the map's displacement over the epoch. The
 gradient g of the phase's change is one for both ends: the direction of the chord. With a gradient for each end the
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -44,7 +44,7 @@ class Kind(IntEnum):
     PHASE = 1
     DOPPLER = 2
     WHEEL = 3
-    SPEED = 4
+    RADAR = 4
     FORCE = 5
     PLACE = 6
 
@@ -224,46 +224,43 @@ def gnss_rows(
     )
 
 
-def sensor_rows(sensors: SensorEpochs, epoch: int, line: Line, mean: Floats) -> Rows | None:
+def sensor_rows(sensors: SensorEpochs, epoch: int, line: Line, mean: Floats, dt: float) -> Rows | None:
     """Rows of the sensors at one epoch, None without any."""
-    count, width = mean.shape
-    listed: list[tuple[dict[int, Floats | float], Floats, float, Kind]] = []
-    for name, way in sensors.wheel_m.items():
-        if np.isfinite(way[epoch]):
-            coefficients: dict[int, Floats | float] = {
-                Unknown.PLACE: 1.0,
-                Unknown.BEFORE: -1.0,
-                Unknown.WHEEL: -float(way[epoch]),
-            }
-            computed = mean[:, Unknown.PLACE] - mean[:, Unknown.BEFORE] - float(way[epoch]) * mean[:, Unknown.WHEEL]
-            listed.append((coefficients, way[epoch] - computed, sensors.wheel_sigma_m[name][epoch], Kind.WHEEL))
-    for name, speed in sensors.speed_mps.items():
-        if np.isfinite(speed[epoch]):
-            coefficients = {Unknown.SPEED: 1.0, Unknown.RADAR: -float(speed[epoch])}
-            computed = mean[:, Unknown.SPEED] - float(speed[epoch]) * mean[:, Unknown.RADAR]
-            listed.append((coefficients, speed[epoch] - computed, sensors.speed_sigma_mps[name][epoch], Kind.SPEED))
-    force, force_sigma = sensors.force_mps2, sensors.force_sigma_mps2
-    if force is not None and force_sigma is not None and np.isfinite(force[epoch]):
-        slope = line.gradient_at(0.5 * (mean[:, Unknown.PLACE] + mean[:, Unknown.BEFORE]))
+    state = {unknown: mean[:, unknown] for unknown in Unknown}
+    moved = state[Unknown.PLACE] - state[Unknown.BEFORE]
+    listed: list[tuple[dict[Unknown, Any], Floats, float, Kind]] = []
+    coefficients: dict[Unknown, Any]
+    for way, sigma, scale, kind in (
+        (sensors.wheel_m, sensors.wheel_sigma_m, Unknown.WHEEL, Kind.WHEEL),
+        (sensors.radar_m, sensors.radar_sigma_m, Unknown.RADAR, Kind.RADAR),
+    ):
+        if way is not None and sigma is not None and np.isfinite(way[epoch]):
+            unsigned = kind is Kind.WHEEL and sensors.wheel_sign == "unknown"
+            signed = float(way[epoch]) * (np.sign(state[Unknown.SPEED]) if unsigned else np.ones(len(mean)))
+            value = signed * (1.0 + state[scale]) - moved
+            coefficients = {Unknown.PLACE: 1.0, Unknown.BEFORE: -1.0, scale: -signed}
+            listed.append((coefficients, value, float(sigma[epoch]), kind))
+    force, sigma = sensors.force_mps2, sensors.force_sigma_mps2
+    if force is not None and sigma is not None and np.isfinite(force[epoch]):
+        slope = line.gradient_at(0.5 * (state[Unknown.PLACE] + state[Unknown.BEFORE]))
         gravity = _GRAVITY_MPS2 * slope / np.sqrt(1.0 + slope**2)
-        computed = mean[:, Unknown.ACCELERATION] + gravity + mean[:, Unknown.FORCE_OFFSET]
-        coefficients = {Unknown.ACCELERATION: 1.0, Unknown.FORCE_OFFSET: 1.0}
-        sigma = float(force_sigma[epoch])
-        listed.append((coefficients, force[epoch] - computed, sigma, Kind.FORCE))
-    for name, place in sensors.place_m.items():
-        if np.isfinite(place[epoch]):
-            sigma = float(sensors.place_sigma_m[name][epoch])
-            listed.append(({Unknown.PLACE: 1.0}, place[epoch] - mean[:, Unknown.PLACE], sigma, Kind.PLACE))
+        gained = (state[Unknown.SPEED] - state[Unknown.SPEED_BEFORE]) / dt
+        value = force[epoch] - gained - gravity - state[Unknown.FORCE_OFFSET]
+        coefficients = {Unknown.SPEED: 1.0 / dt, Unknown.SPEED_BEFORE: -1.0 / dt, Unknown.FORCE_OFFSET: 1.0}
+        listed.append((coefficients, value, float(sigma[epoch]), Kind.FORCE))
+    place, sigma = sensors.place_m, sensors.place_sigma_m
+    if place is not None and sigma is not None and np.isfinite(place[epoch]):
+        listed.append(({Unknown.PLACE: 1.0}, place[epoch] - state[Unknown.PLACE], float(sigma[epoch]), Kind.PLACE))
     if not listed:
         return None
-    design = np.zeros((count, len(listed), width))
+    design = np.zeros((len(mean), len(listed), mean.shape[1]))
     for row, (coefficients, _, _, _) in enumerate(listed):
         for column, coefficient in coefficients.items():
             design[:, row, column] = coefficient
     return Rows(
         design=design,
         value=np.stack([value for _, value, _, _ in listed], axis=1),
-        variance=np.array([float(sigma) ** 2 for _, _, sigma, _ in listed]),
+        variance=np.array([sigma**2 for _, _, sigma, _ in listed]),
         kind=np.array([int(kind) for _, _, _, kind in listed]),
         column=np.full(len(listed), -1, dtype=np.intp),
     )

@@ -47,6 +47,8 @@ class Unknown(IntEnum):
     DOPPLER_SPEED = 15
     #: Displacement along the line by errors of the codes that last minutes (orbits, ionosphere) [m].
     CODE_PLACE = 16
+    #: Speed at the epoch before [m/s].
+    SPEED_BEFORE = 17
 
 
 #: First offset of the clocks.

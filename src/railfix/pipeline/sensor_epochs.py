@@ -1,0 +1,175 @@
+"""Sensor samples of a chunk as measurements of the filter at the epochs of an antenna."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.settings import Settings
+from railfix.core.timescale import seconds
+from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.motion.tachometer import TachometerLimits, tooth_faults, way_m, window_start
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import SensorEpochs
+
+#: Longest time between epochs over which a way or a mean force is taken [s].
+_LONGEST_S: Final = 5.0
+#: Share of the samples of an interval that must be there for its mean.
+_COMPLETE: Final = 0.9
+
+Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds)
+
+
+class SensorLimits(Settings):
+    """Noise of the sensors as the filter sees them.
+
+    Attributes
+    ----------
+    tachometer : TachometerLimits
+    wheel_sigma_m : float
+        Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
+    radar_sigma_mps, radar_step_s : float
+        Of one speed, and the usual time between two.
+    force_sigma_mps2 : float
+        Of a mean force between two epochs: pitching of the body beside the sensor's noise (1 mrad is 0.01 m/s2),
+        and the map's gradient.
+    """
+
+    tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
+    wheel_sigma_m: float = Field(default=0.01, gt=0)
+    radar_sigma_mps: float = Field(default=0.1, gt=0)
+    radar_step_s: float = Field(default=0.1, gt=0)
+    force_sigma_mps2: float = Field(default=0.05, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorState:
+    """Samples that the next chunk still needs.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Last epoch; NaT before the first.
+    samples : SensorSamples
+    """
+
+    time: np.datetime64
+    samples: SensorSamples
+
+    @classmethod
+    def empty(cls) -> SensorState:
+        """State before the first epoch."""
+        return cls(time=np.datetime64("NaT", "ns"), samples=SensorSamples())
+
+
+def sensor_epochs(
+    samples: SensorSamples | None,
+    time: Datetimes,
+    trajectory: Trajectory,
+    state: SensorState,
+    *,
+    limits: SensorLimits,
+) -> tuple[SensorEpochs, SensorState]:
+    """Return ways and forces between the epochs, and the samples to keep.
+
+    Parameters
+    ----------
+    samples : SensorSamples or None
+        Received since the chunk before.
+    time : ndarray of datetime64[ns], shape (T,)
+        Epochs of the antenna.
+    trajectory : Trajectory
+        Tells which way the front points.
+    state : SensorState
+    limits : SensorLimits
+    """
+    samples = samples or SensorSamples()
+    pulses = _together(state.samples.tachometer, samples.tachometer)
+    inertial = _together(state.samples.inertial, samples.inertial)
+    radar = _together(state.samples.radar, samples.radar)
+    if not len(time):
+        kept = SensorSamples(tachometer=pulses, inertial=inertial, radar=radar)
+        return SensorEpochs(), replace(state, samples=kept)
+    first = time[0] if np.isnat(state.time) else state.time
+    edges = np.concatenate([[first], time])
+    facing = 1.0 if trajectory.facing == "rising" else -1.0
+    span = seconds(np.diff(edges))
+    usable = (span > 0.0) & (span <= _LONGEST_S)
+    values: dict[str, Any] = {}
+    if len(pulses):
+        way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
+        known = usable & (edges[:-1] >= pulses.time[0]) & ~_slow(way, span, limits) & ~_faulty(pulses, edges)
+        quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
+        values |= {
+            "wheel_m": np.where(known, facing * way, np.nan),
+            "wheel_sigma_m": np.full(len(time), np.hypot(limits.wheel_sigma_m, quantum)),
+            "wheel_sign": "unknown" if (pulses.direction == 0).all() else "measured",
+        }
+    if len(radar):
+        mean, share = _mean_between(radar.time, radar.speed_mps, edges)
+        known = usable & (share >= _COMPLETE)
+        sigma = limits.radar_sigma_mps * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
+        values |= {"radar_m": np.where(known, facing * mean * span, np.nan), "radar_sigma_m": sigma}
+    if len(inertial):
+        mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
+        known = usable & (share >= _COMPLETE)
+        values |= {
+            "force_mps2": np.where(known, facing * mean, np.nan),
+            "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
+        }
+    kept = SensorSamples(
+        tachometer=_latest(pulses, _needed(pulses, edges[-1], limits)),
+        inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1], side="right") - 1),
+        radar=_latest(radar, np.searchsorted(radar.time, edges[-1], side="right") - 1),
+    )
+    return SensorEpochs(**values), SensorState(time=time[-1], samples=kept)
+
+
+def _slow(way: Floats, span: Floats, limits: SensorLimits) -> Masks:
+    """Whether a wheel has turned too slowly to say anything."""
+    return np.asarray(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
+
+
+def _faulty(pulses: TachometerPulses, edges: Datetimes) -> Masks:
+    """Whether a pulse was lost or doubled between two epochs."""
+    lost, doubled = tooth_faults(pulses)
+    total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[0]) < 2)) | doubled)])
+    # A fault shows with the two pulses after it: an epoch cannot know of one that is not over yet.
+    seen = total[np.maximum(np.searchsorted(pulses.time, edges, side="right") - 2, 0)]
+    return np.asarray(np.diff(seen) > 0)
+
+
+def _needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
+    """First pulse that speeds after an instant may need."""
+    last = int(np.searchsorted(pulses.time, end, side="right")) - 1
+    if last < 1:
+        return 0
+    start = window_start(pulses.time, np.array([last], dtype=np.intp), limits.tachometer.window_s)
+    return max(int(start[0]) - 5, 0)
+
+
+def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Floats, Floats]:
+    """Mean of the samples in each interval after its first edge, and the share of them that is finite."""
+    known = np.isfinite(values)
+    total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
+    count = np.concatenate([[0], np.cumsum(known)])
+    at = np.searchsorted(time, edges, side="right")
+    many, there = np.diff(at), np.diff(count[at])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.diff(total[at]) / there, np.where(many > 0, there / np.maximum(many, 1), 0.0)
+
+
+def _together(before: Samples, after: Samples) -> Samples:
+    """Samples of both, in order of time."""
+    values = {f.name: np.concatenate([getattr(before, f.name), getattr(after, f.name)]) for f in fields(before)}
+    return type(before)(**values)
+
+
+def _latest(samples: Samples, first: int) -> Samples:
+    """Samples from an index on."""
+    start = max(int(first), 0)
+    return type(samples)(**{f.name: getattr(samples, f.name)[start:] for f in fields(samples)})

@@ -1,0 +1,103 @@
+"""Sensor samples as measurements at the epochs of an antenna, however they are cut."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from railfix.core.errors import InputFileError
+from railfix.core.timescale import timedelta
+from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
+from railfix.run.sensors import read_sensors, until
+from tracking_cases import START, bent_line
+
+LIMITS = SensorLimits()
+SECONDS = 20
+
+
+def _samples(speed: float = 10.0, direction: int = 1) -> SensorSamples:
+    pulse = LIMITS.tachometer.pulse_m / speed
+    instants = np.arange(0.0, SECONDS, pulse)
+    fine = np.arange(0.0, SECONDS, 0.01)
+    return SensorSamples(
+        tachometer=TachometerPulses(
+            time=START + timedelta(instants),
+            pulse=np.arange(1, len(instants) + 1),
+            direction=np.full(len(instants), direction),
+        ),
+        inertial=InertialSamples(
+            time=START + timedelta(fine),
+            force_mps2=np.column_stack([np.sin(fine), 0 * fine, 0 * fine - 9.8]),
+            rate_radps=np.zeros((len(fine), 3)),
+        ),
+        radar=RadarSpeeds(time=START + timedelta(fine[::10]), speed_mps=np.full(len(fine[::10]), speed)),
+    )
+
+
+EPOCHS = START + timedelta(np.arange(1.0, SECONDS))
+
+
+@pytest.mark.requirement("E5")
+def test_ways_and_forces_of_each_second() -> None:
+    found, _ = sensor_epochs(_samples(), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS)
+    assert found.wheel_m is not None
+    assert found.radar_m is not None
+    assert found.force_mps2 is not None
+    np.testing.assert_allclose(found.wheel_m[1:], 10.0, atol=1e-3)
+    np.testing.assert_allclose(found.radar_m[1:], 10.0, atol=1e-9)
+    t = np.arange(1.0, SECONDS)
+    np.testing.assert_allclose(found.force_mps2[1:], (np.cos(t[:-1]) - np.cos(t[1:])), atol=0.01)
+    assert found.wheel_sign == "measured"
+
+
+@pytest.mark.requirement("E5")
+def test_the_front_toward_falling_chainage_turns_the_signs() -> None:
+    falling = replace(bent_line(), facing="falling")
+    found, _ = sensor_epochs(_samples(), EPOCHS, falling, SensorState.empty(), limits=LIMITS)
+    assert found.wheel_m is not None
+    assert found.radar_m is not None
+    assert (found.wheel_m[1:] < 0).all()
+    assert (found.radar_m[1:] < 0).all()
+
+
+@pytest.mark.requirement("E2")
+def test_a_wheel_without_direction_is_so_called_and_a_slow_one_says_nothing() -> None:
+    found, _ = sensor_epochs(_samples(direction=0), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS)
+    assert found.wheel_sign == "unknown"
+    slow, _ = sensor_epochs(_samples(0.2), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS)
+    assert slow.wheel_m is not None
+    assert np.isnan(slow.wheel_m).all()
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("cuts", [[1], [3, 4, 11], list(range(1, 19))])
+def test_any_cutting_gives_the_same(cuts: list[int]) -> None:
+    samples, line = _samples(), bent_line()
+    whole, _ = sensor_epochs(samples, EPOCHS, line, SensorState.empty(), limits=LIMITS)
+    state, received, parts = SensorState.empty(), np.datetime64("NaT", "ns"), []
+    for begin, end in zip([0, *cuts], [*cuts, len(EPOCHS)], strict=True):
+        now = EPOCHS[end - 1]
+        part, state = sensor_epochs(until(samples, received, now), EPOCHS[begin:end], line, state, limits=LIMITS)
+        received = now
+        parts.append(part)
+    for name in ("wheel_m", "radar_m", "force_mps2"):
+        np.testing.assert_allclose(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name), atol=1e-9)
+
+
+@pytest.mark.requirement("E2")
+def test_tables_are_read_and_bad_ones_named(tmp_path: Path) -> None:
+    good = tmp_path / "pulses.csv"
+    good.write_text("time_gpst,pulse\n2024-03-05T03:10:00.1,1\n2024-03-05T03:10:00.2,2\n")
+    assert len(read_sensors(tachometer=good).tachometer) == 2
+    bad = tmp_path / "bad.csv"
+    bad.write_text("time_gpst,count\n2024-03-05T03:10:00.1,1\n")
+    with pytest.raises(InputFileError, match="has no column pulse"):
+        read_sensors(tachometer=bad)
+    back = tmp_path / "back.csv"
+    back.write_text("time_gpst,pulse\n2024-03-05T03:10:00.2,1\n2024-03-05T03:10:00.1,2\n")
+    with pytest.raises(InputFileError, match="falls"):
+        read_sensors(tachometer=back)
