@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -173,7 +174,7 @@ def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
         raise ValueError(f"channels of one clock must stand side by side, got {clocks}")
-    return tuple(slice(a, b) for a, b in zip(starts, [*starts[1:], len(clocks)], strict=True))
+    return tuple(slice(a, b) for a, b in pairwise([*starts, len(clocks)]))
 
 
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:

@@ -97,6 +97,9 @@ def robust_fit(
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0
+    if not used.shape[1]:
+        nothing = np.zeros(len(ranges), dtype=np.int64)
+        return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     unknowns, prior = (3, 0.0) if information is None else (1, information)
     freedom = ranges.n_used - ranges.n_clocks - unknowns
     distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])

@@ -321,3 +321,6 @@ class AntennaPairScreen(PairScreen[AntennaPairLimits]):
                 limit=limits.limit_m,
             ),
         )
+
+
+SCREEN = AntennaPairScreen()

@@ -106,3 +106,6 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
                 limit=limits.limit_m,
             ),
         )
+
+
+SCREEN = AntennaSpacingScreen()

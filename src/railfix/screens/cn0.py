@@ -195,3 +195,6 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
                     sides="above",
                 ),
             )
+
+
+SCREEN = Cn0Screen()

@@ -342,3 +342,6 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
                 limit=tables.channels("limit_doppler_m"),
             ),
         )
+
+
+SCREEN = DopplerScreen()

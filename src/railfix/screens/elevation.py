@@ -79,3 +79,6 @@ class ElevationScreen(ObservationScreen[ElevationLimits]):
                 sides="below",
             ),
         )
+
+
+SCREEN = ElevationScreen()

@@ -32,3 +32,6 @@ class RaimScreen(Screen[RaimLimits]):
                 sides="above",
             ),
         )
+
+
+SCREEN = RaimScreen()

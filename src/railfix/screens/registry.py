@@ -1,23 +1,20 @@
-"""Registry of the screens: one line each, in the order in which they judge."""
+"""Registry of the screens: one line each, the name of the screen and of its file, in the order in which they judge."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any, Final
 
-from railfix.screens.antenna_pair import AntennaPairScreen
-from railfix.screens.antenna_spacing import AntennaSpacingScreen
 from railfix.screens.base import Screen
-from railfix.screens.cn0 import Cn0Screen
-from railfix.screens.doppler import DopplerScreen
-from railfix.screens.elevation import ElevationScreen
-from railfix.screens.raim import RaimScreen
 
-#: All screens. First those of single antennas, in this order, then those of two, RAIM, and those of positions.
-SCREENS: Final[tuple[Screen[Any], ...]] = (
-    ElevationScreen(),
-    Cn0Screen(),
-    DopplerScreen(),
-    AntennaPairScreen(),
-    RaimScreen(),
-    AntennaSpacingScreen(),
+_NAMES: Final = (
+    "elevation",
+    "cn0",
+    "doppler",
+    "antenna_pair",
+    "raim",
+    "antenna_spacing",
 )
+
+#: All screens. Those of single antennas judge first, then those of two, then RAIM, then those of positions.
+SCREENS: Final[tuple[Screen[Any], ...]] = tuple(import_module(f"railfix.screens.{name}").SCREEN for name in _NAMES)

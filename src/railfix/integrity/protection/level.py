@@ -195,7 +195,9 @@ def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Int
     """Divide the risk of each epoch."""
     prior = model.used * risk.prior(systems)
     # Excluded satellites count among those that may be faulty, with the largest prior.
-    everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max()], axis=1)
+    everyone = np.concatenate(
+        [prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max(initial=0.0)], axis=1
+    )
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     groups = tuple((s, np.array([t == s for t in systems])) for s in letters)
     group_prior = np.zeros((len(model), len(groups)))

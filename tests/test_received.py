@@ -1,0 +1,169 @@
+"""Navigation records and SBAS messages as they are received, and stages that change nothing that they are given."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline_cases import (
+    ANTENNAS,
+    clean_navigation,
+    clean_observations,
+    clean_trajectories,
+    cut,
+    demo_observations,
+    flat,
+    in_pieces,
+    processor,
+    same,
+)
+from railfix.core.errors import SettingsError
+from railfix.core.reasons import Reason
+from railfix.gnss.navigation import Navigation
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.received import known_from_start, receive
+from railfix.ranges.sbas import read_sbas
+from recordings_score import straight_line
+
+
+def rows(navigation: Navigation, mask: np.ndarray) -> Navigation:
+    """Some of the Keplerian records, and everything else."""
+    kepler = navigation.kepler
+    return replace(navigation, kepler=type(kepler)(**{f.name: getattr(kepler, f.name)[mask] for f in fields(kepler)}))
+
+
+@pytest.mark.requirement("A8")
+def test_records_given_as_they_are_received_give_the_same() -> None:
+    """Each constellation's records come with a chunk of their own; before that its satellites have no ephemeris."""
+    navigation, parts = clean_navigation(), {name: log[:120] for name, log in clean_observations().items()}
+    whole, _ = processor({}).process(parts)
+    letter = navigation.kepler.satellite.astype("<U1")
+    first = rows(navigation, letter == "G")
+    later = rows(navigation, letter != "G")
+    empty = EpochProcessor(parse_config({}), clean_trajectories())
+    alone = processor({}, navigation=first)
+    state, arrived = None, []
+    for k, piece in enumerate(cut(parts, [40, 80])):
+        given = (first, None, later)[k]
+        result, state = empty.process(piece, state, navigation=given)
+        arrived.append(result.antennas["front"])
+    reference, _ = alone.process({name: part[:80] for name, part in parts.items()})
+    same(flat(arrived[0]), flat(alone.process({n: p[:40] for n, p in parts.items()})[0].antennas["front"]), atol=1e-6)
+    np.testing.assert_array_equal(arrived[1].reason, reference.antennas["front"].reason[40:80])
+    others = ~np.char.startswith(arrived[2].satellite, "G")
+    np.testing.assert_array_equal(arrived[2].elevation_deg, whole.antennas["front"].elevation_deg[80:])
+    assert (arrived[2].reason[:, others] == 0).any()
+    seen = (arrived[1].reason[:, others] & Reason.NOT_OBSERVED) == 0
+    assert (arrived[1].reason[:, others][seen] & (Reason.NO_EPHEMERIS | Reason.OTHER_SIGNAL_TAKEN)).all()
+
+
+@pytest.mark.requirement("A8")
+def test_all_records_one_chunk_before_their_use_equal_all_at_the_start() -> None:
+    navigation, parts = clean_navigation(), {name: log[:90] for name, log in clean_observations().items()}
+    expected, _ = in_pieces(processor({}), parts, [30, 60])
+    empty, state = EpochProcessor(parse_config({}), clean_trajectories()), None
+    found: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in ANTENNAS}
+    half = np.arange(len(navigation.kepler)) % 2 == 0
+    nothing = {name: part[:0] for name, part in parts.items()}
+    # The records arrive in two messages before the first epoch, then once more, as satellites repeat them.
+    _, state = empty.process(nothing, state, navigation=rows(navigation, half))
+    _, state = empty.process(nothing, state, navigation=rows(navigation, ~half))
+    for piece in cut(parts, [30, 60]):
+        result, state = empty.process(piece, state, navigation=navigation)
+        for name, antenna in result.antennas.items():
+            found[name].append(flat(antenna))
+    assert state is not None
+    assert len(state.received.navigation.kepler) == len(navigation.kepler)
+    for name, pieces in found.items():
+        joined = {k: np.concatenate([p[k] for p in pieces]) for k in pieces[0]}
+        ignored = {"satellites.record"}  # rows of a table in another order
+        same(
+            {k: v for k, v in joined.items() if k not in ignored},
+            {k: v for k, v in expected[name].items() if k not in ignored},
+            atol=1e-6,
+        )
+
+
+@pytest.mark.requirement("C1")
+def test_sbas_messages_given_as_they_are_received_equal_all_at_the_start(recordings: Path) -> None:
+    folder = recordings / "sbas" / "msas_20080526_crescent"
+    navigation = read_navigation([folder / "cres_20080526.bin.nav"])
+    messages = read_sbas(folder / "cres_20080526.bin.sbs")
+    log = read_observations(folder / "cres_20080526.bin.obs")[:360]
+    config = parse_config({"sbas_prn": 137, "elevation": {"mask_deg": 10.0}})
+    line = {"front": straight_line(log.header.approximate_ecef_m, 45.0)}
+    whole, _ = EpochProcessor(config, line, navigation=navigation, messages=messages).process({"front": log})
+    live, state, statuses, taken = EpochProcessor(config, line, navigation=navigation), None, [], 0
+    reasons = []
+    for first in range(0, len(log), 60):
+        piece = log[first : first + 60]
+        until = int(np.searchsorted(messages.time, piece.time[-1], side="right"))
+        new = messages.take(np.arange(taken, until))
+        taken = until
+        result, state = live.process({"front": piece}, state, messages=new)
+        statuses.append(result.antennas["front"].chainage_m)
+        reasons.append(result.antennas["front"].reason)
+    expected = whole.antennas["front"]
+    np.testing.assert_array_equal(np.concatenate(reasons), expected.reason)
+    np.testing.assert_allclose(np.concatenate(statuses), expected.chainage_m, rtol=0, atol=1e-6)
+    assert np.isfinite(expected.chainage_m).any()
+    with pytest.raises(SettingsError, match="give its PRN"):
+        EpochProcessor(parse_config({}), line, navigation=navigation).process({"front": log[:1]}, messages=messages)
+
+
+def test_nothing_new_is_the_same_value() -> None:
+    config, time = parse_config({}), np.datetime64("2024-03-05T03:10:00", "ns")
+    start = known_from_start(config, navigation=clean_navigation())
+    assert receive(start, config, time) is start
+    again = receive(start, config, time, navigation=clean_navigation())
+    assert again.navigation.kepler is start.navigation.kepler
+
+
+def lock(value: Any) -> None:
+    """Make every array in a value read-only, however deep; frozen dataclasses keep the array itself."""
+    if isinstance(value, np.ndarray):
+        value.flags.writeable = False
+    elif isinstance(value, dict):
+        for inner in value.values():
+            lock(inner)
+    elif is_dataclass(value) and not isinstance(value, type):
+        for item in fields(value):
+            lock(getattr(value, item.name))
+
+
+@pytest.mark.parametrize("carrier", ["off", "smoothed", "float"])
+def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: str) -> None:
+    """Ranges, solutions and states are locked between the stages; the results are those without the locks."""
+    from railfix.pipeline import processor as module
+
+    parts = {name: log[250:310] for name, log in demo_observations().items()}
+    make = processor({"carrier": carrier, "raim": {"false_alarm": 0.2}, "raim_protection": "on"})
+    expected, _ = make.process(parts)
+
+    def locking(function: Any) -> Any:
+        def locked(*arguments: Any, **options: Any) -> Any:
+            for value in (*arguments, *options.values()):
+                lock(value)
+            result = function(*arguments, **options)
+            for value in result if isinstance(result, tuple) else (result,):
+                lock(value)
+            return result
+
+        return locked
+
+    for name in ("correct_ranges", "with_slips", "smoothed", "solve", "antenna_result", "pair_antennas", "along_track"):
+        monkeypatch.setattr(module, name, locking(getattr(module, name)))
+    found, state = make.process({n: p[:30] for n, p in parts.items()})
+    lock(state)
+    more, _ = make.process({n: p[30:] for n, p in parts.items()}, state)
+    for name in ANTENNAS:
+        excluded = more.antennas[name].raim.excluded.any() or found.antennas[name].raim.excluded.any()
+        assert excluded or carrier == "smoothed"
+        both = np.concatenate([found.antennas[name].reason, more.antennas[name].reason])
+        np.testing.assert_array_equal(both, expected.antennas[name].reason)
