@@ -116,6 +116,13 @@ def test_rtcm_observations_are_those_of_rtklib(recordings: Path, tmp_path: Path,
     assert assert_same_values(ours, rinex.read_observations(observations), without=without) > 20_000
     with pytest.raises(InputFileError, match="carry no date"):
         railfix.read_observations(target)
+    cuts = sorted(np.random.default_rng(kind).integers(1, target.stat().st_size, 200).tolist())
+    pieces, _ = in_fragments(target.read_bytes(), cuts, StreamState(time=np.datetime64("2025-08-11", "ns")))
+    assert channels(ours) == channels(pieces)
+    for name in ("time", *NUMBERS, "loss_of_lock"):  # epochs of several messages, cut between and inside them
+        assert np.array_equal(
+            getattr(ours, name), getattr(pieces, name), equal_nan=name not in ("time", "loss_of_lock")
+        ), name
 
 
 def test_ubx_ephemerides_are_those_of_rtklib(recordings: Path, tmp_path: Path) -> None:
@@ -158,9 +165,9 @@ def assert_same_records(
             assert x.tolist() == y.tolist(), name
 
 
-def in_fragments(data: bytes, cuts: list[int]) -> tuple[Observations, list[object]]:
+def in_fragments(data: bytes, cuts: list[int], state: StreamState | None = None) -> tuple[Observations, list[object]]:
     """A log decoded as it arrives in fragments."""
-    state, tracking = StreamState(), Tracking()
+    state, tracking = state or StreamState(), Tracking()
     parts, records = [], []
     for first, last in zip([0, *cuts], [*cuts, None], strict=True):
         piece, state = decode(data[first:last], state, at_end=last is None)

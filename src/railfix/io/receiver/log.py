@@ -79,6 +79,10 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     """
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
+    if not at_end:
+        unfinished = rtcm.unfinished_epoch(frames)
+        if unfinished is not None:  # the rest of its messages is still to come: kept for the next block
+            frames = replace(find_frames(buffer[:unfinished]), data=buffer)
     raw = ubx.rawx_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
     msm = _without(frames) if np.isnat(time) else rtcm.msm_measurements(frames, time)

@@ -124,6 +124,20 @@ def bits_of(frames: Frames, chosen: Indices, length: int) -> Bytes:
     return np.unpackbits(np.where(inside, data, 0).astype(np.uint8), axis=1)
 
 
+def unfinished_epoch(frames: Frames) -> int | None:
+    """Place of the first message of the last epoch, where more messages of that epoch are to follow (DF393)."""
+    chosen = frames.of("rtcm3", *MSM_NUMBERS)
+    if not len(chosen):
+        return None
+    head = bits_of(frames, chosen, 56)
+    more = head[:, 54] == 1
+    if not more[-1]:
+        return None
+    complete = np.flatnonzero(~more)
+    first = chosen[complete[-1] + 1] if len(complete) else chosen[0]
+    return int(frames.frame_start[first])
+
+
 def _of_number(frames: Frames, number: int, near: np.datetime64) -> Iterator[tuple[Integers, Measurements]]:
     """Measurements of one kind of message, those with equal masks together; and each message's place in the stream."""
     chosen = frames.of("rtcm3", number)

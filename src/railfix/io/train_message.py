@@ -1,0 +1,283 @@
+"""The position message of a train: one schema for live positions, supervision and control.
+
+Sent once a period, also without a position. CBOR with integer keys (RFC 8949, canonical order), so that a message
+has about 100 bytes and an older receiver skips keys that it does not know; a JSON view of the same fields; the
+fields of a position report of ETCS (SUBSET-026 v4, 7.4.2, packet 0) as a further view.
+
+Needs the extra ``railfix[live]`` (cbor2).
+"""
+
+from __future__ import annotations
+
+import json
+from enum import IntEnum, IntFlag
+from typing import Annotated, Any, Final, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from railfix.core.errors import InputFileError
+from railfix.core.settings import Settings
+
+#: Version of the schema; a receiver rejects other major versions.
+VERSION: Final = 1
+#: Longest encoded message [bytes]; longer input is rejected unread.
+LONGEST: Final = 1024
+
+Unsigned = Annotated[int, Field(ge=0, lt=1 << 63)]
+Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
+
+
+class MessageStatus(IntEnum):
+    """What the position of a message is worth."""
+
+    #: Position with every check passed.
+    POSITION = 0
+    #: Position carried by sensors alone.
+    COASTING = 1
+    #: Position with a failed check, or several tracks or places possible.
+    DOUBTFUL = 2
+    #: Observations, but no position.
+    NO_POSITION = 3
+    #: Nothing received in this period.
+    NO_INPUT = 4
+    #: Satellite positioning is suspended by order of the ground side.
+    SUSPENDED = 5
+
+
+class Source(IntFlag):
+    """What a position rests on."""
+
+    FRONT_RECEIVER = 1
+    REAR_RECEIVER = 2
+    DOPPLER = 4
+    CARRIER_PHASE = 8
+    TACHOMETER = 16
+    INERTIAL = 32
+    RADAR = 64
+    RANGING = 128
+    FEATURES = 256
+    SBAS = 512
+
+
+class TrainMessage(Settings):
+    """One position message.
+
+    Attributes
+    ----------
+    train : int
+        Identity of the train.
+    sequence : int
+        Number of the message, counted by the sender.
+    time_ns : int [ns]
+        Instant the position is valid at, GPS time since 1980-01-06.
+    sent_ns : int [ns]
+        Sender's clock when it was sent, GPS time; with the receiver's clock it gives the age.
+    line : int
+        Identity of the line or track.
+    chainage_cm : int or None [cm]
+        Front end of the train along the line; None without a position.
+    over_cm, under_cm : int or None [cm]
+        The train's front is at most `under_cm` ahead of and `over_cm` behind `chainage_cm`
+        (SUBSET-026 3.6.4: under- and over-reading amount).
+    speed_cmps, speed_bound_cmps : int or None [cm/s]
+        Positive with rising chainage; bound of its error.
+    direction : {-1, 0, 1}
+        Running direction against chainage, 0 where unknown.
+    facing : {-1, 0, 1}
+        Direction in which the front end looks.
+    standstill : bool
+    status : MessageStatus
+    sources : Source
+    protection_level_cm : int or None [cm]
+    track_permille : int or None
+        Probability that the train is on `line`, in thousandths, rounded down.
+    length_cm : int [cm]
+        Train length.
+    complete : bool
+        Train integrity confirmed.
+    """
+
+    train: Unsigned
+    sequence: Unsigned
+    time_ns: Unsigned
+    sent_ns: Unsigned
+    line: Unsigned
+    chainage_cm: Signed | None = None
+    over_cm: Unsigned | None = None
+    under_cm: Unsigned | None = None
+    speed_cmps: Signed | None = None
+    speed_bound_cmps: Unsigned | None = None
+    direction: Annotated[int, Field(ge=-1, le=1)] = 0
+    facing: Annotated[int, Field(ge=-1, le=1)] = 0
+    standstill: bool = False
+    status: MessageStatus = MessageStatus.NO_POSITION
+    sources: Source = Source(0)
+    protection_level_cm: Unsigned | None = None
+    track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
+    length_cm: Unsigned = 0
+    complete: bool = False
+
+    @model_validator(mode="after")
+    def _place_with_bounds(self) -> Self:
+        placed = self.status in (MessageStatus.POSITION, MessageStatus.COASTING)
+        if placed and None in (self.chainage_cm, self.over_cm, self.under_cm):
+            raise ValueError("a message with a position has chainage_cm, over_cm and under_cm")
+        if self.chainage_cm is None and (self.over_cm is not None or self.under_cm is not None):
+            raise ValueError("over_cm and under_cm stand beside chainage_cm")
+        return self
+
+    @property
+    def rear_cm(self) -> int | None:
+        """Chainage of the train's rear end [cm], its length behind the front; None without facing or position."""
+        if self.chainage_cm is None or self.facing == 0:
+            return None
+        return self.chainage_cm - self.facing * self.length_cm
+
+
+#: Integer key of each field; keys are never used again for another meaning.
+KEYS: Final[dict[str, int]] = {name: k for k, name in enumerate(TrainMessage.model_fields, start=1)}
+_NAMES: Final = {key: name for name, key in KEYS.items()}
+_VERSION_KEY: Final = 0
+_TRUTHS: Final = ("standstill", "complete")
+
+
+class MessageError(InputFileError):
+    """Bytes that are not a position message."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__("position message", what)
+
+
+def encode(message: TrainMessage) -> bytes:
+    """CBOR of a message, always the same bytes for the same message; absent fields are left out."""
+    import cbor2
+
+    values = {KEYS[name]: value for name, value in _plain(message).items() if value is not None}
+    return cbor2.dumps({_VERSION_KEY: VERSION, **values}, canonical=True)
+
+
+def decode(data: bytes) -> TrainMessage:
+    """A message from CBOR.
+
+    Keys that this version does not know are skipped.
+
+    Raises
+    ------
+    MessageError
+        The bytes are not CBOR, not a message, of another version, too long, or hold values out of range.
+    """
+    import cbor2
+
+    if len(data) > LONGEST:
+        raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")
+    try:
+        values = cbor2.loads(data)
+    except (cbor2.CBORDecodeError, ValueError, TypeError, OverflowError, RecursionError, MemoryError) as error:
+        raise MessageError(f"is not CBOR ({type(error).__name__})") from None
+    if not isinstance(values, dict) or not all(type(key) is int for key in values):
+        raise MessageError("is not a map with integer keys")
+    version = values.get(_VERSION_KEY)
+    if type(version) is not int or version != VERSION:
+        raise MessageError(f"is of version {version!r}, {VERSION} was expected")
+    named = {_NAMES[key]: value for key, value in values.items() if key in _NAMES}
+    for name, value in named.items():  # a truth value or a number with a fraction is not an integer
+        expected = bool if name in _TRUTHS else int
+        if type(value) is not expected:
+            raise MessageError(f"{name}: {type(value).__name__} instead of {expected.__name__}")
+    return _validated(named)
+
+
+def _validated(values: dict[str, Any]) -> TrainMessage:
+    try:
+        return TrainMessage.model_validate(values, strict=False)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "message"
+        raise MessageError(f"{where}: {first['msg'].removeprefix('Value error, ')}") from None
+
+
+def _plain(message: TrainMessage) -> dict[str, Any]:
+    values = message.model_dump()
+    values["status"], values["sources"] = int(message.status), int(message.sources)
+    return values
+
+
+def to_json(message: TrainMessage) -> str:
+    """One line of JSON with the names of the fields; statuses and sources in words."""
+    values = _plain(message)
+    values["status"] = message.status.name.lower()
+    values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
+    return json.dumps({"version": VERSION, **values}, separators=(",", ":"))
+
+
+def from_json(line: str) -> TrainMessage:
+    """A message from its line of JSON.
+
+    Raises
+    ------
+    MessageError
+        As `decode`.
+    """
+    try:
+        values = json.loads(line)
+    except (ValueError, RecursionError):
+        raise MessageError("is not JSON") from None
+    if not isinstance(values, dict) or values.pop("version", None) != VERSION:
+        raise MessageError(f"is not a JSON object of version {VERSION}")
+    try:
+        values["status"] = MessageStatus[str(values["status"]).upper()]
+        sources = Source(0)
+        for name in values["sources"]:
+            sources |= Source[str(name).upper()]
+        values["sources"] = sources
+    except (KeyError, TypeError):
+        raise MessageError("has an unknown status or source") from None
+    return _validated(values)
+
+
+def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
+    """Fields of a position report, packet 0 (SUBSET-026 v4, 7.4.2.1), against a reference location of the line.
+
+    Parameters
+    ----------
+    message : TrainMessage
+        With a position.
+    reference_cm : int [cm]
+        Chainage of the reference location (a balise group, or a virtual one).
+    reference : int
+        Its identity, 0 to 16383 (NID_BG), or with the country (NID_LRBG) up to 2^24 - 1.
+
+    Raises
+    ------
+    ValueError
+        The message has no position, or a distance is outside the packet's range.
+    """
+    if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
+        raise ValueError("a message without a position has no packet 0")
+    distance = message.chainage_cm - reference_cm
+    metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
+    # Whole metres (Q_SCALE 1); doubts are rounded up, with the rounding of the distance, so that they stay bounds.
+    rounded = {"D_LRBG": round(metres["D_LRBG"] / 100)}
+    rest = metres["D_LRBG"] - 100 * rounded["D_LRBG"]
+    rounded["L_DOUBTOVER"] = -(-(metres["L_DOUBTOVER"] + abs(rest)) // 100)
+    rounded["L_DOUBTUNDER"] = -(-(metres["L_DOUBTUNDER"] + abs(rest)) // 100)
+    for name, value in rounded.items():
+        if value > 32_766:
+            raise ValueError(f"{name} is {value} m, at most 32766 m can be reported; take a nearer reference")
+    side = {1: 1, -1: 0, 0: 2}
+    along = 0 if distance == 0 else (1 if distance > 0 else -1)
+    speed = abs(message.speed_cmps or 0) * 36 // 1000 // 5  # V_TRAIN counts steps of 5 km/h
+    return {
+        "NID_PACKET": 0,
+        "Q_SCALE": 1,
+        "NID_LRBG": reference,
+        "D_LRBG": rounded["D_LRBG"],
+        "Q_DIRLRBG": side[message.facing],
+        "Q_DLRBG": side[along],
+        "L_DOUBTOVER": rounded["L_DOUBTOVER"],
+        "L_DOUBTUNDER": rounded["L_DOUBTUNDER"],
+        "Q_LENGTH": 1 if message.complete else 0,
+        "L_TRAININT": message.length_cm // 100 if message.complete else 0,
+        "V_TRAIN": min(speed, 127),
+        "Q_DIRTRAIN": side[message.direction],
+    }
