@@ -95,6 +95,13 @@ def test_bins_by_hand() -> None:
     assert bins.index(np.nan, 0.0, 40.0) == -1
 
 
+@pytest.mark.parametrize("edges", [(0.0,), (0.0, 30.0, 30.0), (30.0, 0.0), (-1.0, 90.0), (0.0, 91.0)])
+def test_edges_of_bins_rise_within_the_sky(edges: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="elevation_deg"):
+        ErrorBins(elevation_deg=edges)
+    assert ErrorBins(elevation_deg=(0.0, 90.0), sectors=1).shape == (1, 1, 5)
+
+
 def test_thin_bins_take_the_next_wider_set() -> None:
     rng = np.random.default_rng(3)
     bins = ErrorBins(elevation_deg=(0.0, 30.0, 90.0), sectors=2, cn0_dbhz=(0.0, 40.0, 60.0))

@@ -556,3 +556,17 @@ def test_a_satellite_of_sbas_needs_no_long_term_correction_and_gets_none_of_anot
     assert found.position_m[0].tolist() == [[8.0, 4.0, 2.0], [0.0, 0.0, 0.0]]
     assert (found.clock_s[0, 0], found.clock_s[0, 1]) == (100.0 * 2.0**-31, 0.0)
     assert found.iode.tolist() == [[40, -1]]
+
+
+@pytest.mark.parametrize(("earlier", "expected"), [(2.0, 0.0), (3.0, (0.0058 * 1.0 / 2.0 + 1.0 / 5.0) * 2.0)])
+def test_a_rate_after_an_alarm_does_not_degrade_over_half_the_time_out(earlier: float, expected: float) -> None:
+    """Time-out 12 s (ai = 15), Brrc 1 m, IODF 3: nothing over exactly 6 s, (a |5 - 6| / 2 + Brrc / 5) t over 5 s."""
+    rows = [(0.5, 0, made.mask(0, [1])), (0.6, 0, made.factors(0, [15])), (0.7, 0, made.parameters(0, brrc=500))]
+    rows.append((0.8, 0, made.long_term(0, [(1, 40, (0.0, 0.0, 0.0), 0.0)])))
+    rows += [(earlier, 0, made.fast(2, [1.0], [3])), (8.0, 0, made.fast(2, [4.0], [3], iodf=3))]
+    engine = SbasCorrections(made.made(rows), prn=137)
+    time = made.START + np.array([9], dtype="timedelta64[s]").astype("timedelta64[ns]")
+    found = engine.satellites(time, np.array(["G01"]))
+    assert found.state.item() == SatelliteState.OK
+    assert found.rate_mps.item() == pytest.approx(3.0 / (8.0 - earlier))
+    assert found.rate_growth_m.item() == pytest.approx(expected, abs=1e-12)

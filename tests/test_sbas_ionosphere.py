@@ -160,6 +160,13 @@ def test_cells_are_wider_north_of_60_degrees() -> None:
     assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
 
 
+def test_cells_are_wider_from_60_degrees_on() -> None:
+    points = {(60, 0): (1.0, 0), (65, 0): (2.0, 0), (60, 10): (3.0, 0), (65, 10): (5.0, 0)}
+    found = overhead(grid({9: points}), 60.5, 4.0)
+    weights = np.array([0.6 * 0.9, 0.6 * 0.1, 0.4 * 0.9, 0.4 * 0.1])
+    assert found.delay_m.item() == pytest.approx(weights @ [1.0, 2.0, 3.0, 5.0], abs=1e-9)
+
+
 def test_points_near_the_pole_are_interpolated_along_it_first() -> None:
     """75 to 85 degrees: the upper corners lie between points 30 degrees apart; worked by hand."""
     points = {(75, 40): (1.0, 0), (75, 50): (2.0, 0), (85, 30): (3.0, 0), (85, 60): (6.0, 0)}
