@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import OutputError
+from railfix.core.files import staged_file
 from railfix.core.timescale import seconds
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
 from railfix.report.plots.chart import Chart, Layer, Line, Points
@@ -197,12 +196,6 @@ def _draw_mean(axes: Axes, mean: Cn0Mean, samples: Cn0Samples, limits: Cn0Limits
 
 
 def _save(figure: Figure, path: str | PathLike[str]) -> Path:
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
+    with staged_file(path, what="picture") as temporary:
         figure.savefig(temporary, format="png", dpi=110)
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise OutputError(f"{path}: the picture cannot be written ({error.strerror})") from None
-    return target
+    return Path(path)

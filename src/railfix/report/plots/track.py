@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import OutputError
+from railfix.core.files import staged_file
 from railfix.core.geodesy import enu_axes
 from railfix.track import Track, TrackQuality
 
@@ -67,13 +65,8 @@ def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None
     _draw_plan(figure.add_subplot(grid[0]), quality)
     panels = {name: figure.add_subplot(grid[i + 1]) for i, name in enumerate(names)}
     _draw_panels(panels, quality)
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
-    try:
+    with staged_file(path, what="picture") as temporary:
         figure.savefig(temporary, format="png", dpi=110)
-        temporary.replace(target)
-    except OSError as error:
-        raise OutputError(f"{path}: the picture cannot be written ({error.strerror})") from None
 
 
 def _draw_plan(axes: Axes, quality: TrackQuality) -> None:
