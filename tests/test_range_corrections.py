@@ -265,7 +265,7 @@ def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is
     model = uniform_model(3.0, 0.0)
     for covers, extra in (("local", 1.0), ("satellite_and_atmosphere", 0.0)):
         processor = EpochProcessor(
-            parse_config({"error_model": "line.toml"}),
+            parse_config({"error_model": "line.toml", "screens": []}),
             cases.clean_trajectories(),
             navigation=cases.clean_navigation(),
             error_model=replace(model, covers=cast("Any", covers)),
@@ -297,7 +297,7 @@ def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
 def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:
     """An unbiased estimate has sum |s| >= 1: a bias b of any sign in every range adds b to the level at least."""
     observations = {"front": cases.clean_observations()["front"][:30]}
-    config = parse_config({"error_model": "line.toml"})
+    config = parse_config({"error_model": "line.toml", "screens": []})
     results = []
     for bias in (0.0, 2.0):
         processor = EpochProcessor(
@@ -328,7 +328,7 @@ def test_phases_have_the_weight_of_their_elevation(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(carrier_phase, "phase_positions", phase_positions)
     observations = cases.clean_observations()["front"][:20]
-    result = cases.front_alone(observations, {"carrier": "float", "phase_sigma_m": 0.02})
+    result = cases.front_alone(observations, {"carrier": "float", "phase_sigma_m": 0.02, "screens": []})
     (weight,) = caught
     elevation = result.elevation_deg[:, result.columns]
     used = weight > 0.0
@@ -341,7 +341,7 @@ def test_a_run_with_sbas_adds_the_sbas_variance_to_that_of_the_noise_model(recor
     stem = recordings / "sbas" / "msas_20080526_crescent" / "cres_20080526.bin"
     observations, navigation = read_observations(f"{stem}.obs")[150:220], read_navigation([f"{stem}.nav"])
     line = straight_line(observations.header.approximate_ecef_m, 45.0)
-    config = parse_config({"sbas": [f"{stem}.sbs"], "sbas_prn": 137, "elevation": {"mask_deg": 10.0}})
+    config = parse_config({"sbas": [f"{stem}.sbs"], "sbas_prn": 137, "screens": []})
     result = processor_of(config, navigation, {"front": line}).process({"front": observations})[0].antennas["front"]
     columns = result.columns
     used = result.reason[:, columns] == 0
