@@ -1,0 +1,153 @@
+"""Links between the stages of the pipeline: each test fails on one particular mistake in the glue."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, with_code
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.core.reasons import Reason, Status
+from railfix.gnss.signals import carrier_frequency_hz
+from railfix.integrity.raim import Outcome
+from railfix.pipeline import fault_exclusion
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
+
+#: Forty epochs in the open, and the satellite that gets a fault.
+FRONT = clean_observations()["front"][400:440]
+BASE = {"screens": ["elevation", "raim"]}
+FAULTY = front_alone(FRONT, BASE)
+
+
+def used_satellite() -> int:
+    """Column of a GPS satellite that is used throughout and stands high."""
+    good = (FAULTY.reason == 0).all(axis=0) & np.char.startswith(FRONT.satellite, "G")
+    return int(np.flatnonzero(good)[np.argmax(FAULTY.elevation_deg[0, good])])
+
+
+def with_fault(size_m: float) -> np.ndarray:
+    change = np.zeros(FRONT.code_m.shape)
+    change[:, used_satellite()] = size_m
+    return change
+
+
+@pytest.mark.requirement("C2")
+def test_an_excluded_satellite_counts_in_the_risk() -> None:
+    """The level after an exclusion is larger than the level of the same ranges without a fault found among them."""
+    excluded = front_alone(with_code(FRONT, with_fault(80.0)), BASE)
+    absent = front_alone(with_code(FRONT, with_fault(np.nan)), BASE)
+    assert (excluded.raim.outcome == Outcome.EXCLUDED_ONE).all()
+    assert (excluded.reason[:, used_satellite()] == Reason.FAULT_EXCLUDED).all()
+    np.testing.assert_allclose(excluded.chainage_m[0], absent.chainage_m[0], atol=1e-3)
+    assert excluded.protection is not None
+    assert absent.protection is not None
+    ratio = excluded.protection.level.fault_free_m[0] / absent.protection.level.fault_free_m[0]
+    # a tenth of the risk over the ways to exclude one of a dozen satellites: K from 5.8 to 6.5
+    assert 1.05 < ratio < 1.3
+
+
+def error_model(bias_m: float) -> ErrorModel:
+    """One bin with a sigma of 2 m and a nominal bias."""
+    bins = ErrorBins(elevation_deg=(0.0, 90.0), sectors=1, cn0_dbhz=(0.0, 60.0))
+    shape = bins.shape
+    ones, count = np.ones(shape), np.full(shape, 1000)
+    statistics = BinStatistics(
+        count=count,
+        blocks=count,
+        bias_m=0.0 * ones,
+        sigma_m=2.0 * ones,
+        bound_bias_m=bias_m * ones,
+        bound_sigma_m=2.0 * ones,
+        pooled=np.zeros(shape, dtype=np.int64),
+    )
+    return ErrorModel(bins=bins, before=statistics, after=statistics, covers="satellite_and_atmosphere")
+
+
+@pytest.mark.requirement("C2")
+def test_the_bias_of_the_error_model_is_in_the_level() -> None:
+    """Worst signs of all biases: ``sum |gain| b``, at least b itself times the largest share of a range."""
+    config = parse_config({**BASE, "error_model": "named.toml"})
+
+    def level(bias_m: float) -> AntennaResult:
+        model = error_model(bias_m)
+        path = {"front": clean_trajectories()["front"]}
+        processor = EpochProcessor(config, path, navigation=clean_navigation(), error_model=model)
+        return processor.process({"front": FRONT})[0].antennas["front"]
+
+    without, three, six = (level(bias).protection for bias in (0.0, 3.0, 6.0))
+    assert without is not None
+    assert three is not None
+    assert six is not None
+    added = three.level.fault_free_m - without.level.fault_free_m
+    assert (added > 1.0).all()
+    np.testing.assert_allclose(six.level.fault_free_m - without.level.fault_free_m, 2.0 * added, rtol=1e-9)
+    assert (three.level.level_m > without.level.level_m + 0.9 * added).all()
+
+
+@pytest.mark.requirement("B4")
+def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An exclusion whose remaining ranges fit badly at their own section leaves the epoch unresolved."""
+    original, solved = fault_exclusion.place_on_line, []
+
+    def worse(*arguments: Any, **options: Any) -> Any:
+        place = original(*arguments, **options)
+        wsse = place.constrained.wsse.copy()
+        if len(wsse) == len(FRONT):
+            wsse[::2] = 1e4
+            solved.append(len(wsse))
+        return replace(place, constrained=replace(place.constrained, wsse=wsse))
+
+    monkeypatch.setattr(fault_exclusion, "place_on_line", worse)
+    found = front_alone(with_code(FRONT, with_fault(80.0)), BASE)
+    assert solved
+    assert (found.raim.outcome[::2] == Outcome.UNRESOLVED).all()
+    assert (found.raim.outcome[1::2] == Outcome.EXCLUDED_ONE).all()
+
+
+@pytest.mark.requirement("B3")
+def test_antennas_sampled_at_other_instants_are_compared_at_one() -> None:
+    """The rear receiver samples 8 ms later: its codes are moved there by their own range rates, and nothing changes."""
+    parts = {name: log[400:420] for name, log in clean_observations().items()}
+    rear, later = parts["rear"], 8_000_000
+    rate = -SPEED_OF_LIGHT / carrier_frequency_hz(rear.satellite, rear.signal) * rear.doppler_hz
+    moved = replace(rear, time=rear.time + np.timedelta64(later, "ns"), code_m=rear.code_m + rate * later * 1e-9)
+    config = parse_config({"screens": ["antenna_pair"]})
+    processor = EpochProcessor(config, clean_trajectories(), navigation=clean_navigation())
+    together, _ = processor.process(parts)
+    apart, _ = processor.process({"front": parts["front"], "rear": moved})
+    first, second = (r.antennas["front"].screens["antenna_pair"].metric for r in (together, apart))
+    assert np.isfinite(first).sum() > 100
+    assert np.nanmax(np.abs(rate)) * later * 1e-9 > 4.0
+    np.testing.assert_allclose(second, first, atol=0.1)
+
+
+@pytest.mark.requirement("A4")
+def test_the_error_of_the_map_does_not_grow_with_the_noise() -> None:
+    """The variance less that of the map is the one of the ranges, which the single-epoch sigma gives by itself."""
+    rng = np.random.default_rng(4)
+    log = clean_observations()["front"][300:700]
+    noisy = with_code(log, rng.normal(0.0, 6.0, log.code_m.shape))
+    found = front_alone(noisy, {"screens": ["elevation", "raim"], "map_plan_sigma_m": 30.0, "map_height_sigma_m": 30.0})
+    late = slice(200, None)
+    by_map = (found.constrained.sigma_m**2 - found.constrained.exact_map_sigma_m**2)[late]
+    ratio = (found.along_sigma_m[late] ** 2 - by_map) / found.own_sigma_m[late] ** 2
+    assert np.median(found.noise_scale[late]) > 2.5
+    assert np.median(by_map / found.constrained.exact_map_sigma_m[late] ** 2) > 0.3
+    assert 0.5 < np.median(ratio) < 1.05
+
+
+@pytest.mark.requirement("B7")
+def test_a_noisy_receiver_on_the_map_is_not_off_it() -> None:
+    """Errors five times the weights: the misfit of the line exceeds the limit, but not in the noise of the 3-D fit."""
+    rng = np.random.default_rng(11)
+    log = clean_observations()["front"][300:500]
+    found = front_alone(with_code(log, rng.normal(0.0, 12.0, log.code_m.shape)), {"screens": ["elevation"]})
+    plain = found.constrained.wsse - found.single_point.wsse
+    assert (plain > 27.6).mean() > 0.05
+    assert (found.status == Status.OFF_MAP).mean() < 0.01
