@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 #: Real numbers in the unit that the name of the array ends with; NaN where absent.
 Floats = NDArray[np.float64]
@@ -34,3 +38,11 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
+
+
+def freeze_arrays(instance: DataclassInstance) -> None:
+    """Replace the array fields of a dataclass by read-only views; to be called in its `__post_init__`."""
+    for item in fields(instance):
+        value = getattr(instance, item.name)
+        if isinstance(value, np.ndarray):
+            object.__setattr__(instance, item.name, read_only(value))

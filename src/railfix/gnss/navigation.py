@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Strings, freeze_arrays
 from railfix.core.display import NotebookTable, plural, time_span_text
 
 
@@ -28,10 +28,9 @@ def _records_text(satellite: Strings, toe: Datetimes) -> str:
 def _freeze(table: Any, length: int) -> None:
     for item in fields(table):
         value = getattr(table, item.name)
-        if isinstance(value, np.ndarray):
-            if len(value) != length:
-                raise ValueError(f"{item.name} has {len(value)} records, satellite has {length}")
-            object.__setattr__(table, item.name, read_only(value))
+        if isinstance(value, np.ndarray) and len(value) != length:
+            raise ValueError(f"{item.name} has {len(value)} records, satellite has {length}")
+    freeze_arrays(table)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,8 +186,7 @@ class PreciseEphemeris(NotebookTable):
                 f"position_ecef_m {self.position_ecef_m.shape} and clock_s {self.clock_s.shape} "
                 f"do not match (epochs, satellites) = {expected}"
             )
-        for name in ("time", "satellite", "position_ecef_m", "clock_s"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
+        freeze_arrays(self)
 
     def __repr__(self) -> str:
         span = time_span_text(self.time)

@@ -8,13 +8,13 @@ not have. Absent is NaN; 0 is a value.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain, islice
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings, read_only
+from railfix.core.arrays import Bytes, Datetimes, Floats, Masks, Strings, freeze_arrays
 from railfix.core.display import NotebookTable, plural, time_span_text
 
 #: Largest number of messages about single faults; further faults are only counted.
@@ -120,10 +120,7 @@ class Observations(NotebookTable):
             shape = getattr(self, name).shape
             if shape != (epochs, channels):
                 raise ValueError(f"{name} has shape {shape}, expected {(epochs, channels)} (epochs, channels)")
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, read_only(value))
+        freeze_arrays(self)
 
     def __len__(self) -> int:
         return len(self.time)

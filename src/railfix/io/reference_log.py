@@ -28,7 +28,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_arrays
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending, write_whole
 from railfix.io.named_columns import NamedColumns, read_named_columns
@@ -84,7 +84,7 @@ class AntennaReference:
             value = getattr(self, item.name)
             if len(value) != epochs:
                 raise ValueError(f"{item.name} has {len(value)} epochs, time has {epochs}")
-            object.__setattr__(self, item.name, read_only(value))
+        freeze_arrays(self)
         if np.isnat(self.time).any() or not (np.diff(self.time) > np.timedelta64(0, "ns")).all():
             raise ValueError("time must rise strictly")
         unknown = sorted(set(self.source.tolist()) - set(SOURCES))

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Integers, Masks, read_only
+from railfix.core.arrays import Floats, Integers, Masks, freeze_arrays, read_only
 from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 
@@ -104,10 +104,9 @@ class Track(NotebookTable):
         shape = (len(self.latitude_deg),)
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                if value.shape != shape:
-                    raise ValueError(f"{item.name} has shape {value.shape}, expected {shape}")
-                object.__setattr__(self, item.name, read_only(value))
+            if isinstance(value, np.ndarray) and value.shape != shape:
+                raise ValueError(f"{item.name} has shape {value.shape}, expected {shape}")
+        freeze_arrays(self)
         if shape[0] < 2:
             raise ValueError(f"a track needs at least two points, got {shape[0]}")
         place = np.stack([self.latitude_deg, self.longitude_deg, self.height_m])

@@ -7,14 +7,14 @@ chainage. `Trajectory.from_track` takes the track itself as the antenna's path; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Indices, read_only
+from railfix.core.arrays import Floats, Indices, freeze_arrays, read_only
 from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.track.polyline import NearestOnPolyline
@@ -85,10 +85,7 @@ class Trajectory(NotebookTable):
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected ({points},)")
         if not np.isfinite(self.ecef_m).all():
             raise ValueError("ecef_m must be finite")
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, read_only(value))
+        freeze_arrays(self)
         if not (np.diff(self.chainage_m) > 0).all():
             i = int(np.argmin(np.diff(self.chainage_m)))
             raise ValueError(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
@@ -72,8 +72,7 @@ class SatelliteStates:
     future_record: Masks
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+        freeze_arrays(self)
 
 
 def satellite_states(
