@@ -86,8 +86,8 @@ def test_epochs_with_too_few_satellites_have_their_reason(run: RunSummary) -> No
 
 def test_observations_add_up(run: RunSummary) -> None:
     for told in record_of(run)["antennas"].values():
-        first = told["observations_refused_by_first_reason"]
-        alone = told["observations_refused_by_one_reason_alone"]
+        first = told["observations_rejected_by_first_reason"]
+        alone = told["observations_rejected_by_one_reason_alone"]
         assert told["observations_used"] + sum(first.values()) == told["observations"]
         # first of all that applied: what it alone refused is among them
         assert all(count <= first[reason] for reason, count in alone.items())

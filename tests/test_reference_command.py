@@ -142,7 +142,7 @@ def test_each_sensor_alone(sensor: str, largest_m: float, bench: Bench, tmp_path
     bridged = found.source == "bridged"
     assert bridged.sum() == 298
     assert 0.05 * largest_m < np.abs(error[bridged]).max() < largest_m
-    assert ("bridged by an even run alone" in result.output) == (sensor == "none")
+    assert ("bridged by the motion model alone" in result.output) == (sensor == "none")
     record = json.loads((tmp_path / "out" / "reference.json").read_text())
     assert record["settings_asked"] == {"max_sigma_m": 100.0}
 

@@ -134,7 +134,7 @@ def test_the_head_tells_what_was_run(document: str, folder: Path) -> None:
     settings = document.split("<summary>Settings asked for and used")[1].split("</details>")[0]
     assert settings.count("<tr class=asked>") == 2
     facts = record["antennas"]["front"]
-    for reason, count in facts["observations_refused_by_first_reason"].items():
+    for reason, count in facts["observations_rejected_by_first_reason"].items():
         assert f'<th scope="row">  {reason}</th><td class="n">{count:,}</td>' in document
     assert f"{100 * facts['positioning_rate']:.2f} %" in document
     for note in record["notes"]:

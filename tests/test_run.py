@@ -110,8 +110,8 @@ def test_every_observation_has_a_row_and_the_reasons_add_up(whole: RunSummary, r
         mine = rows.filter(pl.col("antenna") == name)
         told = record["antennas"][name]
         assert mine.height == codes == told["observations"]
-        assert told["observations_used"] + sum(told["observations_refused_by_first_reason"].values()) == codes
-        alone = told["observations_refused_by_one_reason_alone"]
+        assert told["observations_used"] + sum(told["observations_rejected_by_first_reason"].values()) == codes
+        alone = told["observations_rejected_by_one_reason_alone"]
         for reason, count in alone.items():
             assert mine.filter(pl.col("reason_text") == reason).height == count
         assert sum(told["status"].values()) == told["epochs"] == 2000

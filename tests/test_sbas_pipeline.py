@@ -208,7 +208,7 @@ def test_the_command_says_what_was_asked_and_what_was_used(recording: Recording,
     said = " ".join(record["notes"])
     assert "klobuchar, troposphere: saastamoinen asked for, those of SBAS used in their place" in said
     assert "best SBAS PRN by usable fast corrections: 137" in said
-    assert record["antennas"]["front"]["observations_refused_by_first_reason"]["sbas_no_correction"] > 1000
+    assert record["antennas"]["front"]["observations_rejected_by_first_reason"]["sbas_no_correction"] > 1000
     missing = CliRunner().invoke(app, [*command, "--sbas", "nowhere.sbs", "--out", str(tmp_path / "other")])
     assert missing.exit_code == 3
     assert "nowhere.sbs" in missing.output

@@ -110,7 +110,7 @@ def test_screens_asked_for_and_used_stand_side_by_side(bench: Bench, tmp_path: P
     assert record["settings_asked"] == {"preset": "p1", "screens": left}
     assert record["settings_used"]["screens"] == left
     assert record["settings_used"]["raim"]["mode"] == "fixed"
-    refused = record["antennas"]["front"]["observations_refused_by_first_reason"]
+    refused = record["antennas"]["front"]["observations_rejected_by_first_reason"]
     assert "doppler" in refused
     assert "antenna_pair" not in refused
 
@@ -118,7 +118,7 @@ def test_screens_asked_for_and_used_stand_side_by_side(bench: Bench, tmp_path: P
 def test_a_screen_that_is_off_refuses_nothing(bench: Bench, tmp_path: Path) -> None:
     code, output = run(bench, tmp_path / "a", "--screens", "none")
     assert code == 0, output
-    refused = record_of(tmp_path / "a")["antennas"]["front"]["observations_refused_by_first_reason"]
+    refused = record_of(tmp_path / "a")["antennas"]["front"]["observations_rejected_by_first_reason"]
     assert set(refused) <= {"unhealthy", "no_ephemeris", "ephemeris_too_old", "no_correction", "other_signal_taken"}
 
 

@@ -24,15 +24,15 @@ def ablate(
     *,
     out: OutOption,
 ) -> None:
-    r"""What each screen buys and costs on a log: all screens, none, each alone, all but each.
+    r"""Compare choices of screens on a log: all screens, none, each alone, all but each.
 
-    The logs are read once. Screens that are off in the settings stay off, and those that cannot judge
+    The logs are read once. Screens that are off in the settings stay off, and inactive ones
     (no second antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are
-    asked in every case; `none` is these alone, without an elevation mask.
+    checked in every case; `none` is these checks alone, without an elevation mask.
 
     For each choice: the rate of epochs with coordinates and of status ok, satellites used, the median
-    standard deviation along the line; with `--truth` the errors along the line too (over 50 m counts as
-    a wrong place), of all epochs with coordinates and of those that are ok. Into DIR come
+    standard deviation along the line; with `--truth` also the errors along the line (over 50 m counts as
+    a wrong position), of all epochs with coordinates and of those that are ok. Into DIR come
     `ablation.csv` with all figures, those of the conventional position included, and `ablation.json`.
 
     Example:
@@ -40,7 +40,7 @@ def ablate(
         railfix ablate --front front.obs --nav brdc.nav --track line.csv --truth rtk.pos --out screens
 
     Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 the inputs do not belong together; 7 not one position; 8 DIR cannot be
+    4 a setting is wrong; 5 the inputs do not match each other; 7 not one position; 8 DIR cannot be
     written; 1 a defect of railfix.
     """
     settings, asked = settings_of(choices)
@@ -77,7 +77,7 @@ def _show(console: Console, effects: list[Effect]) -> None:
             cells += _errors(figures) if figures is not None else []
         table.add_row(effect.choice, *cells)
     if scored:
-        console.print("errors along the line in metres, wrong places in per cent; all: every epoch with coordinates")
+        console.print("errors along the line in metres, wrong positions in per cent; all: every epoch with coordinates")
     console.print(table)
 
 

@@ -61,15 +61,15 @@ def cn0_curve(
     for path in outputs:
         others = [other for other in outputs if other is not path]
         check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=[*observations, *nav, *others])
-    made = cn0_curve_from_log(
+    fitted = cn0_curve_from_log(
         observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"
     )
     if plot is not None:
         from railfix.report.plots.screens import draw_cn0_curve
 
-        draw_cn0_curve(plot, made.curve, made.samples)
-    write_cn0_curve(made.curve, out)
-    _print_curve(made.curve, made.notes)
+        draw_cn0_curve(plot, fitted.curve, fitted.samples)
+    write_cn0_curve(fitted.curve, out)
+    _print_curve(fitted.curve, fitted.notes)
     show_files(console_of_tables(), outputs)
 
 

@@ -1,4 +1,4 @@
-"""What the command line shows: a progress bar while it works, a summary when it is done."""
+"""Output of the command line: progress bar, summary of a run, notes and files."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def show_summary(summary: RunSummary) -> None:
     console = console_of_tables()
     names = list(summary.tally.antennas)
     console.print(_positions(summary, names))
-    console.print("Pseudoranges, by the first reason that refused them, and by it alone")
+    console.print("Rejected pseudoranges by their first reason, and by that reason alone")
     console.print(_reasons(summary, names))
     show_notes(console, summary.notes)
     show_files(console, summary.files.values())
@@ -111,8 +111,8 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
     levels = summary.levels
     if levels:
         for label, field in (("p50", "p50_m"), ("p95", "p95_m")):
-            found = {n: getattr(levels[n], field) for n in names if n in levels}
-            cells = [f"{found[n]:.2f} m" if found.get(n) is not None else "-" for n in names]
+            values = {n: getattr(levels[n], field) for n in names if n in levels}
+            cells = [f"{values[n]:.2f} m" if values.get(n) is not None else "-" for n in names]
             table.add_row(f"protection level, {label}", *cells)
         for word in ("available", "alarm"):
             shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
@@ -150,5 +150,5 @@ def _reasons(summary: RunSummary, names: list[str]) -> Table:
     return table
 
 
-def _percent(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.2f} %" if whole else "-"
+def _percent(part: int, total: int) -> str:
+    return f"{100 * part / total:.2f} %" if total else "-"

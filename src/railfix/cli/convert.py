@@ -40,9 +40,9 @@ def convert(
 ) -> None:
     """Write the observations and the ephemerides of receiver logs as RINEX files.
 
-    What a log is is told by its content. UBX needs RXM-RAWX for observations and RXM-SFRBX for ephemerides; RTCM 3
-    MSM4 to MSM7 and 1019, 1020, 1042, 1044, 1046. What is passed over (damaged bytes, unknown signals, messages
-    of other kinds) is counted and printed.
+    The kind of a log is detected from its content. UBX needs RXM-RAWX for observations and RXM-SFRBX for
+    ephemerides; RTCM 3 MSM4 to MSM7 and 1019, 1020, 1042, 1044, 1046. Skipped items (damaged bytes, unknown
+    signals, messages of other kinds) are counted and printed.
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
 

@@ -68,7 +68,7 @@ def error_model(
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
-    Exit codes as `railfix --help` says; 5 where run, reference and station do not belong together.
+    Exit codes as `railfix --help` says; 5 where run, reference and station do not match each other.
     """
     if len(reference) != len(runs):
         raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")

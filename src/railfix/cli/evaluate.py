@@ -78,9 +78,9 @@ def evaluate(
     ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    r"""Errors along the line of runs against references, and the figures made of them.
+    r"""Compute errors of runs along the line against references, and statistics of them.
 
-    The error is the distance along the line between the answer and the reference, + toward the end of
+    The error is the distance along the line from the reference to the position, + toward the end of
     the line whichever way the train runs. Shown for the positions on the map, those of status ok, and
     the conventional ones (3-D single point, moved to the nearest point of the line), over each one's own
     epochs and over those that both have; by antenna, section, environment, speed, satellites used
@@ -98,7 +98,7 @@ def evaluate(
         railfix evaluate gps gps-qzs --reference auto --label GPS --label GPS+QZS
 
     Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 run, reference and line do not belong together; 8 DIR cannot be written;
+    4 a setting is wrong; 5 run, reference and line do not match each other; 8 DIR cannot be written;
     1 a defect of railfix.
     """
     pairs = [

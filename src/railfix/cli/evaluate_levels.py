@@ -1,4 +1,4 @@
-"""What ``railfix evaluate`` shows of protection levels: Stanford counts, and the epochs beyond."""
+"""Tables of ``railfix evaluate`` on protection levels: Stanford counts, and epochs with errors above the level."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def show_integrity(evaluation: Evaluation, console: Console) -> None:
             markup=False,
             soft_wrap=True,
         )
-        whole = found.stanford.filter(pl.col("grouping") == "all")
-        console.print(_counts(whole.filter(pl.col("run") == "all") if several else whole, first=()))
+        overall = found.stanford.filter(pl.col("grouping") == "all")
+        console.print(_counts(overall.filter(pl.col("run") == "all") if several else overall, first=()))
         _show_environments(found.stanford, console)
         _show_beyond(found, kind, console)
 
@@ -77,7 +77,7 @@ def _counts(rows: pl.DataFrame, *, first: tuple[str, ...]) -> Table:
 
 
 def _show_beyond(found: Integrity, kind: str, console: Console) -> None:
-    """How many errors are over their level, and the worst of them."""
+    """Print the number of errors above their level, and the worst of them."""
     beyond, usable = found.beyond, int(found.beyond["usable"].sum())
     console.print(
         f"Errors over their level: {len(beyond):,}, of them {usable:,} usable"
@@ -86,12 +86,12 @@ def _show_beyond(found: Integrity, kind: str, console: Console) -> None:
         soft_wrap=True,
     )
     for row in beyond.head(_MOST_BEYOND).iter_rows(named=True):
-        level = f"{row[f'{kind}_level_m']:.2f} m ({row[f'{kind}_cause'] or 'untold'})"
+        level = f"{row[f'{kind}_level_m']:.2f} m ({row[f'{kind}_cause'] or 'not recorded'})"
         where = "an unknown place" if row["chainage_m"] is None else f"{row['chainage_m']:.0f} m"
         console.print(
             f"  {row['time_gpst']} {row['run']} {row['antenna']} at {where}, {row['environment']}: "
             f"error {row['error_m']:+.2f} m, level {level}, "
-            f"status {row['status']}, verdict {row[f'{kind}_status'] or 'untold'}",
+            f"status {row['status']}, verdict {row[f'{kind}_status'] or 'not recorded'}",
             markup=False,
             soft_wrap=True,
         )

@@ -1,4 +1,4 @@
-"""What ``railfix evaluate`` shows: tables with the conventional position beside the one on the map."""
+"""Tables of ``railfix evaluate``: the conventional position beside the one on the map."""
 
 from __future__ import annotations
 
@@ -42,26 +42,26 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
     for run in evaluation.runs:
         console.print(f"{run.name}: {run.configuration}; line {run.line}", markup=False, soft_wrap=True)
         for antenna, method in run.method.items():
-            told = "differences of chainage" if method == "chainage" else "along the trajectory"
+            by = "differences of chainage" if method == "chainage" else "along the trajectory"
             console.print(
-                f"  {antenna}: against {run.reference}, {told}; {run.outside[antenna]:,} epochs outside the reference",
+                f"  {antenna}: against {run.reference}, {by}; {run.outside[antenna]:,} epochs outside the reference",
                 markup=False,
                 soft_wrap=True,
             )
         show_notes(console, run.notes)
     console.print("\nErrors along the line in metres, + toward its end")
     several = len(evaluation.runs) > 1
-    whole = evaluation.figures.filter(pl.col("grouping") == "all")
-    if several and "all" in whole["antenna"]:
-        whole = whole.filter(pl.col("antenna") == "all")
-    console.print(_whole(whole))
-    if whole["mean_low_m"].is_not_null().any():
+    overall = evaluation.figures.filter(pl.col("grouping") == "all")
+    if several and "all" in overall["antenna"]:
+        overall = overall.filter(pl.col("antenna") == "all")
+    console.print(_overall(overall))
+    if overall["mean_low_m"].is_not_null().any():
         options = evaluation.options
         console.print(
             f"Limits of {100 * options.confidence:g} % confidence, from blocks of {options.block_s:g} s drawn "
             f"{options.replicates:,} times"
         )
-        console.print(_limits(whole))
+        console.print(_limits(overall))
     console.print("Metres run and seconds passed between two positions")
     intervals = evaluation.intervals
     console.print(_intervals(intervals.filter(pl.col("run") == "all") if several else intervals))
@@ -92,7 +92,7 @@ def _table(*heads: str, text: int) -> Table:
     return table
 
 
-def _whole(rows: pl.DataFrame) -> Table:
+def _overall(rows: pl.DataFrame) -> Table:
     heads = ("epochs", "rate %", "of run %", "mean", "std", "rms", "p50", "p95", "p99", "max", "at", "wrong", "/sigma")
     table = _table("run", "antenna", "position", *heads, text=3)
     for row in _in_order(rows):

@@ -24,18 +24,18 @@ def reference(
     *,
     out: OutOption,
 ) -> None:
-    r"""Where the antennas really were: fixed positions on the track, the gaps between them bridged.
+    r"""Build the reference trajectory of the antennas: fixed positions on the track, gaps between them bridged.
 
-    Positions are refused that are no fix, have a low ratio, whose two antennas are not as far apart as on the
-    vehicle, that lie off the antenna's path, or that disagree with the way travelled. The others are put on the
-    path. Between them Doppler speeds, pulses and acceleration, whichever are given, are weighed by their
-    variances, and the closing error of each gap is shared back over it. Written into DIR:
+    Positions are rejected that are not fixed, have a low ratio, whose two antennas are not as far apart as on the
+    vehicle, that lie off the antenna's trajectory, or that disagree with the distance travelled. The others are
+    matched to the trajectory. Between them Doppler speeds, pulses and acceleration, whichever are given, are
+    weighted by their variances, and the closing error of each gap is distributed over it. Written into DIR:
 
-    - `reference.csv`: one row an instant and antenna; place, speed, standard deviation, source `rtk` or `bridged`
-    - `fixes.csv`: every position with its verdict and what was measured
-    - `reference.json`: versions, hashes of the inputs, settings asked for and used, counts by reason, gaps
+    - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
+    - `fixes.csv`: every position with its verdict and measurements
+    - `reference.json`: versions, hashes of the inputs, settings given and used, counts by reason, gaps
 
-    Gaps that are too long and instants that are too uncertain are left out, counted and named. All times are
+    Gaps that are too long and instants of too large a standard deviation are left out, counted and named. All times are
     GPS time.
 
     Example:
@@ -44,7 +44,7 @@ def reference(
             --front front.obs --nav brdc.nav --pulses tacho.csv --out reference
 
     Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 the inputs do not belong together; 7 fewer than two good fixes; 8 DIR cannot be
+    4 a setting is wrong; 5 the inputs do not match each other; 7 fewer than two good fixes; 8 DIR cannot be
     written; 1 a defect of railfix.
     """
     asked = settings.model_dump(mode="json", exclude_unset=True)
@@ -57,8 +57,8 @@ def show_reference(summary: ReferenceSummary) -> None:
         source = part.reference.source
         counts = part.fixes.counts()
         good = counts.pop("good")
-        refused = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count) or "none"
-        typer.echo(f"{name}: {len(part.fixes):,} positions, {good:,} good fixes; refused: {refused}")
+        rejected = ", ".join(f"{count:,} {what}" for what, count in counts.items() if count) or "none"
+        typer.echo(f"{name}: {len(part.fixes):,} positions, {good:,} good fixes; rejected: {rejected}")
         by = ", ".join(f"{count:,} by {what}" for what, count in part.bridged_by.items()) or "none"
         bridged = source == "bridged"
         typer.echo(

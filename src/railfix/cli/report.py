@@ -39,7 +39,7 @@ def report(
     title: Annotated[str, typer.Option(metavar="TEXT", help="Heading of the page.")] = "",
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Make one page of one or several runs, to open in a browser.
+    """Write one HTML page on one or several runs, to open in a browser.
 
     At the top: one sentence, five key figures, the line in plan coloured by error, and the error over
     chainage beside the conventional one. Below, folded: figures of merit, counts, protection levels,

@@ -18,16 +18,16 @@ def run(
 
     Reads RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), reads the log in pieces, and writes into DIR:
 
-    - `positions.csv` and `positions.parquet`: one row an epoch and antenna, also where there is no
-      position; place along the line, its standard deviation, coordinates, the conventional
-      position for comparison
+    - `positions.csv` and `positions.parquet`: one row per epoch and antenna, also without a
+      position: chainage, its standard deviation, coordinates, and the conventional position for
+      comparison
     - `train.csv` and `train.parquet`: positions of the filter along the track over all epochs so far,
       with speed, direction and the probability of the branch (not with `--filter off`)
-    - `observations.parquet` (with `--observations`): one row an epoch, satellite and signal
-    - `run.json`: versions, hashes of the inputs, settings asked for and used, counts by status and
+    - `observations.parquet` (with `--observations`): one row per epoch, satellite and signal
+    - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and
       reason, positioning rate
 
-    Times are GPS time, as the receiver tagged them. The results appear in DIR when all is done; an
+    Times are GPS time, as the receiver tagged them. The results appear in DIR when the run is complete; an
     error leaves nothing there.
 
     Example:
@@ -36,7 +36,7 @@ def run(
             --track line.csv --vehicle car.toml --out results
 
     Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
-    4 a setting is wrong; 5 the inputs do not belong together; 7 not one position; 8 DIR cannot be
+    4 a setting is wrong; 5 the inputs do not match each other; 7 not one position; 8 DIR cannot be
     written; 1 a defect of railfix.
     """
     settings, asked = settings_of(choices)

@@ -56,7 +56,9 @@ def simulate(
             help="Only this run of a recipe, by its number from 1 or its name; may be repeated.",
         ),
     ] = None,
-    plain: Annotated[bool, typer.Option("--plain", rich_help_panel=_PANEL, help="Nothing packed: .rnx, .csv.")] = False,
+    plain: Annotated[
+        bool, typer.Option("--plain", rich_help_panel=_PANEL, help="Write unpacked files: .rnx, .csv.")
+    ] = False,
     overwrite: OverwriteOption = False,
     list_shipped: Annotated[bool, typer.Option("--list", help="Name the shipped scenarios and end.")] = False,
 ) -> None:
@@ -69,7 +71,7 @@ def simulate(
 
     Example:
 
-        railfix simulate demo --out made
+        railfix simulate demo --out simulated
 
     Exit codes: 0 done; 2 the command line was misused; 3 a file that the scenario names is not what it
     should be; 4 a setting is wrong; 5 the navigation file does not serve the scenario's time; 8 DIR
@@ -91,8 +93,12 @@ def simulate(
         check_folder(folder, overwrite=replacing)
     changes = _changes(setting or [], seconds, seed)
     scenarios = {number: recipe.scenario(number, changes=changes) for number in numbers}
-    options = [*_said("--seconds", seconds), *_said("--seed", seed), *(w for s in setting or [] for w in ("--set", s))]
-    _make(
+    options = [
+        *_words("--seconds", seconds),
+        *_words("--seed", seed),
+        *(w for s in setting or [] for w in ("--set", s)),
+    ]
+    _simulate(
         recipe,
         ["railfix", "simulate", scenario, "--out", str(out), *options],
         scenarios,
@@ -102,7 +108,7 @@ def simulate(
     )
 
 
-def _make(
+def _simulate(
     recipe: Recipe,
     command: list[str],
     scenarios: dict[int, Scenario],
@@ -173,5 +179,5 @@ def _changes(setting: list[str], seconds: float | None, seed: int | None) -> dic
     return changes
 
 
-def _said(option: str, value: float | None) -> list[str]:
+def _words(option: str, value: float | None) -> list[str]:
     return [] if value is None else [option, str(value)]

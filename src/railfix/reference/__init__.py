@@ -1,4 +1,4 @@
-"""Where the antennas really were, from fixed positions and what measures the way between them (P1 3.1(2), 4.2(2)).
+"""Reference trajectory of the antennas, from fixed positions and sensors that bridge the gaps (P1 3.1(2), 4.2(2)).
 
 `build_references` works on arrays, `reference_files` on files.
 """
@@ -7,7 +7,7 @@ from railfix.io.sensor_log import Acceleration, Pulses, read_acceleration, read_
 from railfix.reference.assemble import Built, Gap
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.driver import ReferenceSummary, reference_files
-from railfix.reference.fixes import Fixes, Refusal
+from railfix.reference.fixes import Fixes, Rejection
 from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
 from railfix.reference.settings import ReferenceSettings
 
@@ -22,7 +22,7 @@ __all__ = [
     "ReferenceOptions",
     "ReferenceSettings",
     "ReferenceSummary",
-    "Refusal",
+    "Rejection",
     "build_references",
     "read_acceleration",
     "read_pulses",

@@ -1,4 +1,4 @@
-"""From the smoothed way to the reference that is given out: what is kept, how certain it is, what is left out."""
+"""Assemble the reference from the smoothed positions: instants kept and left out, and their standard deviations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class Gap:
-    """A stretch between two good fixes that are further apart than the log's usual step."""
+    """Gap between two good fixes that are further apart than the log's usual step."""
 
     start: np.datetime64
     end: np.datetime64
@@ -28,20 +28,20 @@ class Gap:
 
 @dataclass(frozen=True, kw_only=True)
 class Built:
-    """The reference of one antenna, and what it came from.
+    """Reference of one antenna, with its fixes and gaps.
 
     Attributes
     ----------
     reference : AntennaReference
     fixes : Fixes
-        Every row of the log of positions with its refusal.
+        Every row of the position log with its reasons for rejection.
     gaps : tuple of Gap
     left_out : dict of str to int
         Instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap``, ``uncertain``.
     bridged_by : dict of str to int
         Bridged instants by the sensors that measured there.
     facts : dict
-        Plain values: what was estimated and used.
+        Estimated and used parameters, as plain values.
     """
 
     reference: AntennaReference
@@ -147,7 +147,7 @@ def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
 
 
 def _near(known_s: Floats, at_s: Floats) -> Masks:
-    """Whether one of the known instants, rising, is within `_NEAR_S` of each."""
+    """Return whether one of the known instants, rising, is within `_NEAR_S` of each."""
     if not len(known_s):
         return np.zeros(len(at_s), dtype=np.bool_)
     after = np.clip(np.searchsorted(known_s, at_s), 0, len(known_s) - 1)

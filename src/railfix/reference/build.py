@@ -1,9 +1,9 @@
-"""Reference positions of one run: fixes judged, put on the track, the gaps between them bridged.
+"""Reference positions of one run: fixes checked, matched to the track, gaps between them bridged.
 
-1. The positions of each antenna are judged by themselves, in pairs, by their place (`fixes`).
+1. The positions of each antenna are checked by themselves, in pairs, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at the places so far, which between fixes are at
    first those of an even run, and after a round those of the smoother.
-3. The way between fixes is held against the way travelled; fixes that do not agree go.
+3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
 4. Everything together is smoothed (`smoother`); 2 and 4 are repeated.
 """
 
@@ -42,15 +42,15 @@ from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 GRAVITY_MPS2: Final = 9.80665
 #: Rounds of Dopplers and smoother; the first starts from an even run between the fixes.
 _ROUNDS: Final = 3
-#: Fixes tell a direction when they are this many standard deviations apart.
+#: Fixes show the direction of travel when they are this many standard deviations apart.
 _MOVED: Final = 4.0
-#: Closing errors below this many standard deviations are what noise makes.
+#: Closing errors below this many standard deviations are within the noise.
 _TELLING: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceData:
-    """What a reference is made of, read.
+    """Measurements for a reference.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class _Builder:
         fixes: Fixes,
         settings: ReferenceSettings,
     ) -> Floats:
-        """By how many of its standard deviations the best way misses the next fix, from fix to fix; 1 where few."""
+        """Return the closing error of each gap in standard deviations of the best sensor; 1 where there are few."""
         good = fixes.good
         fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])
         variance = np.full(len(moved), np.inf)
@@ -193,7 +193,7 @@ class _Builder:
     def _calibrated(
         self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], wheel: Wheel | None, fixes: Fixes
     ) -> tuple[ReferenceSettings, dict[str, Any]]:
-        """The settings with the errors that the log's own fixes tell of Dopplers and wheel, and how they came."""
+        """Return the settings with sensor errors estimated from the log's own fixes, and where each came from."""
         settings, told, good = self.settings, {}, fixes.good
         joined = self._joined(speeds)
         if joined is not None and len(joined.time) > 1:
@@ -284,7 +284,7 @@ class _Builder:
         return way, white + lasting
 
     def _hint(self, time: Datetimes, joined: Speeds | None, fixes: Fixes) -> Floats:
-        """Speeds that tell the direction of the wheel: Dopplers, else fixes that follow each other closely."""
+        """Return speeds that show the direction of the wheel: Dopplers, else close consecutive fixes."""
         good = fixes.good
         fix_time, fix_m = fixes.time[good], fixes.arc_m[good]
         step = seconds(np.diff(fix_time))
@@ -340,7 +340,7 @@ class _Builder:
         smoothed: Smoothed,
         told: Mapping[str, Mapping[str, Any]],
     ) -> dict[str, Any]:
-        """What was estimated, as plain values."""
+        """Return the estimated parameters as plain values."""
         facts: dict[str, Any] = {"doppler": None, "pulses": None, "acceleration": None}
         if speeds:
             facts["doppler"] = {

@@ -41,7 +41,7 @@ _NAMED: Final = 5
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSummary:
-    """What a reference came to.
+    """Result of a reference.
 
     Attributes
     ----------
@@ -64,11 +64,11 @@ def reference_files(
     options: ReferenceOptions | None = None,
     asked: Mapping[str, Any] | None = None,
 ) -> ReferenceSummary:
-    """Make the reference of a run and write it.
+    """Build the reference of a run and write it.
 
     ================== ======================================================================
     reference.csv      `railfix.io.reference_log`, one row an instant and antenna
-    fixes.csv          every row of the logs of positions, with what was refused and why
+    fixes.csv          every row of the position logs, with its reasons for rejection
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
 
@@ -80,7 +80,7 @@ def reference_files(
         Folder for the results.
     options : ReferenceOptions, optional
     asked : mapping, optional
-        Settings that were asked for, as opposed to defaults.
+        Settings that were given, as opposed to defaults.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def reference_files(
 
 
 def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tuple[ReferenceData, list[str]]:
-    """All files but those of the line."""
+    """Read all files except those of the line."""
     day = None if options.date is None else np.datetime64(options.date, "D")
     logs: dict[str, PositionLog] = {
         name: read_any_positions(path, broken_lines=options.broken_lines, date=day)
@@ -135,7 +135,7 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
     }
     notes = [note for log in logs.values() for note in log.notes]
     notes += [
-        f"{log.path}: tells no quality, every row is taken as fixed" for log in logs.values() if not log.has_quality
+        f"{log.path}: has no qualities, every row is taken as fixed" for log in logs.values() if not log.has_quality
     ]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
@@ -177,7 +177,7 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
 
 
 def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
-    """What a reader must know: gaps left out, instants too uncertain, positions that were never checked."""
+    """Return notes on gaps left out, uncertain instants and unchecked positions."""
     notes = []
     long = [gap for gap in part.gaps if not gap.bridged]
     if long:
@@ -189,7 +189,7 @@ def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
     if count := part.left_out["uncertain"]:
         notes.append(f"{name}: {count} bridged instants less certain than {settings.max_sigma_m:g} m are left out")
     if alone := part.bridged_by.get("nothing"):
-        notes.append(f"{name}: {alone} instants are bridged by an even run alone, no sensor measured there")
+        notes.append(f"{name}: {alone} instants are bridged by the motion model alone, no sensor measured there")
     if np.isnan(part.fixes.travel_m).all():
-        notes.append(f"{name}: no sensor measured the way between fixes, so it was not checked")
+        notes.append(f"{name}: no sensor measured the distance between fixes, so it was not checked")
     return notes

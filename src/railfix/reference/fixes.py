@@ -1,4 +1,4 @@
-"""Which positions are good enough to be a reference, and why the others are not (P1 3.1(2), 4.2(2), P2 3.3)."""
+"""Select the positions for a reference, with the reason for each rejection (P1 3.1(2), 4.2(2), P2 3.3)."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
 
-class Refusal(IntFlag):
-    """Why a position is no reference; 0: it is one."""
+class Rejection(IntFlag):
+    """Reasons to reject a position as a reference; 0: accepted."""
 
     NONE = 0
     NO_POSITION = 1
@@ -42,13 +42,13 @@ class Refusal(IntFlag):
 
     @property
     def text(self) -> str:
-        """The word in the output, by the bits that are set."""
-        return " ".join(flag.name.lower() for flag in Refusal if flag and flag in self and flag.name)
+        """Names of the bits that are set, as in the output."""
+        return " ".join(flag.name.lower() for flag in Rejection if flag and flag in self and flag.name)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fixes:
-    """Positions of one antenna, judged, n rows in order of time.
+    """Positions of one antenna with the reasons for rejection, n rows in order of time.
 
     Attributes
     ----------
@@ -59,16 +59,16 @@ class Fixes:
         NaN where the log has none.
     sigma_enu_m : ndarray, shape (n, 3) [m]
         East, north, up; NaN where the log has none.
-    refusal : ndarray of int64, shape (n,)
-        `Refusal` bits; a row that fails at one stage is not asked at the next.
+    rejection : ndarray of int64, shape (n,)
+        `Rejection` bits; a row that is rejected at one stage is not checked at the next.
     spacing_m : ndarray, shape (n,) [m]
-        Distance to the other antenna less the body's; NaN where it was not looked at.
+        Distance to the other antenna minus that on the vehicle; NaN where it was not checked.
     arc_m, lateral_m, height_m : ndarray, shape (n,) [m]
-        Place on the trajectory, and how far off it; NaN where it was not looked at.
+        Position on the trajectory, and distance from it; NaN where it was not checked.
     sigma_m : ndarray, shape (n,) [m]
         Along the track.
     travel_m : ndarray, shape (n,) [m]
-        Way since the good fix before, less the way travelled; NaN where nothing measured that.
+        Distance from the previous good fix minus the distance travelled; NaN where no sensor measured that.
     """
 
     time: Datetimes
@@ -76,7 +76,7 @@ class Fixes:
     quality: Integers
     ratio: Floats
     sigma_enu_m: Floats
-    refusal: Bits
+    rejection: Bits
     spacing_m: Floats
     arc_m: Floats
     lateral_m: Floats
@@ -89,36 +89,36 @@ class Fixes:
 
     @property
     def good(self) -> Indices:
-        """Rows without a refusal."""
-        return np.flatnonzero(self.refusal == 0)
+        """Rows that are accepted."""
+        return np.flatnonzero(self.rejection == 0)
 
     def counts(self) -> dict[str, int]:
         """Number of rows by reason, the good ones first."""
-        counted = {"good": int((self.refusal == 0).sum())}
-        for flag in Refusal:
+        counted = {"good": int((self.rejection == 0).sum())}
+        for flag in Rejection:
             if flag:
-                counted[flag.text] = int((self.refusal & flag != 0).sum())
+                counted[flag.text] = int((self.rejection & flag != 0).sum())
         return counted
 
 
 def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
-    """The rows of a log by what they say of themselves: a position, a fix, its ratio.
+    """Check each row of a log by itself: whether it has a position, is a fix, and its ratio.
 
-    A log that tells no quality (a CSV without the column) is taken as all fixed.
+    Without qualities (a CSV without the column) all rows are taken as fixed.
     """
     timed = np.flatnonzero(~np.isnat(log.time))
     rows = timed[np.argsort(log.time[timed], kind="stable")]
     time, ecef = log.time[rows], log.ecef_m[rows]
     ratio = np.full(len(rows), np.nan) if log.ratio is None else log.ratio[rows]
-    refusal = np.zeros(len(rows), dtype=np.int64)
-    _refuse(refusal, np.asarray(~np.isfinite(ecef).all(axis=1)), Refusal.NO_POSITION)
+    rejection = np.zeros(len(rows), dtype=np.int64)
+    _reject(rejection, np.asarray(~np.isfinite(ecef).all(axis=1)), Rejection.NO_POSITION)
     if log.has_quality:
-        _refuse(refusal, log.quality[rows] != _FIX, Refusal.NOT_FIXED)
+        _reject(rejection, log.quality[rows] != _FIX, Rejection.NOT_FIXED)
     with np.errstate(invalid="ignore"):
-        _refuse(refusal, np.asarray(ratio < settings.ratio), Refusal.LOW_RATIO)
+        _reject(rejection, np.asarray(ratio < settings.ratio), Rejection.LOW_RATIO)
     repeated = np.zeros(len(rows), dtype=np.bool_)
     repeated[1:] = np.diff(time) == np.timedelta64(0, "ns")
-    _refuse(refusal, repeated, Refusal.REPEATED)
+    _reject(rejection, repeated, Rejection.REPEATED)
     blank = np.full(len(rows), np.nan)
     return Fixes(
         time=time,
@@ -126,7 +126,7 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
         quality=log.quality[rows],
         ratio=ratio,
         sigma_enu_m=log.sigma_m[rows][:, [1, 0, 2]],
-        refusal=refusal,
+        rejection=rejection,
         spacing_m=blank,
         arc_m=blank,
         lateral_m=blank,
@@ -136,15 +136,15 @@ def judge_alone(log: PositionLog, settings: ReferenceSettings) -> Fixes:
     )
 
 
-def _refuse(refusal: Bits, mask: Masks, reason: Refusal) -> None:
+def _reject(rejection: Bits, mask: Masks, reason: Rejection) -> None:
     """Give a reason to rows that have none yet."""
-    refusal[mask & (refusal == 0)] |= reason
+    rejection[mask & (rejection == 0)] |= reason
 
 
 def judge_pair(one: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
     """The rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
-    rows = np.flatnonzero(other.refusal & ~np.int64(_OF_THE_PAIR) == 0)
-    refusal, spacing = one.refusal.copy(), np.full(len(one), np.nan)
+    rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
+    rejection, spacing = one.rejection.copy(), np.full(len(one), np.nan)
     paired = np.zeros(len(one), dtype=np.bool_)
     if len(rows):
         there = other.time[rows].astype(np.int64)
@@ -153,17 +153,17 @@ def judge_pair(one: Fixes, other: Fixes, distance_m: float, settings: ReferenceS
         after = np.minimum(after, len(there) - 1)
         before = np.maximum(after - 1, 0)
         nearest = np.where(np.abs(there[before] - here) <= np.abs(there[after] - here), before, after)
-        paired = (np.abs(there[nearest] - here) <= SAME_INSTANT_NS) & (refusal == 0)
+        paired = (np.abs(there[nearest] - here) <= SAME_INSTANT_NS) & (rejection == 0)
         # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other one is moved to the same instant.
         late_s = (here - there[nearest]) / 1e9
         moved = other.ecef_m[rows[nearest]] + late_s[:, None] * _velocity(other.time[rows], other.ecef_m[rows])[nearest]
         apart = np.linalg.norm(one.ecef_m - moved, axis=1) - distance_m
         spacing = np.where(paired, apart, np.nan)
-    if settings.unpaired == "refuse":
-        _refuse(refusal, ~paired, Refusal.UNPAIRED)
+    if settings.unpaired == "reject":
+        _reject(rejection, ~paired, Rejection.UNPAIRED)
     with np.errstate(invalid="ignore"):
-        _refuse(refusal, np.abs(spacing) > settings.spacing_m, Refusal.SPACING)
-    return replace(one, refusal=refusal, spacing_m=spacing)
+        _reject(rejection, np.abs(spacing) > settings.spacing_m, Rejection.SPACING)
+    return replace(one, rejection=rejection, spacing_m=spacing)
 
 
 def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
@@ -174,13 +174,13 @@ def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
 
 
 #: The other antenna's row counts in a pair whatever this very check said of it.
-_OF_THE_PAIR: Final = Refusal.UNPAIRED | Refusal.SPACING
+_OF_THE_PAIR: Final = Rejection.UNPAIRED | Rejection.SPACING
 
 
 def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSettings) -> Fixes:
     """The rows by their distance to the trajectory, with their place on it and its standard deviation."""
     rows = fixes.good
-    refusal = fixes.refusal.copy()
+    rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
     if len(rows):
         found = match(
@@ -193,12 +193,12 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
         )
         arc[rows], lateral[rows], height[rows] = found.arc_m, found.lateral_m, found.height_m
         sigma[rows] = _along_sigma(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory, found, settings)
-        missed = np.isnan(arc) & (refusal == 0)
-        _refuse(refusal, missed & ~(np.abs(lateral) <= settings.lateral_m), Refusal.OFF_TRACK)
-        _refuse(refusal, missed & ~(np.abs(height) <= settings.height_m), Refusal.OFF_HEIGHT)
+        missed = np.isnan(arc) & (rejection == 0)
+        _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), Rejection.OFF_TRACK)
+        _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), Rejection.OFF_HEIGHT)
         # What is left is beyond an end of the line.
-        _refuse(refusal, missed, Refusal.OFF_TRACK)
-    return replace(fixes, refusal=refusal, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
+        _reject(rejection, missed, Rejection.OFF_TRACK)
+    return replace(fixes, rejection=rejection, arc_m=arc, lateral_m=lateral, height_m=height, sigma_m=sigma)
 
 
 def _along_sigma(
@@ -243,11 +243,11 @@ def judge_travel(
         return np.asarray(~(np.abs(offset[j] - offset[i]) > limit))
 
     keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), settings.travel_hold_s)
-    refusal, travel = fixes.refusal.copy(), np.full(len(fixes), np.nan)
-    refusal[rows[~keep]] |= Refusal.TRAVEL
+    rejection, travel = fixes.rejection.copy(), np.full(len(fixes), np.nan)
+    rejection[rows[~keep]] |= Rejection.TRAVEL
     kept = np.flatnonzero(keep)
     travel[rows[kept[1:]]] = np.diff(offset[kept])
-    return replace(fixes, refusal=refusal, travel_m=travel)
+    return replace(fixes, rejection=rejection, travel_m=travel)
 
 
 def _best_chain(agrees: Callable[[Indices, Indices], Masks], time_s: Floats, hold_s: float) -> Masks:

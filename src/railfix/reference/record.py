@@ -10,7 +10,7 @@ import polars as pl
 
 from railfix.io.reference_log import COLUMNS, AntennaReference
 from railfix.reference.assemble import Built
-from railfix.reference.fixes import Refusal
+from railfix.reference.fixes import Rejection
 from railfix.track.trajectory import Trajectory
 
 
@@ -31,20 +31,20 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
         )
         for name, part in references.items()
     ]
-    told = pl.when(pl.col("environment") != "").then(pl.col("environment")).alias("environment")
-    return _rounded(pl.concat(tables).sort("time_gpst", maintain_order=True).select(COLUMNS).with_columns(told))
+    environment = pl.when(pl.col("environment") != "").then(pl.col("environment")).alias("environment")
+    return _rounded(pl.concat(tables).sort("time_gpst", maintain_order=True).select(COLUMNS).with_columns(environment))
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
     """Rows of fixes.csv of one antenna."""
     fixes = part.fixes
-    words = {int(code): Refusal(int(code)).text or "good" for code in np.unique(fixes.refusal)}
+    words = {int(code): Rejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
     return _rounded(
         pl.DataFrame(
             {
                 "time_gpst": fixes.time,
                 "antenna": np.full(len(fixes), name),
-                "verdict": [words[code] for code in fixes.refusal.tolist()],
+                "verdict": [words[code] for code in fixes.rejection.tolist()],
                 "quality": fixes.quality,
                 "ratio": fixes.ratio,
                 "chainage_m": trajectory.chainage_at(fixes.arc_m),
@@ -59,7 +59,7 @@ def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
 
 
 def _rounded(table: pl.DataFrame) -> pl.DataFrame:
-    """Tenths of millimetres, and blank where there is no number."""
+    """Round to tenths of millimetres, blank where there is no number."""
     return table.with_columns(pl.col(pl.Float64).round(4).fill_nan(None))
 
 

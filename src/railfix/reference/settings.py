@@ -27,7 +27,7 @@ class ReferenceSettings(Settings):
         Least ratio of the ambiguity test of a fix, where the log has one (RTKLIB's own default is 3).
     spacing_m : float [m]
         Largest difference between the distance of the two antennas' positions and that on the vehicle (P2 3.3: 5 cm).
-    unpaired : {"refuse", "keep"}
+    unpaired : {"reject", "keep"}
         Whether a fix is rejected if the other antenna has none at that time, where two logs are given.
     lateral_m, height_m : float [m]
         Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
@@ -66,7 +66,7 @@ class ReferenceSettings(Settings):
     spacing_m: float = _limit(
         "Largest difference of the antennas' distance from that on the vehicle.", 0.05, "M", "--spacing"
     )
-    unpaired: Literal["refuse", "keep"] = "refuse"
+    unpaired: Literal["reject", "keep"] = "reject"
     lateral_m: float = _limit("Largest distance beside the antenna's trajectory.", 1.0, "M", "--lateral")
     height_m: float = _limit("Largest distance above or below it.", 2.0, "M", "--height")
     travel_m: float = _positive(0.10)

@@ -1,4 +1,4 @@
-"""The way between fixes: everything that measures it, weighed against each other, closed on the fixes.
+"""Smooth the distance between fixes: all sensors weighted by their variances, closed on the fixes.
 
 The unknowns of each instant are the place along the track, the speed, and one slow error for each
 kind of sensor: the lasting part of the Doppler speed's error, the difference and the scale of the
@@ -36,7 +36,7 @@ _LEAST_STEP_M: Final = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What is known along one antenna's path at N instants; NaN where nothing is.
+    """Measurements along one antenna's path at N instants; NaN where there is none.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Evidence:
 
 @dataclass(frozen=True, kw_only=True)
 class Smoothed:
-    """Place and speed of every instant.
+    """Position and speed at every instant.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class _Unknowns:
 
 
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
-    """Place and speed at every instant from all evidence at once.
+    """Estimate position and speed at every instant from all measurements together.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
 def _with_motion(
     chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, moved: Floats, settings: ReferenceSettings
 ) -> Chain:
-    """Place, speed and an acceleration that lasts a while (Singer's model); and what measures its change of speed."""
+    """Position, speed and a time-correlated acceleration (Singer's model), with the accelerometer's measurements."""
     first = np.array([0])
     for unknown, sigma in ((unknowns.speed, _ANY_SPEED_MPS), (unknowns.acceleration, settings.motion_mps2)):
         chain = chain.with_observations(first, _one(unknowns, unknown), np.zeros(1), np.full(1, sigma**-2))
@@ -169,7 +169,7 @@ def _with_motion(
 
 
 def singer(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """Step of place, speed and acceleration, and the covariance of its noise, shapes (K, 3, 3).
+    """Transition of position, speed and acceleration, and the covariance of its noise, shapes (K, 3, 3).
 
     The acceleration is a first-order Gauss-Markov process (R. A. Singer, Estimating optimal tracking filter
     performance for manned maneuvering targets, 1970, doi:10.1109/TAES.1970.310128). Steps of less than a tenth
@@ -211,7 +211,7 @@ def _with_doppler(
     relief: Floats,
     settings: ReferenceSettings,
 ) -> Chain:
-    """Doppler speed = speed + lasting error + noise; the lasting error is a first-order Gauss-Markov process."""
+    """Doppler speed = speed + time-correlated error + noise; that error is a first-order Gauss-Markov process."""
     if unknowns.doppler < 0:
         return chain
     kept = np.exp(-dt / settings.doppler_bias_s)
@@ -230,7 +230,7 @@ def _with_doppler(
 def _with_wheel(
     chain: Chain, unknowns: _Unknowns, evidence: Evidence, dt: Floats, nominal: Floats, settings: ReferenceSettings
 ) -> Chain:
-    """Reading = place + difference; the difference changes with the way by the scale, and by slip."""
+    """Reading = position + difference; the difference changes with distance by the scale error, and by slip."""
     if unknowns.difference < 0:
         return chain
     read = np.flatnonzero(np.isfinite(evidence.wheel_m))
@@ -277,7 +277,7 @@ def _one(unknowns: _Unknowns, unknown: int) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class Closings:
-    """What a way fails to close by between fixes, over W windows.
+    """Closing errors of a measured distance between fixes, over W windows.
 
     Attributes
     ----------
@@ -298,7 +298,7 @@ class Closings:
         return len(self.error_m)
 
     def excess_m2(self) -> float:
-        """Variance beyond what is explained, from the 80th percentile of the squared errors [m2]."""
+        """Variance in excess of the model, from the 80th percentile of the squared errors [m2]."""
         return max(float(np.quantile(self.error_m**2, 0.8)) / _CHI2_80 - float(np.median(self.white_m2)), 0.0)
 
 
@@ -311,7 +311,7 @@ def closings(
     *,
     window_s: float,
 ) -> Closings:
-    """Compare a measured way with that between fixes, over windows of about a length.
+    """Compare a measured distance with that between fixes, over windows of about a length.
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def closings(
 
 
 def lasting_error_mps(found: Closings, settings: ReferenceSettings) -> float:
-    """Size of the lasting part of the Doppler speed's error [m/s], from what it fails to close by.
+    """Standard deviation of the time-correlated Doppler speed error [m/s], from the closing errors.
 
     What the noise of single speeds and of the fixes does not explain is the lasting part. That of the settings
     where fewer than `WINDOWS` windows are there.
@@ -351,7 +351,7 @@ def lasting_error_mps(found: Closings, settings: ReferenceSettings) -> float:
 
 
 def slip_m(found: Closings, settings: ReferenceSettings) -> float:
-    """Random error of the wheel [m per square root of m], from what it fails to close by.
+    """Random error of the wheel [m per square root of m], from the closing errors.
 
     Its scale is taken off first. That of the settings where fewer than `WINDOWS` windows in motion are there.
     """

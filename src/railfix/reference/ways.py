@@ -1,4 +1,4 @@
-"""Speeds from Dopplers as a way along the track, and the instants that a reference is made at."""
+"""Distance travelled from Doppler speeds, and the instants of a reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from railfix.core.timescale import seconds, timedelta
 
 #: Tags that differ by no more belong to one instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
-#: Speeds further apart leave the way between them unknown [s], with this variance [m2].
+#: Speeds further apart leave the distance between them unknown [s], with this variance [m2].
 LONGEST_STEP_S: Final = 2.5
 UNKNOWN_M2: Final = 1e8
 
@@ -27,7 +27,7 @@ class Speeds:
     sigma_mps: Floats
 
     def way(self, time: Datetimes) -> tuple[Floats, Floats]:
-        """Way up to instants by trapezia [m], and the variance of its white part since the start [m2]; NaN outside."""
+        """Return the distance travelled (trapezoidal rule) [m] and its variance by white noise [m2]; NaN outside."""
         if len(self.time) < 2:
             return np.full(len(time), np.nan), np.full(len(time), np.nan)
         known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
@@ -40,7 +40,7 @@ class Speeds:
 
 
 def fused(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Speeds of all sources at instants, weighed by their variances, shapes (N,); NaN where none has one."""
+    """Combine speeds of all sources, weighted by their variances, shapes (N,); NaN where there is none."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest(time, source.time)
@@ -53,7 +53,7 @@ def fused(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
 
 
 def nearest(time: Datetimes, wanted: Datetimes) -> Indices:
-    """Row of `time` at each wanted instant within `SAME_INSTANT_NS`; -1 where there is none."""
+    """Return the row of `time` at each wanted instant within `SAME_INSTANT_NS`; -1 where there is none."""
     if not len(time):
         return np.full(len(wanted), -1, dtype=np.intp)
     have, want = time.astype(np.int64), wanted.astype(np.int64)
@@ -64,7 +64,7 @@ def nearest(time: Datetimes, wanted: Datetimes) -> Indices:
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
-    """Rows of the log of positions, epochs of receivers between them, and regular ones where there is neither.
+    """Return the instants of a reference: rows of the position log, receiver epochs, regular steps elsewhere.
 
     Parameters
     ----------

@@ -136,7 +136,7 @@ def budget(run: ReportedRun) -> list[Block]:
         ]
         for r in few
     ]
-    first, only = "observations_refused_by_first_reason", "observations_refused_by_one_reason_alone"
+    first, only = "observations_rejected_by_first_reason", "observations_rejected_by_one_reason_alone"
     reasons = dict.fromkeys(r for facts in antennas.values() for r in facts.get(first) or {})
     head = ["", *(word for n in names for word in (n, "share", "only reason"))]
     observed = {n: antennas[n].get("observations") or 0 for n in names}

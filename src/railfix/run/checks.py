@@ -1,4 +1,4 @@
-"""Whether inputs that can each be read belong together, and whether a run led to anything."""
+"""Checks that inputs match each other, and that a run has positions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from railfix.run.tally import AntennaTally, Tally
 
 #: A conventional position further from the trajectory than this belongs to another place [m].
 ANOTHER_PLACE_M: Final = 100_000.0
-#: Conventional positions that must agree on that before a run is stopped half-way.
+#: Conventional positions that must all be so far before a run is stopped early.
 ENOUGH_TO_STOP: Final = 10
 #: Navigation records further from the log than this are of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
@@ -62,7 +62,7 @@ def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -
     ----------
     tally : Tally
     antennas : {"all", "any"}
-        Whether every antenna must be elsewhere (half-way through a run, after a few positions of
+        Whether every antenna must be elsewhere (during a run, after a few positions of
         each), or one is enough (at the end).
 
     Raises
@@ -98,8 +98,8 @@ def check_same_time(tally: Tally) -> None:
     latest_start = max(first for first, _ in spans.values())
     earliest_end = min(last for _, last in spans.values())
     if latest_start > earliest_end:
-        told = " and ".join(f"the {n} log covers {_period(*span)}" for n, span in spans.items())
-        raise MismatchError(f"{told} (GPS time), expected logs of one run; give logs that overlap")
+        spans_text = " and ".join(f"the {n} log covers {_period(*span)}" for n, span in spans.items())
+        raise MismatchError(f"{spans_text} (GPS time), expected logs of one run; give logs that overlap")
 
 
 def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
@@ -132,8 +132,8 @@ def check_positions(tally: Tally) -> None:
         return
     if not tally.epochs:
         raise NoPositionError("no epoch between --start and --end; the logs have none there")
-    told = "; ".join(_why_nothing(name, antenna) for name, antenna in tally.antennas.items() if antenna.epochs)
-    raise NoPositionError(f"not one position: {told}")
+    causes = "; ".join(_why_nothing(name, antenna) for name, antenna in tally.antennas.items() if antenna.epochs)
+    raise NoPositionError(f"not one position: {causes}")
 
 
 def _why_nothing(name: str, antenna: AntennaTally) -> str:
@@ -141,11 +141,11 @@ def _why_nothing(name: str, antenna: AntennaTally) -> str:
     text = f"{name}: {status} in {epochs} of {antenna.epochs} epochs"
     if antenna.first_reason:
         reason, count = antenna.first_reason.most_common(1)[0]
-        text += f", {count} of {antenna.observations} pseudoranges refused as {reason}"
+        text += f", {count} of {antenna.observations} pseudoranges rejected as {reason}"
     return text
 
 
 def _period(first: np.datetime64, last: np.datetime64) -> str:
     """``2021-05-17 02:33 to 03:00``."""
-    one, two = (str(t.astype("datetime64[m]")).replace("T", " ") for t in (first, last))
-    return f"{one} to {two[11:] if one[:10] == two[:10] else two}"
+    start, end = (str(t.astype("datetime64[m]")).replace("T", " ") for t in (first, last))
+    return f"{start} to {end[11:] if start[:10] == end[:10] else end}"

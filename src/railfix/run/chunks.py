@@ -23,7 +23,7 @@ def _spacing_ns(part: Observations) -> int:
 def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
     """Chunks that cover the same span of time for every antenna.
 
-    Each antenna keeps its own epochs. A chunk ends where the first of the parts at hand ends;
+    Each antenna keeps its own epochs. A chunk ends where the first of the current parts ends;
     what the others have beyond waits for the next chunk. Epochs that belong together but are
     tagged a little apart (`SAME_INSTANT_NS`) stay in one chunk.
 

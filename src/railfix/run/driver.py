@@ -1,4 +1,4 @@
-"""The run itself: readers, aligned chunks, the epoch processor, tables, files."""
+"""Run: read logs in chunks, process epochs, write tables."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from railfix.track import check_track
 
 
 class Progress(Protocol):
-    """Whoever wants to know how far a run is."""
+    """Callback for the progress of a run."""
 
     def __call__(self, *, epochs: int, fraction: float) -> None:
         """Epochs done so far, and the part of the logs that has been read, 0 to 1."""
@@ -50,7 +50,7 @@ class Progress(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSummary:
-    """What a run came to.
+    """Summary of a run.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ def run_files(
         Folder for the results.
     options : RunOptions, optional
     asked : mapping, optional
-        Settings that were asked for, as opposed to defaults; goes into ``run.json``.
+        Settings that were given, as opposed to defaults; goes into ``run.json``.
     progress : Progress, optional
 
     Returns
@@ -150,7 +150,7 @@ def run_files(
 
 
 def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Line, dict[Antenna, Log]]:
-    """Navigation and line, read, and the logs, ready to be read.
+    """Read navigation and line, and open the logs.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _position(
     options: RunOptions,
     progress: Progress | None,
 ) -> Tally:
-    """Chunk by chunk: positions, counts, rows."""
+    """Position chunk by chunk: counts and rows."""
     tally, state = Tally(min_satellites=processor.config.min_satellites), State()
     received = np.datetime64("NaT", "ns")
     for chunk in aligned({name: log.parts() for name, log in logs.items()}):
@@ -233,7 +233,7 @@ def _position(
 def notes_of(
     line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
 ) -> tuple[str, ...]:
-    """Everything a reader of the results should know, each once.
+    """Return the notes of a run, each once.
 
     Parameters
     ----------
@@ -244,20 +244,20 @@ def notes_of(
     note_statistic : float
         Statistic of the test of the map from which on there is a note (`MapOffsetLimits.note_threshold`).
     """
-    said = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.notes]
+    notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.notes]
     for name, antenna in tally.antennas.items():
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
-            said.append(f"{name}: satellites seen without any usable navigation record: {seen}")
+            notes.append(f"{name}: satellites seen without any usable navigation record: {seen}")
         offset = antenna.map_offset
         if offset is not None and offset.statistic > note_statistic:
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"
-            said.append(f"{name}: the map {doubt}: {offset.text}")
+            notes.append(f"{name}: the map {doubt}: {offset.text}")
         off = antenna.status["off_map"]
         if off > 0.1 * antenna.positioned:
             which = "every position is" if off == antenna.positioned else f"{off} of {antenna.positioned} positions are"
-            said.append(f"{name}: {which} off the map; is this the right track?")
-    return tuple(dict.fromkeys(said))
+            notes.append(f"{name}: {which} off the map; is this the right track?")
+    return tuple(dict.fromkeys(notes))
 
 
 def _map_notes(line: Line) -> Iterator[str]:
@@ -274,12 +274,12 @@ def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
     for name, log in logs.items():
         yield from log.problems
         if log.skipped:
-            told = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
-            yield f"{name}: read over: {told}"
+            skipped = ", ".join(f"{count} {what}" for what, count in sorted(log.skipped.items()))
+            yield f"{name}: skipped: {skipped}"
 
 
 def _notes_of_levels(config: Config, tally: Tally, found: Mapping[str, Levels]) -> Iterator[str]:
-    """Where a run speaks against what its protection levels stand on."""
+    """Return notes on assumptions of the protection levels that this run contradicts."""
     if not found:
         return
     for name, of_antenna in found.items():
@@ -294,7 +294,7 @@ def _notes_of_levels(config: Config, tally: Tally, found: Mapping[str, Levels]) 
     prior = risk.local_prior + max(risk.satellite_prior.values())
     if excluded > prior * (used + excluded):
         yield (
-            f"protection level: it stands for faults with a probability of {prior:g} a range at most, and RAIM has "
+            f"protection level: it assumes a fault probability of at most {prior:g} per range, but RAIM has "
             f"excluded {excluded} of {used + excluded} ({excluded / (used + excluded):.2g}); see risk.local_prior"
         )
 

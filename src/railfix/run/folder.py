@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -53,10 +53,10 @@ class RunRecord:
 
         Raises
         ------
-        InputFileError, SettingsError
+        InputFileError
             The record lacks them, or they are not settings of this version.
         """
-        config = parse_config(self.part("settings_used"), source=str(self.path / "run.json"))
+        config = self._this_version(lambda: parse_config(self.part("settings_used"), source="settings_used"))
         files = {name: self.located(name) for name in ("cn0_curve", "error_model", "sbas")}
         changes = {name: tuple(paths) if name == "sbas" else paths[0] for name, paths in files.items() if paths}
         return config.replaced(**changes) if changes else config
@@ -69,16 +69,16 @@ class RunRecord:
         values = {
             name: self.located(name)[0] if name in one else tuple(self.located(name)) for name in dict.fromkeys(entries)
         }
-        return self._validated(RunInputs, values)
+        return self._this_version(lambda: validated(RunInputs, values, source="inputs"))
 
     @cached_property
     def options(self) -> RunOptions:
         """Options that were used."""
-        return self._validated(RunOptions, self.part("options"))
+        return self._this_version(lambda: validated(RunOptions, self.part("options"), source="options"))
 
-    def _validated(self, model: type[Model], values: Mapping[str, Any]) -> Model:
+    def _this_version(self, read: Callable[[], Model]) -> Model:
         try:
-            return validated(model, values, source="")
+            return read()
         except SettingsError as error:
             path = self.path / "run.json"
             raise InputFileError(path, f"was not written by this version ({error}); repeat the run") from None

@@ -1,4 +1,4 @@
-"""``run.json``: what was read, what was asked for, what was used, what came of it."""
+"""``run.json``: inputs, settings given and used, and results of a run."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def run_record(
     notes: Sequence[str],
     wall_s: float,
 ) -> dict[str, Any]:
-    """Everything that ``run.json`` says, as plain values.
+    """Return the content of ``run.json`` as plain values.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def run_record(
     tally : Tally
     sigma : mapping of str to AlongSigma
     protection : mapping
-        What the protection levels rest on (`protecting.level_facts`).
+        Assumptions of the protection levels (`railfix.pipeline.protection_levels.level_facts`).
     found_levels : mapping of str to Levels
     notes : sequence of str
     wall_s : float
@@ -170,10 +170,10 @@ def _overall_ok_rate(tally: Tally) -> float | None:
 
 
 def _versions() -> dict[str, str]:
-    found = {}
+    versions = {}
     for name in PACKAGES:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "absent"
-    return found
+            versions[name] = "absent"
+    return versions

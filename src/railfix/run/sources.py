@@ -43,9 +43,9 @@ class Line:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What the map, the vehicle and the trajectories have to say, each once."""
-        said = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
-        return tuple(dict.fromkeys([*said, *self.track.provenance.notes, *(self.frame.notes if self.frame else ())]))
+        """Notes on the map, the vehicle and the trajectories, each once."""
+        notes = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
+        return tuple(dict.fromkeys([*notes, *self.track.provenance.notes, *(self.frame.notes if self.frame else ())]))
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -124,7 +124,7 @@ class Log:
     problems : list of str
         Sentences on what was broken and passed over.
     skipped : Counter of str
-        What was read over, counted by what it is.
+        Skipped items, counted by kind.
     """
 
     paths: tuple[Path, ...]

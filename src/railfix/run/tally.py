@@ -12,7 +12,7 @@ from railfix.core.arrays import Masks
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.pipeline.processor import AntennaResult, Result
 
-_NOT_A_REFUSAL = Reason.NOT_OBSERVED
+_NOT_A_REJECTION = Reason.NOT_OBSERVED
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 
@@ -65,7 +65,7 @@ class AntennaTally:
         reason without which alone there would be enough. `not_observed`: too few were observed; `used`: enough
         were used, but their clocks left no range for the place.
     first_reason, only_reason : Counter of str
-        Refused observations by the first reason that applied, and those that one reason alone refused.
+        Rejected observations by the first reason that applied, and those that one reason alone rejected.
     observations, used : int
         Pseudoranges, and those that were used.
     satellites : Counter of str
@@ -140,7 +140,7 @@ class AntennaTally:
             )
 
     def _add_reasons(self, result: AntennaResult) -> None:
-        seen = (result.reason & _NOT_A_REFUSAL) == 0
+        seen = (result.reason & _NOT_A_REJECTION) == 0
         reason = result.reason[seen]
         first = first_reason(reason)
         self.observations += reason.size
@@ -172,14 +172,14 @@ class AntennaTally:
             return np.asarray(np.count_nonzero(left, axis=1) >= self.min_satellites)
 
         so_far, undecided = 0, np.ones(len(short), dtype=bool)
-        whole = sum(reason_names())
+        all_reasons = sum(reason_names())
         for bit, name in reason_names().items():
             so_far |= bit
             lost = undecided & ~enough(so_far)
             self.short_first.update({name: int(lost.sum())})
             undecided &= ~lost
             if bit != Reason.NOT_OBSERVED:
-                self.short_only.update({name: int((enough(whole & ~bit) & ~enough(whole)).sum())})
+                self.short_only.update({name: int((enough(all_reasons & ~bit) & ~enough(all_reasons)).sum())})
         self.short_first.update({"used": int(undecided.sum())})
 
     @property
@@ -198,20 +198,20 @@ class AntennaTally:
             "first_epoch_gpst": None if self.first is None else str(self.first),
             "last_epoch_gpst": None if self.last is None else str(self.last),
             "status": {s.text: self.status[s.text] for s in Status},
-            "epochs_with_position_by_status": _told(self.status_positioned),
-            "epochs_without_position_by_status": _told(self.status - self.status_positioned),
-            "too_few_satellites_by_first_reason": _told(self.short_first),
-            "too_few_satellites_by_one_reason_alone": _told(self.short_only),
+            "epochs_with_position_by_status": _nonzero(self.status_positioned),
+            "epochs_without_position_by_status": _nonzero(self.status - self.status_positioned),
+            "too_few_satellites_by_first_reason": _nonzero(self.short_first),
+            "too_few_satellites_by_one_reason_alone": _nonzero(self.short_only),
             "observations": self.observations,
             "observations_used": self.used,
-            "observations_refused_by_first_reason": dict(self.first_reason),
-            "observations_refused_by_one_reason_alone": dict(self.only_reason),
+            "observations_rejected_by_first_reason": dict(self.first_reason),
+            "observations_rejected_by_one_reason_alone": dict(self.only_reason),
             "satellites_seen": dict(sorted(self.satellites.items())),
             "satellites_without_any_record": self.never_recorded,
         }
 
 
-def _told(counts: Counter[str]) -> dict[str, int]:
+def _nonzero(counts: Counter[str]) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
