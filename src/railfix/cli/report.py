@@ -57,7 +57,13 @@ def report(
     4 the number of references fits neither one nor each run; 5 a reference is of another time;
     8 the page cannot be written; 1 a defect of railfix.
     """
-    in_runs = [path for run in runs if run.is_dir() for path in run.iterdir() if path.suffix != ".html"]
+    in_runs = [
+        path
+        for run in [*runs, *(conventional or ())]
+        if run.is_dir()
+        for path in run.iterdir()
+        if path.suffix != ".html"
+    ]
     inputs = [*(reference or ()), *in_runs, *([] if background is None else [background])]
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=inputs)
     page = write_report(
