@@ -17,6 +17,7 @@ import polars as pl
 
 import recordings_score
 import recordings_truth
+from phase_run import phase_run
 from pipeline_cases import clean_files
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.evaluate import along_track_error, interpolate_reference, score
@@ -37,7 +38,6 @@ from railfix.positioning.carrier import (
     find_slips,
     number_arcs,
     phase_positions,
-    phase_run,
     smooth_codes,
     track_jumps,
 )

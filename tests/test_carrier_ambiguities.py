@@ -12,16 +12,17 @@ from hypothesis import strategies as st
 
 import carrier_made
 import synthetic
+from phase_run import phase_run
 from railfix.core.geodesy import range_with_rotation
-from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases, PhaseState, phase_positions, phase_run
+from railfix.positioning.carrier import PhaseLimits, PhasePositions, Phases, PhaseState, phase_positions
 from railfix.positioning.carrier.ambiguities import FREE_AMBIGUITY_M, hop_of
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
 LINE = carrier_made.straight()
-CONSTANT = PhaseLimits(drift_m=0.0, correlation_s=0.0, tolerance_m=1e-7)
-WALKING = PhaseLimits(drift_m=0.02, hop_s=2.0, correlation_s=0.0, tolerance_m=1e-7)
+CONSTANT = PhaseLimits(drift_m=0.0, correlation_s=0.0)
+WALKING = PhaseLimits(drift_m=0.02, hop_s=2.0, correlation_s=0.0)
 
 
 def moving(epochs: int, speed_mps: float = 15.0) -> np.ndarray:

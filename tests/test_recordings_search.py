@@ -16,12 +16,13 @@ from scipy.optimize import least_squares
 
 import recordings_score
 import synthetic
+from exhaustive_search import exhaustive_search
 from pipeline_cases import demo_observations, processor
 from railfix.pipeline import corrected_ranges, solve
 from railfix.positioning import constrained, section_search
 from railfix.positioning.constrained import Constrained
 from railfix.positioning.normal_equations import UNTIED_M, Ranges
-from railfix.positioning.section_search import SearchIndex, Section, exhaustive_search
+from railfix.positioning.section_search import SearchIndex, Section
 from railfix.track.trajectory import Trajectory
 
 #: Points times channels looked at together, to keep the exhaustive search in memory.

@@ -1,10 +1,9 @@
-"""Section search: at which point of the trajectory do the ranges fit best?
+"""Section search: the point of the trajectory that fits the ranges best.
 
 P1 2.2(2) compares ranges with distances by between-satellite single differences. With their full
 covariance these give the weighted sum of squared residuals after the clock of each constellation
-is taken out (`clock_elimination.fit`), so no reference satellite has to be chosen. The point with
-the least such ``q`` is the answer; `exhaustive_search` is that definition, `search` finds the
-same point in time that does not grow with the line:
+is eliminated (`normal_equations.fit`), so no reference satellite has to be chosen. `search` returns the
+point with the least such ``q``, in a time that does not grow with the line:
 
 * where a 3-D position exists, ``q`` grows from it as a quadratic form, so the point lies in a ball
   whose radius follows from the ``q`` of any one point; a k-d tree returns its points;
@@ -12,7 +11,7 @@ same point in time that does not grow with the line:
   change faster than the square root of the summed weights times the distance moved, so a stretch
   of line whose middle fits too badly is dropped whole.
 
-Both are exact, not heuristic: a test holds them against `exhaustive_search`.
+Both are exact, not heuristic: tests compare them with ``q`` at every point of the line.
 """
 
 from __future__ import annotations
@@ -154,22 +153,6 @@ class _Candidates:
     matrix: Floats
 
 
-def exhaustive_search(ranges: Ranges, trajectory: Trajectory) -> tuple[Indices, Floats]:
-    """The definition: q at every point of the trajectory.
-
-    Returns
-    -------
-    vertex : ndarray of int, shape (T,)
-        Point with the least q, -1 where no range is redundant with the clocks.
-    q : ndarray, shape (T, V)
-    """
-    points = trajectory.ecef_m
-    q = np.empty((len(ranges), len(points)))
-    for t in range(len(ranges)):
-        q[t] = fit(ranges.take(np.full(len(points), t)), points)
-    return np.where(_searchable(ranges), np.argmin(q, axis=1), -1), q
-
-
 def _searchable(ranges: Ranges) -> Masks:
     return np.asarray(ranges.n_used > ranges.n_clocks)
 
@@ -182,7 +165,7 @@ def search(
     limits: SectionLimits | None = None,
     predicted: PredictedPlace | None = None,
 ) -> Section:
-    """The same point as `exhaustive_search`, without looking at the whole line.
+    """Return the point of the trajectory with the least q at each epoch, and the best other place.
 
     Parameters
     ----------

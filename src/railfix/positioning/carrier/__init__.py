@@ -7,7 +7,7 @@ full one: code and phase with the same geometry and clocks, an unknown constant 
 
 from __future__ import annotations
 
-from railfix.positioning.carrier.ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions, phase_run
+from railfix.positioning.carrier.ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions
 from railfix.positioning.carrier.arcs import ArcState, number_arcs
 from railfix.positioning.carrier.continuity import ContinuityLimits, ContinuityState, TrackJumps, track_jumps
 from railfix.positioning.carrier.filtered import PhaseState, phase_positions
@@ -36,7 +36,6 @@ __all__ = [
     "find_slips",
     "number_arcs",
     "phase_positions",
-    "phase_run",
     "smooth_codes",
     "track_jumps",
 ]

@@ -4,8 +4,8 @@ P4's observation model with the map's constraint: unknown are the distance and t
 epoch and one constant an arc of phase. The epochs' own unknowns are eliminated, so that the
 normal matrix is as large as there are arcs, whatever the number of epochs.
 
-`phase_run` uses the whole run for each of its epochs, later ones too: for logs. `phase_positions`
-in `filtered` uses the past alone: for live use.
+`phase_positions` in `filtered` uses each epoch and those before it. The tests compare it with one least
+squares over all epochs of a run (`tests/phase_run.py`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import GPS_EPOCH, seconds
 from railfix.positioning.carrier.observation_model import (
@@ -24,16 +24,11 @@ from railfix.positioning.carrier.observation_model import (
     OwnUnknowns,
     PhaseClocks,
     Phases,
-    linearise,
-    own_clock,
-    own_unknowns,
-    reduce,
-    shifted,
 )
 from railfix.positioning.normal_equations import Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Sigma of an ambiguity against its first value [m]: keeps matrices regular, says nothing.
+#: Sigma of an ambiguity against its first value [m]: loose prior for conditioning.
 FREE_AMBIGUITY_M: Final = 1e4
 
 
@@ -56,10 +51,6 @@ class PhaseLimits(Settings):
         to each other than this tell the ambiguities the same thing again. The variance that the
         ambiguities bring is multiplied by correlation / interval, up to that of codes alone. The
         positions do not change. 0 for noise that is white, as a simulated one.
-    tolerance_m : float
-        `phase_run`: last step along the line.
-    max_iterations : int
-        `phase_run`: linearisations.
     passes : int
         `phase_positions`: linearisations, each with its own memory, so that no result depends on
         how a log is cut.
@@ -73,8 +64,6 @@ class PhaseLimits(Settings):
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)
     correlation_s: float = Field(default=20.0, ge=0)
-    tolerance_m: float = Field(default=1e-4, gt=0)
-    max_iterations: int = Field(default=8, ge=1)
     passes: int = Field(default=2, ge=1)
     forget_s: float = Field(default=600.0, gt=0)
     largest_sigma_m: float = Field(default=1e3, gt=0)
@@ -96,7 +85,7 @@ def repeats_of(time: Datetimes, limits: PhaseLimits) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class ArcAmbiguities:
-    """Constants of arcs, A of them (`phase_run` with a drift: of stretches of arcs inside a hop).
+    """Constants of arcs, A of them (of a whole run with a drift: of stretches of arcs inside a hop).
 
     Attributes
     ----------
@@ -134,7 +123,7 @@ class PhasePositions:
     n_codes, n_phases : ndarray of int, shape (T,)
         Used.
     arcs : ArcAmbiguities
-        All arcs of the run (`phase_run`), or those alive after the last epoch (`phase_positions`).
+        All arcs of a run, or those alive after the last epoch (`phase_positions`).
     iterations : int
     """
 
@@ -228,115 +217,3 @@ def assembled(
         arcs=arcs,
         iterations=iterations,
     )
-
-
-def phase_run(
-    time: Datetimes,
-    ranges: Ranges,
-    phases: Phases,
-    trajectory: Trajectory,
-    arc_m_start: Floats,
-    *,
-    limits: PhaseLimits | None = None,
-) -> PhasePositions:
-    """Positions of a run of epochs, all observations of the run in one least squares.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    ranges : Ranges
-        T epochs: corrected codes with their weights, satellites, clocks, ties between clocks.
-    phases : Phases
-    trajectory : Trajectory
-    arc_m_start : ndarray, shape (T,) [m]
-        Where each epoch starts from (the constrained position of codes alone); NaN leaves it out.
-    limits : PhaseLimits, optional
-
-    Returns
-    -------
-    PhasePositions
-        Memory: T x M x M and A x A numbers for A arcs; cut long logs into runs of minutes.
-    """
-    limits = limits or PhaseLimits()
-    started = np.isfinite(arc_m_start)
-    ranges, phases, arc = startable(ranges, phases, trajectory, arc_m_start)
-    used = phases.weight > 0
-    # Row-major: the first place of an arc is its first epoch.
-    walk = _walk(hop_of(time, limits), used, phases.arc_id, limits)
-    first, column, count = walk.first, walk.column, len(walk.arc_id)
-    index = np.full(used.shape, count, dtype=np.intp)
-    index[used] = column
-    base = np.zeros(count + 1)
-    iteration = 0
-    while True:
-        lin = linearise(ranges, phases, trajectory, arc, clocks=limits.clocks)
-        if iteration == 0:
-            base[:count] = lin.phase_m[used][first]
-        lin = shifted(lin, base[index])
-        value, covariance = _solved(lin, index, walk.links)
-        among = covariance[index[:, :, None], index[:, None, :]]
-        own = own_unknowns(lin, value[index], among, trajectory, repeats=repeats_of(time, limits))
-        after = moved(arc, own, trajectory)
-        step = float(np.abs(after - arc)[started].max(initial=0.0))
-        arc, iteration = after, iteration + 1
-        if step <= limits.tolerance_m or iteration >= limits.max_iterations:
-            break
-    total = base + value[:, 0]
-    arcs = ArcAmbiguities(arc_id=walk.arc_id, ambiguity_m=total[:count], covariance_m2=covariance[:count, :count])
-    return assembled(
-        arc, started, own, lin, total[index], np.diagonal(covariance)[index], arcs,
-        iterations=iteration, limits=limits,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Walk:
-    """Unknowns of a run: one a stretch of an arc inside a hop, linked to the next of its arc.
-
-    `first` is the place of each arc's first value among the used phases, `column` the unknown of
-    each of them, `links` the information of the random walk between unknowns, shape (A, A).
-    """
-
-    arc_id: Integers
-    first: Indices
-    column: Indices
-    links: Floats
-
-
-def _walk(hop: Integers, used: Masks, arc_id: Integers, limits: PhaseLimits) -> _Walk:
-    """Unknowns of the arcs' ambiguities, and what the walk between them says."""
-    when = np.broadcast_to(hop[:, None], used.shape)[used] if limits.drift_m > 0.0 else np.zeros(used.sum(), np.int64)
-    # Row-major: the first place of an arc is its first epoch.
-    pairs = np.stack([arc_id[used], when], axis=1)
-    stretches, column = np.unique(pairs, axis=0, return_inverse=True)
-    ids, first = np.unique(arc_id[used], return_index=True)
-    links = np.zeros((len(stretches), len(stretches)))
-    next_one = np.flatnonzero(stretches[1:, 0] == stretches[:-1, 0])
-    if limits.drift_m > 0.0:
-        steps = (stretches[next_one + 1, 1] - stretches[next_one, 1]) * limits.hop_s
-        weight = 1.0 / (limits.drift_m**2 * steps)
-        for one, two, sign in ((0, 0, 1), (1, 1, 1), (0, 1, -1), (1, 0, -1)):
-            np.add.at(links, (next_one + one, next_one + two), sign * weight)
-    return _Walk(
-        arc_id=stretches[:, 0],
-        first=first[np.searchsorted(ids, stretches[:, 0])],
-        column=column.reshape(-1),
-        links=links,
-    )
-
-
-def _solved(lin: Linearised, index: Indices, links: Floats) -> tuple[Floats, Floats]:
-    """Ambiguities less their first values with their responses to the map, and their covariance.
-
-    Shapes (A + 1, 3) and (A + 1, A + 1): the last one stands for channels without a phase.
-    """
-    part, count = reduce(lin), len(links)
-    matrix = np.zeros((count + 1, count + 1))
-    right = np.zeros((count + 1, 3))
-    np.add.at(matrix, (index[:, :, None], index[:, None, :]), part.matrix)
-    np.add.at(right, index, part.right)
-    matrix[:-1, :-1] += links
-    matrix[-1], matrix[:, -1], right[-1] = 0.0, 0.0, 0.0
-    held = np.append(np.ones(count), 0.0) if own_clock(lin) else np.zeros(count + 1)
-    covariance = inverse_of_arcs(matrix, held)
-    return covariance @ right, covariance
