@@ -132,6 +132,8 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=30.0, help="no new mutant is begun after so long (default 30)")
     options = parser.parse_args()
     pool, started, limits, killed, done = mutants_of(options.package), time.monotonic(), {}, 0, 0
+    if not pool:
+        sys.exit(f"no functions under {SOURCE / options.package}; give a package, for example ranges or ranges/sbas")
     drawn = random.Random(options.seed).sample(pool, min(options.sample, len(pool)))
     with tempfile.TemporaryDirectory() as folder:
         copied = Path(folder) / "src" / "railfix"
