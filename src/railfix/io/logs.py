@@ -1,4 +1,4 @@
-"""Receiver logs and navigation files of any kind, told apart by their content.
+"""Receiver logs and navigation files of any kind, recognised by their content.
 
 RINEX 2 to 4 (plain, packed, Hatanaka), UBX, RTCM 3 and mixed receiver streams are logs like any other: the
 functions here have the arguments of `railfix.io.rinex` and hand each file to its reader.

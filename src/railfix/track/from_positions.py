@@ -42,7 +42,7 @@ class ThinningLimits(Settings):
     jump_m : float [m]
         Neighbouring points further apart, joined by a straight line, are reported.
     gap_m : float [m]
-        Neighbouring points further apart are no line: the positions are refused.
+        Neighbouring points further apart do not form a line: an error.
     speed_mps : float [m/s]
         Positions that the vehicle could reach from the others only faster than this are wrong and dropped; without
         times, those further than `gap_m` from the others.
@@ -395,8 +395,8 @@ def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
         worst = [SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[5]) for q in np.unique(log.quality[kept])]
         plan, height = max([plan, *(w[0] for w in worst)]), max([height, *(w[1] for w in worst)])
         reasons.append("the quality of the positions")
-    told = " and ".join(reasons) if reasons else "an assumption, for the log states neither quality nor sigma"
-    return plan, height, f"accuracy of the map {plan:.2f} m in plan, {height:.2f} m in height: {told}"
+    basis = " and ".join(reasons) if reasons else "an assumption, for the log states neither quality nor sigma"
+    return plan, height, f"accuracy of the map {plan:.2f} m in plan, {height:.2f} m in height: {basis}"
 
 
 def from_position_log(
