@@ -272,7 +272,7 @@ def test_a_log_without_enough_good_positions(tmp_path: Path, options: dict[str, 
 
 def test_filters_that_the_log_cannot_serve(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
-    path.write_text("latitude_deg,longitude_deg,height_m\n35,139,1\n35.1,139,1\n", encoding="utf-8")
+    path.write_text("latitude_deg,longitude_deg,height_m\n35,139,1\n35.0001,139,1\n", encoding="utf-8")
     log = read_positions(path)
     with pytest.raises(InputFileError, match="no column 'quality'"):
         from_position_log(log, quality=(1,))
