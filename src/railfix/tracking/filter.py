@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.timescale import seconds
 from railfix.tracking.clocks import clocks_of_epoch, weighed
 from railfix.tracking.epochs import GnssEpochs, Previous, SensorEpochs
-from railfix.tracking.hypotheses import surviving
+from railfix.tracking.hypotheses import surviving, with_map_error
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, write_place, write_rows
@@ -137,7 +137,9 @@ def _step(
         weight = first_weights(rows, covariance, limits.degrees_of_freedom)
         innovation = rows.value
         update = _settled(rows, weight, channels, sensors, epoch, line, mean, covariance, dt, noise, limits)
-        log_probability = state.log_probability + update.log_evidence
+        places = mean[:, Unknown.PLACE] + update.change[:, Unknown.PLACE]
+        evidence = with_map_error(update.log_evidence, line.at(places)[0], state.log_probability, limits)
+        log_probability = state.log_probability + evidence
         state = replace(
             state,
             mean=mean + update.change,

@@ -26,6 +26,9 @@ _ANY_DRIFT_MPS: Final = 1e3
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
+#: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
+_BEND_SPEED_MPS: Final = 10.0
+_BESIDE_SHARE: Final = 0.01
 #: What a new hypothesis takes over from a lost track: its error has gone into everything else.
 _KEPT: Final = np.array([Unknown.WHEEL, Unknown.FORCE_OFFSET, Unknown.RADAR])
 
@@ -144,6 +147,54 @@ def split(
     covariances = narrower + np.outer(gain, gain) * (sigma_m**2)[:, None, None]
     log_weight = -0.5 * (arc_m - mean[place]) ** 2 / wide + np.log(sigma_m)
     return means, covariances, log_probability + log_weight - np.logaddexp.reduce(log_weight)
+
+
+def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Floats, Floats, Floats]:
+    """Mean, covariance and logarithm of the share of hypotheses a little before and after one, its speed unknown.
+
+    Where a line turns back within some tens of metres, Dopplers fit one leg run forward and the other run backward
+    alike, and a step of the estimate over the bend is none of the equations linearised before it. Contradicted by its
+    motion, the place beyond the bend must be tried.
+
+    Parameters
+    ----------
+    mean, covariance : ndarray, shapes (N,), (N, N)
+    limits : TrackingLimits
+    """
+    steps = limits.bend_m * np.array([-2.0, -1.0, 1.0, 2.0])
+    means = np.repeat(mean[None], len(steps), axis=0)
+    means[:, Unknown.PLACE] += steps
+    covariances = np.repeat(covariance[None], len(steps), axis=0)
+    for unknown, sigma in (
+        (Unknown.PLACE, 0.5 * limits.bend_m),
+        (Unknown.SPEED, _BEND_SPEED_MPS),
+        (Unknown.ACCELERATION, limits.acceleration_mps2),
+    ):
+        covariances[:, unknown, unknown] += sigma**2
+    return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))
+
+
+def with_map_error(log_evidence: Floats, ecef_m: Floats, log_probability: Floats, limits: TrackingLimits) -> Floats:
+    """Evidence of the hypotheses where branches lie within the error of the map, shape (H,).
+
+    Two branches a few metres apart differ in their ranges by as much as the map may be wrong, at every epoch alike:
+    summed over epochs the difference would decide between them, and often wrongly. The difference to the most probable
+    hypothesis counts by ``d^2 / (d^2 + map_branch_m^2)`` with their distance d.
+
+    Parameters
+    ----------
+    log_evidence : ndarray, shape (H,)
+        Of this epoch.
+    ecef_m : ndarray, shape (H, 3) [m]
+        Places of the hypotheses.
+    log_probability : ndarray, shape (H,)
+        Before the epoch.
+    limits : TrackingLimits
+    """
+    best = int(np.argmax(log_probability))
+    square = ((ecef_m - ecef_m[best]) ** 2).sum(axis=1)
+    share = square / (square + limits.map_branch_m**2)
+    return np.asarray(log_evidence[best] + share * (log_evidence - log_evidence[best]))
 
 
 def surviving(

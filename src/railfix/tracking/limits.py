@@ -26,7 +26,8 @@ class TrackingLimits(Settings):
     code_white_share : float
         White part of a code's error, over its standard deviation; per second, not per epoch.
     slow_code_m, slow_code_s : float
-        Displacement along the line by errors of orbits and ionosphere, about 1 m a satellite, and how long it lasts:
+        Displacement along the line by errors of orbits and ionosphere, about 1 m a satellite with a dilution of one,
+        and how long it lasts:
         averaging over epochs does not take it away.
     doppler_floor_mps, doppler_zenith_mps : float
         ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2`` of a Doppler.
@@ -49,6 +50,9 @@ class TrackingLimits(Settings):
         Error of a length along the map [m per square root of m].
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
+    map_branch_m : float
+        Distance of two branches at which half of their difference is the map's: three times an error of 1 m, that of
+        a track surveyed by car or train.
     decided_travel_m : float
         Hypotheses are dropped only after this much travel: before, motion has not told branches apart.
     least_probability : float
@@ -63,6 +67,8 @@ class TrackingLimits(Settings):
     lost_motion_weight, lost_motion_s, lost_code_weight, lost_code_s : float
         The track is lost when the mean weight of Dopplers and phases, or of codes, stays below these for so long
         (1 is the weight of an error of one standard deviation).
+    bend_m : float
+        Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
     expired_sigma_m : float
         Standard deviation from which on a predicted place is no position.
     """
@@ -74,7 +80,7 @@ class TrackingLimits(Settings):
     code_correlation_s: float = Field(default=60.0, gt=0)
     code_correlation_m: float = Field(default=100.0, gt=0)
     code_white_share: float = Field(default=0.5, gt=0)
-    slow_code_m: float = Field(default=0.7, ge=1e-6)
+    slow_code_m: float = Field(default=1.0, ge=1e-6)
     slow_code_s: float = Field(default=600.0, gt=0)
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
@@ -90,6 +96,7 @@ class TrackingLimits(Settings):
     map_correlation_m: float = Field(default=50.0, gt=0)
     map_scale_m: float = Field(default=0.03, gt=0)
     map_absolute_m: float = Field(default=500.0, gt=0)
+    map_branch_m: float = Field(default=3.0, gt=0)
     decided_travel_m: float = Field(default=60.0, ge=0)
     least_probability: float = Field(default=1e-4, gt=0, lt=0.5)
     most_hypotheses: int = Field(default=8, ge=1)
@@ -100,4 +107,5 @@ class TrackingLimits(Settings):
     lost_motion_s: float = Field(default=6.0, gt=0)
     lost_code_weight: float = Field(default=0.5, ge=0)
     lost_code_s: float = Field(default=12.0, gt=0)
+    bend_m: float = Field(default=20.0, gt=0)
     expired_sigma_m: float = Field(default=200.0, gt=0)

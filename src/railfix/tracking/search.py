@@ -9,7 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Masks, Strings
 from railfix.core.timescale import seconds
-from railfix.tracking.hypotheses import begin, places, split
+from railfix.tracking.hypotheses import begin, beside, places, split
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
@@ -71,7 +71,7 @@ def sought(
     gap = seconds(now - state.measured) > limits.gap_s
     wide = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE]) > limits.start_sigma_m
     if not (lost or (gap and wide.any())):
-        return state, False
+        return (_tried_beside(state, limits) if state.weak_motion_s > 0.0 else state), False
     arc, sigma = places(channels, line, limits)
     if not len(arc):
         return state, lost
@@ -97,3 +97,19 @@ def sought(
         weak_motion_s=0.0, weak_code_s=0.0,
     )  # fmt: skip
     return state, lost
+
+
+def _tried_beside(state: TrackState, limits: TrackingLimits) -> TrackState:
+    """The state with hypotheses beside its best, whose motion was contradicted at the epoch before."""
+    if state.hypotheses > limits.most_hypotheses // 2:
+        return state
+    best = int(np.argmax(state.log_probability))
+    mean, covariance, share = beside(state.mean[best], state.covariance[best], limits)
+    log_probability = np.concatenate([state.log_probability, state.log_probability[best] + share])
+    return replace(
+        state,
+        mean=np.concatenate([state.mean, mean]),
+        covariance=np.concatenate([state.covariance, covariance]),
+        log_probability=log_probability - np.logaddexp.reduce(log_probability),
+        origin_m=np.concatenate([state.origin_m, mean[:, Unknown.PLACE]]),
+    )

@@ -1,0 +1,285 @@
+r"""Slip, slide, low speed and rolling away, found by the pitch of the vehicle (P2 2.1), and carried by inertia.
+
+The accelerometer measures motion and the share of gravity along its axis, the tachometer the motion of the wheel
+alone: ``sin(theta_T) = (f_x - a_T) / g`` is the pitch where the wheel rolls. Where it does not, the pitch becomes
+one that no line has. Two rules:
+
+* ``"p2"``: ``|sin(theta_T)|`` beyond the steepest line and the pitching of the body. It sees the acceleration of a
+  slip, not its speed: at the top of a slip the wheel's acceleration is that of the train, and the rule is silent.
+* ``"map"``: against the gradient of the line at the present place, with a latch: once found, a slip ends only when
+  the wheel has come back to the speed carried by inertia and the pitch fits.
+
+While a slip lasts, speed and way come from the accelerometer less the gradient and its offset, which is learnt while
+the wheel rolls; they start `look_back_s` before the detection, for the wheel was off already then.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+from itertools import pairwise
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Codes, Floats
+from railfix.core.settings import Settings
+
+#: Standard gravity [m/s2].
+GRAVITY_MPS2: Final = 9.80665
+
+
+class MotionState(IntEnum):
+    """What the speed of a sample rests on."""
+
+    #: Nothing known yet.
+    INIT = 0
+    #: No pulse for a second and the body at rest.
+    STANDING = 1
+    #: Moving too slowly for the tachometer; carried by inertia.
+    LOW_SPEED = 2
+    #: The wheel rolls.
+    NORMAL = 3
+    #: The wheel is faster than the train; carried by inertia.
+    INERTIAL_SPIN = 4
+    #: The wheel is slower than the train; carried by inertia.
+    INERTIAL_SLIDE = 5
+    #: Freed and rolling away below the tachometer's least speed; carried by inertia.
+    ROLLING = 6
+    #: Carried for too long: no speed.
+    EXPIRED = 7
+
+
+class SlipLimits(Settings):
+    """Limits of the detection.
+
+    Attributes
+    ----------
+    rule : {"map", "p2"}
+        See the module; "p2" has neither latch nor look-back.
+    p2_limit : float
+        Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
+    map_limit : float
+        Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
+    confirm_s : float
+        Time over the limit after which a slip is one.
+    latch_mps, latch_share, latch_s : float
+        A slip ends when wheel and inertia agree within the larger of a speed and a share of it for so long.
+    look_back_s : float
+        How long before the detection the carry begins.
+    longest_carry_s : float
+        After this the carried speed has expired: an offset of 1e-3 of gravity has become 0.3 m/s.
+    smoothing_s : float
+        Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
+    offset_s : float
+        Time constant with which the accelerometer's offset is learnt while the wheel rolls.
+    standing_s : float
+        Time without a pulse after which a vehicle at rest stands.
+    rolling_limit, rolling_s, rolling_mps : float
+        Change of the apparent pitch at standstill, its duration, and the speed carried by then, that mean rolling away.
+    """
+
+    rule: Literal["map", "p2"] = "map"
+    p2_limit: float = Field(default=0.045, gt=0)
+    map_limit: float = Field(default=0.015, gt=0)
+    confirm_s: float = Field(default=0.1, ge=0)
+    latch_mps: float = Field(default=0.15, gt=0)
+    latch_share: float = Field(default=0.01, ge=0)
+    latch_s: float = Field(default=0.5, ge=0)
+    look_back_s: float = Field(default=0.3, ge=0)
+    longest_carry_s: float = Field(default=30.0, gt=0)
+    smoothing_s: float = Field(default=0.2, gt=0)
+    offset_s: float = Field(default=60.0, gt=0)
+    standing_s: float = Field(default=1.0, gt=0)
+    rolling_limit: float = Field(default=0.002, gt=0)
+    rolling_s: float = Field(default=0.3, gt=0)
+    rolling_mps: float = Field(default=0.05, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipResult:
+    """Speed and its source at N samples.
+
+    Attributes
+    ----------
+    state : ndarray of int8, shape (N,)
+        `MotionState`.
+    speed_mps : ndarray, shape (N,) [m/s]
+        Of the wheel where it rolls, else carried; NaN in INIT and EXPIRED.
+    way_m : ndarray, shape (N,) [m]
+        Integral of the speed from the first sample, each slip corrected from its look-back on.
+    metric : ndarray, shape (N,)
+        Sine of the pitch by wheel and accelerometer less that of the line; NaN without pulses.
+    offset_mps2 : ndarray, shape (N,) [m/s2]
+        Of the accelerometer, as learnt.
+    """
+
+    state: Codes
+    speed_mps: Floats
+    way_m: Floats
+    metric: Floats
+    offset_mps2: Floats
+
+
+def find_slips(
+    time_s: Floats,
+    wheel_mps: Floats,
+    wheel_mps2: Floats,
+    force_mps2: Floats,
+    line_sine: Floats,
+    *,
+    limits: SlipLimits | None = None,
+) -> SlipResult:
+    """Return the state of the motion, its speed and way, each sample from itself and earlier ones.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (N,) [s]
+        Rising, 10 to 100 samples a second.
+    wheel_mps, wheel_mps2 : ndarray, shape (N,) [m/s], [m/s2]
+        Speed and acceleration of the wheel; NaN where pulses say nothing.
+    force_mps2 : ndarray, shape (N,) [m/s2]
+        Specific force along the vehicle.
+    line_sine : ndarray, shape (N,)
+        Sine of the line's gradient at the vehicle, + up in the direction of travel; the pitch last known without a map.
+    limits : SlipLimits, optional
+    """
+    limits = limits or SlipLimits()
+    size = len(time_s)
+    state = np.zeros(size, dtype=np.int8)
+    speed, metric, offsets = np.full(size, np.nan), np.full(size, np.nan), np.zeros(size)
+    way = np.zeros(size)
+    automaton = _Automaton(limits)
+    for k in range(size):
+        dt = float(time_s[k] - time_s[k - 1]) if k else 0.0
+        automaton.step(dt, float(wheel_mps[k]), float(wheel_mps2[k]), float(force_mps2[k]), float(line_sine[k]))
+        state[k], speed[k], metric[k] = automaton.state, automaton.speed, automaton.metric
+        way[k], offsets[k] = automaton.way, automaton.offset
+    return SlipResult(state=state, speed_mps=speed, way_m=way, metric=metric, offset_mps2=offsets)
+
+
+class _Automaton:
+    """One sample after the other; the numbers that lead from one to the next."""
+
+    def __init__(self, limits: SlipLimits) -> None:
+        self.limits = limits
+        self.state = MotionState.INIT
+        self.speed, self.way, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
+        self._smooth = 0.0
+        self._over = self._fits = self._silent = self._carried = self._apart = self._age = 0.0
+        self._rest = float("nan")
+        #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
+        self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
+
+    def step(self, dt: float, wheel: float, acceleration: float, force: float, sine: float) -> None:
+        limits, heard = self.limits, wheel == wheel
+        inertial = force - GRAVITY_MPS2 * sine - self.offset
+        self._age += dt
+        self._silent = 0.0 if heard else self._silent + dt
+        if heard and acceleration == acceleration:
+            self.metric = (force - acceleration) / GRAVITY_MPS2 - sine
+            share = min(dt / limits.smoothing_s, 1.0)
+            self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
+        else:
+            self.metric = float("nan")
+        if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
+            self._carry(dt, inertial)
+            self._release(dt, wheel, heard=heard)
+        elif heard:
+            self._roll(dt, wheel, acceleration, inertial, sine)
+        else:
+            self._quiet(dt, force, inertial)
+        if self.speed == self.speed:
+            self.way += self.speed * dt
+        self._past.append((self._age, self.speed, inertial))
+
+    def _carry(self, dt: float, inertial: float) -> None:
+        self.speed += inertial * dt
+        self._carried += dt
+        if self._carried > self.limits.longest_carry_s:
+            self.state, self.speed = MotionState.EXPIRED, float("nan")
+
+    def _release(self, dt: float, wheel: float, *, heard: bool) -> None:
+        """Latch: the wheel must come back to the carried speed, with a pitch that fits."""
+        limits = self.limits
+        if limits.rule == "p2":
+            back = heard and abs(self.metric) <= limits.p2_limit
+            if back:
+                self.state, self.speed = MotionState.NORMAL, wheel
+            return
+        near = max(limits.latch_mps, limits.latch_share * abs(self.speed))
+        fits = heard and abs(wheel - self.speed) < near and abs(self._smooth) < limits.map_limit
+        self._fits = self._fits + dt if fits else 0.0
+        if self._fits >= limits.latch_s:
+            self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
+
+    def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
+        """The wheel turns: it is believed unless the pitch contradicts."""
+        limits = self.limits
+        self.state, self._carried = MotionState.NORMAL, 0.0
+        self._rest = float("nan")
+        if limits.rule == "p2":
+            over = acceleration == acceleration and abs(self.metric + sine) > limits.p2_limit
+            value = self.metric + sine
+        else:
+            over, value = abs(self._smooth) > limits.map_limit, self._smooth
+        self._over = self._over + dt if over else 0.0
+        self.speed = wheel
+        if not over:
+            share = min(dt / limits.offset_s, 1.0)
+            self.offset += share * GRAVITY_MPS2 * self._smooth
+        if self._over > 0.0 and self._over >= limits.confirm_s:
+            self.state = MotionState.INERTIAL_SPIN if value < 0 else MotionState.INERTIAL_SLIDE
+            self._fits = self._over = 0.0
+            if limits.rule == "map":
+                self._look_back(inertial, dt)
+
+    def _look_back(self, inertial: float, dt: float) -> None:
+        """Put speed and way on the carry from a little before the detection."""
+        begin = self._age - self.limits.look_back_s - self.limits.confirm_s - self.limits.smoothing_s
+        past = [entry for entry in self._past if entry[0] >= begin and entry[1] == entry[1]]
+        if not past:
+            return
+        speed, old_way, new_way = past[0][1], 0.0, 0.0
+        for before, after in pairwise(past):
+            step = after[0] - before[0]
+            speed += after[2] * step
+            old_way += after[1] * step
+            new_way += speed * step
+        self.speed = speed + inertial * dt
+        self.way += new_way - old_way
+
+    def _quiet(self, dt: float, force: float, inertial: float) -> None:
+        """No pulse: standing, starting or stopping slowly, or rolling away."""
+        limits = self.limits
+        if self.state == MotionState.NORMAL:
+            self.state = MotionState.LOW_SPEED
+        if self.state == MotionState.LOW_SPEED:
+            self.speed = max(self.speed + inertial * dt, 0.0) if self.speed >= 0 else min(self.speed + inertial * dt, 0)
+            self._carried += dt
+        if self.state in (MotionState.STANDING, MotionState.ROLLING):
+            self._watch(dt, force)
+        elif self._silent >= limits.standing_s and not abs(self.speed) > 0.5:
+            self.state, self.speed, self._rest, self._apart = MotionState.STANDING, 0.0, force, 0.0
+        elif self._carried > limits.longest_carry_s:
+            self.state, self.speed = MotionState.EXPIRED, float("nan")
+
+    def _watch(self, dt: float, force: float) -> None:
+        """At rest the force is gravity's share; freed, it falls toward zero and the change is the motion."""
+        limits = self.limits
+        change = force - self._rest
+        moved = abs(change) > limits.rolling_limit * GRAVITY_MPS2
+        if self.state == MotionState.STANDING:
+            self._apart = self._apart + dt if moved else 0.0
+            if not moved:
+                self._rest += min(dt / limits.offset_s, 1.0) * change
+                self.speed = 0.0
+                return
+            # Rolling freely the accelerometer shows nothing; the acceleration is gravity's, which it showed at rest.
+            self.speed += change * dt
+            if self._apart >= limits.rolling_s and abs(self.speed) > limits.rolling_mps:
+                self.state = MotionState.ROLLING
+        else:
+            self.speed += change * dt

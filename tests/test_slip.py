@@ -1,0 +1,127 @@
+"""Slip, slide, low speed and rolling away on motions with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from railfix.motion.slip import GRAVITY_MPS2, MotionState, SlipLimits, SlipResult, find_slips
+
+RATE_HZ = 50.0
+SLIPPING = (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)
+
+
+@dataclass(frozen=True)
+class Motion:
+    time_s: np.ndarray
+    speed: np.ndarray
+    wheel: np.ndarray
+    force: np.ndarray
+    sine: np.ndarray
+
+    def run(self, **limits: object) -> SlipResult:
+        acceleration = np.gradient(self.wheel, self.time_s)
+        return find_slips(
+            self.time_s, self.wheel, acceleration, self.force, self.sine, limits=SlipLimits.model_validate(limits)
+        )
+
+
+def motion(
+    seconds: float, slips: list[tuple[float, float, float]], *, noise: float = 0.0, pitching: float = 0.0, seed: int = 0
+) -> Motion:
+    """Runs between 5 and 25 m/s; each slip (begin, duration, ratio) rises and falls by half a sine."""
+    t = np.arange(0.0, seconds, 1.0 / RATE_HZ)
+    speed = 15.0 + 10.0 * np.sin(2.0 * np.pi * t / 120.0 - 0.5 * np.pi) * np.minimum(t / 60.0, 1.0)
+    acceleration = np.gradient(speed, t)
+    sine = 0.02 * np.sin(2.0 * np.pi * np.cumsum(speed) / RATE_HZ / 4000.0)
+    ratio = np.zeros(len(t))
+    for begin, duration, size in slips:
+        inside = (t >= begin) & (t <= begin + duration)
+        ratio[inside] = size * np.sin(np.pi * (t[inside] - begin) / duration)
+    random = np.random.default_rng(seed)
+    body = pitching * np.sin(2.0 * np.pi * 1.1 * t + 3.0 * np.sin(0.05 * t))
+    force = acceleration + GRAVITY_MPS2 * (sine + body) + 0.02 + noise * random.normal(size=len(t))
+    return Motion(t, speed, speed * (1.0 + ratio), force, sine)
+
+
+SLIPS = [(70.0 + 40.0 * k, 1.0 + 0.4 * (k % 5), (0.3, -0.3, 0.15, -0.5, 0.8)[k % 5]) for k in range(12)]
+
+
+@pytest.mark.requirement("E1")
+def test_every_slip_is_found_and_its_way_kept() -> None:
+    case = motion(600.0, SLIPS, noise=0.02, pitching=0.002)
+    found = case.run()
+    slipping = np.isin(found.state, SLIPPING)
+    for begin, duration, ratio in SLIPS:
+        inside = (case.time_s >= begin) & (case.time_s <= begin + duration + 1.5)
+        assert slipping[inside].any(), (begin, duration, ratio)
+        k, m = np.searchsorted(case.time_s, [begin - 1.0, begin + duration + 3.0])
+        way = found.way_m[m] - found.way_m[k]
+        true = np.trapezoid(case.speed[k : m + 1], case.time_s[k : m + 1])
+        assert abs(way - true) < 0.15, (begin, duration, ratio)
+
+
+@pytest.mark.requirement("E1")
+def test_the_latch_holds_through_the_top_where_the_papers_rule_is_blind() -> None:
+    case = motion(100.0, [(75.0, 3.0, 0.1)])
+    top = (case.time_s > 76.45) & (case.time_s < 76.55)
+    assert np.isin(case.run().state[top], SLIPPING).all()
+    assert not np.isin(case.run(rule="p2").state[top], SLIPPING).any()
+
+
+@pytest.mark.requirement("E1")
+def test_the_papers_rule_misses_slow_slips_that_the_map_shows() -> None:
+    weak = [(75.0, 4.0, 0.012)]
+    case = motion(100.0, weak)
+    assert not np.isin(case.run(rule="p2").state, SLIPPING).any()
+    assert np.isin(case.run().state, SLIPPING).any()
+
+
+@pytest.mark.requirement("E1")
+@pytest.mark.slow
+def test_less_than_one_false_alarm_an_hour_over_ten_hours() -> None:
+    case = motion(36_000.0, [], noise=0.1, pitching=0.004, seed=3)
+    slipping = np.isin(case.run().state, SLIPPING)
+    alarms = np.count_nonzero(np.diff(slipping.astype(int)) == 1)
+    assert alarms < 10
+
+
+@pytest.mark.requirement("E1")
+def test_no_false_alarm_in_half_an_hour() -> None:
+    case = motion(1800.0, [], noise=0.1, pitching=0.004, seed=3)
+    assert not np.isin(case.run().state, SLIPPING).any()
+
+
+@pytest.mark.requirement("E1")
+@pytest.mark.parametrize("permille", [5.0, 20.0])
+def test_rolling_away_on_a_gradient_is_found_below_walking_speed(permille: float) -> None:
+    t = np.arange(0.0, 12.0, 1.0 / RATE_HZ)
+    sine = -permille / 1e3
+    free = t > 6.0
+    force = np.where(free, 0.0, GRAVITY_MPS2 * sine)
+    wheel = np.where(t < 0.5, 0.0, np.nan)
+    found = find_slips(t, wheel, np.zeros(len(t)), force, np.full(len(t), sine))
+    rolling = np.flatnonzero(found.state == MotionState.ROLLING)
+    assert (found.state[(t > 2.0) & (t < 6.0)] == MotionState.STANDING).all()
+    assert len(rolling)
+    true = GRAVITY_MPS2 * permille / 1e3 * (t - 6.0)
+    assert true[rolling[0]] < 1.0 / 3.6
+    np.testing.assert_allclose(found.speed_mps[rolling], true[rolling], atol=0.03)
+
+
+@pytest.mark.requirement("E1")
+def test_noiseless_pitch_is_that_of_the_line() -> None:
+    case = motion(300.0, [])
+    found = case.run()
+    late = case.time_s > 5.0
+    np.testing.assert_allclose(found.metric[late], 0.02 / GRAVITY_MPS2, atol=1e-4)
+
+
+@pytest.mark.requirement("E1")
+def test_the_other_way_gives_the_same_flags() -> None:
+    case = motion(300.0, SLIPS[:5], noise=0.02)
+    mirrored = Motion(case.time_s, -case.speed, -case.wheel, -case.force + 0.04, -case.sine)
+    a, b = np.isin(case.run().state, SLIPPING), np.isin(mirrored.run().state, SLIPPING)
+    assert np.mean(a == b) > 0.98
