@@ -8,14 +8,20 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import polars as pl
 import pytest
 
 from conftest import ROOT
-from railfix.core.reasons import Reason, reason_names, reason_text, screen_reason
-from railfix.pipeline.config import SCREEN_NAMES, Config
+from pipeline_cases import clean_observations, processor
+from railfix.core.errors import NoPositionError
+from railfix.core.reasons import Reason, Status, reason_names, reason_text, screen_reason
+from railfix.io.rinex import read_observations, write_observations
+from railfix.pipeline.config import SCREEN_NAMES, Config, parse_config
+from railfix.run import RunInputs, run_files
 from railfix.screens import SCREENS
 
 DEMO = ROOT / "data" / "demo"
@@ -70,3 +76,42 @@ def test_a_screen_is_one_file_and_one_line(tmp_path: Path) -> None:
     assert counts["large_sigma"] > 0
     railfix("plot-screens", tmp_path / "out", "--out", tmp_path / "pictures")
     assert (tmp_path / "pictures" / "front_large_sigma.png").stat().st_size > 1000
+
+
+@pytest.mark.requirement("B7")
+def test_a_note_says_where_a_screen_cannot_judge(tmp_path: Path) -> None:
+    """One antenna and a log without Doppler: the screens of two antennas and of the Doppler are named in the notes."""
+    log = read_observations(DEMO / "front.crx.gz")[:100]
+    silent = replace(log, doppler_hz=np.full_like(log.doppler_hz, np.nan))
+    write_observations(silent, tmp_path / "front.rnx")
+    inputs = RunInputs(front=(tmp_path / "front.rnx",), nav=(DEMO / "nav.rnx.gz",), track=(DEMO / "track.csv",))
+    notes = run_files(inputs, out=tmp_path / "out").notes
+    assert any("screen doppler has judged nothing; it needs the Doppler" in note for note in notes)
+    for name in ("antenna_pair", "antenna_spacing"):
+        assert any(f"screen {name}: inactive; it needs two antennas" in note for note in notes)
+    assert not any("screen elevation" in note for note in notes)
+
+
+@pytest.mark.requirement("B7")
+def test_a_log_without_the_systems_asked_for_is_one_sentence(tmp_path: Path) -> None:
+    inputs = RunInputs(front=(DEMO / "front.crx.gz",), nav=(DEMO / "nav.rnx.gz",), track=(DEMO / "track.csv",))
+    with pytest.raises(NoPositionError, match="system_not_selected") as caught:
+        run_files(inputs, parse_config({"systems": ["C"]}), out=tmp_path / "out")
+    assert caught.value.exit_code == 7
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("carrier", ["off", "smoothed", "float"])
+def test_epochs_without_any_channel_have_a_status(carrier: str) -> None:
+    """A receiver that has lost every satellite, then finds them again."""
+    log = clean_observations()["front"]
+    nothing = np.zeros((5, 0))
+    empty = replace(
+        log[100:105], satellite=log.satellite[:0], signal=log.signal[:0], code_m=nothing, phase_cycles=nothing,
+        doppler_hz=nothing, cn0_dbhz=nothing, loss_of_lock=nothing.astype(np.uint8),
+    )  # fmt: skip
+    live = processor({"carrier": carrier})
+    result, state = live.process({"front": empty})
+    assert (result.antennas["front"].status == Status.NO_OBSERVATION).all()
+    later, _ = live.process({"front": log[105:110]}, state)
+    assert np.isfinite(later.antennas["front"].chainage_m).all()

@@ -38,6 +38,7 @@ from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_reco
 from railfix.run.sensors import read_sensors, until
 from railfix.run.sources import Line, Log, open_line
 from railfix.run.tally import Tally
+from railfix.screens import SCREENS
 from railfix.track import check_track
 
 
@@ -246,6 +247,11 @@ def notes_of(
     """
     notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.notes]
     for name, antenna in tally.antennas.items():
+        notes += [
+            f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"
+            for screen in SCREENS
+            if antenna.judged.get(screen.name) is False
+        ]
         if antenna.never_recorded:
             seen = ", ".join(antenna.never_recorded)
             notes.append(f"{name}: satellites seen without any usable navigation record: {seen}")

@@ -55,6 +55,8 @@ class AntennaTally:
     ----------
     min_satellites : int
         Satellites that an epoch needs.
+    judged : dict of str to bool
+        By verdict of a screen, whether it has judged anything.
     epochs, observed, positioned : int
         Epochs; those with at least one pseudorange; those with coordinates.
     status : Counter of str
@@ -82,6 +84,7 @@ class AntennaTally:
     """
 
     min_satellites: int = 3
+    judged: dict[str, bool] = field(default_factory=dict)
     epochs: int = 0
     observed: int = 0
     positioned: int = 0
@@ -107,6 +110,8 @@ class AntennaTally:
             return
         self.first = result.time[0] if self.first is None else self.first
         self.last = result.time[-1]
+        for name, screened in result.screens.items():
+            self.judged[name] = self.judged.get(name, False) or bool(np.isfinite(screened.metric).any())
         counts = np.bincount(result.status, minlength=len(Status))
         self.epochs += len(result.time)
         self.observed += len(result.time) - int(counts[Status.NO_OBSERVATION])
