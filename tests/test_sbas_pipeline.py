@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from railfix.core.reasons import Reason, Status
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import satellite_states
+from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
@@ -25,6 +28,7 @@ from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.protection_levels import level_facts, protection_levels
 from railfix.pipeline.results import AntennaState, State
 from railfix.pipeline.solve import place_on_line
+from railfix.positioning.map_offset import MapOffset
 from railfix.positioning.single_point import single_point
 from railfix.ranges.atmosphere import saastamoinen_delay_m
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, read_sbas
@@ -164,9 +168,12 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     place = place_on_line(ranges, index, point, config)
     scale = np.ones(len(ranges))
     ranges, place, raim = fault_free(ranges, index, place, scale, config.model_copy(update={"screens": ()}))
+    section = np.maximum(place.constrained.section, 0)
+    model_on_line = constrained_model(ranges, index.trajectory, place.constrained.arc_m, section=section)
+    offset = cast("MapOffset", SimpleNamespace(beyond_m=(np.zeros(len(ranges)), np.zeros(len(ranges)))))
 
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
-        return protection_levels(one, ranges, index.trajectory, place.constrained, raim, scale, settings).level.level_m
+        return protection_levels(one, model_on_line, offset, raim, scale, settings).level.level_m
 
     has = np.isfinite(levels(scale, config))
     assert has.any()
