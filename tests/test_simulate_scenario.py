@@ -19,7 +19,7 @@ from conftest import ROOT
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.settings import validated, write_toml
 from railfix.gnss.observations import concatenate
-from railfix.io.rinex import read_navigation, write
+from railfix.io.rinex import read_navigation, write_navigation, write_observations
 from railfix.simulate import (
     Element,
     GeneratedLine,
@@ -145,7 +145,7 @@ def test_a_duration_can_be_that_of_the_run(tmp_path: Path) -> None:
 
 def test_paths_are_relative_to_the_file_that_names_them(tmp_path: Path) -> None:
     (tmp_path / "below").mkdir()
-    write.write_navigation(simulated_navigation(Scenario()), tmp_path / "below" / "sky.nav")
+    write_navigation(simulated_navigation(Scenario()), tmp_path / "below" / "sky.nav")
     path = write_text(tmp_path / "below", '[sky]\nnav = "sky.nav"\nunhealthy = []')
     assert Simulation(load_scenario(path)).navigation.sources == (str(tmp_path / "below" / "sky.nav"),)
     recipe = '[parts.sky]\nsky.nav = "below/sky.nav"\nsky.unhealthy = []\n[[runs]]\nname = "a"\nparts = ["sky"]\n'
@@ -255,7 +255,7 @@ def test_the_files_are_the_same_bytes_by_any_cutting(tmp_path: Path) -> None:
     simulation = Simulation(Scenario(duration_s=20.0))
     for size in (7, 64, 200):
         pieces = (piece.observations for piece in simulation.pieces("rear", chunk_epochs=size))
-        write.write_observations(pieces, tmp_path / f"{size}.rnx")
+        write_observations(pieces, tmp_path / f"{size}.rnx")
     assert len({(tmp_path / f"{size}.rnx").read_bytes() for size in (7, 64, 200)}) == 1
 
 
@@ -292,7 +292,7 @@ def test_the_truth_tells_acceleration_and_what_stands_along_the_line(tmp_path: P
 
 def test_a_made_sky_read_back_from_its_file_is_the_same_sky(tmp_path: Path) -> None:
     scenario = Scenario(duration_s=5.0, rate_hz=1.0, sky=SkySettings(systems="GJEC", unhealthy=()))
-    write.write_navigation(simulated_navigation(scenario), tmp_path / "sky.rnx")
+    write_navigation(simulated_navigation(scenario), tmp_path / "sky.rnx")
     filed = scenario.replaced(sky=scenario.sky.replaced(nav=str(tmp_path / "sky.rnx")))
     made, read = whole(scenario).observations, whole(filed).observations
     assert made.satellite.tolist() == read.satellite.tolist()
@@ -323,14 +323,14 @@ def test_a_real_sky_is_corrected_by_the_product(recordings: Path, systems: str) 
 
 
 def test_a_time_outside_of_the_file_is_refused(tmp_path: Path) -> None:
-    write.write_navigation(simulated_navigation(Scenario()), tmp_path / "sky.rnx")
+    write_navigation(simulated_navigation(Scenario()), tmp_path / "sky.rnx")
     sky = SkySettings(nav=str(tmp_path / "sky.rnx"), unhealthy=())
     for start, duration in (("2024-03-05T09:00:00", 10.0), ("2024-03-04T03:10:00", 10.0), ("2024-03-05T03:10:00", 3e4)):
         scenario = Scenario(start=np.datetime64(start, "ns"), duration_s=duration, sky=sky)
         with pytest.raises(MismatchError, match=r"sky\.rnx: no satellite .* reference times in the file"):
             simulated_navigation(scenario)
     navigation = replace(read_navigation(tmp_path / "sky.rnx"), klobuchar={})
-    write.write_navigation(navigation, tmp_path / "bare.rnx")
+    write_navigation(navigation, tmp_path / "bare.rnx")
     with pytest.raises(MismatchError, match="Klobuchar"):
         simulated_navigation(Scenario(sky=sky.replaced(nav=str(tmp_path / "bare.rnx"))))
     with pytest.raises(ValidationError, match="unhealthy"):

@@ -137,7 +137,7 @@ def joint_figures(sample: Sample, error: Floats, used: Masks) -> dict[str, float
 
     Faults are errors over 20 m: shares of the epochs with two and three or more, and the mean number of pairs of
     faults in an epoch over that of independent faults of the same share. Correlation of one code's errors, clipped
-    at 50 m, after 1 s and 10 s. Share of errors beyond 5 sigma of the receiver's code noise at their C/N0 and elevation.
+    at 50 m, after 1 s and 10 s. Share of errors beyond 5 sigma of the receiver's code noise.
     """
     fault = used & (np.abs(error) > 20.0)
     count, codes = fault.sum(axis=1), used.sum(axis=1)

@@ -13,7 +13,7 @@ from railfix.simulate.errors.processes import satellite_key
 from railfix.simulate.errors.settings import InterSystemSettings
 from railfix.simulate.noise import CarriedNoise, CodeSmoothing, Tracking
 from railfix.simulate.satellites import newest_record
-from railfix.simulate.scenario import ANTENNAS
+from railfix.simulate.scenario import RECEIVERS
 
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
@@ -30,7 +30,7 @@ class Receiver:
 
     def __init__(self, simulation: Simulation, antenna: str) -> None:
         scenario, errors, channels = simulation.scenario, simulation.scenario.errors, simulation.channels
-        number = ANTENNAS.index(antenna)
+        number = RECEIVERS.index(antenna)
         self.antenna = antenna
         self.header = simulation.header(antenna)
         self.names, self.signals = (np.array(part) for part in zip(*channels, strict=True))
@@ -42,7 +42,7 @@ class Receiver:
         self.second = np.array([g != SIGNALS[n[0]][0] for n, g in channels])
         self.group_delay_error_m = simulation.common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
         offsets = [errors.intersystem.get(name[0], InterSystemSettings()) for name, _ in channels]
-        self.offset_m = np.array([o.offset_m + (o.rear_difference_m if number else 0.0) for o in offsets])
+        self.offset_m = np.array([o.offset_m + (o.rear_difference_m if antenna == "rear" else 0.0) for o in offsets])
         self.offset_drift_mps = np.array([o.drift_mps for o in offsets])
         sigma = scenario.receiver.cn0_satellite_sigma_db
         #: Difference of each satellite's C/N0 from the mean, the same for both receivers.

@@ -19,7 +19,8 @@ from railfix.gnss.observations import Observations
 from railfix.io.rinex import write_navigation, write_observations
 from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
 from railfix.simulate.run_readme import run_readme
-from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
+from railfix.simulate.sbas.service import sbas_messages, write_sbas
+from railfix.simulate.scenario import ANTENNAS, RECEIVERS, Scenario, VehicleSettings
 from railfix.simulate.scenario_file import scenario_table
 from railfix.simulate.sensors.tables import sensor_tables
 from railfix.simulate.signals import Simulation
@@ -94,11 +95,13 @@ def write_run(
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
+    station.crx.gz               observations of the reference station, where the scenario has one
     nav.rnx.gz                   broadcast records (nav.rnx)
     track.csv                    track map
     vehicle.toml                 vehicle
     truth.csv.gz                 `truth_table` (truth.csv)
     sections.csv                 `section_table`
+    messages.sbs                 SBAS messages, where the scenario has them
     tachometer.parquet, ...      sensors, where the scenario has any (`sensor_tables`)
     scenario.toml                the scenario, as `load_scenario` reads it
     README.md                    contents and settings of the run
@@ -121,7 +124,7 @@ def write_run(
     Returns
     -------
     dict of str to Path
-        The files, by ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, the
+        The files, by ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``sections``, ``sbas``, the
         sensors' names, ``scenario``, ``readme``.
 
     Raises
@@ -149,13 +152,16 @@ def _write_files(
 ) -> dict[str, Path]:
     scenario = simulation.scenario
     observation, packed = ("crx.gz", ".gz") if packing == "packed" else ("rnx", "")
-    names = {name: f"{name}.{observation}" for name in ANTENNAS}
+    receivers = ANTENNAS if scenario.station is None else RECEIVERS
+    names = {name: f"{name}.{observation}" for name in receivers}
     names |= {"nav": f"nav.rnx{packed}", "track": "track.csv", "vehicle": "vehicle.toml"}
     names |= {"truth": f"truth.csv{packed}", "sections": "sections.csv"}
+    if scenario.sbas is not None:
+        names["sbas"] = "messages.sbs"
     names |= {name: f"{name}.{'parquet' if packed else 'csv'}" for name in tables}
     names |= {"scenario": "scenario.toml", "readme": "README.md"}
     files = {key: out.staged(name) for key, name in names.items()}
-    for antenna in ANTENNAS:
+    for antenna in receivers:
 
         def watched(antenna: str = antenna) -> Iterator[Observations]:
             for part in simulation.observations(antenna):
@@ -170,6 +176,8 @@ def _write_files(
     content = _csv(truth_table(simulation), TRUTH_DECIMALS)
     _write(files["truth"], gzip.compress(content, compresslevel=6, mtime=0) if packed else content)
     _write(files["sections"], _csv(section_table(simulation), TRUTH_DECIMALS))
+    if scenario.sbas is not None:
+        write_sbas(sbas_messages(simulation, scenario.sbas), files["sbas"])
     for name, table in tables.items():
         _write(files[name], _parquet(table) if packed else _csv(table, None))
     write_toml(files["scenario"], scenario_table(scenario))

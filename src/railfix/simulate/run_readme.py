@@ -73,6 +73,8 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
         "vehicle": "bogie distance, gauge, antennas",
         "truth": "ground truth: chainage of the centreline point abeam each antenna, its position (ECEF), speed, "
         "acceleration, kind of section",
+        "station": "the same of the reference station; its position is in the header",
+        "sbas": "SBAS messages as RTKLIB logs them: time of week of the complete reception, PRN, type, message",
         "sections": "ground truth: sections of the line",
         "scenario": "all settings, a scenario file for `railfix simulate`",
         "readme": "this file",
@@ -95,6 +97,8 @@ def _switched_on(scenario: Scenario) -> str:
         else "Multipath and blockage by structures along the line (see the sections).",
         "No sensors besides the receivers." if scenario.sensors is None else "Sensors besides the receivers.",
     ]
+    if scenario.sbas is not None:
+        parts.append("SBAS messages that correct GPS and the ionosphere.")
     if scenario.vehicle.sway_sigma_deg:
         parts.append("The body sways.")
     if scenario.multipath:

@@ -20,6 +20,7 @@ from railfix.simulate.disturbance import Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
 from railfix.simulate.errors.settings import ErrorSettings
 from railfix.simulate.line_settings import LineSettings
+from railfix.simulate.sbas.settings import SbasSettings
 from railfix.simulate.sensors.settings import SensorSettings
 from railfix.simulate.setting_types import (
     SYSTEMS,
@@ -36,6 +37,8 @@ from railfix.simulate.setting_types import (
 ANTENNAS: Final = ("front", "rear")
 #: Longest run, a hundred days; more epochs than this are many runs [s].
 LONGEST_S: Final = 8.64e6
+#: All receivers: those of the antennas, and the reference station's.
+RECEIVERS: Final = (*ANTENNAS, "station")
 
 
 class Station(ScenarioSettings):
@@ -238,6 +241,20 @@ class ReceiverSettings(ScenarioSettings):
     clock_steps: Literal["none", "millisecond"] = "none"
 
 
+class ReferenceStation(ScenarioSettings):
+    """Receiver that stands beside the line under an open sky; its clock and noise are its own.
+
+    Attributes
+    ----------
+    chainage_m, lateral_m, height_m : float
+        Position: along the line, to the right of the track's axis, above the rails.
+    """
+
+    chainage_m: Finite = 0.0
+    lateral_m: Finite = 50.0
+    height_m: Finite = 10.0
+
+
 class Scenario(ScenarioSettings):
     """One run.
 
@@ -255,6 +272,10 @@ class Scenario(ScenarioSettings):
         Errors of satellites, atmosphere and receivers beyond the noise of `receiver`; none by default.
     sensors : SensorSettings or None
         Sensors on board besides the receivers.
+    station : ReferenceStation or None
+        Reference station whose observations are written beside the train's.
+    sbas : SbasSettings or None
+        SBAS that corrects the simulated errors, and that the train receives.
     environment : EnvironmentSettings
         Structures along the line; none by default.
     place_seed : int
@@ -276,6 +297,8 @@ class Scenario(ScenarioSettings):
     environment: EnvironmentSettings = EnvironmentSettings()
     place_seed: Seed = 1
     sensors: SensorSettings | None = None
+    station: ReferenceStation | None = None
+    sbas: SbasSettings | None = None
     multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
 
     @model_validator(mode="after")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
@@ -29,7 +29,7 @@ from railfix.simulate.kinematics import Motion
 from railfix.simulate.motion import build_motion
 from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
 from railfix.simulate.satellites import SatelliteTable, links
-from railfix.simulate.scenario import ANTENNAS, Scenario
+from railfix.simulate.scenario import ANTENNAS, RECEIVERS, Scenario
 
 #: Receivers report C/N0 in steps [dB-Hz].
 CN0_STEP_DBHZ: Final = 0.25
@@ -120,7 +120,9 @@ class Simulation:
         """Bias of a receiver's clock, tag minus GPS time, at tags counted from the start, shape (T,) [s]."""
         settings = self.scenario.receiver
         bias, drift = settings.clock_bias_s, settings.clock_drift
-        if antenna != ANTENNAS[0] and settings.clocks == "separate":
+        if antenna == RECEIVERS[-1]:
+            bias, drift = 0.37 * bias, 0.55 * drift
+        elif antenna != ANTENNAS[0] and settings.clocks == "separate":
             bias, drift = -0.61 * bias, 0.83 * drift
         value = bias + drift * tag_s
         walk = self._walk(antenna)
@@ -131,6 +133,8 @@ class Simulation:
     def clock_drift(self, antenna: str) -> float:
         """Drift of a receiver's clock [s/s]."""
         settings = self.scenario.receiver
+        if antenna == RECEIVERS[-1]:
+            return 0.55 * settings.clock_drift
         return settings.clock_drift * (0.83 if antenna != ANTENNAS[0] and settings.clocks == "separate" else 1.0)
 
     def clock_rate_mps(self, antenna: str, tag_s: Floats) -> Floats:
@@ -141,13 +145,14 @@ class Simulation:
 
     def _walk(self, antenna: str) -> ClockWalk | None:
         """Random walk of a receiver's clock, the same for both where the clock is common."""
-        return self._walks[0 if self.scenario.receiver.clocks == "common" else ANTENNAS.index(antenna)]
+        common = self.scenario.receiver.clocks == "common" and antenna in ANTENNAS
+        return self._walks[0 if common else RECEIVERS.index(antenna)]
 
     @cached_property
     def _walks(self) -> tuple[ClockWalk | None, ...]:
         scenario, walk = self.scenario, self.scenario.errors.clock
         if walk.walk_m_per_sqrt_s == 0.0 and walk.frequency_walk_mps_per_sqrt_s == 0.0:
-            return (None,) * len(ANTENNAS)
+            return (None,) * len(RECEIVERS)
         return tuple(
             ClockWalk(
                 (scenario.seed, _WALK, k),
@@ -156,7 +161,7 @@ class Simulation:
                 interval_s=self.interval_s,
                 duration_s=scenario.duration_s,
             )
-            for k in range(len(ANTENNAS))
+            for k in range(len(RECEIVERS))
         )
 
     @property
@@ -176,26 +181,47 @@ class Simulation:
 
     @cached_property
     def common_errors(self) -> CommonErrors:
-        """Errors of satellites and atmosphere."""
+        """Errors of satellites and atmosphere, of `satellites`."""
+        return self.errors_of(self.satellites)
+
+    def errors_of(self, satellites: Sequence[str]) -> CommonErrors:
+        """Errors of satellites and atmosphere; those of a satellite do not depend on the others."""
         scenario = self.scenario
         return CommonErrors(
             scenario.errors,
             seed=scenario.seed,
             start=scenario.start,
             duration_s=scenario.duration_s,
-            origin_deg=self._origin_deg,
+            origin_deg=self.origin_deg,
             records=self.navigation.kepler,
-            satellites=self.satellites,
+            satellites=satellites,
         )
 
     @cached_property
-    def _origin_deg(self) -> tuple[float, float]:
+    def origin_deg(self) -> tuple[float, float]:
+        """Latitude and longitude of the first point of the line [deg]."""
         latitude, longitude, _ = geodetic_from_ecef(self.line.at(np.zeros(1)))
         return float(latitude[0]), float(longitude[0])
 
     def truth(self, antenna: str, seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
-        """True position of an antenna at seconds after the start, and the train's speed [m/s]."""
+        """True position of an antenna at seconds after the start, and its speed along the line [m/s]."""
+        if antenna == RECEIVERS[-1]:
+            return self._station_truth(len(seconds_s)), np.zeros(len(seconds_s))
         return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
+
+    def _station_truth(self, count: int) -> AntennaTruth:
+        """Position of the reference station, the same at all of so many instants."""
+        station = self.scenario.station
+        if station is None:
+            raise ValueError("the scenario has no reference station")
+        at = np.full(count, station.chainage_m)
+        place, tangent = self.line.at(at), self.line.tangent_at(at)
+        latitude, longitude, _ = geodetic_from_ecef(place)
+        up = enu_axes(latitude, longitude)[:, 2]
+        right = np.cross(tangent, up)
+        right /= np.linalg.norm(right, axis=-1, keepdims=True)
+        ecef = place + station.lateral_m * right + station.height_m * up
+        return AntennaTruth(ecef_m=ecef, chainage_m=at, forward=tangent)
 
     def body_truth(self, offset_m: tuple[float, float, float], seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
         """True position of a point of the body at seconds after the start, and the speed."""
@@ -220,14 +246,14 @@ class Simulation:
         return tuple((name, signal) for name in names for signal in SIGNALS[name[0]][:count])
 
     def header(self, antenna: str) -> ObservationHeader:
-        """Header of an antenna's log; the approximate position is rounded to 100 m."""
+        """Header of a receiver's log; the approximate position is rounded to 100 m, that of the station is exact."""
         place = self.truth(antenna, np.zeros(1))[0].ecef_m[0]
         return ObservationHeader(
             version=3.04,
             marker=f"MADE {antenna.upper()}",
             receiver="SIMULATED",
             antenna="SIMULATED",
-            approximate_ecef_m=np.round(place, -2),
+            approximate_ecef_m=np.round(place, -2 if antenna in ANTENNAS else 4),
             interval_s=self.interval_s,
             leap_seconds=self.navigation.leap_seconds,
             signals={
@@ -369,7 +395,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     cn0 = cn0 + receiver.cn0_offset_db
     cn0 = cn0 + settings.cn0_sigma_dbhz * noise[:, :, 3] + receiver.carried.cn0_db(len(time))
     added_code, added_phase, added_doppler = np.zeros((3, *code.shape))
-    for source in simulation.disturbances:
+    for source in simulation.disturbances if receiver.antenna in ANTENNAS else ():
         more = source(geometry)
         added_code, added_phase = added_code + more.code_m, added_phase + more.phase_m
         added_doppler, cn0 = added_doppler + more.doppler_hz, cn0 + more.cn0_db

@@ -1,0 +1,6 @@
+"""Messages of a simulated SBAS that corrects the simulated errors."""
+
+from railfix.simulate.sbas import encode
+from railfix.simulate.sbas.settings import SbasSettings
+
+__all__ = ["SbasSettings", "encode"]
