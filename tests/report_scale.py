@@ -2,14 +2,16 @@
 
     python tests/report_scale.py [--epochs 100000] [--keep FOLDER]
 
-Prints epochs, rows, size of the page, time to write it, and what the browser says of opening it: from
-the request to the end of loading, and to the first pictures drawn.
+Prints rows, size of the page and of its print, time and memory to write it, and the time to open it in a browser: from
+the request to the end of loading, and to the first charts drawn.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -21,7 +23,7 @@ import polars as pl
 from railfix.report import write_report
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
-from report_page import browser, opened, timing_ms
+from report_page import browser, opened, run_browser, timing_ms
 
 
 def laid_end_to_end(table: pl.DataFrame, times: int, span: pl.Expr) -> pl.DataFrame:
@@ -49,21 +51,35 @@ def long_run(folder: Path, epochs: int) -> tuple[Path, Path]:
     return whole, folder / "truth.csv"
 
 
+def write(run: Path, truth: Path, page: Path) -> None:
+    """Write the page; print the time [s] and the largest resident memory of this process [MB]."""
+    began = time.perf_counter()
+    write_report([run], page, references=[truth])
+    print(time.perf_counter() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+
+
 def main() -> None:
     """Make the run, write the report, open it five times."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--epochs", type=int, default=100_000, help="epochs of each antenna")
     parser.add_argument("--keep", type=Path, help="folder to leave the page in")
+    parser.add_argument("--write", nargs=3, metavar=("RUN", "REFERENCE", "PAGE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if arguments.write:
+        return write(*(Path(name) for name in arguments.write))
     with tempfile.TemporaryDirectory() as place:
         run, truth = long_run(Path(place), arguments.epochs)
-        began = time.perf_counter()
-        page = write_report([run], (arguments.keep or Path(place)) / "report.html", references=[truth])
-        took = time.perf_counter() - began
+        page = (arguments.keep or Path(place)) / "report.html"
+        program = [sys.executable, __file__, "--write", str(run), str(truth), str(page)]
+        took, peak = subprocess.run(program, capture_output=True, text=True, check=True).stdout.split()
         rows = {name: pl.scan_parquet(run / f"{name}.parquet").select(pl.len()).collect().item() for name in
                 ("positions", "observations")}  # fmt: skip
         print(f"{rows['positions']:,} rows of positions, {rows['observations']:,} of observations")
-        print(f"written in {took:.1f} s, {page.stat().st_size / 1e6:.2f} MB")
+        print(f"written in {float(took):.1f} s with {float(peak):.0f} MB of memory, {page.stat().st_size / 1e6:.2f} MB")
+        if browser() is not None:
+            paper = Path(place) / "report.pdf"
+            run_browser(page, f"--print-to-pdf={paper}")
+            print(f"printed: {paper.stat().st_size / 1e6:.2f} MB")
         if browser() is None:
             sys.exit("no chromium here: the opening time is not measured")
         tries = [timing_ms(opened(page)) for _ in range(5)]

@@ -133,7 +133,7 @@ def antenna_groups(
     )
     yield Group(title="Sky", charts=() if in_view.empty else (in_view,), start=start)
     curves = cn0_over_elevation(
-        observations.select(CN0_COLUMNS).collect(),
+        observations.select(CN0_COLUMNS),
         limits=run.config.cn0 if "cn0" in run.config.screens else None,
         curve=run.curve,
         mask_deg=run.config.elevation.mask_deg if "elevation" in run.config.screens else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
@@ -29,18 +30,18 @@ SKY_COLUMNS: Final = ("time_gpst", *CN0_COLUMNS, "azimuth_deg")
 
 
 def cn0_over_elevation(
-    observations: pl.DataFrame,
+    observations: pl.DataFrame | pl.LazyFrame,
     *,
     limits: Cn0Limits | None = None,
     curve: Cn0Curve | None = None,
     mask_deg: float | None = None,
     title: str = "C/N0 over elevation",
 ) -> list[Chart]:
-    """C/N0 over elevation with mean and thresholds, a chart a constellation and signal (P1 figure 3).
+    """C/N0 over elevation with mean and thresholds, one chart per constellation and signal (P1 figure 3).
 
     Parameters
     ----------
-    observations : polars.DataFrame
+    observations : polars.DataFrame or polars.LazyFrame
         Of one antenna, columns of `railfix.pipeline.tables.OBSERVATION_COLUMNS`.
     limits : Cn0Limits, optional
         Thresholds that were in force; none are drawn without.
@@ -55,17 +56,21 @@ def cn0_over_elevation(
     list of Chart
         Of every signal that was taken, the most observed first.
     """
-    taken = observations.filter(pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0)
-    taken = taken.filter(pl.col("cn0_dbhz").is_not_null(), pl.col("elevation_deg") >= 0.0)
-    names = taken["satellite"].unique().to_list()
-    kinds = pl.DataFrame({"satellite": names, "kind": [satellite_kind(name) for name in names]}, schema_overrides={
-        "satellite": pl.String, "kind": pl.String,
-    })  # fmt: skip
-    taken = taken.join(kinds, on="satellite", how="left")
-    groups = taken.partition_by("kind", "signal", as_dict=True)
+    taken = observations.lazy().filter(
+        pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
+        pl.col("cn0_dbhz").is_not_null(),
+        pl.col("elevation_deg") >= 0.0,
+    )
+    groups: dict[tuple[str, str], list[str]] = {}
+    counts_of: Counter[tuple[str, str]] = Counter()
+    for satellite, signal, count in taken.group_by("satellite", "signal").len().collect().sort("satellite").iter_rows():
+        groups.setdefault((satellite_kind(satellite), signal), []).append(satellite)
+        counts_of[satellite_kind(satellite), signal] += count
     charts = []
-    for (kind, signal), rows in sorted(groups.items(), key=lambda item: -len(item[1])):
-        lines = tuple(_lines(rows, str(kind), str(signal), limits, curve, mask_deg))
+    for (kind, signal), satellites in sorted(groups.items(), key=lambda item: (-counts_of[item[0]], item[0])):
+        mine = taken.filter(pl.col("signal") == signal, pl.col("satellite").is_in(satellites))
+        rows = mine.select("elevation_deg", "cn0_dbhz").collect()
+        lines = tuple(_lines(rows, kind, signal, limits, curve, mask_deg))
         counts, _, _ = np.histogram2d(
             floats(rows, "elevation_deg"), floats(rows, "cn0_dbhz"), bins=(_ELEVATION_EDGES, _CN0_EDGES)
         )
@@ -79,7 +84,7 @@ def cn0_over_elevation(
         charts.append(
             Chart(
                 name=f"cn0-{kind}-{signal}".lower(),
-                title=f"{title}: {KINDS.get(str(kind), str(kind))}, {signal}",
+                title=f"{title}: {KINDS.get(kind, kind)}, {signal}",
                 caption=f"{len(rows):,} observations, the more the darker.",
                 x_label="elevation [deg]",
                 y_label="C/N0 [dB-Hz]",

@@ -253,7 +253,7 @@
 
   // Many points on paper: as a picture, which is smaller than thousands of outlines.
   function raster(pen, box) {
-    const picture = document.createElement("canvas"), ratio = 1.5;
+    const picture = document.createElement("canvas"), ratio = 1;
     picture.width = Math.round(box.width * ratio);
     picture.height = Math.round(box.height * ratio);
     const dots = picture.getContext("2d");
