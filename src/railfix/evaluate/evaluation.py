@@ -49,6 +49,8 @@ class RunAndReference:
     conventional : Path or None
         Folder of another run on the same log, whose conventional positions take the place of the run's own: one
         with the screens elevation and C/N0 alone gives those that P1 compares with.
+    folder : RunFolder or None
+        The run, if it has been read already.
     """
 
     run: Path
@@ -56,6 +58,7 @@ class RunAndReference:
     configuration: str | None = None
     table: str = POSITIONS_TABLE
     conventional: Path | None = None
+    folder: RunFolder | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,7 +256,7 @@ def _levelled(part: _Part, name: str) -> LevelledRun | None:
 
 
 def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, options: EvaluationOptions) -> _Part:
-    folder = read_run(item.run, table=item.table, conventional=item.conventional)
+    folder = item.folder or read_run(item.run, table=item.table, conventional=item.conventional)
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
     notes = []
     if item.conventional is not None:

@@ -217,9 +217,9 @@ def _read_table(path: Path, name: str, needed: Sequence[str]) -> tuple[Path, pl.
         raise InputFileError(file, f"has no column {missing[0]}; expected the {name} of railfix run")
     if not len(rows):
         raise InputFileError(file, "has no rows; there is nothing to evaluate")
-    if rows.select(pl.struct(_KEYS).is_duplicated().any()).item():
+    if len(rows.select(_KEYS).unique()) < len(rows):
         raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
-    return file, rows.sort("time_gpst", maintain_order=True)
+    return file, rows if rows["time_gpst"].is_sorted() else rows.sort("time_gpst", maintain_order=True)
 
 
 def _table(file: Path) -> pl.DataFrame:
@@ -231,7 +231,11 @@ def _table(file: Path) -> pl.DataFrame:
     except (PolarsError, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputFileError(file, f"cannot be read as a table ({reason}); run railfix run again") from error
-    numbers = [name for name in table.columns if name.endswith("_m") or name in ("n_used", "n_rejected")]
+    numbers = [
+        name
+        for name, kind in table.schema.items()
+        if kind != pl.Float64 and (name.endswith("_m") or name in ("n_used", "n_rejected"))
+    ]
     try:
         return table.with_columns(
             pl.col(numbers).cast(pl.Float64),

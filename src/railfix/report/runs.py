@@ -134,9 +134,15 @@ def read_runs(
         each = references if len(references) == len(paths) else [references[0]] * len(paths)
         evaluation = evaluate_runs(
             [
-                RunAndReference(run=path, reference=reference, table=table, conventional=other)
-                for path, reference, other in zip(paths, each, beside, strict=True)
-                for table in tables_of(path)
+                RunAndReference(
+                    run=folder.path,
+                    reference=reference,
+                    table=table,
+                    conventional=other,
+                    folder=folder if table == POSITIONS_TABLE else None,
+                )
+                for folder, reference, other in zip(folders, each, beside, strict=True)
+                for table in tables_of(folder.path)
             ]
         )
     reported = tuple(
