@@ -309,10 +309,14 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     train = pl.read_parquet(mine / "positions.parquet").select(columns).with_columns(status=pl.lit("tracking"))
     train.write_parquet(mine / "train.parquet")
     runs, evaluation = read_runs([mine], [demo_truth()])
-    page = Page(report_page(runs, evaluation))
-    values = chart(page, "error-chainage")
+    values = chart(Page(report_page(runs, evaluation)), "error-chainage")
     on_map, filtered = (unpacked(layer_of(values, name)["y"]) for name in ("on the map", "filtered along the track"))
     np.testing.assert_allclose(filtered, on_map, atol=1e-6)
+    document = report_page(runs, evaluation)
+    assert evaluation is not None
+    largest = evaluation.figure("max_m", run="run (train)", antenna="front")
+    assert "Filtered along the track, the train has a position at" in document
+    assert f"and the worst is {largest:.1f} m off." in document
 
 
 def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     return Headline(
         verdict=verdict,
         figures=(*(_beside(figure) for figure in figures), _integrity_figure(run, antenna, evaluation, own)),
-        remarks=(_alike(run, compared), *_larger_error(compared), *_marked(compared)),
+        remarks=(*_filtered(run, antenna), _alike(run, compared), *_larger_error(compared), *_marked(compared)),
     )
 
 
@@ -142,6 +142,21 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
         value=number(median, 1, " m"),
         beside=f"usable errors above their level: {len(beyond):,}",
     )
+
+
+def _filtered(run: ReportedRun, antenna: str) -> list[str]:
+    """A sentence on the filter along the track."""
+    table = run.filtered_of(antenna)
+    known = pl.DataFrame() if table is None else table.filter("positioned", "reference_good")
+    if table is None or not len(known):
+        return []
+    size = np.abs(floats(known, "error_m"))
+    rate = len(table.filter("in_reference", "positioned")) / max(len(table.filter("in_reference")), 1)
+    return [
+        f"Filtered along the track, the train has a position at {share(rate, 1)} of all epochs, those without "
+        f"satellites included; 95 % of these are within {number(float(np.percentile(size, 95.0)), 1)} m, and the worst is "
+        f"{number(float(size.max()), 1)} m off."
+    ]
 
 
 def _alike(run: ReportedRun, compared: _Compared) -> str:
