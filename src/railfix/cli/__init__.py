@@ -19,6 +19,7 @@ class _Program(LazyCommands):
 
     summaries: ClassVar[Mapping[str, str]] = {
         "run": "Position receiver logs along the line.",
+        "campaign": "Position many logs side by side, resumable.",
         "demo": "Position the demonstration log and compare it with its ground truth.",
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
         "evaluate": "Compute errors of runs against references.",

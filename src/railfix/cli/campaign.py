@@ -1,0 +1,67 @@
+"""``railfix campaign``: position many logs side by side."""
+
+from __future__ import annotations
+
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from railfix.cli.console import console_of_tables, show_files
+from railfix.cli.options import OutOption
+from railfix.core.errors import NoPositionError
+from railfix.run.campaign import run_campaign
+
+
+def campaign(
+    path: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="Patterns of logs and navigation, track.")],
+    *,
+    out: OutOption,
+    workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Processes side by side.")] = 2,
+) -> None:
+    r"""Position all logs of a campaign, each into its own folder; a killed campaign is continued.
+
+    CAMPAIGN.toml has patterns with fields in braces, relative to the file. Logs with the same fields are one run;
+    navigation files are matched by the fields that they share with the logs:
+
+        front = "logs/{train}/{day}/front.obs*"
+        rear = "logs/{train}/{day}/rear.obs*"
+        nav = "nav/{day}.nav*"
+        track = ["line.csv"]
+        vehicle = "car.toml"
+        config = "settings.toml"
+
+    Into DIR come `runs/train=A/day=2024-03-05/` with the files of `railfix run` for each run (together one
+    hive-partitioned data set), and `campaign.csv` with one row per run. A run that fails is a row with its error.
+    Runs whose results are there, of the same inputs and settings, are not repeated.
+
+    Example:
+
+        railfix campaign line.toml --out results --workers 8
+
+    Exit codes as `railfix --help` says; 7 where every run has failed.
+    """
+
+    def progress(*, done: int, failed: int, total: int, left_s: float) -> None:
+        minutes, seconds = divmod(round(left_s), 60)
+        typer.echo(f"{done} of {total} runs, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
+        sys.stderr.flush()
+
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
+        table = run_campaign(path, out=out, executor=executor, progress=progress)
+    failed = table.filter(status="failed")
+    console = console_of_tables()
+    shown = Table(*(name for name in table.columns if name != "folder"), show_edge=False)
+    for row in table.iter_rows(named=True):
+        cells = (row[name] for name in row if name != "folder")
+        shown.add_row(
+            *("" if cell is None else f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in cells)
+        )
+    console.print(shown)
+    show_files(console, [out / "campaign.csv"])
+    if len(failed) == len(table):
+        raise NoPositionError(f"every run has failed; the first: {failed['error'][0]}")

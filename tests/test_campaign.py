@@ -1,0 +1,129 @@
+"""Campaigns: runs found by patterns, failures as rows, continued after a stop, one data set."""
+
+from __future__ import annotations
+
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from bad_inputs import desk_in
+from railfix.cli import app
+from railfix.core.errors import InputFileError, OutputError, SettingsError
+from railfix.run.campaign import read_campaign, run_campaign
+
+pytestmark = pytest.mark.requirement("G1")
+
+RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
+CAMPAIGN = """
+front = "logs/{train}/{day}/front*.obs"
+rear = "logs/{train}/{day}/rear.obs"
+nav = "nav/{day}.nav"
+track = ["line.csv"]
+vehicle = "train.toml"
+[options]
+chunk_epochs = 50
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two trains on two days; one log is broken, one day has no rear antenna."""
+    folder = tmp_path_factory.mktemp("campaign")
+    desk = desk_in(tmp_path_factory.mktemp("desk")).folder
+    for name in ("line.csv", "train.toml"):
+        shutil.copy(desk / name, folder / name)
+    (folder / "nav").mkdir()
+    for day in ("2024-03-05", "2024-03-06"):
+        shutil.copy(desk / "brdc.nav", folder / "nav" / f"{day}.nav")
+        for train in ("A", "B"):
+            place = folder / "logs" / train / day
+            place.mkdir(parents=True)
+            shutil.copy(desk / "front.obs", place / "front.obs")
+            shutil.copy(desk / "rear.obs", place / "rear.obs")
+    (folder / "logs/B/2024-03-06/rear.obs").unlink()
+    (folder / "logs/B/2024-03-05/front.obs").write_text("no log\n")
+    (folder / "campaign.toml").write_text(CAMPAIGN)
+    return folder
+
+
+def test_runs_are_found_by_the_fields_of_the_patterns(folder: Path, tmp_path: Path) -> None:
+    runs = read_campaign(folder / "campaign.toml", tmp_path)
+    assert [tuple(run.fields.values()) for run in runs] == [
+        (train, day) for train in "AB" for day in ("2024-03-05", "2024-03-06")
+    ]
+    for run in runs:
+        assert run.inputs.nav == (folder / "nav" / f"{run.fields['day']}.nav",)
+        assert run.inputs.front == (folder / "logs" / run.fields["train"] / run.fields["day"] / "front.obs",)
+        assert run.options.chunk_epochs == 50
+    assert runs[3].inputs.rear == ()
+    assert runs[0].out == tmp_path / "runs" / "train=A" / "day=2024-03-05"
+
+
+def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    seen = []
+    with ThreadPoolExecutor(1) as executor:
+        first = run_campaign(
+            folder / "campaign.toml", out=out, executor=executor, progress=lambda **state: seen.append(state)
+        )
+    assert first["status"].to_list() == ["done", "done", "failed", "done"]
+    assert "front.obs" in first["error"][2]
+    assert [(state["done"], state["failed"]) for state in seen] == [(1, 0), (2, 0), (3, 1), (4, 1)]
+    assert pl.read_csv(out / "campaign.csv", try_parse_dates=False).height == 4
+    rows = pl.scan_parquet(out / "runs" / "**" / "positions.parquet", hive_partitioning=True).collect()
+    assert rows.group_by("train").len().sort("train").rows() == [("A", 800), ("B", 200)]
+
+    record = out / "runs/train=A/day=2024-03-05/run.json"
+    shutil.rmtree(out / "runs/train=A/day=2024-03-06")
+    before = record.stat().st_mtime_ns
+    with ThreadPoolExecutor(1) as executor:
+        again = run_campaign(folder / "campaign.toml", out=out, executor=executor)
+    assert record.stat().st_mtime_ns == before
+    compared = [name for name in first.columns if name != "wall_s"]
+    assert again.select(compared).equals(first.select(compared), null_equal=True)
+
+    changed = folder / "strict.toml"
+    changed.write_text(CAMPAIGN.replace("[options]", 'config = "settings.toml"\n[options]'))
+    (folder / "settings.toml").write_text('preset = "strict"\n')
+    with ThreadPoolExecutor(1) as executor:
+        run_campaign(changed, out=out, executor=executor)
+    assert record.stat().st_mtime_ns != before
+
+
+def test_the_command_and_what_reads_its_runs(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = RUNNER.invoke(app, ["campaign", str(folder / "campaign.toml"), "--out", str(out), "--workers", "2"])
+    assert result.exit_code == 0, result.output
+    assert "4 of 4 runs, 1 failed, 0 min 00 s left" in result.stderr
+    truth = str(tmp_path.parent / "none.csv")
+    words = ["report", str(out / "runs/train=A/day=2024-03-05"), "--out", str(tmp_path / "page.html")]
+    assert RUNNER.invoke(app, words).exit_code == 0
+    assert RUNNER.invoke(app, [*words, "--overwrite", "--reference", truth]).exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (("logs/{train}/{day}/front*.obs", "logs/{train}/{day}/none.obs"), InputFileError, "no file matches front"),
+        (("logs/{train}/{day}/front*.obs", "logs/A/2024-03-05/front.obs"), SettingsError, "has no field"),
+        (("nav/{day}.nav", "nav/{week}.nav"), SettingsError, "nav has the field week, which front has not"),
+        (("vehicle", "vehikel"), SettingsError, "vehikel"),
+    ],
+)
+def test_a_wrong_campaign_is_one_sentence(
+    folder: Path, tmp_path: Path, change: tuple[str, str], error: type[Exception], words: str
+) -> None:
+    wrong = folder / "wrong.toml"
+    wrong.write_text(CAMPAIGN.replace(*change))
+    with pytest.raises(error, match=words):
+        read_campaign(wrong, tmp_path)
+
+
+def test_a_folder_with_other_files_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    with ThreadPoolExecutor(1) as executor, pytest.raises(OutputError, match="nor that of a campaign"):
+        run_campaign(folder / "campaign.toml", out=tmp_path, executor=executor)
