@@ -9,6 +9,7 @@ import typer
 
 from railfix.cli.options import OverwriteOption
 from railfix.report.plots.run_screens import draw_run_screens
+from railfix.run.folder import reading_table
 from railfix.run.output import OutputFolder
 
 
@@ -32,7 +33,9 @@ def plot_screens(
     8 the pictures cannot be written; 1 a defect of railfix.
     """
     with OutputFolder(out, overwrite="replace" if overwrite else "refuse") as folder:
-        for picture in draw_run_screens(run, folder.staging):
+        with reading_table(run / "observations.parquet"):
+            pictures = draw_run_screens(run, folder.staging)
+        for picture in pictures:
             folder.staged(picture.name)
         drawn = folder.commit()
     for path in drawn.values():

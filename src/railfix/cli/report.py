@@ -9,6 +9,7 @@ import typer
 
 from railfix.cli.options import OverwriteOption
 from railfix.report import write_report
+from railfix.run.folder import reading_table
 from railfix.run.output import check_output_file
 
 
@@ -66,12 +67,14 @@ def report(
     ]
     inputs = [*(reference or ()), *in_runs, *([] if background is None else [background])]
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=inputs)
-    page = write_report(
-        runs,
-        out,
-        references=tuple(reference or ()),
-        conventional=tuple(conventional or ()),
-        background=background,
-        title=title,
-    )
+    # the observations are read piece by piece while the page is drawn
+    with reading_table(runs[0] / "observations.parquet" if len(runs) == 1 else Path("observations.parquet of a RUN")):
+        page = write_report(
+            runs,
+            out,
+            references=tuple(reference or ()),
+            conventional=tuple(conventional or ()),
+            background=background,
+            title=title,
+        )
     typer.echo(f"wrote {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -159,8 +160,15 @@ def read_parquet(path: Path) -> pl.DataFrame:
     InputFileError
         It cannot be read as Parquet.
     """
-    try:
+    with reading_table(path):
         return pl.read_parquet(path)
+
+
+@contextmanager
+def reading_table(path: Path) -> Iterator[None]:
+    """Raise errors of reading a table, also of a lazy one, as `InputFileError`."""
+    try:
+        yield
     except (PolarsError, PanicException, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputFileError(path, f"cannot be read as a table ({reason}); run railfix run again") from None
