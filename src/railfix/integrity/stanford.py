@@ -140,7 +140,7 @@ def stanford(
         Along the track, signed or not; NaN where there is no position or no reference.
     level_m : array_like, shape (T,) [m]
         Protection level; infinite where no error can be excluded, NaN where there is no position.
-        Where there is an error but no level the position is not vouched for: as infinite.
+        An error without a level counts as an infinite level.
     alarm_limit_m : float [m]
     windows_s : sequence of float [s]
         Lengths of the windows of continuity: 15 s is an approach's in aviation; a minute, a station to the next.

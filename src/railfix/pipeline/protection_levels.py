@@ -1,4 +1,4 @@
-"""The protection level of the positions: which sigmas, biases and probabilities it rests on."""
+"""Protection levels of the positions: their sigmas, biases and fault probabilities."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.results import ProtectionResult, RaimResult
 from railfix.positioning.map_offset import MapOffset
 
-#: What a level rests on: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
+#: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
 def kind_of(config: Config) -> str:
-    """Which of `KINDS` the levels of a run are."""
+    """Return which of `KINDS` the levels of a run are."""
     return KINDS[0] if config.sbas else KINDS[1]
 
 
 def level_facts(config: Config) -> dict[str, Any]:
-    """What the levels of a run rest on, as plain values; empty where they are off."""
+    """Return the basis of the levels of a run as plain values; empty where they are off."""
     if config.protection == "off":
         return {}
     risk = risk_of(config)
@@ -47,7 +47,7 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 
 def risk_of(config: Config) -> RiskBudget:
-    """The budget in force: with SBAS the satellites' own faults are its business, what is left is local."""
+    """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones are left."""
     if kind_of(config) == "separation":
         return config.risk
     return config.risk.replaced(satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
@@ -61,7 +61,7 @@ def protection_levels(
     scale: Floats,
     config: Config,
 ) -> ProtectionResult:
-    """Levels of the positions of a chunk.
+    """Return the protection levels of the positions of a chunk.
 
     Parameters
     ----------
@@ -95,15 +95,15 @@ def protection_levels(
 
 
 def _level_scale(scale: Floats, config: Config) -> Floats | float:
-    """What the sigmas of the ranges are multiplied by: those of a model stand; quiet residuals shrink none."""
+    """Return the factor on the sigmas of the ranges: 1 with an error model, otherwise the noise scale, 1 at least."""
     return 1.0 if config.error_model is not None else np.maximum(scale, 1.0)
 
 
 def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:
-    """Levels beside the verdicts on the positions.
+    """Return the levels with the verdicts on the positions applied.
 
-    A level stands for the place that the ranges were linearised at. Where another place explains them as
-    well, or the position is off the map, it is of no use: unavailable. Where a check has failed: alarm.
+    A level holds at the place where the ranges were linearised. Where another place explains them as well,
+    or the position is off the map, it is unavailable. Where a check has failed: alarm.
 
     Parameters
     ----------

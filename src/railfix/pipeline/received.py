@@ -22,7 +22,7 @@ _ELEMENTS: Final[dict[str, Any]] = {
     "Floats": np.float64,
     "Integers": np.int64,
 }
-#: Fields that tell two Keplerian records of one satellite apart.
+#: Fields that distinguish two Keplerian records of one satellite.
 _KEPLER_KEY: Final = ("satellite", "message", "toe", "toc", "iode", "iodc", "health")
 _GLONASS_KEY: Final = ("satellite", "toe", "health")
 

@@ -62,11 +62,11 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "z_m": "antenna, ECEF",
     "n_used": "satellites used",
     "n_rejected": "satellites with a pseudorange that were not used",
-    "noise_scale": "noise of this receiver against what the weights assume, estimated so far",
-    "raim_outcome": "what RAIM made of the ranges: "
+    "noise_scale": "noise of this receiver over that of the weights, estimated so far",
+    "raim_outcome": "result of RAIM: "
     "`passed`, `excluded_one`, `excluded_two`, `inseparable`, `unresolved`, `untestable`",
     "raim_statistic": "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
-    "raim_threshold": "what it is compared with; a fault is detected from there on",
+    "raim_threshold": "threshold of the statistic, above which a fault is detected",
     "raim_level_m": "P4's level: error by a fault that RAIM misses, and by noise; infinite where a satellite is "
     "unchecked, empty where a fault is left or `raim_protection` is off",
     "protection_level_m": "along the line: the error exceeds it with the stated risk, all hypotheses together; "
@@ -75,11 +75,11 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "`protection_level_m` spends the whole risk on the sum of all and may be smaller than a part",
     "protection_one_fault_m": "the same for a fault of one satellite; 0 where that is less likely than its share",
     "protection_two_faults_m": "the same for faults of two satellites; 0 where that is less likely than its share",
-    "protection_k_fault_free": "sigmas that the first part stands for",
-    "protection_k_one_fault": "sigmas that the second part stands for, beside its threshold",
-    "protection_k_two_faults": "sigmas that the third part stands for, beside its threshold",
+    "protection_k_fault_free": "K of the first part",
+    "protection_k_one_fault": "K of the second part, beside its threshold",
+    "protection_k_two_faults": "K of the third part, beside its threshold",
     "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
-    "protection_kind": "what it rests on: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
+    "protection_kind": "basis: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
     "hypotheses of satellites' own faults as well",
     "protection_cause": "what sets the level: "
     "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
@@ -296,7 +296,7 @@ def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack |
 
 
 def screen_metrics(result: AntennaResult) -> dict[str, Floats]:
-    """What the screens measured of each channel, by column of `OBSERVATION_COLUMNS`.
+    """Return the metrics of the screens for each channel, by column of `OBSERVATION_COLUMNS`.
 
     Parameters
     ----------

@@ -82,7 +82,7 @@ def _along(
     matrix[:, 1, 1] += 1.0 / trajectory.sigma_plan_m**2
     matrix[:, 2, 2] += 1.0 / trajectory.sigma_height_m**2
     vector = np.einsum("tij,tj->ti", axes, equations.vector)
-    # Schur complement of the map error: what remains tells of the distance along the line alone.
+    # Schur complement of the map error: what remains depends on the distance along the line alone.
     coupling = matrix[:, 0, 1:]
     a, b, c = matrix[:, 1, 1], matrix[:, 1, 2], matrix[:, 2, 2]
     determinant = a * c - b * b
@@ -110,7 +110,7 @@ def constrained_position(
     Newton steps inside a section (P1 2.2(3), algorithm of one unknown after the clocks are
     eliminated); a step that leaves the section stops at its end and goes on from there in the
     neighbouring one. Where both neighbours of a point send the step back to it, the point itself
-    is the answer. At either end of the line the position is clamped and `overshoot_m` tells how
+    is the answer. At either end of the line the position is clamped and `overshoot_m` is how
     far beyond it the ranges pull.
 
     Parameters

@@ -43,7 +43,7 @@ _TELLING: Final = 2.0
 
 
 class DopplerSpeedLimits(Settings):
-    """What is used, how it is weighed, what is refused.
+    """Limits and weights of the Doppler speed.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class DopplerSpeed:
     clock_drift_mps : ndarray, shape (T,) [m/s]
         c times the drift of the receiver clock.
     residual_mps : ndarray, shape (T, K) [m/s]
-        Measured less fitted, of used and refused Dopplers; NaN elsewhere.
+        Measured less fitted, of used and rejected Dopplers; NaN elsewhere.
     used, rejected : ndarray of bool, shape (T, K)
     n_used : ndarray of int, shape (T,)
     scale : float

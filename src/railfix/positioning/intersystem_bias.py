@@ -24,15 +24,15 @@ from railfix.positioning.single_point import SinglePoint
 
 
 class ClockOffsetLimits(Settings):
-    """How offsets are trusted.
+    """Limits of the inter-system biases.
 
     Attributes
     ----------
     stability_m : float
-        What an offset may differ by from its mean at any epoch; infinite leaves every
+        Standard deviation of an offset about its mean at any epoch; infinite leaves every
         constellation its own clock. On an urban recording the spread was 1.0 m (Galileo, BeiDou).
     correlation_s : float
-        Epochs nearer to each other than this say the same thing twice: errors of a standing
+        Epochs nearer to each other than this are not independent: errors of a standing
         train are correlated over tens of seconds.
     window_s : float
         Time constant of forgetting: receivers keep their offsets to a metre over hours, so half an hour loses
@@ -46,7 +46,7 @@ class ClockOffsetLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetState:
-    """What the epochs so far say, by clock letter.
+    """Offsets estimated so far, by clock letter.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ def tie_clocks(
     clocks : tuple of str, length G
         Letter of each group of `ranges`.
     reference : str
-        Letter of the clock that the others are told against.
+        Letter of the reference clock.
     ranges : Ranges
         Without ties; those that agree with each other alone, so that a faulty satellite moves no offset.
     free : SinglePoint

@@ -1,8 +1,8 @@
 """Normal equations of ranges with the receiver clocks eliminated.
 
-The single-point position, the constrained position and the section search all ask the same
-question: how well do pseudoranges fit a place, whatever the receiver clock of each constellation
-is? Subtracting the weighted mean of a constellation's satellites from its residuals and design
+The single-point position, the constrained position and the section search all solve the same
+problem: how well pseudoranges fit a place, for any receiver clock of each constellation. Subtracting the
+weighted mean of a constellation's satellites from its residuals and design
 rows is the same as solving for that clock (algebraically: the Schur complement of the clock
 block). What is left is a 3 x 3 system in the place alone.
 
@@ -31,7 +31,7 @@ UNTIED_M: Final = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class ClockTies:
-    """What is known of the clocks of the constellations against each other.
+    """Known offsets between the receiver clocks of the constellations.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Ranges:
     groups : tuple of slice
         Channels that share one receiver clock stand side by side; one slice a clock.
     ties : ClockTies or None
-        What is known of these clocks against each other; None: nothing.
+        Known offsets between these clocks; None: none.
     """
 
     sat_ecef_m: Floats
@@ -124,9 +124,9 @@ class NormalEquations:
     residual_m : ndarray, shape (T, M) [m]
         Code - range - clock; 0 where the weight is 0.
     clock_slope : ndarray, shape (T, 3, G)
-        What a step from the place takes from `clock_m`, by metre of each axis.
+        Decrease of `clock_m` by a step from the place, per metre of each axis.
     design : ndarray, shape (T, 3, M)
-        What a step from the place takes from `residual_m`, by metre of each axis.
+        Decrease of `residual_m` by a step from the place, per metre of each axis.
     """
 
     matrix: Floats
@@ -209,7 +209,7 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     if ranges.ties is not None:
         apart, mass = _between_clocks(means, totals, ranges.ties)
         system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
-        # A clock lies between what its own satellites and what the others say.
+        # A clock lies between the estimates from its own satellites and from the others.
         shift = apart / (totals * ranges.ties.sigma_m**2 + 1.0)[:, None]
         means -= shift
         rows += np.repeat(shift, sizes, axis=2) * used

@@ -41,7 +41,7 @@ _FAN_OUT: Final = 8
 
 
 class SectionLimits(Settings):
-    """When a second place counts as possible.
+    """Limits of ambiguous sections.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class SectionLimits(Settings):
         Probability that noise alone makes the true place fit this much worse than the best one
         (chi-square, one degree of freedom). P1 3.2: wrong sections on sharp curves.
     separation_m : float
-        Distance along the line from which on another place is another place.
+        Least distance along the line between two distinct places.
     redundancy : int
         Ranges beyond the unknowns (clocks and distance) below which a section is doubtful: on real
         recordings of two constellations a quarter of the sections were wrong with one redundant
@@ -100,7 +100,7 @@ class Section:
         Its weighted sum of squared residuals.
     excess : ndarray, shape (T,)
         How much worse the best other place fits, in q at its own best point between the points of
-        the trajectory, in units of what the fit of the best place says is one variance (never
+        the trajectory, in variances estimated from the fit of the best place (never
         below the variance of the weights); negative when it fits better, infinite when there is none.
     other_vertex : ndarray of int, shape (T,)
         Where that other place is; -1 when there is none.
@@ -124,7 +124,7 @@ class _Stretches:
 
 
 class SearchIndex:
-    """What the search prepares once for a trajectory: a k-d tree, and stretches of rising length."""
+    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -254,7 +254,7 @@ def _ball(
 
 
 def _bend(distance_m: Floats) -> Floats:
-    """What the linear model of a range can be wrong by at a distance from where it was made [m]."""
+    """Return the largest error of the linear model of a range at a distance from its expansion point [m]."""
     return np.asarray(distance_m**2 / (2.0 * _SHORTEST_RANGE) + _ROTATION_GRADIENT * distance_m)
 
 
@@ -295,7 +295,7 @@ def _coarse_to_fine(
     limits: SectionLimits,
     epochs: Indices,
 ) -> tuple[_Candidates, Integers]:
-    """Points that noise cannot tell from the best, by dropping stretches of line that fit too badly."""
+    """Return the points that fit as well as noise allows, by dropping stretches of line that fit too badly."""
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
     looked = np.zeros(len(ranges), dtype=np.int64)

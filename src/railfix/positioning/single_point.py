@@ -1,6 +1,6 @@
 """Conventional positioning: the 3-D single point, without the map.
 
-The yardstick of P1 section 5. Weighted least squares in x, y, z and one receiver clock a
+The reference method of P1 section 5. Weighted least squares in x, y, z and one receiver clock a
 constellation; the nearest point of the trajectory is taken afterwards by the pipeline.
 """
 
@@ -17,7 +17,7 @@ from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equ
 
 
 class SinglePointLimits(Settings):
-    """When an iteration counts as settled.
+    """Convergence limits of the iteration.
 
     Attributes
     ----------

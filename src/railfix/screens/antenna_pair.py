@@ -67,8 +67,8 @@ class AntennaPairLimits(Settings):
     tag_tolerance_s : float [s]
         Largest difference of the time tags of a pair of epochs.
     verdict : {"weigh", "reject"}
-        What becomes of a satellite whose difference does not fit: its sigma grows on both antennas, for which of
-        them is wrong is not known, or it is rejected on both, as P1 does.
+        Treatment of a satellite whose difference does not fit: its sigma grows on both antennas, as which of
+        them is wrong is unknown, or it is rejected on both, as in P1.
     """
 
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)

@@ -217,7 +217,7 @@ class RunTables(Protocol):
 
 
 class Screen(ABC, Generic[Limits]):
-    """One screen; use a subclass that says what it judges.
+    """One screen; derive from the subclass for what it judges.
 
     Attributes
     ----------

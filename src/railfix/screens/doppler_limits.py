@@ -41,7 +41,7 @@ from railfix.screens.medians import row_median
 
 #: Median of the absolute value of a unit normal variable.
 _MEDIAN_NORMAL: Final = 0.674_489_750_196_081_7
-#: Changes finer than this say nothing of a receiver [m].
+#: Smallest change used for the receiver's scale [m].
 _FINEST_M: Final = 1e-3
 #: Changes an epoch needs for its scale.
 _LEAST_CHANGES: Final = 5
@@ -76,8 +76,8 @@ class DopplerLimits(Settings):
     least_satellites : int
         Satellites of one clock needed to take its step out.
     verdict : {"weigh", "reject"}
-        What becomes of a suspected satellite in a run: its sigma grows by the size of the jump
-        (`railfix.screens.suspicion_sigma_m`), or it is rejected, as P1 does. Where few satellites are left,
+        Treatment of a suspected satellite: its sigma grows by the size of the jump
+        (`railfix.screens.suspicion_sigma_m`), or it is rejected, as in P1. Where few satellites are left,
         the geometry without one turns a few metres into a hundred; a weight does not.
     """
 

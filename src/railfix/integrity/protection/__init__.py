@@ -1,4 +1,4 @@
-"""Protection level along the track (P1 2.4): how wrong may the position be, at a stated risk?
+"""Protection level along the track (P1 2.4): the largest error at a stated risk.
 
 From the model of `railfix.integrity.raim`::
 

@@ -37,7 +37,7 @@ _SAME: Final = 1e-9
 
 
 class Cause(IntEnum):
-    """What uses up most of the risk of an epoch at its level, or why there is none."""
+    """Hypothesis that uses most of the risk of an epoch at its level, or why there is no level."""
 
     #: The noise of the position without a fault.
     FAULT_FREE = 0
@@ -106,7 +106,7 @@ class ProtectionLevel:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What each epoch spends, T epochs."""
+    """Allocation of the risk, T epochs."""
 
     prior: Floats  # (T, M), 0 where not used
     groups: tuple[tuple[str, Masks], ...]  # constellations with a prior of their own: letter, members (M,)

@@ -1,7 +1,7 @@
-"""The risk that a protection level may leave, and what it is spent on.
+"""Integrity risk of a protection level, and its allocation to fault hypotheses.
 
-Integrity is promised for an hour, a level is computed for an epoch: the risk of the hour is divided
-by the number of independent samples in it. What an epoch may risk is divided among the hypotheses:
+Integrity is specified per hour, a level is computed per epoch: the risk of the hour is divided
+by the number of independent samples in it. The risk of an epoch is divided among the hypotheses:
 no fault, one, two; more than two are not checked, their whole probability is taken off beforehand.
 P1 2.4 sets out from 1e-7 an hour (RTCA DO-229D).
 """
@@ -76,7 +76,7 @@ class RiskBudget(Settings):
         SBAS corrections within minutes (DO-229D appendix J counts 10 samples an hour). More samples are
         the safe side; from 10 to 3600 the fault-free K grows by 0.9.
     fault_free_share, one_fault_share, two_fault_share : float
-        Of what an epoch may risk; together at most 1. The level is the largest of the three parts, and a
+        Shares of the risk of an epoch; together at most 1. The level is the largest of the three parts, and a
         share twice as large lowers a K of 6 by 0.1, one of 3 by 0.2: thirds.
     exclusion_share : float
         Of the risk, kept for epochs with one and (as much again) with two satellites excluded.
@@ -112,7 +112,7 @@ class RiskBudget(Settings):
 
     @property
     def risk_per_sample(self) -> float:
-        """What an epoch may risk, exclusions and unchecked faults included."""
+        """Risk of an epoch, exclusions and unchecked faults included."""
         return self.risk_per_hour / self.samples_per_hour
 
     @property
@@ -134,7 +134,7 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """What an epoch may risk in the set that is left after exclusions, any shape.
+        """Return the risk of an epoch in the set that is left after exclusions, any shape.
 
         More faults than are checked are taken off once. Every set that exclusion could have left is a way
         to fail, so the share of the risk for e exclusions is divided by the number of sets of e among all
@@ -161,7 +161,7 @@ class RiskBudget(Settings):
         return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
 
     def require(self, systems: Sequence[str]) -> None:
-        """Refuse a budget that more than two faults among these satellites already spend.
+        """Raise where more than two faults among these satellites already exceed the risk.
 
         Raises
         ------

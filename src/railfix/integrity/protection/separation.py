@@ -123,7 +123,7 @@ def without_one(all_of: Whole) -> Separations:
 def without_two(all_of: Whole, first: Indices, second: Indices) -> Separations:
     """Pairs of places (K,) in the compact arrays left out.
 
-    Two that only vouch for each other (both of a clock of their own) have a singular S_JJ. Where the error
+    Two that only check each other (both of a clock of their own) have a singular S_JJ. Where the error
     that no residual shows does not move the position, what the residuals show of the pair is used; where it
     does, nothing bounds it.
     """

@@ -47,7 +47,7 @@ class RaimLimits(Settings):
         (chi-square, one degree of freedom). Another exclusion of as many satellites that passes
         and fits nearly as well makes the epoch inseparable.
     same_position_m : float
-        Exclusions whose positions differ by less than this do not stand against each other: either
+        Exclusions whose positions differ by less than this do not compete: either
         way the position is the same (the two satellites of a clock of their own). 0: they always do.
     noise_risk : float
         Two-sided probability that K sigma leaves to noise in the protection level; 1 gives K = 0,

@@ -1,4 +1,4 @@
-"""Fault exclusion: which one or two satellites do not agree with the rest?
+"""Fault exclusion: the one or two satellites that disagree with the rest.
 
 P1 2.3(4) excludes up to two satellites, and only those whose error is over the limit. Leaving out
 the satellites E is the same as giving each an unknown bias: against the rest their own errors are
@@ -19,7 +19,7 @@ from railfix.core.arrays import Codes, Floats, Indices, Masks
 from railfix.integrity.raim.detection import Detection, RaimLimits, detect, threshold
 from railfix.integrity.raim.model import Compact, LinearModel, compact
 
-#: Share of its error that a range must show in the residuals, so that its error can be told at all.
+#: Least redundancy number of a range whose error can be estimated.
 LEAST_REDUNDANCY: Final = 1e-9
 #: Share of a WSSE within which two are the same number.
 _ROUNDING: Final = 1e-9
@@ -28,9 +28,9 @@ _BLOCK_SIZE: Final = 40_000
 
 
 class Outcome(IntEnum):
-    """What became of an epoch."""
+    """Result of fault detection and exclusion at an epoch."""
 
-    #: The residuals of all satellites are what noise explains.
+    #: The residuals are within the noise.
     PASSED = 0
     #: One satellite excluded; the rest passes.
     EXCLUDED_ONE = 1
@@ -58,8 +58,8 @@ class Exclusion:
         Channels of the subset that leaves the least statistic, of those that pass; -1 where none.
         Given for INSEPARABLE too.
     alternative : ndarray of int, shape (T, 2)
-        The next such subset of as many channels: where INSEPARABLE, the one that stands against
-        `best`; -1 where none.
+        The next such subset of as many channels: where INSEPARABLE, the closest competing exclusion;
+        -1 where none.
     own_error_m : ndarray, shape (T, M) [m]
         Error of the channels of `best` against the rest: + where the range is too long; NaN elsewhere.
     statistic_after : ndarray, shape (T,)
@@ -235,7 +235,7 @@ def _choose(
     scale: Floats,
     limits: RaimLimits,
 ) -> None:
-    """Write the best subset of each epoch that has one, and what stands against it."""
+    """Write the best subset of each epoch that has one, and the closest competing exclusion."""
     passing = trial.allowed & (trial.statistic < after[:, None])
     rows = np.flatnonzero(passing.any(axis=1))
     if not len(rows):

@@ -47,7 +47,7 @@ class LinearModel:
     covariance_m2 : ndarray, shape (T, 3, 3) [m^2]
         Of the place, prior included (Q); NaN where the ranges do not determine it.
     prior : ndarray, shape (3, 3) [1/m^2]
-        What is known of the place beforehand: the map error across and up.
+        Prior information on the place: the map error across and up.
     misfit : ndarray, shape (T, M)
         Whitened code - range at the position, up to a clock (y); 0 where not used.
     freedom : ndarray of int, shape (T,)

@@ -33,7 +33,7 @@ FREE_AMBIGUITY_M: Final = 1e4
 
 
 class PhaseLimits(Settings):
-    """How phases are trusted, and for how long.
+    """Limits of the float ambiguities.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class PhaseLimits(Settings):
         The walk is taken in steps at multiples of this time since the GPS epoch.
     correlation_s : float
         Code errors of a real receiver last for tens of seconds (multipath, delays): epochs nearer
-        to each other than this tell the ambiguities the same thing again. The variance that the
+        to each other than this give the ambiguities no new information. The variance that the
         ambiguities bring is multiplied by correlation / interval, up to that of codes alone. The
         positions do not change. 0 for noise that is white, as a simulated one.
     passes : int
@@ -76,7 +76,7 @@ def hop_of(time: Datetimes, limits: PhaseLimits) -> Integers:
 
 
 def repeats_of(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Epochs that tell the same thing as each epoch, shape (T,); 1 for the first."""
+    """Return the number of correlated epochs for each epoch, shape (T,); 1 for the first."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -171,7 +171,7 @@ def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Flo
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    With a clock of the phases' own nothing tells a constant common to all ambiguities. It is fixed
+    With a clock of the phases' own a constant common to all ambiguities is unobservable. It is fixed
     by asking that the `held` ones (1, others 0; shape (..., A)) are zero in the mean: no difference
     between them changes by that, and no digits are lost.
     """
@@ -200,7 +200,7 @@ def assembled(
     iterations: int,
     limits: PhaseLimits,
 ) -> PhasePositions:
-    """Everything side by side, NaN where there is nothing."""
+    """Return the positions of a run, NaN where there is none."""
     has = started & (own.noise_sigma_m <= limits.largest_sigma_m)
     code, phase = lin.code_weight > 0, lin.phase_weight > 0
     return PhasePositions(

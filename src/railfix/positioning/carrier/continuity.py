@@ -1,4 +1,4 @@
-"""Phase jumps against the line: what one epoch's change of the phases says of itself.
+"""Phase jumps detected on the line from the change of the phases between two epochs.
 
 Between two epochs the antenna moved by one unknown distance along a known line and the clock by
 one unknown; every further satellite is a check, good to a centimetre at any rate of the log and
@@ -36,7 +36,7 @@ class ContinuityLimits(Settings):
     sigmas : float
         A channel is out from so many standard deviations of its own residual on.
     refused : int
-        Channels that may be taken out; where more would have to be, none is kept as joined.
+        Largest number of channels rejected; where more would be, no channel continues.
     max_gap_s : float
         Longest interval that is judged.
     """
@@ -81,7 +81,7 @@ class TrackJumps:
     jump : ndarray of bool, shape (T, M)
         True where the phase does not fit: its arc begins anew.
     metric_m : ndarray, shape (T, M) [m]
-        Change of phase less what the channels kept say; NaN where not judged.
+        Change of phase less that of the channels kept; NaN where not judged.
     judged : ndarray of bool, shape (T, M)
     moved_m : ndarray, shape (T,) [m]
         Way along the line since the epoch before, from the phases; NaN where not known.

@@ -1,7 +1,7 @@
 """Positions along the line from code and phase, each epoch from the past alone.
 
 The normal matrix of the running arcs' ambiguities is what one epoch leaves to the next; each epoch
-adds what it says, and at multiples of a hop the ambiguities walk a little. Ambiguities of ended
+adds its information, and at multiples of a hop the ambiguities walk a little. Ambiguities of ended
 arcs are eliminated. So the state is as small as there are channels, a live epoch costs the same
 however long the run, and any cutting into chunks gives the same.
 """
@@ -46,7 +46,7 @@ SEGMENT_EPOCHS: Final = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """What the epochs so far say of the running arcs, A of them.
+    """Information of the epochs so far on the running arcs, A of them.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ def phase_positions(
 
 @dataclass(frozen=True)
 class _Inputs:
-    """What one segment is computed from."""
+    """Inputs of one segment."""
 
     time: Datetimes
     ranges: Ranges

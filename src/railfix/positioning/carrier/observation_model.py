@@ -35,7 +35,7 @@ PhaseClocks = Literal["own", "shared"]
 
 #: Own unknowns of an epoch before the clocks: along, across, up.
 PLACE: Final = 3
-#: Sigma of an own unknown of which nothing is known [m]: keeps matrices regular where no satellite tells.
+#: Sigma of an unknown without any information [m]: loose prior for conditioning.
 _FREE_M: Final = 1e5
 #: Least sigma of a tie between clocks [m].
 _LEAST_TIE_M: Final = 1e-2
@@ -97,7 +97,7 @@ class Linearised:
     clock_m, phase_clock_m : ndarray, shape (T,) [m]
         First values of the epoch's clocks, taken off codes and phases.
     known : ndarray, shape (T, P, P)
-        What is known beside the observations: the map's errors, ties between clocks.
+        Prior information: errors of the map, ties between clocks.
     inverse : ndarray, shape (T, P, P)
         Inverse of the normal matrix of the own unknowns.
     right : ndarray, shape (T, P)
@@ -158,7 +158,7 @@ def linearise(
     phase = np.where(v > 0, phases.phase_m - distance - clock[:, None], 0.0)
     prior = np.array([trajectory.sigma_plan_m**-2.0, trajectory.sigma_height_m**-2.0])
     known = np.zeros((len(code), unknowns, unknowns))
-    # What no satellite of an epoch tells: the matrix stays regular, the sigma says so.
+    # Unobservable unknowns of an epoch: the matrix stays regular, their sigma is large.
     for free in (0, *range(PLACE, unknowns)):
         known[:, free, free] = _FREE_M**-2.0
     known[:, 1, 1], known[:, 2, 2] = prior
@@ -197,7 +197,7 @@ def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
 
 
 def _ties(ties: ClockTies) -> tuple[Floats, Floats]:
-    """What is known of the clocks against each other, a common clock eliminated: matrix and right-hand side.
+    """Return matrix and right-hand side of the known clock offsets, a common clock eliminated.
 
     The first value of the clocks, the same for all groups, does not show in these differences.
     """
@@ -227,7 +227,7 @@ def shifted(lin: Linearised, first_m: Floats) -> Linearised:
 
 @dataclass(frozen=True, kw_only=True)
 class Reduced:
-    """What each epoch says of the ambiguities of its channels.
+    """Return the information of each epoch on the ambiguities of its channels.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ def reduce(lin: Linearised) -> Reduced:
     """
     gain = np.matmul(lin.inverse, lin.coupling)
     # As a sum of squares of what the own unknowns leave: never negative, and errors of the inverse
-    # enter squared; diag(v) - C^T L^-1 C would lose all digits where an epoch says little.
+    # enter squared; diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
         (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),

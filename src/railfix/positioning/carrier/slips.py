@@ -1,11 +1,11 @@
 """Where the phase of a channel cannot be joined to the epoch before: cycle slips and gaps.
 
 Each epoch is judged against the one just before it. The phase's change is compared with what the
-mean of the two Dopplers says, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``; where
+mean of the two Dopplers gives, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``; where
 that cannot judge, with the change of the code. What is common to the channels is the receiver's
 clock and is taken off as their median, so that a clock step is no slip.
 
-What is assumed of a clock step: it is common to all channels of an epoch; codes follow the time
+Assumptions on a clock step: it is common to all channels of an epoch; codes follow the time
 tags (a RINEX pseudorange is tag less transmit time), so that the true interval is the tags' less
 the step seen in the codes; phases either step with the codes or run on, and a difference between
 the two is a whole number of milliseconds, which `Slips.phase_m` adds to the phases.
@@ -49,7 +49,7 @@ class SlipReason(IntFlag):
     HALF_CYCLE = 1 << 3
     #: The epoch before is longer ago than the limit.
     GAP = 1 << 4
-    #: The log says that nothing may be differenced into this epoch.
+    #: The log marks a break before this epoch.
     BREAK = 1 << 5
     #: The phase's change is not that of the Dopplers.
     DOPPLER = 1 << 6
@@ -60,7 +60,7 @@ class SlipReason(IntFlag):
 class SlipLimits(Settings):
     """Limits of the tests, in metres for an interval dt in seconds.
 
-    The Doppler test refuses a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
+    The Doppler test rejects a change over ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``: noise
     of the phases, noise of the mean Doppler, and what the trapezoid of the Dopplers misses of a
     motion with that jerk. One cycle on L1 (0.19 m) is seen up to intervals of about 1 s, two to
     1.5 s; a test on the track (`continuity.track_jumps`) has no such end.
@@ -123,12 +123,12 @@ class Slips:
         Phase times wavelength on the clock of the codes: whole milliseconds that only the codes
         stepped are added. NaN where there is no phase or its wavelength is unknown.
     doppler_metric_m, code_metric_m : ndarray, shape (T, M) [m]
-        What the two tests compare with their limits; NaN where they cannot judge.
+        Metrics of the two tests; NaN where they cannot judge.
     doppler_limit_m : ndarray, shape (T,) [m]
     clock_step_m : ndarray, shape (T,) [m]
         Step of the receiver's clock into the epoch as the codes show it; 0 where none is seen.
     half_cycle : ndarray of bool, shape (T, M)
-        The receiver says that half a cycle is not resolved: harmless to a float ambiguity.
+        The receiver reports an unresolved half cycle: harmless to a float ambiguity.
     """
 
     slip: Masks

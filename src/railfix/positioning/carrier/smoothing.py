@@ -21,7 +21,7 @@ from railfix.positioning.carrier.recursion import linear_recursion
 
 
 class SmoothingLimits(Settings):
-    """How long codes are averaged.
+    """Limits of the smoothing.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class SmoothingState:
     last_m : ndarray, shape (M,) [m]
         Last code less phase, for `clocks="own"`.
     clock_m : float [m]
-        What the codes have moved against the phases in the mean.
+        Mean change of the codes against the phases so far.
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
