@@ -16,7 +16,7 @@ import recordings_truth
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import timedelta
-from railfix.evaluate import Score, along_track_error, interpolate_reference, score
+from railfix.evaluate import Score, along_track_error, interpolate_reference, score, straight_distance
 from railfix.integrity.raim import Outcome as RaimOutcome
 from railfix.integrity.raim import constrained_model, exclude
 from railfix.io.rinex import read_navigation, read_observations
@@ -58,6 +58,7 @@ class Outcome:
     result: AntennaResult | None
     trajectory: Trajectory
     ranges: Ranges | None = None
+    straight: Score | None = None
 
 
 def trajectory_of(time: np.ndarray, ecef_m: np.ndarray) -> Trajectory:
@@ -81,7 +82,8 @@ def outcome(name: str, antenna: AntennaResult, reference: np.ndarray, trajectory
     observed = np.isfinite(reference[:, 0]) & np.any((antenna.reason & 1) == 0, axis=1)
     error = along_track_error(antenna.arc_m, reference, trajectory)
     other = along_track_error(antenna.conventional_arc_m, reference, trajectory)
-    return Outcome(name, score(error, observed), score(other, observed), error, antenna, trajectory)
+    straight = score(straight_distance(antenna.arc_m, reference, trajectory), observed)
+    return Outcome(name, score(error, observed), score(other, observed), error, antenna, trajectory, straight=straight)
 
 
 def urbannav_f9p(data: Path, config: Config = SETTINGS) -> Outcome:
@@ -236,6 +238,7 @@ def smartloc(data: Path, config: Config = SETTINGS) -> Outcome:
         None,
         trajectory,
         ranges,
+        score(straight_distance(arc, reference, trajectory), observed),
     )
 
 
@@ -251,7 +254,7 @@ RECORDINGS: dict[str, Callable[[Path, Config], Outcome]] = {
 def print_table(data: Path, config: Config) -> None:
     """All recordings with one configuration."""
     head = "recording                  epochs  rate %   p50 m   p95 m   max m  wrong %"
-    print(f"{head}  | conventional: rate %  p50 m  p95 m")
+    print(f"{head}  | conventional: rate %  p50 m  p95 m  | straight: p50 m   p95 m   max m")
     outcomes = [run(data, config) for run in RECORDINGS.values()]
     stations = [geonet(data, station, azimuth, config) for station in ("0759", "3040") for azimuth in (0, 45, 90, 135)]
     for o in [*outcomes, *stations]:
@@ -259,6 +262,7 @@ def print_table(data: Path, config: Config) -> None:
         print(
             f"{o.name:26s} {a.epochs:6d} {100 * a.rate:7.2f} {a.p50_m:7.2f} {a.p95_m:7.2f} {a.max_m:7.1f} "
             f"{100 * a.wrong_place:8.2f}  | {100 * b.rate:20.2f} {b.p50_m:6.2f} {b.p95_m:6.2f}"
+            + (f"  | {o.straight.p50_m:15.2f} {o.straight.p95_m:7.2f} {o.straight.max_m:7.1f}" if o.straight else "")
         )
     together = np.concatenate([o.error_m for o in stations])
     pooled = score(together, np.ones(len(together), dtype=bool))

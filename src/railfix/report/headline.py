@@ -154,8 +154,8 @@ def _filtered(run: ReportedRun, antenna: str) -> list[str]:
     rate = len(table.filter("in_reference", "positioned")) / max(len(table.filter("in_reference")), 1)
     return [
         f"Filtered along the track, the train has a position at {share(rate, 1)} of all epochs, those without "
-        f"satellites included; 95 % of these are within {number(float(np.percentile(size, 95.0)), 1)} m, and the worst is "
-        f"{number(float(size.max()), 1)} m off."
+        f"satellites included; 95 % of these are within {number(float(np.percentile(size, 95.0)), 1)} m, and the worst "
+        f"is {number(float(size.max()), 1)} m off."
     ]
 
 
