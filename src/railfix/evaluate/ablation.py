@@ -1,4 +1,4 @@
-"""What each screen buys and costs: one reading of the logs, every choice of screens side by side."""
+"""Effect of each screen: the logs are read once and processed with every choice of screens."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 import time as clock
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -40,7 +40,7 @@ ALL, NONE = "all", "none"
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """What one choice of screens came to on one antenna.
+    """Rates and errors of one choice of screens on one antenna.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Effect:
     screens : tuple of str
     antenna : str
     epochs : int
-        Epochs with observations; with a truth, those of them inside its time.
+        Epochs with observations, and with a reference where one is given.
     rate, ok_rate : float
         Share of the epochs with coordinates, and of those of status ok.
     n_used : float
@@ -57,8 +57,8 @@ class Effect:
     sigma_p50_m : float [m]
         Median of the standard deviation along the line, of the epochs with coordinates.
     coordinates, ok, conventional : Score or None
-        Against the truth: epochs with coordinates, of status ok, and the conventional position from the
-        same ranges. None without a truth.
+        Errors of all positions, of those with status ok, and of the conventional position from the same ranges;
+        None without a reference.
     """
 
     choice: str
@@ -108,19 +108,16 @@ class Ablation:
 
 
 def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """All screens, none, each alone, all but each, by name; of two choices that are the same, the first."""
+    """Choices of screens by name: all, none, each alone, all but each; equal choices once."""
     named = {ALL: tuple(screens), NONE: ()}
     named |= {f"only {name}": (name,) for name in screens}
     named |= {f"without {name}": tuple(other for other in screens if other != name) for name in screens}
-    found: dict[str, tuple[str, ...]] = {}
-    for name, chosen in named.items():
-        if chosen not in found.values():
-            found[name] = chosen
-    return found
+    first = {chosen: name for name, chosen in reversed(named.items())}
+    return {name: chosen for name, chosen in named.items() if first[chosen] == name}
 
 
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Screens that are on and can judge in this run, and one sentence on each that cannot."""
+    """Active screens that can work in this run, and one sentence on each that cannot."""
     setup = ScreenSetup(
         antennas=len(trajectories),
         spacing_known=all(t.body_chainage_m is not None for t in trajectories.values()),
@@ -141,17 +138,17 @@ def ablate_files(
     asked: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Ablation:
-    """Position the logs with every choice of screens, and write what each comes to.
+    """Process the logs with every choice of screens, and write the rates and errors of each.
 
-    The logs are read once; each chunk goes through all choices. ``ablation.csv`` has a row a choice
-    and antenna, ``ablation.json`` also what `run_files` writes to ``run.json``.
+    The logs are read once. ``ablation.csv`` has a row per choice and antenna, ``ablation.json`` also the content of
+    ``run.json``.
 
     Parameters
     ----------
     inputs : RunInputs
-        Its `truth`, where given, adds errors along the line.
+        With a `truth`, errors along the line are added.
     config : Config, optional
-        Its screens are the ones that are switched.
+        Its screens are switched.
     out : Path
     options : RunOptions, optional
     asked : mapping, optional
@@ -176,7 +173,7 @@ def ablate_files(
         screens, left_out = judging_screens(config, line.trajectories)
         processors = {
             name: processor_of(
-                # Nobody asks for a protection level here.
+                # protection levels are not part of the result
                 config.model_copy(update={"screens": chosen, "protection": "off"}),
                 navigation,
                 line.trajectories,
@@ -185,13 +182,15 @@ def ablate_files(
         }
         states = dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
-        kept = _Kept(truth=truth, trajectories=line.trajectories)
+        parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
         for chunk in aligned({name: log.parts() for name, log in logs.items()}):
             for name, processor in processors.items():
                 result, states[name] = processor.process(chunk, states[name])
                 tallies[name].add(result)
-                for antenna, found in result.antennas.items():
-                    kept.add(name, antenna, found)
+                for antenna, positions in result.antennas.items():
+                    reference = None if truth is None else truth[antenna]
+                    columns = _columns(positions, reference, line.trajectories[antenna])
+                    parts.setdefault((name, antenna), []).append(columns)
             check_same_day(navigation, tallies[NONE])
             check_same_place(tallies[NONE], antennas="all")
             if progress is not None:
@@ -201,7 +200,7 @@ def ablate_files(
         check_same_place(tallies[NONE])
         check_positions(tallies[NONE])
         effects = tuple(
-            kept.effect(name, processor.config.screens, antenna)
+            _effect(name, processor.config.screens, antenna, parts[name, antenna])
             for antenna in inputs.logs
             for name, processor in processors.items()
         )
@@ -230,63 +229,52 @@ def ablate_files(
     return Ablation(effects=effects, notes=notes, files=files, wall_s=wall)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Kept:
-    """What is kept of each epoch, by choice and antenna, chunk by chunk."""
+def _columns(result: AntennaResult, reference: AntennaReference | None, trajectory: Trajectory) -> dict[str, Floats]:
+    """Columns of one chunk of one antenna from which the effect is computed."""
+    counted = result.status != Status.NO_OBSERVATION
+    columns = {
+        "has": np.isfinite(result.arc_m).astype(np.float64),
+        "ok": (result.status == Status.OK).astype(np.float64),
+        "n_used": result.n_used.astype(np.float64),
+        "sigma_m": result.along_sigma_m,
+    }
+    if reference is not None:
+        place = interpolate_reference(result.time, reference.time, reference.ecef_m)
+        counted = counted & np.isfinite(place[:, 0])
+        columns["error_m"] = along_track_error(result.arc_m, place, trajectory)
+        columns["conventional_m"] = along_track_error(result.conventional_arc_m, place, trajectory)
+    return columns | {"counted": counted.astype(np.float64)}
 
-    truth: Mapping[str, AntennaReference] | None
-    trajectories: Mapping[str, Trajectory]
-    parts: dict[tuple[str, str], list[dict[str, Floats]]] = field(default_factory=dict)
 
-    def add(self, choice: str, antenna: str, result: AntennaResult) -> None:
-        """One chunk of one choice and antenna."""
-        if not len(result):
-            return
-        part = {
-            "counts": (result.status != Status.NO_OBSERVATION).astype(np.float64),
-            "has": np.isfinite(result.arc_m).astype(np.float64),
-            "ok": (result.status == Status.OK).astype(np.float64),
-            "n_used": result.n_used.astype(np.float64),
-            "sigma_m": result.along_sigma_m,
+def _effect(choice: str, screens: tuple[str, ...], antenna: str, parts: Sequence[Mapping[str, Floats]]) -> Effect:
+    """Effect of one choice on one antenna, from the columns of all chunks.
+
+    Raises
+    ------
+    MismatchError
+        The reference and the log have no time in common.
+    """
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    counts = columns["counted"] > 0
+    if not counts.any():
+        raise MismatchError(f"the truth and the {antenna} log have no time in common; give that of the same run")
+    has, ok = counts & (columns["has"] > 0), counts & (columns["ok"] > 0)
+    figures: dict[str, Score] = {}
+    if "error_m" in columns:
+        error = columns["error_m"]
+        figures = {
+            "coordinates": score(error, counts),
+            "ok": score(np.where(ok, error, np.nan), counts),
+            "conventional": score(columns["conventional_m"], counts),
         }
-        if self.truth is not None:
-            truth, path = self.truth[antenna], self.trajectories[antenna]
-            reference = interpolate_reference(result.time, truth.time, truth.ecef_m)
-            part["counts"] *= np.isfinite(reference[:, 0])
-            part["error_m"] = along_track_error(result.arc_m, reference, path)
-            part["conventional_m"] = along_track_error(result.conventional_arc_m, reference, path)
-        self.parts.setdefault((choice, antenna), []).append(part)
-
-    def effect(self, choice: str, screens: tuple[str, ...], antenna: str) -> Effect:
-        """All chunks of one choice and antenna together.
-
-        Raises
-        ------
-        MismatchError
-            The truth and the log have no time in common.
-        """
-        parts = self.parts.get((choice, antenna), [])
-        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        counts = whole["counts"] > 0
-        if not counts.any():
-            raise MismatchError(f"the truth and the {antenna} log have no time in common; give that of the same run")
-        has, ok = counts & (whole["has"] > 0), counts & (whole["ok"] > 0)
-        figures: dict[str, Score] = {}
-        if self.truth is not None:
-            error = whole["error_m"]
-            figures = {
-                "coordinates": score(error, counts),
-                "ok": score(np.where(ok, error, np.nan), counts),
-                "conventional": score(whole["conventional_m"], counts),
-            }
-        return Effect(
-            choice=choice,
-            screens=screens,
-            antenna=antenna,
-            epochs=int(counts.sum()),
-            rate=float(has.sum() / counts.sum()),
-            ok_rate=float(ok.sum() / counts.sum()),
-            n_used=float(whole["n_used"][counts].mean()),
-            sigma_p50_m=float(np.median(whole["sigma_m"][has])) if has.any() else float("nan"),
-            **figures,
-        )
+    return Effect(
+        choice=choice,
+        screens=screens,
+        antenna=antenna,
+        epochs=int(counts.sum()),
+        rate=float(has.sum() / counts.sum()),
+        ok_rate=float(ok.sum() / counts.sum()),
+        n_used=float(columns["n_used"][counts].mean()),
+        sigma_p50_m=float(np.median(columns["sigma_m"][has])) if has.any() else float("nan"),
+        **figures,
+    )
