@@ -9,16 +9,18 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Integers
 from railfix.core.timescale import seconds
+from railfix.tracking.bank import levelled
 from railfix.tracking.clocks import clocks_of_epoch, weighed
 from railfix.tracking.epochs import GnssEpochs, Previous, SensorEpochs
-from railfix.tracking.hypotheses import surviving, with_map_error
+from railfix.tracking.hypotheses import most_probable, surviving, with_map_error
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
+from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, write_place, write_rows
 from railfix.tracking.robust import Update, better_mode, first_weights, robust_update
 from railfix.tracking.rows import Channels, Kind, Rows, gnss_rows, joined, noise_of, sensor_rows
 from railfix.tracking.search import sought, with_satellites
-from railfix.tracking.state import CLOCKS, TrackState, Unknown
+from railfix.tracking.state import CLOCKS, Bank, TrackState, Unknown
 
 #: Mean weight of measurements under which another start of the reweighting is tried, and of which kinds.
 _DOUBTFUL: Final = 0.7
@@ -108,6 +110,7 @@ def _step(
     change = np.where(epochs.phase_joined[epoch], change, np.nan)
     has = np.isfinite(epochs.code_m[epoch]) | np.isfinite(epochs.rate_mps[epoch]) | np.isfinite(change)
     has &= np.isfinite(epochs.sat_ecef_m[epoch, :, 0])
+    old = frozenset(state.satellite.tolist())
     state = with_satellites(state, epochs.satellite, has, now, limits)
     slot = {str(name): k for k, name in enumerate(state.satellite)}
     columns = np.flatnonzero(has)
@@ -131,6 +134,7 @@ def _step(
     noise = noise_of(channels, dt, limits, state.log_scale)
     rows = _all_rows(channels, sensors, epoch, line, mean, mean[:, [Unknown.PLACE, Unknown.BEFORE]], dt, noise)
     if rows.value.shape[1]:
+        prior = covariance
         shifted, covariance, known = clocks_of_epoch(rows, channels, mean, covariance, state.offset_known)
         moved = (rows.design @ (shifted - mean)[..., None])[..., 0]
         mean, rows = shifted, replace(rows, value=rows.value - moved)
@@ -148,9 +152,23 @@ def _step(
             offset_known=known,
             measured=now,
         )
-        best = int(np.argmax(state.log_probability))
+        best = most_probable(state.log_probability)
+        if limits.level == "on":
+            named = np.where(rows.column >= 0, epochs.satellite[rows.column], "")
+            bank = Bank.empty(mean.shape[1]) if state.bank is None or lost or best else state.bank
+            stepped = np.diagonal(covariance[best]) != np.diagonal(prior[best])
+            new = frozenset(state.satellite.tolist()) - old
+            before_update = (mean[best], covariance[best])
+            bank = levelled(bank, rows, best, before_update, stepped, named, new, line, dt, limits)
+            state = replace(state, bank=bank)
         state = weighed(state, rows, update, best, dt, limits)
         write_rows(result, epoch, rows, innovation[best], update.weight[best])
+    elif state.bank is not None:
+        means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits)
+        state = replace(state, bank=replace(state.bank, mean=means, covariance=covariances))
+    aided = bool((rows.kind == Kind.CODE).any())
+    travel = abs(float(state.mean[most_probable(state.log_probability), Unknown.SPEED])) * dt
+    state = replace(state, unaided_m=0.0 if aided else state.unaided_m + travel)
     chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
     state = replace(
         state,

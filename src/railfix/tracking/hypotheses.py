@@ -26,6 +26,8 @@ _ANY_DRIFT_MPS: Final = 1e3
 WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
+#: How much more probable another place must be to be gone by: near-equal ones would take turns.
+_SWITCH: Final = 3.0
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
@@ -197,6 +199,12 @@ def with_map_error(log_evidence: Floats, ecef_m: Floats, log_probability: Floats
     return np.asarray(log_evidence[best] + share * (log_evidence - log_evidence[best]))
 
 
+def most_probable(log_probability: Floats) -> int:
+    """The hypothesis to go by: that of before, the first, unless another is `_SWITCH` times as probable."""
+    best = int(np.argmax(log_probability))
+    return best if log_probability[best] > log_probability[0] + np.log(_SWITCH) else 0
+
+
 def surviving(
     mean: Floats, covariance: Floats, log_probability: Floats, origin_m: Floats, limits: TrackingLimits
 ) -> tuple[Indices, Floats]:
@@ -206,6 +214,8 @@ def surviving(
     enough for their motion to have told them apart.
     """
     order = np.argsort(-log_probability, kind="stable")
+    first = most_probable(log_probability)
+    order = np.concatenate([[first], order[order != first]])
     place = mean[:, Unknown.PLACE]
     sigma = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE])
     kept: list[int] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from railfix.core.settings import Settings
@@ -69,6 +71,16 @@ class TrackingLimits(Settings):
         (1 is the weight of an error of one standard deviation).
     bend_m : float
         Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
+    level : {"on", "off"}
+        Whether a bank of sub-filters gives a protection level: some 20 filters instead of one.
+    level_risk_per_hour : float
+        Probability an hour that the error exceeds the level unnoticed: 1e-7 for the satellite part (P1 2.4).
+    level_samples_per_hour : float
+        Independent errors an hour: those of codes last about a minute.
+    level_fault_prior : float
+        Probability that a source is faulty at such a sample: multipath of a satellite beyond its weight in a city.
+    level_passes : int
+        Rounds of reweighting of the sub-filters.
     expired_sigma_m : float
         Standard deviation from which on a predicted place is no position.
     """
@@ -108,4 +120,9 @@ class TrackingLimits(Settings):
     lost_code_weight: float = Field(default=0.5, ge=0)
     lost_code_s: float = Field(default=12.0, gt=0)
     bend_m: float = Field(default=20.0, gt=0)
+    level: Literal["on", "off"] = "off"
+    level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
+    level_samples_per_hour: float = Field(default=60.0, gt=0)
+    level_fault_prior: float = Field(default=1e-3, gt=0, lt=1)
+    level_passes: int = Field(default=3, ge=1)
     expired_sigma_m: float = Field(default=200.0, gt=0)

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers
+from railfix.tracking.bank import SCALE_BOUND, level_m
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.robust import mean_weight
 from railfix.tracking.rows import Kind, Rows
@@ -58,6 +59,11 @@ class Tracked:
     code_weight, motion_weight : ndarray, shape (T,)
         Mean weights of codes, and of Dopplers and phases.
     wheel_scale, force_offset_mps2, radar_scale : ndarray, shape (T,)
+    level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
+        `bank.level_m`; NaN where levels are off.
+    amount_m : ndarray, shape (T,) [m]
+        Over- and under-reading amount: the level, and never less than the bound of the scale times the way since
+        codes were used (SUBSET-026 3.6.8).
     used : ndarray of int, shape (T, len(Kind))
         Measurements of each kind with a weight of more than a half.
     innovation : ndarray, shape (T, 3, K)
@@ -79,6 +85,10 @@ class Tracked:
     wheel_scale: Floats
     force_offset_mps2: Floats
     radar_scale: Floats
+    level_m: Floats
+    level_noise_m: Floats
+    separation_m: Floats
+    amount_m: Floats
     used: Integers
     innovation: Floats
     weight: Floats
@@ -92,7 +102,8 @@ class Tracked:
         size = len(time)
         names = (
             "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
-            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale",
+            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "level_m", "level_noise_m",
+            "separation_m", "amount_m",
         )  # fmt: skip
         return cls(
             time=time,
@@ -136,6 +147,10 @@ def write_place(
     result.wheel_scale[epoch] = mean[Unknown.WHEEL]
     result.force_offset_mps2[epoch] = mean[Unknown.FORCE_OFFSET]
     result.radar_scale[epoch] = mean[Unknown.RADAR]
+    if state.bank is not None:
+        level, noise, apart = level_m(state.bank, float(mean[Unknown.PLACE]), sigma, limits)
+        result.level_m[epoch], result.level_noise_m[epoch], result.separation_m[epoch] = level, noise, apart
+        result.amount_m[epoch] = max(level, SCALE_BOUND * state.unaided_m)
     if lost:
         status = TrackStatus.LOST
     elif not measured:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, Masks
 from railfix.tracking.rows import Kind, Rows
 from railfix.tracking.state import Unknown
 
@@ -54,7 +54,9 @@ def first_weights(rows: Rows, covariance: Floats, degrees: float) -> Floats:
     return np.asarray((degrees + 1.0) / (degrees + value**2 / spread))
 
 
-def robust_update(rows: Rows, covariance: Floats, weight: Floats, *, degrees: float, passes: int) -> Update:
+def robust_update(
+    rows: Rows, covariance: Floats, weight: Floats, *, degrees: float, passes: int, use: Masks | None = None
+) -> Update:
     """Reweighted least squares of one epoch against its prior.
 
     Variational form of Student's t (M. E. Tipping and N. D. Lawrence, Variational inference for Student-t models,
@@ -69,6 +71,8 @@ def robust_update(rows: Rows, covariance: Floats, weight: Floats, *, degrees: fl
         Of the first pass.
     degrees : float
     passes : int
+    use : ndarray of bool, shape (H, M), optional
+        Rows that each Gaussian takes.
     """
     count, _, width = rows.design.shape
     inverse = np.linalg.inv(covariance)
@@ -77,6 +81,7 @@ def robust_update(rows: Rows, covariance: Floats, weight: Floats, *, degrees: fl
     change = np.zeros((count, width))
     after, residual, spread = covariance, rows.value, np.zeros_like(rows.value)
     for turn in range(passes):
+        weight = weight if use is None else np.where(use, weight, 0.0)
         scaled = transposed * (weight / rows.variance)[:, None, :]
         after = np.asarray(np.linalg.inv(prior + scaled @ rows.design), dtype=np.float64)
         change = (after @ (scaled @ rows.value[..., None]))[..., 0]

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Masks, Strings
+from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.core.timescale import seconds
 from railfix.tracking.hypotheses import begin, beside, places, split
 from railfix.tracking.limits import TrackingLimits
@@ -35,20 +35,30 @@ def with_satellites(
     if kept.all() and not new:
         return replace(state, seen=seen)
     index = np.concatenate([np.arange(SATELLITES), SATELLITES + np.flatnonzero(kept)]).astype(np.intp)
-    width = len(index) + len(new)
-    mean = np.zeros((state.hypotheses, width))
-    mean[:, : len(index)] = state.mean[:, index]
-    covariance = np.zeros((state.hypotheses, width, width))
-    covariance[:, : len(index), : len(index)] = state.covariance[:, index[:, None], index]
-    diagonal = np.arange(len(index), width)
-    covariance[:, diagonal, diagonal] = 1.0
+    mean, covariance = _rearranged(state.mean, state.covariance, index, len(new))
+    bank = state.bank
+    if bank is not None:
+        parts = _rearranged(bank.mean, bank.covariance, index, len(new))
+        bank = replace(bank, mean=parts[0], covariance=parts[1])
     return replace(
         state,
         mean=mean,
         covariance=covariance,
         satellite=np.array([*state.satellite[kept].tolist(), *new], dtype="<U3"),
         seen=np.concatenate([seen[kept], np.full(len(new), now, dtype="datetime64[ns]")]),
+        bank=bank,
     )
+
+
+def _rearranged(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
+    """Gaussians over some of their unknowns and so many new errors of satellites."""
+    count, old, width = len(mean), len(index), len(index) + new
+    means, covariances = np.zeros((count, width)), np.zeros((count, width, width))
+    means[:, :old] = mean[:, index]
+    covariances[:, :old, :old] = covariance[:, index[:, None], index]
+    diagonal = np.arange(old, width)
+    covariances[:, diagonal, diagonal] = 1.0
+    return means, covariances
 
 
 def sought(

@@ -60,6 +60,31 @@ FRESH: Final = (Unknown.CODE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown
 
 
 @dataclass(frozen=True, kw_only=True)
+class Bank:
+    """Sub-filters beside the most probable hypothesis, each without one source: B Gaussians over the same unknowns.
+
+    Attributes
+    ----------
+    without : tuple of str
+        A satellite ("G05"), a constellation by the letter of its clock ("G"), or a sensor ("wheel").
+    mean : ndarray, shape (B, N)
+    covariance : ndarray, shape (B, N, N)
+    weak_s : ndarray, shape (B,) [s]
+        How long the measurements of each have contradicted it.
+    """
+
+    without: tuple[str, ...]
+    mean: Floats
+    covariance: Floats
+    weak_s: Floats
+
+    @classmethod
+    def empty(cls, width: int) -> Bank:
+        """No sub-filter, for so many unknowns."""
+        return cls(without=(), mean=np.empty((0, width)), covariance=np.empty((0, width, width)), weak_s=np.empty(0))
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrackState:
     """What one epoch leaves to the next: H hypotheses of N unknowns.
 
@@ -83,8 +108,12 @@ class TrackState:
         Last epoch with measurements that the filter used.
     weak_motion_s, weak_code_s : float [s]
         How long the mean weights have been low.
-    log_scale : ndarray, shape (2,)
+    log_scale : tuple of float
         Logarithm of the variance of Dopplers and of phases against that of the limits.
+    bank : Bank or None
+        Where levels are asked for.
+    unaided_m : float [m]
+        Way since codes were used.
     """
 
     time: np.datetime64
@@ -100,6 +129,8 @@ class TrackState:
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
     log_scale: tuple[float, float] = (0.0, 0.0)
+    bank: Bank | None = None
+    unaided_m: float = 0.0
 
     @property
     def hypotheses(self) -> int:

@@ -1,0 +1,85 @@
+"""Level of the filtered position: sub-filters without one source, faults that last."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from railfix.tracking import TrackingLimits, track
+from railfix.tracking.bank import factors
+from tracking_cases import part, ride, wheel, without_epochs
+
+LIMITS = TrackingLimits(level="on")
+
+
+@pytest.mark.requirement("C2")
+def test_factors_spend_the_risk() -> None:
+    limits = TrackingLimits(level_risk_per_hour=1e-7, level_samples_per_hour=60.0, level_fault_prior=1e-3)
+    noise, fault = factors(limits)
+    spent = 60.0 * (2.0 * norm.sf(noise) + 1e-3 * 2.0 * norm.sf(fault))
+    assert spent == pytest.approx(1e-7, rel=1e-6)
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize("fault", ["ramp 0.1", "ramp 1", "step 50"])
+def test_no_error_over_the_level_with_a_faulty_satellite(fault: str) -> None:
+    case = ride(100, noise=1.0, seed=4)
+    kind, size = fault.split()
+    t = np.arange(100.0)
+    bias = np.where(t >= 30.0, float(size) * (t - 30.0) if kind == "ramp" else float(size), 0.0)
+    worst = 0.0
+    for satellite in (2, 5):
+        code, rate = case.epochs.code_m.copy(), case.epochs.rate_mps.copy()
+        code[:, satellite] += bias
+        result, _ = track(replace(case.epochs, code_m=code, rate_mps=rate), case.line, limits=LIMITS)
+        error = np.abs(result.arc_m - case.arc_m)
+        assert (error <= result.level_m)[5:].all(), fault
+        worst = max(worst, float(np.median(result.level_m[40:])))
+    assert worst < 40.0
+
+
+@pytest.mark.requirement("C2")
+def test_the_sub_filter_without_the_faulty_satellite_keeps_the_place() -> None:
+    case = ride(100, noise=1.0, seed=2)
+    code = case.epochs.code_m.copy()
+    code[20:, 3] += 0.3 * np.arange(80.0)
+    _, state = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS)
+    assert state.bank is not None
+    k = state.bank.without.index(str(case.epochs.satellite[3]))
+    sigma = np.sqrt(state.bank.covariance[k, 0, 0])
+    assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < 3.0 * sigma
+
+
+@pytest.mark.requirement("C2")
+def test_cutting_changes_no_level() -> None:
+    case = ride(50, noise=1.0)
+    whole, _ = track(case.epochs, case.line, limits=LIMITS)
+    state, levels = None, []
+    for begin, end in ((0, 1), (1, 20), (20, 50)):
+        result, state = track(part(case.epochs, slice(begin, end)), case.line, state, limits=LIMITS)
+        levels.append(result.level_m)
+    np.testing.assert_array_equal(np.concatenate(levels), whole.level_m)
+
+
+@pytest.mark.requirement("C2")
+def test_amounts_grow_with_the_way_since_codes_and_sensors_are_left_out_too() -> None:
+    case = ride(120, noise=1.0)
+    gap = np.zeros(120, dtype=bool)
+    gap[80:] = True
+    result, state = track(without_epochs(case.epochs, gap), case.line, limits=LIMITS, sensors=wheel(case))
+    assert state.bank is not None
+    assert "wheel" in state.bank.without
+    error = np.abs(result.arc_m - case.arc_m)
+    assert (error <= result.amount_m)[10:].all()
+    assert (result.amount_m >= 0.02 * (case.arc_m - case.arc_m[79]) * 0.9)[80:].all()
+
+
+@pytest.mark.requirement("C2")
+def test_off_there_is_no_level() -> None:
+    case = ride(20)
+    result, state = track(case.epochs, case.line)
+    assert np.isnan(result.level_m).all()
+    assert state.bank is None
