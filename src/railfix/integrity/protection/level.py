@@ -19,19 +19,37 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from itertools import combinations
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings
-from railfix.integrity.protection.risk import MOST_EXCLUDED, RiskBudget, more_than_two, one_sided_k, pair_sum
-from railfix.integrity.protection.separation import Separations, whole, without_constellation, without_one, without_two
+from railfix.integrity.protection.risk import (
+    MOST_EXCLUDED,
+    RiskBudget,
+    more_than_three,
+    more_than_two,
+    one_sided_k,
+    pair_sum,
+)
+from railfix.integrity.protection.separation import (
+    Separations,
+    whole,
+    without_constellation,
+    without_constellation_and_one,
+    without_one,
+    without_three,
+    without_two,
+)
 from railfix.integrity.protection.tails import Tails, least_level
 from railfix.integrity.raim import LinearModel
 
 #: Numbers of a pair array that a block of epochs holds.
 _BLOCK_SIZE: Final = 80_000
+#: Number of the tails of three faults among those of all kinds.
+_OF_TRIPLES: Final = 3
 #: Separation, over the sigma of the position, below which the two positions are the same.
 _SAME: Final = 1e-9
 
@@ -43,7 +61,7 @@ class Cause(IntEnum):
     FAULT_FREE = 0
     #: A fault of one satellite, or of a constellation.
     ONE_FAULT = 1
-    #: Faults of two satellites.
+    #: Faults of two satellites, or of a constellation and a satellite of another.
     TWO_FAULTS = 2
     #: Infinite: a fault that nothing checks is likelier than its share of the risk.
     UNCHECKED = 3
@@ -51,6 +69,8 @@ class Cause(IntEnum):
     BUDGET = 4
     #: No position.
     NO_POSITION = 5
+    #: Faults of three satellites.
+    THREE_FAULTS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,6 +136,7 @@ class _Plan:
     one: Floats
     two: Floats
     pairs: Masks  # two faults are likelier than their share
+    triples: Masks  # three faults are likelier than what may stay unchecked
     k_false_alarm: Floats
 
 
@@ -204,14 +225,20 @@ def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Int
     together = np.zeros(len(model))
     for c, (letter, members) in enumerate(groups):
         group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
-        # A constellation and a satellite of another: not checked.
-        together += group_prior[:, c] * (everyone.sum(axis=1) - (prior * members).sum(axis=1))
-    beyond = more_than_two(everyone) + together + pair_sum(group_prior)
+        # A constellation and two satellites of others: not checked.
+        together += group_prior[:, c] * pair_sum(prior * ~members)
+    three = more_than_two(everyone)
+    triples = three > risk.unchecked_share * risk.risk_per_sample
+    beyond = np.where(triples, more_than_three(everyone), three) + together + pair_sum(group_prior)
     n = np.count_nonzero(model.used, axis=1)
     left = risk.sample_risk(n, out, beyond)
+    # With triples every part gives up a quarter to them.
+    left = np.where(triples, 0.75, 1.0) * left
     two = risk.two_fault_share * left
-    pairs = pair_sum(prior) > two
+    pairs = (pair_sum(prior) > two) | triples
     tests = n + np.where(pairs, n * (n - 1) // 2, 0) + np.count_nonzero(group_prior, axis=1)
+    tests = tests + n * np.count_nonzero(group_prior, axis=1)
+    tests = tests + np.where(triples, n * (n - 1) * (n - 2) // 6, 0)
     return _Plan(
         prior=prior,
         groups=groups,
@@ -221,6 +248,7 @@ def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Int
         one=risk.one_fault_share * left,
         two=two,
         pairs=pairs,
+        triples=triples,
         k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1))),
     )
 
@@ -284,21 +312,38 @@ def _level_of_block(
 
     n, pairs = prior.shape[1], plan.pairs[rows]
     first, second = np.triu_indices(n, 1)
-    two = _nothing(len(rows))
+    doubles, double_prior = [], []
     if pairs.any() and n > 1:
-        pair_prior = prior[:, first] * prior[:, second] * pairs[:, None]
-        two = _part(without_two(all_of, first, second), pair_prior, plan.two[rows], k_false_alarm, sigma)
+        doubles.append(without_two(all_of, first, second))
+        double_prior.append(prior[:, first] * prior[:, second] * pairs[:, None])
+    for c, (_, members) in enumerate(plan.groups):
+        of_group = members[all_of.channel] & all_of.used
+        doubles.append(without_constellation_and_one(all_of, of_group))
+        double_prior.append(plan.group_prior[rows, c : c + 1] * prior * ~of_group)
+    two = _nothing(len(rows))
+    if doubles:
+        every = np.concatenate(double_prior, axis=1)
+        two = _part(_beside(doubles), every, plan.two[rows], k_false_alarm, sigma)
+
+    three, of_three = _nothing(len(rows)), np.zeros(len(rows))
+    triples = plan.triples[rows]
+    if triples.any() and n > 2:
+        triple = np.array(list(combinations(range(n), 3)), dtype=np.intp)
+        triple_prior = prior[:, triple].prod(axis=2) * triples[:, None]
+        of_three = np.where(triples, (plan.fault_free[rows] + plan.one[rows] + plan.two[rows]) / 3.0, 0.0)
+        three = _part(without_three(all_of, triple), triple_prior, of_three, k_false_alarm, sigma)
 
     noise = Tails(offset_m=all_of.bias_m[:, None], sigma_m=sigma[:, None], weight=np.full((len(rows), 1), 2.0))
-    left = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] - one.unchecked - two.unchecked
+    left = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] + of_three
+    left = left - one.unchecked - two.unchecked - three.unchecked
     left = left - np.where(pairs, 0.0, pair_sum(prior))
-    above = np.maximum(np.maximum(fault_free, one.level_m), two.level_m)
-    level, spender = least_level(above, [noise, one.tails, two.tails], left)
+    above = np.maximum(np.maximum(fault_free, one.level_m), np.maximum(two.level_m, three.level_m))
+    level, spender = least_level(above, [noise, one.tails, two.tails, three.tails], left)
     result.level_m[rows], result.sigma_m[rows] = level, sigma
     result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = fault_free, one.level_m, two.level_m
     result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k_fault_free, one.k, two.k
     result.k_false_alarm[rows] = k_false_alarm
-    result.separation[rows] = np.maximum(one.separation, two.separation)
+    result.separation[rows] = np.maximum(np.maximum(one.separation, two.separation), three.separation)
     result.consistent[rows] = result.separation[rows] <= 1.0
     at = np.arange(len(rows))
     single = (one.worst >= 0) & (one.worst < n)
@@ -306,11 +351,13 @@ def _level_of_block(
     letters = np.array([*(letter for letter, _ in plan.groups), ""])
     result.worst_constellation[rows] = letters[np.where(one.worst >= n, one.worst - n, len(plan.groups))]
     if n > 1:
-        places = np.stack([first, second], axis=1)[np.maximum(two.worst, 0)]
+        pair = (two.worst >= 0) & (two.worst < len(first)) & bool(pairs.any())
+        places = np.stack([first, second], axis=1)[np.where(pair, two.worst, 0)]
         found = np.take_along_axis(all_of.channel, places, axis=1)
-        result.worst_two[rows] = np.where(two.worst[:, None] >= 0, found, -1)
+        result.worst_two[rows] = np.where(pair[:, None], found, -1)
     infinite = np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET)
-    result.cause[rows] = np.where(np.isinf(level), infinite, spender)
+    spent_on = np.where(spender == _OF_TRIPLES, Cause.THREE_FAULTS, spender)
+    result.cause[rows] = np.where(np.isinf(level), infinite, spent_on)
     result.unchecked_risk[rows] = plan.beyond[rows]
 
 
@@ -348,8 +395,8 @@ def _part(apart: Separations, prior: Floats, budget: Floats, k_false_alarm: Floa
     k = np.where(needed & (left > 0) & (total == 0), -np.inf, k)
     usable = checked & np.isfinite(k)[:, None]
     threshold = k_false_alarm[:, None] * apart.separation_sigma_m
-    offset = np.where(blind, 0.0, threshold + apart.bias_m)
-    tails = Tails(offset_m=offset, sigma_m=np.where(blind, 1.0, apart.sigma_m), weight=prior * checked)
+    offset = np.where(checked, threshold + apart.bias_m, 0.0)
+    tails = Tails(offset_m=offset, sigma_m=np.where(checked, apart.sigma_m, 1.0), weight=prior * checked)
     with np.errstate(invalid="ignore"):
         each = np.where(usable, offset + k[:, None] * tails.sigma_m, -np.inf)
     spent = needed & (left <= 0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -78,6 +78,9 @@ class RiskBudget(Settings):
     fault_free_share, one_fault_share, two_fault_share : float
         Shares of the risk of an epoch; together at most 1. The level is the largest of the three parts, and a
         share twice as large lowers a K of 6 by 0.1, one of 3 by 0.2: thirds.
+    unchecked_share : float
+        Of the risk, that faults which are not hypotheses may have together: where three at a time are likelier than
+        this, they become hypotheses too, and four at a time are what is left unchecked.
     exclusion_share : float
         Of the risk, kept for epochs with one and (as much again) with two satellites excluded.
     false_alarm : float
@@ -87,6 +90,9 @@ class RiskBudget(Settings):
     local_prior : float
         Probability that a satellite's range is off at a time by local causes that the screens left, on top of
         that: multipath, interference. An assumption until measured on the line (P1 7).
+    priors : {"assumed", "measured"}
+        Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are
+        called indicative in every output: they carry no risk an hour.
     constellation_prior : mapping of str to float
         Probability of a fault that many satellites of a constellation share; a constellation that is not
         named has none, and the level does not cover one.
@@ -97,10 +103,12 @@ class RiskBudget(Settings):
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
+    unchecked_share: float = Field(default=0.3, gt=0, lt=1)
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
+    priors: Literal["assumed", "measured"] = "assumed"
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -168,10 +176,10 @@ class RiskBudget(Settings):
         ValueError
             Says what is over what.
         """
-        spent = float(more_than_two(self.prior(systems)[None])[0])
+        spent = float(more_than_three(self.prior(systems)[None])[0])
         if spent >= self.risk_per_sample:
             raise ValueError(
-                f"more than two of {len(systems)} satellites are faulty with probability {spent:.2g} a sample, "
+                f"more than three of {len(systems)} satellites are faulty with probability {spent:.2g} a sample, "
                 f"all that the risk allows is {self.risk_per_sample:.2g}: lower samples_per_hour or the priors, "
                 "or allow more risk"
             )
@@ -180,6 +188,13 @@ class RiskBudget(Settings):
 def pair_sum(prior: Floats) -> Floats:
     """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""
     return np.asarray((prior.sum(axis=1) ** 2 - (prior**2).sum(axis=1)) / 2.0)
+
+
+def more_than_three(prior: Floats) -> Floats:
+    """Bound of the probability of four faults or more: the sum over sets of four, shape (T, M) to (T,)."""
+    one, two, three, four = (np.sum(prior**k, axis=1) for k in (1, 2, 3, 4))
+    total = one**4 - 6.0 * one**2 * two + 3.0 * two**2 + 8.0 * one * three - 6.0 * four
+    return np.asarray(np.maximum(total / 24.0, 0.0))
 
 
 def more_than_two(prior: Floats) -> Floats:

@@ -161,6 +161,45 @@ def without_two(all_of: Whole, first: Indices, second: Indices) -> Separations:
     return _separations(all_of, weight_one * one + weight_two * two, response, moved, bias, blind)
 
 
+def without_three(all_of: Whole, members: Indices) -> Separations:
+    """Triples of places (K, 3) in the compact arrays left out.
+
+    Three whose S_JJ is singular (all satellites of a clock of their own) are told as unchecked, so that their whole
+    prior counts: it is the product of three.
+    """
+    n, gain = all_of.channel.shape[1], all_of.gain_m
+    flat = all_of.projector.reshape(-1, n * n)
+    i, j, k = members.T
+    a, b, c = (np.take(flat, m * n + m, axis=1) for m in (i, j, k))
+    d, e, f = (np.take(flat, m * n + o, axis=1) for m, o in ((i, j), (i, k), (j, k)))
+    # Cofactors of the symmetric matrix [[a, d, e], [d, b, f], [e, f, c]].
+    aa, bb, cc = b * c - f * f, a * c - e * e, a * b - d * d
+    dd, ee, ff = e * f - c * d, d * f - b * e, d * e - a * f
+    determinant = a * aa + d * dd + e * ee
+    least = np.minimum(np.minimum(a, b), c)
+    regular = (least > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * a * b * c)
+    inverse = 1.0 / np.where(regular, determinant, 1.0)
+    one, two, three = gain[:, i], gain[:, j], gain[:, k]
+    weights = (
+        (aa * one + dd * two + ee * three) * inverse,
+        (dd * one + bb * two + ff * three) * inverse,
+        (ee * one + ff * two + cc * three) * inverse,
+    )
+    square, moved, bias = np.zeros(one.shape), np.zeros(one.shape), np.zeros(one.shape)
+    response = np.zeros((*one.shape, 2))
+    for place, weight in zip((i, j, k), weights, strict=True):
+        square += weight * gain[:, place]
+        moved -= weight * all_of.residual[:, place]
+        response += weight[..., None] * all_of.map_gain_m[:, place]
+    if all_of.range_bias is not None:
+        left = gain[:, None, :] - sum(
+            weight[..., None] * all_of.projector[:, place] for place, weight in zip((i, j, k), weights, strict=True)
+        )
+        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
+    used = all_of.used[:, i] & all_of.used[:, j] & all_of.used[:, k]
+    return _separations(all_of, np.maximum(square, 0.0), response, moved, bias, ~regular & used)
+
+
 def without_constellation(model: LinearModel, members: Masks, all_of: Whole, bias_m: Floats | None) -> Separations:
     """A whole constellation left out, K = 1: the information of the rest, inverted (3 x 3).
 
@@ -210,6 +249,54 @@ def without_constellation(model: LinearModel, members: Masks, all_of: Whole, bia
         moved[:, None],
         bias[:, None],
         blind[:, None],
+    )
+
+
+def without_constellation_and_one(all_of: Whole, members: Masks) -> Separations:
+    """A whole constellation left out with each channel of the others, K = n.
+
+    What leaving out the constellation J makes of the projector, the residuals and the gains of the rest,
+    ``S - S_.J S_JJ^+ S_J.`` and the like, is what `without_one` needs of it. Where the clock is theirs alone, S_JJ
+    is singular in a direction that moves nothing.
+
+    Parameters
+    ----------
+    all_of : Whole
+    members : ndarray of bool, shape (T, n)
+        Places of the constellation in the compact arrays; some epochs may have none.
+    """
+    mask, rest = members.astype(np.float64), all_of.used & ~members
+    projector, gain = all_of.projector, all_of.gain_m
+    values, vectors = np.linalg.eigh(projector * mask[:, :, None] * mask[:, None, :])
+    some = values > LEAST_REDUNDANCY
+    inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
+    inverse *= mask[:, :, None] * mask[:, None, :]
+    hidden = np.einsum("tij,ti->tj", vectors * mask[:, :, None], gain * mask) * ~some
+    blind = np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(all_of.variance_m2)
+    across = projector @ inverse  # (T, n, n): of the rest onto the constellation
+    pull = np.einsum("tij,tj->ti", inverse, gain)
+    square = (pull * gain).sum(axis=1)
+    moved = -(pull * all_of.residual).sum(axis=1)
+    response = np.einsum("ti,tij->tj", pull, all_of.map_gain_m)
+    left_gain = rest * (gain - np.einsum("tij,tj->ti", across, gain))
+    left_residual = rest * (all_of.residual - np.einsum("tij,tj->ti", across, all_of.residual))
+    left_map = rest[..., None] * (all_of.map_gain_m - across @ all_of.map_gain_m)
+    left_projector = (projector - across @ projector) * (rest[:, :, None] & rest[:, None, :])
+    share = np.einsum("tii->ti", left_projector)
+    checked = share > LEAST_REDUNDANCY
+    weight = np.where(checked, left_gain / np.where(checked, share, 1.0), 0.0)
+    bias = np.zeros(gain.shape)
+    if all_of.range_bias is not None:
+        left = left_gain[:, None, :] - weight[:, :, None] * left_projector
+        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
+    alone = ~checked & (np.abs(left_gain) > _NO_EFFECT * np.sqrt(all_of.variance_m2)[:, None])
+    return _separations(
+        all_of,
+        np.maximum(square[:, None] + weight * left_gain, 0.0),
+        response[:, None] + weight[..., None] * left_map,
+        moved[:, None] - weight * left_residual,
+        bias,
+        (alone | blind[:, None]) & rest,
     )
 
 
