@@ -28,6 +28,7 @@ class Level:
     fault_free_m: float
     one_fault_m: float
     two_fault_m: float
+    largest_m: float
     separation: float
     worst_one: int
     worst_two: tuple[int, int]
@@ -77,6 +78,7 @@ def level(
     scale: float = 1.0,
     bias_m: np.ndarray | None = None,
     constellations: tuple[tuple[tuple[int, ...], float], ...] = (),
+    unchecked_share: float = 0.3,
 ) -> Level:
     """The level of one epoch; `prior` by channel, `share` of each part, constellations as (channels, prior)."""
     solved = Resolved(case, scale)
@@ -86,13 +88,20 @@ def level(
         bias[: len(channels)] = bias_m[channels] / case.sigma_m
     ones = [((c,), prior[c]) for c in channels] + list(constellations)
     twos = [((c, d), prior[c] * prior[d]) for c, d in combinations(channels, 2)]
-    beyond = sum(prior[c] * prior[d] * prior[e] for c, d, e in combinations(channels, 3))
+    threes = [((c, d, e), prior[c] * prior[d] * prior[e]) for c, d, e in combinations(channels, 3)]
+    triples = sum(p for _, p in threes) > unchecked_share * risk_per_sample
+    fours = sum(prior[c] * prior[d] * prior[e] * prior[f] for c, d, e, f in combinations(channels, 4))
+    beyond = fours if triples else sum(p for _, p in threes)
+    with_one = []
     for members, p in constellations:
-        beyond += p * sum(prior[c] for c in channels if c not in members)
+        others = [c for c in channels if c not in members]
+        with_one += [((*members, c), p * prior[c]) for c in others]
+        beyond += p * sum(prior[c] * prior[d] for c, d in combinations(others, 2))
     beyond += sum(p * q for (_, p), (_, q) in combinations(constellations, 2))
-    part = share * max(risk_per_sample - beyond, 0.0)
-    asked = sum(p for _, p in twos) > part
-    tests = len(ones) + (len(twos) if asked else 0)
+    part = share * max(risk_per_sample - beyond, 0.0) * (0.75 if triples else 1.0)
+    asked = triples or sum(p for _, p in twos) > part
+    tests = len(ones) + (len(twos) if asked else 0) + (len(threes) if triples else 0)
+    tests += len(channels) * len(constellations)
     k_alarm = norm.isf(false_alarm / (2.0 * tests))
 
     def of(hypotheses: list[tuple[tuple[int, ...], float]]) -> tuple[float, float, tuple[int, ...]]:
@@ -117,12 +126,14 @@ def level(
         return largest, ratio, worst
 
     one, ratio_one, worst_one = of(ones)
-    two, ratio_two, worst_two = of(twos) if asked else (0.0, 0.0, ())
+    doubles = [*(twos if asked else []), *with_one]
+    two, ratio_two, worst_two = of(doubles) if doubles else (0.0, 0.0, ())
+    three, ratio_three, _ = of(threes) if triples else (0.0, 0.0, ())
     fault_free = norm.isf(part / 2.0) * solved.all.sigma_m + np.abs(solved.all.operator) @ bias
 
     def spent(level_m: float) -> float:
         total = 2.0 * norm.sf((level_m - np.abs(solved.all.operator) @ bias) / solved.all.sigma_m)
-        for members, p in [*ones, *(twos if asked else [])]:
+        for members, p in [*ones, *doubles, *(threes if triples else [])]:
             answer = solved.without(members)
             if answer.determined:
                 offset = k_alarm * solved.apart(answer)[1] + np.abs(answer.operator) @ bias
@@ -131,16 +142,19 @@ def level(
                 total += p
         return float(total + (0.0 if asked else sum(p for _, p in twos)))
 
-    largest = max(float(fault_free), one, two)
+    largest = max(float(fault_free), one, two, three)
     whole = largest
     if np.isfinite(largest) and largest < 1e4:
-        whole = float(brentq(lambda at: np.log(spent(at)) - np.log(3.0 * part), 0.0, largest, xtol=1e-9))
+        whole = float(
+            brentq(lambda at: np.log(spent(at)) - np.log((4.0 if triples else 3.0) * part), 0.0, largest, xtol=1e-9)
+        )
     return Level(
         level_m=whole,
         fault_free_m=float(fault_free),
         one_fault_m=one,
         two_fault_m=two,
-        separation=max(ratio_one, ratio_two),
+        largest_m=largest,
+        separation=max(ratio_one, ratio_two, ratio_three),
         worst_one=worst_one[0] if len(worst_one) == 1 else -1,
         worst_two=worst_two if len(worst_two) == 2 else (-1, -1),
         sigma_m=solved.all.sigma_m,

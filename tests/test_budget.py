@@ -39,7 +39,7 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
         {
             "min_satellites": 13,
             "failed_checks": request.param,
-            "antenna_pair": {"limit_m": 3.0},
+            "antenna_pair": {"limit_m": 3.0, "verdict": "reject"},
             "antenna_spacing": {"limit_m": 1.0},
             "raim": {"false_alarm": 0.05, "max_excluded": 0},
         }
@@ -105,6 +105,7 @@ def result_of(reasons: list[list[int]], satellites: list[str], status: list[Stat
             conventional_offset_m=np.full(epochs, np.nan),
             reason=np.array(reasons, dtype=np.int64),
             satellite=np.array(satellites),
+            map_offset=SimpleNamespace(statistic=np.full(epochs, np.nan)),
         ),
     )
 
@@ -132,7 +133,18 @@ def test_reasons_of_too_few_satellites_by_hand() -> None:
 def test_the_screen_shows_the_budget(bench: Bench, tmp_path: Path) -> None:
     files = ["--front", bench.front, "--rear", bench.rear, "--nav", bench.nav, "--track", bench.track]
     command = ["run", *map(str, files), "--vehicle", str(bench.vehicle), "--out", str(tmp_path / "out")]
-    result = RUNNER.invoke(app, [*command, "--set", "min_satellites=12", "--set", "antenna_pair.limit_m=2.5"])
+    result = RUNNER.invoke(
+        app,
+        [
+            *command,
+            "--set",
+            "min_satellites=12",
+            "--set",
+            "antenna_pair.limit_m=2.5",
+            "--set",
+            "antenna_pair.verdict=reject",
+        ],
+    )
     assert result.exit_code == 0, result.output
     told = json.loads((tmp_path / "out" / "run.json").read_text())["antennas"]["front"]
     first = told["too_few_satellites_by_first_reason"]["antenna_pair"]

@@ -123,7 +123,7 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
     systems, ties = system
     ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: fault})
     model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
-    budget = replace(HAND, risk_per_hour=risk, constellation_prior={"E": 1e-5, "C": 1e-4} if shared else {})
+    budget = HAND.replaced(risk_per_hour=risk, constellation_prior={"E": 1e-5, "C": 1e-4} if shared else {})
     bias = np.random.default_rng(seed).uniform(0.0, 1.0, len(systems)) if biased else None
     constellations = tuple(
         (tuple(c for c, s in enumerate(systems) if s == letter), p)
@@ -151,8 +151,8 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
     ):
         if not 1e3 < theirs < np.inf:
             assert mine[0] == pytest.approx(theirs, rel=1e-6)
-    largest = max(got.fault_free_m[0], got.one_fault_m[0], got.two_fault_m[0])
-    assert got.level_m[0] <= largest
+    largest = max(expected.largest_m, got.fault_free_m[0], got.one_fault_m[0], got.two_fault_m[0])
+    assert got.level_m[0] <= largest * (1.0 + 1e-6)
     assert np.isinf(got.level_m[0]) == np.isinf(largest)
     if largest < 1e3:  # never below what is allowed; above by the little that iteration leaves where tails are flat
         assert expected.level_m * (1.0 - 1e-7) <= got.level_m[0] <= 1.02 * expected.level_m
@@ -204,7 +204,7 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
     got = along_track_level(model, list("GGGEEE"))
     assert np.isinf(got.level_m[0])
     assert got.cause[0] == Cause.UNCHECKED
-    rare = replace(HAND, satellite_prior={"G": 1e-7, "E": 1e-7}, local_prior=0.0)
+    rare = HAND.replaced(satellite_prior={"G": 1e-7, "E": 1e-7}, local_prior=0.0)
     small = along_track_level(model, list("GGGEEE"), risk=rare)
     assert small.level_m[0] <= small.fault_free_m[0] < np.inf
     assert small.level_m[0] > small.sigma_m[0] * norm.isf(1e-4 / 2.0)  # the whole risk spent on noise
@@ -223,7 +223,7 @@ def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligibl
 def test_what_nothing_checks_is_taken_off_the_risk(systems, common):
     ranges = oracle.made(ARC, systems, seed=4)
     model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
-    budget = replace(HAND, satellite_prior={"G": common, "E": 0.3}, local_prior=0.0)
+    budget = HAND.replaced(satellite_prior={"G": common, "E": 0.3}, local_prior=0.0)
     expected = protection_oracle.level(
         case,
         dict(enumerate(budget.prior(list(systems)))),

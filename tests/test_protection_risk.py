@@ -68,7 +68,7 @@ def test_priors_and_what_they_leave():
     risk = RiskBudget()
     assert risk.prior(list("GE")) == pytest.approx([2e-5, 4e-5])
     risk.require(["G"] * 10 + ["E"] * 10)
-    with pytest.raises(ValueError, match=r"more than two of 20 satellites are faulty with probability 1\.1e-06"):
+    with pytest.raises(ValueError, match=r"more than three of 20 satellites are faulty with probability 4\.8e-09"):
         RiskBudget(satellite_prior={"G": 1e-3}, local_prior=0.0).require(["G"] * 20)
     with pytest.raises(ValueError, match="constellation 'X'"):
         risk.prior(["X"])

@@ -184,7 +184,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     # Without the integrity of an SBAS the satellites' own faults are hypotheses, too.
     assert (levels(scale, plain)[has] > levels(scale, config)[has]).all()
     model = config.model_copy(update={"error_model": Path("line.toml")})
-    np.testing.assert_array_equal(levels(3.0 * scale, model), levels(scale, model))
+    np.testing.assert_array_equal(levels(0.3 * scale, model), levels(scale, model))
     assert np.nanmin(one.sigma_m[one.reason == 0]) > 1.0
 
 

@@ -72,7 +72,7 @@ def protection_levels(
         What of it lies beyond its own sigma is a bias of the level.
     raim : RaimResult
     scale : ndarray, shape (T,)
-        The receiver's noise scale; an error model stands for itself and is scaled by 1 at least.
+        The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, also for an error model.
     config : Config
 
     Returns
@@ -85,18 +85,13 @@ def protection_levels(
         replace(model, covariance_m2=covariance),
         [name[0] for name in corrected.satellite.tolist()],
         risk=risk_of(config),
-        scale=_level_scale(scale, config),
+        scale=np.maximum(scale, 1.0),
         bias_m=None if config.error_model is None else corrected.bias_m,
         map_bias_m=np.stack(offset.beyond_m, axis=1),
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     return ProtectionResult(level=level, status=status, kind=kind_of(config))
-
-
-def _level_scale(scale: Floats, config: Config) -> Floats | float:
-    """Return the factor on the sigmas of the ranges: 1 with an error model, otherwise the noise scale, 1 at least."""
-    return 1.0 if config.error_model is not None else np.maximum(scale, 1.0)
 
 
 def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:

@@ -164,8 +164,8 @@ def without_two(all_of: Whole, first: Indices, second: Indices) -> Separations:
 def without_three(all_of: Whole, members: Indices) -> Separations:
     """Triples of places (K, 3) in the compact arrays left out.
 
-    Three whose S_JJ is singular (all satellites of a clock of their own) are told as unchecked, so that their whole
-    prior counts: it is the product of three.
+    Where S_JJ is singular (satellites of a clock of their own), the direction that no residual shows must not move
+    the position; where it does, nothing bounds it.
     """
     n, gain = all_of.channel.shape[1], all_of.gain_m
     flat = all_of.projector.reshape(-1, n * n)
@@ -180,11 +180,23 @@ def without_three(all_of: Whole, members: Indices) -> Separations:
     regular = (least > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * a * b * c)
     inverse = 1.0 / np.where(regular, determinant, 1.0)
     one, two, three = gain[:, i], gain[:, j], gain[:, k]
-    weights = (
-        (aa * one + dd * two + ee * three) * inverse,
-        (dd * one + bb * two + ff * three) * inverse,
-        (ee * one + ff * two + cc * three) * inverse,
+    weights = np.stack(
+        [aa * one + dd * two + ee * three, dd * one + bb * two + ff * three, ee * one + ff * two + cc * three]
     )
+    weights *= inverse
+    used = all_of.used[:, i] & all_of.used[:, j] & all_of.used[:, k]
+    blind = np.zeros(regular.shape, dtype=bool)
+    t, at = np.nonzero(~regular & used)
+    if len(t):
+        places = members[at]
+        part = all_of.projector[t[:, None, None], places[:, :, None], places[:, None, :]]
+        values, vectors = np.linalg.eigh(part)
+        shown = values > LEAST_REDUNDANCY
+        share = np.einsum("sij,si->sj", vectors, np.take_along_axis(gain[t], places, axis=1))
+        hidden = np.sqrt((np.where(shown, 0.0, share) ** 2).sum(axis=1))
+        blind[t, at] = hidden > _NO_EFFECT * np.sqrt(all_of.variance_m2[t])
+        solved = np.where(shown, share / np.where(shown, values, 1.0), 0.0)
+        weights[:, t, at] = np.einsum("sij,sj->is", vectors, solved)
     square, moved, bias = np.zeros(one.shape), np.zeros(one.shape), np.zeros(one.shape)
     response = np.zeros((*one.shape, 2))
     for place, weight in zip((i, j, k), weights, strict=True):
@@ -192,12 +204,11 @@ def without_three(all_of: Whole, members: Indices) -> Separations:
         moved -= weight * all_of.residual[:, place]
         response += weight[..., None] * all_of.map_gain_m[:, place]
     if all_of.range_bias is not None:
-        left = gain[:, None, :] - sum(
-            weight[..., None] * all_of.projector[:, place] for place, weight in zip((i, j, k), weights, strict=True)
-        )
+        left = np.repeat(gain[:, None, :], len(members), axis=1)
+        for place, weight in zip((i, j, k), weights, strict=True):
+            left -= weight[..., None] * all_of.projector[:, place]
         bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
-    used = all_of.used[:, i] & all_of.used[:, j] & all_of.used[:, k]
-    return _separations(all_of, np.maximum(square, 0.0), response, moved, bias, ~regular & used)
+    return _separations(all_of, np.maximum(square, 0.0), response, moved, bias, blind)
 
 
 def without_constellation(model: LinearModel, members: Masks, all_of: Whole, bias_m: Floats | None) -> Separations:
