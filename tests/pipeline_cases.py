@@ -118,7 +118,7 @@ def in_pieces(
 
 
 #: What belongs to the channels of a log or to the settings, not to its epochs.
-NO_EPOCHS = {"satellite", "signal", "columns", "clocks", "kind"}
+NO_EPOCHS = {"satellite", "signal", "columns", "clocks", "kind", "basis"}
 
 
 def flat(value: Any, prefix: str = "") -> dict[str, np.ndarray]:

@@ -106,6 +106,7 @@ def result_of(reasons: list[list[int]], satellites: list[str], status: list[Stat
             reason=np.array(reasons, dtype=np.int64),
             satellite=np.array(satellites),
             map_offset=SimpleNamespace(statistic=np.full(epochs, np.nan)),
+            screens={},
         ),
     )
 

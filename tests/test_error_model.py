@@ -20,6 +20,7 @@ from railfix.ranges.error_model import (
     ErrorModelSource,
     ErrorSamples,
     condition_differences,
+    fault_rate,
     fit_bins,
     gaussian_overbound,
     read_error_model,
@@ -39,6 +40,7 @@ def samples_of(error: np.ndarray, elevation: float, azimuth: float, cn0: float, 
         cn0_dbhz=np.full(n, cn0),
         block=block + np.arange(n) // 10,
         used=np.ones(n, dtype=bool),
+        sigma_m=np.full(n, 2.0),
     )
 
 
@@ -139,6 +141,7 @@ def made_model() -> ErrorModel:
         cn0_dbhz=rng.uniform(20, 55, n),
         block=np.arange(n) // 5,
         used=rng.random(n) < 0.7,
+        sigma_m=np.full(n, 2.0),
     )
     fit = ErrorModelFit()
     return ErrorModel(
@@ -268,3 +271,29 @@ def test_the_summary_pools_mean_and_variance_over_the_bins() -> None:
     assert rows["C/N0 0-60"] == ("40", "+0.00", "2.50", "2.5-4.0", "0", "-", "-", "-")
     assert rows["elevation 45-90"][:4] == ("10", "-3.00", "1.00", "2.5-2.5")
     assert "all round" in rows
+
+
+def test_the_rate_of_faults_is_counted_by_blocks() -> None:
+    """1000 blocks of ten ranges, two satellites a block of time; 12 blocks with one range beyond 5 sigma."""
+    n = 10_000
+    error = np.zeros(n)
+    error[np.arange(12) * 200 + 3] = 11.0
+    block = (np.arange(n) // 20) * 1_000_000 + (np.arange(n) // 10) % 2
+    samples = replace(samples_of(error, 45.0, 0.0, 45.0), block=block)
+    rate = fault_rate(samples)
+    assert (rate.ranges, rate.faulty, rate.blocks, rate.faulty_blocks) == (n, 12, 1000, 12)
+    assert rate.prior == pytest.approx(1.2e-3)
+    # Clopper and Pearson: 12 of 1000 blocks, at most 0.0193 with 95 % confidence; a tenth of their ranges is faulty.
+    assert rate.upper == pytest.approx(1.93e-3, rel=0.02)
+    assert rate.together == 0.0
+    none = fault_rate(replace(samples, error_m=np.zeros(n)))
+    assert none.upper == pytest.approx(3.0 / 1000, rel=0.01)  # the rule of three
+
+
+def test_two_at_a_time_are_counted_against_independence() -> None:
+    n = 2000
+    block = (np.arange(n) // 2) * 1_000_000 + np.arange(n) % 2
+    error = np.zeros(n)
+    error[:40] = 50.0  # twenty times both satellites
+    rate = fault_rate(replace(samples_of(error, 45.0, 0.0, 45.0), block=block))
+    assert rate.together == pytest.approx(20.0 / (1000 * 0.02**2), rel=1e-9)

@@ -95,6 +95,7 @@ def made_error_model(path: Path) -> Path:
         cn0_dbhz=rng.uniform(25.0, 55.0, n),
         block=np.arange(n, dtype=np.int64),
         used=np.ones(n, dtype=np.bool_),
+        sigma_m=np.ones(n),
     )
     fit = ErrorModelFit()
     of_all = fit_bins(samples, samples.used, fit)

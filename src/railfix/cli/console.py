@@ -113,7 +113,7 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
         for label, field in (("p50", "p50_m"), ("p95", "p95_m")):
             values = {n: getattr(levels[n], field) for n in names if n in levels}
             cells = [f"{values[n]:.2f} m" if values.get(n) is not None else "-" for n in names]
-            table.add_row(f"protection level, {label}", *cells)
+            table.add_row(f"{summary.level_basis} level, {label}", *cells)
         for word in ("available", "alarm"):
             shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
             table.add_row(f"  {word}", *shown)

@@ -84,13 +84,15 @@ def show_errors(evaluation: Evaluation) -> None:
 
 def show_levels(evaluation: Evaluation, console: Console) -> None:
     """Print the protection level of each antenna: median, availability, and errors above it."""
+    indicative = any(run.protection.get("basis") == "indicative" for run in evaluation.runs)
     for kind, found in evaluation.integrity.items():
         rows = found.stanford.filter(grouping="all", levels_of="usable", own_limit=True)
         for row in rows.filter(rows["antenna"] != "all").iter_rows(named=True):
             median = median_level(evaluation, kind, row["antenna"])
             over = found.beyond.filter(antenna=row["antenna"])
+            named = "indicative protection level" if indicative else "protection level"
             console.print(
-                f"protection level ({kind}), {row['antenna']}: median {'-' if median is None else f'{median:.2f} m'}, "
+                f"{named} ({kind}), {row['antenna']}: median {'-' if median is None else f'{median:.2f} m'}, "
                 f"within the alarm limit of {row['alarm_limit_m']:g} m at "
                 f"{100 * (row['availability_of_observed'] or 0.0):.2f} % of the epochs with observations, errors over "
                 f"it: {int(over['usable'].sum())} of {row['judged']:,}, and "

@@ -28,6 +28,8 @@ _HEADS: Final = (
 def show_integrity(evaluation: Evaluation, console: Console) -> None:
     """Levels of each kind against the errors."""
     several = len(evaluation.runs) > 1
+    if any(run.protection.get("basis") == "indicative" for run in evaluation.runs):
+        console.print("The protection levels are indicative: their priors are assumed, not measured on this line.")
     for kind, found in evaluation.integrity.items():
         console.print(
             f"Protection levels against errors ({kind}): epochs of each region of the Stanford diagram, availability, "

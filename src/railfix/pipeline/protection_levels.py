@@ -21,6 +21,16 @@ from railfix.positioning.map_offset import MapOffset
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
+#: Standing of a level: whether its priors were measured on the line, or assumed. An indicative level carries no risk
+#: an hour.
+BASES: Final[tuple[str, str]] = ("measured", "indicative")
+
+
+def basis_of(config: Config) -> str:
+    """Return which of `BASES` the levels of a run are."""
+    return BASES[0] if config.risk.priors == "measured" else BASES[1]
+
+
 def kind_of(config: Config) -> str:
     """Return which of `KINDS` the levels of a run are."""
     return KINDS[0] if config.sbas else KINDS[1]
@@ -34,6 +44,8 @@ def level_facts(config: Config) -> dict[str, Any]:
     sigmas = "noise settings times the receiver's estimated scale, 1 at least: no promise about tails"
     return {
         "kind": kind_of(config),
+        "basis": basis_of(config),
+        "priors": risk.priors,
         "sigmas": sigmas if config.error_model is None else str(config.error_model),
         "alarm_limit_m": config.alarm_limit_m,
         "risk_per_hour": risk.risk_per_hour,
@@ -91,7 +103,7 @@ def protection_levels(
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    return ProtectionResult(level=level, status=status, kind=kind_of(config))
+    return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
 
 
 def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:
@@ -118,4 +130,4 @@ def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Conf
     verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
     doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET])
     verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
-    return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind)
+    return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind, basis=protection.basis)

@@ -68,12 +68,15 @@ class ProtectionResult:
     status : ndarray of int8, shape (T,)
         `protection.LevelStatus` against `Config.alarm_limit_m`.
     kind : str
-        Basis of the levels: "sbas" or "separation" (`protection_levels.KINDS`).
+        Hypotheses of the levels: "sbas" or "separation" (`protection_levels.KINDS`).
+    basis : str
+        "measured" or "indicative": whether the priors were measured on the line (`protection_levels.BASES`).
     """
 
     level: ProtectionLevel
     status: Codes
     kind: str
+    basis: str
 
 
 @dataclass(frozen=True, kw_only=True)

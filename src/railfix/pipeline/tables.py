@@ -18,7 +18,7 @@ from railfix.core.reasons import Reason, Status, reason_text
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import AlongTrack, innovations
-from railfix.pipeline.protection_levels import KINDS
+from railfix.pipeline.protection_levels import BASES, KINDS
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.screens import SCREENS
 
@@ -31,6 +31,8 @@ STATUS_TYPE: Final = pl.Enum([s.text for s in Status])
 OUTCOME_TYPE: Final = pl.Enum([o.name.lower() for o in Outcome])
 #: Words of the column ``protection_kind``.
 KIND_TYPE: Final = pl.Enum(KINDS)
+#: Words of the column ``protection_basis``.
+BASIS_TYPE: Final = pl.Enum(BASES)
 #: Words of the column ``protection_cause``, and of ``protection_status``.
 CAUSE_TYPE: Final = pl.Enum([c.name.lower() for c in Cause])
 LEVEL_STATUS_TYPE: Final = pl.Enum([s.name.lower() for s in LevelStatus])
@@ -81,8 +83,10 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
     "protection_kind": "basis: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
     "hypotheses of satellites' own faults as well",
+    "protection_basis": "`measured`: the priors of faults were measured on the line; `indicative`: they are assumed, "
+    "and the level carries no risk an hour",
     "protection_cause": "what sets the level: "
-    "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`",
+    "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`, `three_faults`",
     "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
     "the place; `alarm`: the ranges contradict the level, or a check has failed",
     **_screen_columns("positions"),
@@ -231,6 +235,8 @@ def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
     }
     named = pl.Series(values=[None if found is None else found.kind], dtype=KIND_TYPE)
     columns["protection_kind"] = named.new_from_index(0, epochs)
+    basis = pl.Series(values=[None if found is None else found.basis], dtype=BASIS_TYPE)
+    columns["protection_basis"] = basis.new_from_index(0, epochs)
     for name, (kind, values) in words.items():
         if values is None:
             columns[name] = pl.Series(values=[None], dtype=kind).new_from_index(0, epochs)

@@ -56,6 +56,13 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
     ]
 
 
+#: What the basis of a level says of its standing.
+_STANDING: Final = {
+    "indicative": "indicative: the priors of faults are assumed, not measured on this line; no risk an hour",
+    "measured": "the priors of faults were measured on this line",
+}
+
+
 def _assumptions(run: ReportedRun, kind: str) -> Table:
     """Assumptions of the levels of a run."""
     stated: Mapping[str, Any] = run.record.get("protection") or {}
@@ -63,6 +70,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
     sigmas = f"error model {model}" if model is not None else str(stated.get("sigmas", "not recorded"))
     rows = [
         ("kind", f"{kind}: {_KINDS.get(kind, 'not recorded')}"),
+        ("standing", _STANDING.get(str(stated.get("basis")), "not recorded")),
         ("errors without a fault", sigmas),
         ("alarm limit", _value(stated.get("alarm_limit_m"), " m")),
         ("risk per hour", _value(stated.get("risk_per_hour"))),

@@ -18,7 +18,7 @@ from railfix.io.sp3 import read_sp3
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor, State
-from railfix.pipeline.protection_levels import level_facts, risk_of
+from railfix.pipeline.protection_levels import basis_of, level_facts, risk_of
 from railfix.pipeline.tables import observations_table, positions_table, rounded
 from railfix.pipeline.train_table import train_table
 from railfix.run.checks import (
@@ -60,6 +60,8 @@ class RunSummary:
         Percentiles of the along-track standard deviation by antenna.
     levels : mapping of str to Levels
         Protection levels by antenna; empty where they are off.
+    level_basis : str
+        "indicative protection" where the priors of the levels are assumed, "protection" where they are measured.
     notes : tuple of str
     files : mapping of str to Path
         The results.
@@ -69,6 +71,7 @@ class RunSummary:
     tally: Tally
     sigma: Mapping[str, AlongSigma]
     levels: Mapping[str, Levels]
+    level_basis: str
     notes: tuple[str, ...]
     files: Mapping[str, Path]
     wall_s: float
@@ -129,6 +132,7 @@ def run_files(
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally, found_levels),
         )
+        level_basis = "protection" if basis_of(config) == "measured" else "indicative protection"
         wall = clock.perf_counter() - began
         record = run_record(
             files=[entry.result() for entry in entries],
@@ -147,7 +151,9 @@ def run_files(
         )
         folder.write_json("run.json", record)
         files = folder.commit(_footer(record))
-    return RunSummary(tally=tally, sigma=sigma, levels=found_levels, notes=notes, files=files, wall_s=wall)
+    return RunSummary(
+        tally=tally, sigma=sigma, levels=found_levels, level_basis=level_basis, notes=notes, files=files, wall_s=wall
+    )
 
 
 def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Line, dict[Antenna, Log]]:
@@ -291,17 +297,28 @@ def _notes_of_levels(config: Config, tally: Tally, found: Mapping[str, Levels]) 
     for name, of_antenna in found.items():
         if of_antenna.without_budget:
             yield (
-                f"{name}: {of_antenna.without_budget} epochs without a protection level, where more than two faults at "
-                "a time, or more satellites excluded, are likelier than the risk allows (settings risk)"
+                f"{name}: {of_antenna.without_budget} epochs without a protection level, where more than three faults "
+                "at a time, or more satellites excluded, are likelier than the risk allows (settings risk)"
             )
+    risk = risk_of(config)
+    if basis_of(config) == "indicative":
+        yield (
+            "protection level: indicative, its priors are assumed and not measured on this line; it carries no risk an "
+            "hour (railfix error-model measures them, risk.local_prior and risk.priors state them)"
+        )
+    if "raim" not in config.screens:
+        return
     used = sum(antenna.used for antenna in tally.antennas.values())
     excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
-    risk = risk_of(config)
+    # Noise alone is excluded at the rate of false alarms; what is over that stands against the prior.
+    observed = sum(antenna.observed for antenna in tally.antennas.values())
+    faults = excluded - config.raim.false_alarm * observed
     prior = risk.local_prior + max(risk.satellite_prior.values())
-    if excluded > prior * (used + excluded):
+    if faults > 3.0 * np.sqrt(excluded) and faults > prior * (used + excluded):
         yield (
-            f"protection level: it assumes a fault probability of at most {prior:g} per range, but RAIM has "
-            f"excluded {excluded} of {used + excluded} ({excluded / (used + excluded):.2g}); see risk.local_prior"
+            f"protection level: it assumes a fault probability of at most {prior:g} per range, but RAIM has excluded "
+            f"{excluded} of {used + excluded}, {faults:.0f} more than false alarms "
+            f"({faults / (used + excluded):.2g} per range); see risk.local_prior"
         )
 
 

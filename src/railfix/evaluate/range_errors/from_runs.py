@@ -23,6 +23,7 @@ from railfix.ranges.error_model import (
     ErrorModelSource,
     ErrorSamples,
     condition_differences,
+    fault_rate,
     fit_bins,
 )
 from railfix.run.chunks import aligned
@@ -134,6 +135,7 @@ def error_model_from_runs(
             railfix_version=__version__,
             files=tuple(files.items()),
         ),
+        faults=fault_rate(samples),
     )
     return model, samples
 

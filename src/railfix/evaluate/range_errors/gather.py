@@ -153,6 +153,7 @@ def range_errors(
             cn0_dbhz=result.cn0_dbhz[:, columns][epoch, channel],
             block=time_block[epoch] * 1_000_000 + numbers[channel],
             used=used[epoch, channel],
+            sigma_m=(result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None])[epoch, channel],
         ),
         time=result.time[epoch],
         satellite=satellite[channel],

@@ -35,7 +35,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath
 from railfix.core.settings import Settings, write_toml
 from railfix.ranges.error_model.conditions import Conditions
-from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource
+from railfix.ranges.error_model.model import POOLED, BinStatistics, ErrorBins, ErrorModel, ErrorModelSource, FaultRate
 from railfix.ranges.model_file import read_model_file
 
 FORMAT: Final = "railfix error model 2"
@@ -64,6 +64,7 @@ class _File(Settings):
     bins: ErrorBins
     conditions: Conditions | None = None
     source: ErrorModelSource = Field(default_factory=ErrorModelSource)
+    faults: FaultRate | None = None
     before: _Columns
     after: _Columns
 
@@ -82,6 +83,7 @@ def write_error_model(model: ErrorModel, path: FilePath) -> None:
         bins=model.bins,
         conditions=model.conditions,
         source=model.source,
+        faults=model.faults,
         before=_columns(model.before),
         after=_columns(model.after),
     )
@@ -110,6 +112,7 @@ def read_error_model(path: FilePath) -> ErrorModel:
         covers=file.covers,
         conditions=file.conditions,
         source=file.source,
+        faults=file.faults,
     )
 
 

@@ -44,6 +44,8 @@ class ErrorSamples:
         Number of the satellite's block of time: samples of one block are not independent.
     used : ndarray of bool, shape (n,)
         Samples that passed every screen.
+    sigma_m : ndarray, shape (n,) [m]
+        Standard deviation that the protection level of the run gave the range.
     """
 
     error_m: Floats
@@ -52,6 +54,7 @@ class ErrorSamples:
     cn0_dbhz: Floats
     block: Integers
     used: Masks
+    sigma_m: Floats
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:

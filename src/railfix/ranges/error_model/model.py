@@ -124,6 +124,36 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()
 
 
+class FaultRate(Settings):
+    """Probability that a used range is faulty at a time, measured.
+
+    Attributes
+    ----------
+    beyond_sigma : float
+        A range is faulty beyond this many sigmas of the level: 5, which noise passes with 6e-7.
+    ranges, faulty : int
+        Ranges used, and those beyond.
+    blocks, faulty_blocks : int
+        Blocks of time of single satellites, which are independent of each other, and those with a faulty range.
+    prior : float
+        faulty / ranges.
+    upper : float
+        Upper end of the 95 % interval of the prior (Clopper and Pearson, one-sided, by blocks): the `local_prior`
+        to use.
+    together : float
+        Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
+    """
+
+    beyond_sigma: float = Field(gt=0)
+    ranges: int = Field(ge=0)
+    faulty: int = Field(ge=0)
+    blocks: int = Field(ge=0)
+    faulty_blocks: int = Field(ge=0)
+    prior: float = Field(ge=0, le=1)
+    upper: float = Field(ge=0, le=1)
+    together: float = Field(ge=0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ErrorModel:
     """Errors of corrected pseudoranges by bin.
@@ -140,6 +170,8 @@ class ErrorModel:
     conditions : Conditions or None
         Settings under which it holds; None: unknown, compared with nothing.
     source : ErrorModelSource
+    faults : FaultRate or None
+        Rate of local faults among the ranges that the model was made of; None: not measured.
     """
 
     bins: ErrorBins
@@ -148,6 +180,7 @@ class ErrorModel:
     covers: Literal["local", "satellite_and_atmosphere"]
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
+    faults: FaultRate | None = None
 
     def at(
         self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike
