@@ -154,7 +154,7 @@ def test_a_value_that_does_not_fit_its_field_is_an_error() -> None:
 
 
 def test_a_station_stands_still_shares_the_errors_and_changes_no_train() -> None:
-    plain, with_station = (scenario(60.0, station=station) for station in (None, ReferenceStation(chainage_m=200.0)))
+    plain, with_station = (scenario(60.0, stations=s) for s in ((), (ReferenceStation(chainage_m=200.0),)))
     train, base = Simulation(with_station), Simulation(with_station)
     front, station = next(train.pieces("front")), next(base.pieces("station"))
     before = whole(plain)
@@ -175,11 +175,35 @@ def test_a_station_stands_still_shares_the_errors_and_changes_no_train() -> None
 
 
 def test_messages_and_station_are_written(tmp_path: Path) -> None:
-    files = write_run(scenario(3.0, station=ReferenceStation()), tmp_path, packing="plain")
+    files = write_run(scenario(3.0, stations=(ReferenceStation(),)), tmp_path, packing="plain")
     assert files["sbas"].name == "messages.sbs"
     assert len(read_sbas(files["sbas"])) == 303
     station = read_observations(files["station"])
     assert len(station) == 3
-    simulation = Simulation(scenario(3.0, station=ReferenceStation()))
+    simulation = Simulation(scenario(3.0, stations=(ReferenceStation(),)))
     true = simulation.truth("station", np.zeros(1))[0].ecef_m[0]
     assert station.header.approximate_ecef_m == pytest.approx(true, abs=1e-3)
+
+
+def test_a_fault_of_one_station_is_its_own() -> None:
+    """Three stations (P3, 3): a receiver fault shows in one of them, a satellite fault in all."""
+    seen = [name for name in Simulation(scenario(5.0)).satellites if name.startswith("G")]
+    own = SatelliteFault(satellite=seen[0], start_s=10.0, ramp_mps=2.0)
+    common = SatelliteFault(satellite=seen[1], start_s=10.0, step_m=30.0)
+    stations = tuple(
+        ReferenceStation(name=name, chainage_m=at, faults=(own,) if name == "b" else ())
+        for name, at in (("a", 100.0), ("b", 600.0), ("c", 1100.0))
+    )
+    errors = scenario().errors.replaced(faults=(common,))
+    simulation = Simulation(scenario(30.0, stations=stations, errors=errors))
+    for station in stations:
+        piece = next(simulation.pieces(station.name))
+        without = next(Simulation(scenario(30.0, stations=stations)).pieces(station.name))
+        added = dict(zip(piece.observations.satellite.tolist(), (piece.error_m - without.error_m).T, strict=True))
+        time = np.arange(30.0)
+        assert added[seen[1]] == pytest.approx(np.where(time >= 10.0, 30.0, 0.0), abs=1e-6)
+        healthy = (ReferenceStation(chainage_m=station.chainage_m),)
+        other = next(Simulation(scenario(30.0, stations=healthy)).pieces("station"))
+        ramp = (without.error_m - other.error_m)[:, piece.observations.satellite == seen[0]][:, 0]
+        expected = 2.0 * np.maximum(time - 10.0, 0.0) if station.name == "b" else 0.0 * time
+        assert ramp == pytest.approx(expected, abs=1e-6)

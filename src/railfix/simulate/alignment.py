@@ -118,6 +118,15 @@ class Alignment:
         """Unit vectors along the curve, shape (..., 3), of length 1 within 1e-6."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
 
+    def point_beside(self, chainage_m: Floats, lateral_m: float, height_m: float) -> Floats:
+        """Points to the right of the curve and above it, square to it and level, shape (n, 3) ECEF [m]."""
+        place, tangent = self.at(chainage_m), self.tangent_at(chainage_m)
+        latitude, longitude, _ = geodetic_from_ecef(place)
+        up = enu_axes(latitude, longitude)[:, 2]
+        right = np.cross(tangent, up)
+        right /= np.linalg.norm(right, axis=-1, keepdims=True)
+        return np.asarray(place + lateral_m * right + height_m * up)
+
     def sampled_chainage_m(self) -> Floats:
         """Chainage of the map's points: the elements' ends, and even steps between within the spacing; a file's own."""
         if self.file is not None:

@@ -13,7 +13,6 @@ from railfix.simulate.errors.processes import satellite_key
 from railfix.simulate.errors.settings import InterSystemSettings
 from railfix.simulate.noise import CarriedNoise, CodeSmoothing, Tracking
 from railfix.simulate.satellites import newest_record
-from railfix.simulate.scenario import RECEIVERS
 
 if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
@@ -30,7 +29,7 @@ class Receiver:
 
     def __init__(self, simulation: Simulation, antenna: str) -> None:
         scenario, errors, channels = simulation.scenario, simulation.scenario.errors, simulation.channels
-        number = RECEIVERS.index(antenna)
+        number = scenario.receivers.index(antenna)
         self.antenna = antenna
         self.header = simulation.header(antenna)
         self.names, self.signals = (np.array(part) for part in zip(*channels, strict=True))
@@ -56,16 +55,16 @@ class Receiver:
             errors.noise,
             key=(scenario.seed, _CARRIED, number),
             channels=len(channels),
-            interval_s=simulation.interval_s,
+            interval_s=scenario.interval_s,
         )
         self.smoothing = CodeSmoothing(
-            scenario.receiver.code_smoothing_s, channels=len(channels), interval_s=simulation.interval_s
+            scenario.receiver.code_smoothing_s, channels=len(channels), interval_s=scenario.interval_s
         )
         self.tracking = Tracking(
             errors.tracking,
             key=(scenario.seed, _SLIPS, number),
             channels=len(channels),
-            interval_s=simulation.interval_s,
+            interval_s=scenario.interval_s,
         )
 
     def white(self, epochs: int) -> Floats:

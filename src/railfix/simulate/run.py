@@ -20,7 +20,7 @@ from railfix.io.rinex import write_navigation, write_observations
 from railfix.run.output import CSV_TIME, OutputFolder, Overwrite
 from railfix.simulate.run_readme import run_readme
 from railfix.simulate.sbas.service import sbas_messages, write_sbas
-from railfix.simulate.scenario import ANTENNAS, RECEIVERS, Scenario, VehicleSettings
+from railfix.simulate.scenario import ANTENNAS, Scenario, VehicleSettings
 from railfix.simulate.scenario_file import scenario_table
 from railfix.simulate.sensors.tables import sensor_tables
 from railfix.simulate.signals import Simulation
@@ -95,7 +95,7 @@ def write_run(
 
     ============================ ===================================================
     front.crx.gz, rear.crx.gz    observations (front.rnx, rear.rnx when plain)
-    station.crx.gz               observations of the reference station, where the scenario has one
+    station.crx.gz, ...          observations of reference stations, where the scenario has them
     nav.rnx.gz                   broadcast records (nav.rnx)
     track.csv                    track map
     vehicle.toml                 vehicle
@@ -152,8 +152,7 @@ def _write_files(
 ) -> dict[str, Path]:
     scenario = simulation.scenario
     observation, packed = ("crx.gz", ".gz") if packing == "packed" else ("rnx", "")
-    receivers = ANTENNAS if scenario.station is None else RECEIVERS
-    names = {name: f"{name}.{observation}" for name in receivers}
+    names = {name: f"{name}.{observation}" for name in scenario.receivers}
     names |= {"nav": f"nav.rnx{packed}", "track": "track.csv", "vehicle": "vehicle.toml"}
     names |= {"truth": f"truth.csv{packed}", "sections": "sections.csv"}
     if scenario.sbas is not None:
@@ -161,7 +160,7 @@ def _write_files(
     names |= {name: f"{name}.{'parquet' if packed else 'csv'}" for name in tables}
     names |= {"scenario": "scenario.toml", "readme": "README.md"}
     files = {key: out.staged(name) for key, name in names.items()}
-    for antenna in receivers:
+    for antenna in scenario.receivers:
 
         def watched(antenna: str = antenna) -> Iterator[Observations]:
             for part in simulation.observations(antenna):

@@ -73,7 +73,10 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
         "vehicle": "bogie distance, gauge, antennas",
         "truth": "ground truth: chainage of the centreline point abeam each antenna, its position (ECEF), speed, "
         "acceleration, kind of section",
-        "station": "the same of the reference station; its position is in the header",
+        **{
+            station.name: "the same of a reference station; its position is in the header"
+            for station in simulation.scenario.stations
+        },
         "sbas": "SBAS messages as RTKLIB logs them: time of week of the complete reception, PRN, type, message",
         "sections": "ground truth: sections of the line",
         "scenario": "all settings, a scenario file for `railfix simulate`",

@@ -18,7 +18,7 @@ from railfix.core.errors import SettingsError
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
 from railfix.simulate.disturbance import Disturbances
 from railfix.simulate.environment.settings import EnvironmentSettings
-from railfix.simulate.errors.settings import ErrorSettings
+from railfix.simulate.errors.settings import ErrorSettings, SatelliteFault
 from railfix.simulate.line_settings import LineSettings
 from railfix.simulate.sbas.settings import SbasSettings
 from railfix.simulate.sensors.settings import SensorSettings
@@ -35,10 +35,10 @@ from railfix.simulate.setting_types import (
 
 #: Antennas of the vehicle, in the order in which they are written.
 ANTENNAS: Final = ("front", "rear")
+#: Names of other files of a run.
+_FILES: Final = (*ANTENNAS, "nav", "track", "vehicle", "truth", "sections", "scenario", "readme", "sbas")
 #: Longest run, a hundred days; more epochs than this are many runs [s].
 LONGEST_S: Final = 8.64e6
-#: All receivers: those of the antennas, and the reference station's.
-RECEIVERS: Final = (*ANTENNAS, "station")
 
 
 class Station(ScenarioSettings):
@@ -246,13 +246,19 @@ class ReferenceStation(ScenarioSettings):
 
     Attributes
     ----------
+    name : str
+        Of its log; small letters, digits and hyphens.
     chainage_m, lateral_m, height_m : float
         Position: along the line, to the right of the track's axis, above the rails.
+    faults : tuple of SatelliteFault
+        Faults of this receiver alone, by satellite.
     """
 
+    name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")
     chainage_m: Finite = 0.0
     lateral_m: Finite = 50.0
     height_m: Finite = 10.0
+    faults: tuple[SatelliteFault, ...] = ()
 
 
 class Scenario(ScenarioSettings):
@@ -272,8 +278,8 @@ class Scenario(ScenarioSettings):
         Errors of satellites, atmosphere and receivers beyond the noise of `receiver`; none by default.
     sensors : SensorSettings or None
         Sensors on board besides the receivers.
-    station : ReferenceStation or None
-        Reference station whose observations are written beside the train's.
+    stations : tuple of ReferenceStation
+        Reference stations whose observations are written beside the train's.
     sbas : SbasSettings or None
         SBAS that corrects the simulated errors, and that the train receives.
     environment : EnvironmentSettings
@@ -297,9 +303,17 @@ class Scenario(ScenarioSettings):
     environment: EnvironmentSettings = EnvironmentSettings()
     place_seed: Seed = 1
     sensors: SensorSettings | None = None
-    station: ReferenceStation | None = None
+    stations: tuple[ReferenceStation, ...] = ()
     sbas: SbasSettings | None = None
     multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
+
+    @field_validator("stations")
+    @classmethod
+    def _named_apart(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
+        names = [*_FILES, *(station.name for station in stations)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"must have different names, none of {', '.join(_FILES)}")
+        return stations
 
     @model_validator(mode="after")
     def _whole_epochs(self) -> Scenario:
@@ -343,6 +357,16 @@ class Scenario(ScenarioSettings):
     def epochs(self) -> int:
         """Number of epochs."""
         return round(self.duration_s * self.rate_hz)
+
+    @property
+    def interval_s(self) -> float:
+        """Time between two epochs [s]."""
+        return float(self.interval / np.timedelta64(1, "s"))
+
+    @property
+    def receivers(self) -> tuple[str, ...]:
+        """Names of all receivers: the antennas, then the reference stations."""
+        return (*ANTENNAS, *(station.name for station in self.stations))
 
     @property
     def interval(self) -> np.timedelta64:

@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
@@ -19,17 +19,17 @@ from railfix.simulate.alignment import Alignment, build_alignment
 from railfix.simulate.body import AntennaTruth, antenna_truth
 from railfix.simulate.body_motion import BodyMotion
 from railfix.simulate.clear_sky import CN0_SECOND_DB
+from railfix.simulate.clocks import ReceiverClocks
 from railfix.simulate.constellation import simulated_navigation
 from railfix.simulate.delays import ionosphere_m, troposphere_m
 from railfix.simulate.disturbance import Disturbances, Geometry
 from railfix.simulate.environment import Environment
-from railfix.simulate.errors.common import CommonErrors
-from railfix.simulate.errors.processes import ClockWalk
+from railfix.simulate.errors.common import CommonErrors, fault_m
 from railfix.simulate.kinematics import Motion
 from railfix.simulate.motion import build_motion
 from railfix.simulate.receiver import SIGNALS, Receiver, group_delay_s
 from railfix.simulate.satellites import SatelliteTable, links
-from railfix.simulate.scenario import ANTENNAS, RECEIVERS, Scenario
+from railfix.simulate.scenario import ANTENNAS, Scenario
 
 #: Receivers report C/N0 in steps [dB-Hz].
 CN0_STEP_DBHZ: Final = 0.25
@@ -42,8 +42,6 @@ _RATE_S: Final = 0.005
 #: C/N0 of the receiver's nominal sigmas, and C/N0 above which the noise no longer falls [dB-Hz].
 _SIGMA_AT_DBHZ: Final = 45.0
 _BEST_DBHZ: Final = 50.0
-#: Stream of random numbers of the clocks' wander.
-_WALK: Final = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +92,7 @@ class Simulation:
     disturbances : tuple of Disturbances
         The environment where there is any, then the scenario's `multipath`.
     navigation : Navigation
+    clocks : ReceiverClocks
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -110,64 +109,16 @@ class Simulation:
         place = () if scenario.environment.empty else (self.environment,)
         self.disturbances: tuple[Disturbances, ...] = (*place, *scenario.multipath)
         self.navigation: Navigation = simulated_navigation(scenario)
+        self.clocks = ReceiverClocks(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Datetimes:
         """Time tags of epochs `first` to before `last`, GPS time."""
         last = self.scenario.epochs if last is None else last
         return np.asarray(self.scenario.start + np.arange(first, last) * self.scenario.interval)
 
-    def clock_s(self, antenna: str, tag_s: Floats) -> Floats:
+    def clock_s(self, receiver: str, tag_s: Floats) -> Floats:
         """Bias of a receiver's clock, tag minus GPS time, at tags counted from the start, shape (T,) [s]."""
-        settings = self.scenario.receiver
-        bias, drift = settings.clock_bias_s, settings.clock_drift
-        if antenna == RECEIVERS[-1]:
-            bias, drift = 0.37 * bias, 0.55 * drift
-        elif antenna != ANTENNAS[0] and settings.clocks == "separate":
-            bias, drift = -0.61 * bias, 0.83 * drift
-        value = bias + drift * tag_s
-        walk = self._walk(antenna)
-        if walk is not None:
-            value = value + walk.at(np.ravel(tag_s))[:, 0].reshape(np.shape(tag_s)) / SPEED_OF_LIGHT
-        return value - np.rint(value * 1e3) * 1e-3 if settings.clock_steps == "millisecond" else value
-
-    def clock_drift(self, antenna: str) -> float:
-        """Drift of a receiver's clock [s/s]."""
-        settings = self.scenario.receiver
-        if antenna == RECEIVERS[-1]:
-            return 0.55 * settings.clock_drift
-        return settings.clock_drift * (0.83 if antenna != ANTENNAS[0] and settings.clocks == "separate" else 1.0)
-
-    def clock_rate_mps(self, antenna: str, tag_s: Floats) -> Floats:
-        """Rate of a receiver's clock at tags, its steps left out, shape (T,) [m/s]."""
-        even = np.full(np.shape(tag_s), SPEED_OF_LIGHT * self.clock_drift(antenna))
-        walk = self._walk(antenna)
-        return even if walk is None else even + walk.rate(tag_s)[:, 0]
-
-    def _walk(self, antenna: str) -> ClockWalk | None:
-        """Random walk of a receiver's clock, the same for both where the clock is common."""
-        common = self.scenario.receiver.clocks == "common" and antenna in ANTENNAS
-        return self._walks[0 if common else RECEIVERS.index(antenna)]
-
-    @cached_property
-    def _walks(self) -> tuple[ClockWalk | None, ...]:
-        scenario, walk = self.scenario, self.scenario.errors.clock
-        if walk.walk_m_per_sqrt_s == 0.0 and walk.frequency_walk_mps_per_sqrt_s == 0.0:
-            return (None,) * len(RECEIVERS)
-        return tuple(
-            ClockWalk(
-                (scenario.seed, _WALK, k),
-                walk=walk.walk_m_per_sqrt_s,
-                frequency_walk=walk.frequency_walk_mps_per_sqrt_s,
-                interval_s=self.interval_s,
-                duration_s=scenario.duration_s,
-            )
-            for k in range(len(RECEIVERS))
-        )
-
-    @property
-    def interval_s(self) -> float:
-        """Time between two epochs [s]."""
-        return float(self.scenario.interval / np.timedelta64(1, "s"))
+        return self.clocks.bias_s(receiver, tag_s)
 
     @cached_property
     def satellites(self) -> tuple[str, ...]:
@@ -205,23 +156,16 @@ class Simulation:
 
     def truth(self, antenna: str, seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
         """True position of an antenna at seconds after the start, and its speed along the line [m/s]."""
-        if antenna == RECEIVERS[-1]:
-            return self._station_truth(len(seconds_s)), np.zeros(len(seconds_s))
+        if antenna not in ANTENNAS:
+            return self._station_truth(antenna, len(seconds_s)), np.zeros(len(seconds_s))
         return self.body_truth(getattr(self.scenario.vehicle, antenna), seconds_s)
 
-    def _station_truth(self, count: int) -> AntennaTruth:
-        """Position of the reference station, the same at all of so many instants."""
-        station = self.scenario.station
-        if station is None:
-            raise ValueError("the scenario has no reference station")
+    def _station_truth(self, name: str, count: int) -> AntennaTruth:
+        """Position of a reference station, the same at all of so many instants."""
+        station = next(item for item in self.scenario.stations if item.name == name)
         at = np.full(count, station.chainage_m)
-        place, tangent = self.line.at(at), self.line.tangent_at(at)
-        latitude, longitude, _ = geodetic_from_ecef(place)
-        up = enu_axes(latitude, longitude)[:, 2]
-        right = np.cross(tangent, up)
-        right /= np.linalg.norm(right, axis=-1, keepdims=True)
-        ecef = place + station.lateral_m * right + station.height_m * up
-        return AntennaTruth(ecef_m=ecef, chainage_m=at, forward=tangent)
+        place = self.line.point_beside(at, station.lateral_m, station.height_m)
+        return AntennaTruth(ecef_m=place, chainage_m=at, forward=self.line.tangent_at(at))
 
     def body_truth(self, offset_m: tuple[float, float, float], seconds_s: Floats) -> tuple[AntennaTruth, Floats]:
         """True position of a point of the body at seconds after the start, and the speed."""
@@ -254,7 +198,7 @@ class Simulation:
             receiver="SIMULATED",
             antenna="SIMULATED",
             approximate_ecef_m=np.round(place, -2 if antenna in ANTENNAS else 4),
-            interval_s=self.interval_s,
+            interval_s=self.scenario.interval_s,
             leap_seconds=self.navigation.leap_seconds,
             signals={
                 s: tuple(sorted({g for name, g in self.channels if name[0] == s}))
@@ -377,8 +321,8 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
     clock = SPEED_OF_LIGHT * simulation.clock_s(receiver.antenna, tags)
-    # What a channel's code and phase are longer by alike, and its rate.
-    fault, fault_rate = simulation.common_errors.fault_m(tags, receiver.names.tolist())
+    # Errors of code and phase alike, and their rate.
+    fault, fault_rate = _faults(simulation, receiver, tags)
     extra = fault + receiver.offset_m + receiver.offset_drift_mps * tags[:, None]
     extra_rate = fault_rate + receiver.offset_drift_mps
     path = now.path_m[:, column] + clock[:, None] + extra
@@ -387,7 +331,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     )
     code = path + ionosphere + delay + receiver.group_delay_error_m
     error = now.path_error_m[:, column] + scale * now.ionosphere_error_m[:, column]
-    drift = simulation.clock_rate_mps(receiver.antenna, tags)[:, None] + extra_rate
+    drift = simulation.clocks.rate_mps(receiver.antenna, tags)[:, None] + extra_rate
     doppler = -(path_rate[:, column] - scale * ionosphere_rate[:, column] + drift) / wavelength
     noise = receiver.white(len(time))
     sine = np.sin(np.radians(np.maximum(geometry.elevation_deg, 1.0)))
@@ -428,6 +372,17 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
         clean_code_m=code,
         error_m=error + extra + receiver.group_delay_error_m,
     )
+
+
+def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
+    """Range errors of faults of satellites and of a station's receiver [m], and their rates [m/s], shapes (T, M)."""
+    names = receiver.names.tolist()
+    fault, rate = simulation.common_errors.fault_m(tag_s, names)
+    for station in simulation.scenario.stations:
+        if station.name == receiver.antenna and station.faults:
+            own, own_rate = fault_m(station.faults, tag_s, names)
+            fault, rate = fault + own, rate + own_rate
+    return fault, rate
 
 
 def _tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:

@@ -18,7 +18,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.errors.processes import GaussMarkov, satellite_key
-from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings
+from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 from railfix.simulate.satellites import newest_record, record_state
 
 #: Radius of the Earth and height of the layer that the residual ionosphere lies in [km] (DO-229D, A.4.4.10).
@@ -226,13 +226,18 @@ class CommonErrors:
         )
 
     def fault_m(self, time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-        """Range errors of faults [m] and their rates [m/s], shapes (T, M)."""
-        names = np.asarray(satellites)
-        added, rate = np.zeros((2, len(time_s), len(names)))
-        for fault in self._settings.faults:
-            since = time_s - fault.start_s
-            on = (since >= 0.0) & (time_s < (np.inf if fault.end_s is None else fault.end_s))
-            mine = names == fault.satellite
-            added[:, mine] += np.where(on, fault.step_m + fault.ramp_mps * since, 0.0)[:, None]
-            rate[:, mine] += np.where(on, fault.ramp_mps, 0.0)[:, None]
-        return added, rate
+        """Range errors of satellites' faults [m] and their rates [m/s], shapes (T, M)."""
+        return fault_m(self._settings.faults, time_s, satellites)
+
+
+def fault_m(faults: Sequence[SatelliteFault], time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
+    """Range errors of faults [m] and their rates [m/s], shapes (T, M), at seconds after the start."""
+    names = np.asarray(satellites)
+    added, rate = np.zeros((2, len(time_s), len(names)))
+    for fault in faults:
+        since = time_s - fault.start_s
+        on = (since >= 0.0) & (time_s < (np.inf if fault.end_s is None else fault.end_s))
+        affected = names == fault.satellite
+        added[:, affected] += np.where(on, fault.step_m + fault.ramp_mps * since, 0.0)[:, None]
+        rate[:, affected] += np.where(on, fault.ramp_mps, 0.0)[:, None]
+    return added, rate

@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
-from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.simulate.sensors.settings import GroundUnit, RangingSettings
 
 if TYPE_CHECKING:
@@ -21,12 +20,7 @@ _NOISE, _POSITION, _ECHO, _LOST = 40, 41, 42, 43
 
 def unit_ecef_m(line: Alignment, unit: GroundUnit) -> Floats:
     """Position of a ground unit, shape (3,) ECEF [m]."""
-    at = np.array([unit.chainage_m])
-    place, tangent = line.at(at)[0], line.tangent_at(at)[0]
-    latitude, longitude, _ = geodetic_from_ecef(place[None])
-    up = enu_axes(latitude, longitude)[0, 2]
-    right = np.cross(tangent, up)
-    return np.asarray(place + unit.lateral_m * right / np.linalg.norm(right) + unit.height_m * up)
+    return np.asarray(line.point_beside(np.array([unit.chainage_m]), unit.lateral_m, unit.height_m)[0])
 
 
 def unit_table(simulation: Simulation, settings: RangingSettings) -> pl.DataFrame:
