@@ -142,7 +142,7 @@ def test_stanford_counts_by_hand() -> None:
         "misleading 1 (",
         "hazardous 1 (",
         "unavailable 3 (50.000 %)",
-        "Available 57.14 % of all epochs",
+        "Available: 57.14 % of all epochs",
     ):
         assert part in chart.caption
     # cells of 0.4 m: 1 m under 4 m; infinite levels in the last row, which ends at 40 m

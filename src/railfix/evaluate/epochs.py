@@ -90,8 +90,8 @@ def level_columns(table: pl.DataFrame) -> list[str]:
 def protection_columns(table: pl.DataFrame) -> list[str]:
     """Names of the columns of protection levels, then of their parts, causes and statuses."""
     levels = level_columns(table)
-    told = [f"_protection_{name}" for name in (*PARTS, *STATED)]
-    return levels + [name for name in table.columns if name.endswith(tuple(told))]
+    endings = [f"_protection_{name}" for name in (*PARTS, *STATED)]
+    return levels + [name for name in table.columns if name.endswith(tuple(endings))]
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:

@@ -1,4 +1,4 @@
-"""Runs against their references: one, or a campaign of several."""
+"""Evaluate one run, or a campaign of several, against reference trajectories."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class RunAndReference:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """How one run was evaluated.
+    """Facts on the evaluation of one run.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class EvaluatedRun:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Runs against their references.
+    """Evaluation of runs against reference trajectories.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class Evaluation:
 
 @dataclass(kw_only=True)
 class _Part:
-    """One run, read and set against its reference."""
+    """One run with its reference and the table of its epochs."""
 
     folder: RunFolder
     reference: str
@@ -177,7 +177,7 @@ def evaluate_run(
     files: TrackFiles | None = None,
     options: EvaluationOptions | None = None,
 ) -> Evaluation:
-    """Set one run against its reference; see `evaluate_runs`."""
+    """Evaluate one run against its reference trajectory; see `evaluate_runs`."""
     one = RunAndReference(run=run, reference=reference)
     return evaluate_runs([one], sections=sections, files=files, options=options)
 
@@ -189,7 +189,7 @@ def evaluate_runs(
     files: TrackFiles | None = None,
     options: EvaluationOptions | None = None,
 ) -> Evaluation:
-    """Set runs against their references.
+    """Evaluate runs against their reference trajectories.
 
     Parameters
     ----------
@@ -263,14 +263,14 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
         notes.append(f"the conventional positions are those of {item.conventional}")
         inputs.append(fingerprint("conventional", read_run(item.conventional).positions_path))
     if isinstance(item.reference, Mapping):
-        references, told = item.reference, "given"
+        references, source = item.reference, "given"
         if missing := [name for name in folder.antennas if name not in references]:
             raise MismatchError(f"{folder.path}: the references given have none of the {missing[0]} antenna; add it")
     else:
         path = item.reference or reference_beside(folder)
         if item.reference is None:
             notes.append(f"the reference was found beside the log: {path}")
-        references, told = read_reference(path, folder.antennas), str(path)
+        references, source = read_reference(path, folder.antennas), str(path)
         inputs.append(fingerprint("reference", path))
     stretches = None
     if sections is not None:
@@ -298,14 +298,14 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
         notes.append("run.json does not tell what the protection levels rest on; they are named unknown")
     if folder.level_kind is not None and "protection_status" not in folder.positions.columns:
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
-    said = [note for antenna in antennas.values() for note in antenna.errors.notes]
+    more = [note for antenna in antennas.values() for note in antenna.errors.notes]
     return _Part(
         folder=folder,
-        reference=told,
+        reference=source,
         configuration=item.configuration,
         antennas=antennas,
         inputs=inputs + entries,
-        notes=list(dict.fromkeys([*notes, *said])),
+        notes=list(dict.fromkeys([*notes, *more])),
     )
 
 
@@ -327,21 +327,21 @@ def reference_beside(run: RunFolder) -> Path:
             folder, f"holds no reference ({', '.join(BESIDE_THE_LOG)}) beside the log of {run.path}; name the file"
         )
     if len(found) > 1:
-        told = " and ".join(path.name for path in found)
-        raise InputFileError(folder, f"holds {told} beside the log of {run.path}; name the one that counts")
+        names = " and ".join(path.name for path in found)
+        raise InputFileError(folder, f"holds {names} beside the log of {run.path}; name the one to use")
     return found[0]
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | None]) -> list[str]:
-    """A name for the settings of each run: its preset, then what is not the same in all runs."""
+    """A name for the settings of each run: its preset and the settings that differ between the runs."""
     keys = dict.fromkeys(key for one in settings for key in one)
     differ = [key for key in keys if key != "preset" and len({str(one.get(key)) for one in settings}) > 1]
     if len(settings) == 1:
         differ = ["screens"]
     names = []
     for one, label in zip(settings, given, strict=True):
-        told = [f"{key}: {one[key] if one.get(key) not in (None, '') else 'none'}" for key in differ]
-        names.append(label or "; ".join([str(one.get("preset", "unknown preset")), *told]))
+        parts = [f"{key}: {one[key] if one.get(key) not in (None, '') else 'none'}" for key in differ]
+        names.append(label or "; ".join([str(one.get("preset", "unknown preset")), *parts]))
     return names
 
 

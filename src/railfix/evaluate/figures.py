@@ -19,7 +19,7 @@ from railfix.evaluate.scores import WRONG_PLACE_M
 POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 #: What names a row of every table.
 KEYS: Final = ("run", "configuration", "line", "antenna")
-#: Groupings that are told with limits of confidence.
+#: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
 #: Names while they are grouped by: many rows, few words.
 WORDS: Final = pl.Categorical()

@@ -322,15 +322,15 @@ def _pooled(rows: list[dict[str, Any]]) -> pl.DataFrame:
 def _beyond(epochs: pl.DataFrame, kind: str) -> pl.DataFrame:
     """Epochs whose error exceeds a finite level, the largest excess first."""
     level = pl.col(level_name(kind))
-    told = {name: f"{kind}_protection_{name}" for name in (*PARTS, *STATED)}
-    absent = [name for name in told.values() if name not in epochs.columns]
+    columns = {name: f"{kind}_protection_{name}" for name in (*PARTS, *STATED)}
+    absent = [name for name in columns.values() if name not in epochs.columns]
     blank = [pl.lit(None, pl.Float64 if name.endswith("_m") else pl.String).alias(name) for name in absent]
     over = epochs.with_columns(blank).filter(
         "in_reference", "reference_good", "positioned", level.is_finite() & (pl.col("error_m").abs() > level)
     )
     excess = pl.col("error_m").abs() - level
-    verdict = pl.Series("usable", _usable(_words(over, "status"), _words(over, told["status"])))
-    named = {f"{kind}_{name}": pl.col(column) for name, column in told.items()}
+    verdict = pl.Series("usable", _usable(_words(over, "status"), _words(over, columns["status"])))
+    named = {f"{kind}_{name}": pl.col(column) for name, column in columns.items()}
     listed = over.with_columns(verdict, level.alias(f"{kind}_level_m"), **named)
     return listed.sort(excess, descending=True, maintain_order=True).select(
         name.replace("KIND", kind) for name in BEYOND_COLUMNS

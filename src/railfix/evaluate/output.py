@@ -94,7 +94,7 @@ def as_record(evaluation: Evaluation) -> dict[str, Any]:
     for kind, found in evaluation.integrity.items():
         tables |= {f"stanford_{kind}": found.stanford, f"beyond_{kind}": found.beyond.head(MOST_BEYOND)}
         columns[f"stanford_{kind}"] = STANFORD_COLUMNS
-        columns[f"beyond_{kind}"] = {name.replace("KIND", kind): told for name, told in BEYOND_COLUMNS.items()}
+        columns[f"beyond_{kind}"] = {name.replace("KIND", kind): meaning for name, meaning in BEYOND_COLUMNS.items()}
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), "polars": pl.__version__},
         "command": list(sys.argv),

@@ -53,7 +53,7 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
     edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
     top, limit = float(edges[-1]), diagram.alarm_limit_m
     judged = int(diagram.histogram.sum())
-    said = ", ".join(
+    regions = ", ".join(
         f"{region.name.lower().replace('_', ' and ')} {diagram.counts[region]:,}"
         f" ({100 * diagram.counts[region] / max(judged, 1):.3f} %)"
         for region, *_ in _REGIONS
@@ -65,9 +65,9 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
     return Chart(
         name="stanford",
         title=title,
-        caption=f"{judged:,} epochs with an error: {said}. Available {100 * diagram.available_rate:.2f} % of all epochs"
-        f"{'; it stays so over ' + kept if kept else ''}. Right of the diagonal the error is larger than the level. "
-        f"What is beyond {top:g} m, infinite levels among it, stands in the last cells. The darker a cell the more "
+        caption=f"{judged:,} epochs with an error: {regions}. Available: {100 * diagram.available_rate:.2f} % of all "
+        f"epochs{'; available windows that stay so: ' + kept if kept else ''}. Right of the diagonal the error exceeds "
+        f"the level. Values above {top:g} m, infinite levels among them, are in the last cells. Darker cells have more "
         "epochs, on a logarithmic scale.",
         x_label="size of the error along the line [m]",
         y_label="protection level [m]",
@@ -179,10 +179,10 @@ def _levels(
 
 def _counted(positions: pl.DataFrame) -> str:
     """Epochs by status and cause of the level, in words."""
-    said = []
+    sentences = []
     for column, what in (("protection_status", "Epochs"), ("protection_cause", "What sets the level")):
         if column in positions.columns:
             counts = Counter(words(positions, column).tolist())
-            told_of = ", ".join(f"{word or 'none'} {count:,}" for word, count in counts.most_common())
-            said.append(f"{what}: {told_of}.")
-    return " ".join(said)
+            listed = ", ".join(f"{word or 'none'} {count:,}" for word, count in counts.most_common())
+            sentences.append(f"{what}: {listed}.")
+    return " ".join(sentences)

@@ -110,9 +110,9 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
         axes.set_ylabel(label, fontsize=8)
         axes.set_xlim(along[0], along[-1])
         axes.grid(visible=True, alpha=0.3)
-    told = track.gradient_permille
-    if np.isfinite(told).any():
-        panels["gradient"].plot(along, told, "-", color="0.5", linewidth=0.9, label="told by the map")
+    stated = track.gradient_permille
+    if np.isfinite(stated).any():
+        panels["gradient"].plot(along, stated, "-", color="0.5", linewidth=0.9, label="stated in the map")
         panels["gradient"].legend(loc="best", fontsize=7)
     for finding in quality.findings:
         if finding.kind in _PANELS:
