@@ -32,6 +32,9 @@ _WEIGHED_BY_FILTER: Final = (
 )
 #: Slower than this, with two sigmas, the train stands [m/s]: 1 km/h, where tachometers give out too.
 STANDSTILL_MPS: Final = 1.0 / 3.6
+#: Places beyond an end of the line by so many sigmas, or so far [m], are on its end.
+_END_SIGMAS: Final = 4.0
+_END_M: Final = 30.0
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
 
@@ -108,8 +111,7 @@ def along_track(
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
     sensors, kept = sensor_epochs(samples, epochs.time, trajectory, state.sensors, limits=config.sensors)
     tracked, after = track(epochs, Line.of(trajectory), state.track, limits=config.tracking, sensors=sensors)
-    arc = tracked.arc_m
-    inside = np.where((arc >= 0.0) & (arc <= trajectory.arc_m[-1]), arc, np.nan)
+    inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
     speed, sigma = np.nan_to_num(tracked.speed_mps), np.nan_to_num(tracked.speed_sigma_mps, nan=np.inf)
@@ -126,6 +128,17 @@ def along_track(
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
     )
     return result, FilterState(slips=slips, track=after, sensors=kept)
+
+
+def on_line_m(tracked: Tracked, trajectory: Trajectory) -> Floats:
+    """Return arc lengths on the trajectory, shape (T,) [m].
+
+    Beyond an end by no more than errors allow (four sigmas, or those of codes at a start) a place is that end; NaN
+    further out.
+    """
+    arc, end = tracked.arc_m, trajectory.arc_m[-1]
+    near = np.clip(arc, 0.0, end)
+    return np.where(np.abs(arc - near) <= np.maximum(_END_SIGMAS * tracked.sigma_m, _END_M), near, np.nan)
 
 
 def gnss_epochs(

@@ -86,7 +86,7 @@ def levelled(
     kept = [
         k
         for k, name in enumerate(bank.without)
-        if (name in names or len(name) != 3) and bank.weak_s[k] < limits.lost_motion_s
+        if (name in names or name in CLOCKS or name in SENSORS.values()) and bank.weak_s[k] < limits.lost_motion_s
     ]
     added = [name for name in names if name not in {bank.without[k] for k in kept}]
     copies = [name in new and len(bank.without) > 0 for name in added]
@@ -152,7 +152,7 @@ def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
     """Rows of a source."""
     if name in SENSORS.values():
         return np.asarray(rows.kind == next(kind for kind, text in SENSORS.items() if text == name))
-    if len(name) == 1:
+    if name in CLOCKS:
         return np.array([_clock(str(other)) == name for other in satellite], dtype=np.bool_)
     return np.asarray(satellite == name)
 

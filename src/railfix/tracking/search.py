@@ -44,7 +44,7 @@ def with_satellites(
         state,
         mean=mean,
         covariance=covariance,
-        satellite=np.array([*state.satellite[kept].tolist(), *new], dtype="<U3"),
+        satellite=np.array([*state.satellite[kept].tolist(), *new]),
         seen=np.concatenate([seen[kept], np.full(len(new), now, dtype="datetime64[ns]")]),
         bank=bank,
     )

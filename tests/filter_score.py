@@ -1,0 +1,284 @@
+"""Scores of the filter along the track on the real recordings: ``python tests/filter_score.py [TABLE ...]``.
+
+Tables: ``figures`` (with single epochs beside), ``ablation`` (without each kind of measurement), ``gaps`` (windows
+without satellites, with and without a wheel), ``starts`` (cold starts), ``levels`` (faults of single satellites),
+``cost``. One setting for all recordings; distances are straight ones on the map.
+"""
+
+from __future__ import annotations
+
+import sys
+import time as clock
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+import recordings_score
+import recordings_truth
+from railfix.core.constants import CLOCK_GROUP
+from railfix.core.timescale import seconds
+from railfix.evaluate import interpolate_reference, straight_distance
+from railfix.pipeline import along_track
+from railfix.pipeline.config import parse_config
+from railfix.ranges.weights import code_sigma_m
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
+
+CONFIG = parse_config({"filter": "track", "elevation": {"mask_deg": 15.0}})
+#: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
+SMARTLOC_SCALE = float(np.sqrt(8.0))
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording as measurements of the filter."""
+
+    name: str
+    epochs: GnssEpochs
+    trajectory: Trajectory
+    reference: np.ndarray
+    observed: np.ndarray
+    single_arc_m: np.ndarray
+    wheel: SensorEpochs | None = None
+
+    def run(self, epochs: GnssEpochs | None = None, **changes: object) -> Tracked:
+        sensors = changes.pop("sensors", None)
+        assert sensors is None or isinstance(sensors, SensorEpochs)
+        limits = TrackingLimits.model_validate(changes)
+        return track(epochs or self.epochs, Line.of(self.trajectory), limits=limits, sensors=sensors)[0]
+
+    def error(self, found: Tracked) -> np.ndarray:
+        arc = along_track.on_line_m(found, self.trajectory)
+        return straight_distance(arc, self.reference, self.trajectory)
+
+
+def rinex_case(name: str, run: Callable[..., recordings_score.Outcome], data: Path) -> Case:
+    kept: list[GnssEpochs] = []
+    make = along_track.gnss_epochs
+
+    def keeping(*args: object, **words: object) -> object:
+        made = make(*args, **words)  # type: ignore[arg-type]
+        kept.append(made[0])
+        return made
+
+    with mock.patch.object(along_track, "gnss_epochs", keeping):
+        outcome = run(data, CONFIG)
+    assert outcome.result is not None
+    reading = {"m8t": "urbannav", "f9p": "urbannav", "pixel": "gsdc", "japan": "japan"}[name]
+    reference = interpolate_reference(outcome.result.time, *recordings_truth.TRUTHS[reading](data))
+    observed = np.isfinite(reference[:, 0]) & np.any((outcome.result.reason & 1) == 0, axis=1)
+    return Case(name, kept[0], outcome.trajectory, reference, observed, outcome.result.arc_m)
+
+
+def smartloc_case(data: Path) -> Case:
+    """Codes and odometry alone: the recording has neither Dopplers nor phases."""
+    folder = data / "kinematic" / "smartloc_berlin"
+    log = recordings_score.smartloc_ranges(folder)
+    truth = recordings_truth.smartloc_truth(folder)
+    trajectory = recordings_score.trajectory_of(*truth)
+    single = recordings_score.smartloc(data, CONFIG)
+    sigma = SMARTLOC_SCALE * code_sigma_m(log.cn0_dbhz, log.elevation_deg, noise=CONFIG.noise)
+    nothing = np.full(log.code_m.shape, np.nan)
+    epochs = GnssEpochs(
+        time=log.time,
+        satellite=log.satellite,
+        clock=np.array([CLOCK_GROUP[str(s)[0]] for s in log.satellite]),
+        sat_ecef_m=log.sat_ecef_m,
+        sat_velocity_mps=np.zeros_like(log.sat_ecef_m),
+        code_m=np.where(log.elevation_deg >= 15.0, log.code_m, np.nan),
+        code_sigma_m=sigma,
+        phase_m=nothing,
+        phase_joined=np.zeros(nothing.shape, dtype=bool),
+        rate_mps=nothing,
+        cn0_dbhz=log.cn0_dbhz,
+    )
+    lines = (folder / "Berlin_Potsdamer_Platz_Input.txt").read_text(encoding="ascii").splitlines()
+    odometry = np.array([[float(x) for x in line.split()[1:3]] for line in lines if line.startswith("odom3")])
+    t = seconds(log.time - recordings_truth.SMARTLOC_START)
+    way = np.concatenate([[0.0], np.cumsum(np.diff(odometry[:, 0]) * 0.5 * (odometry[1:, 1] + odometry[:-1, 1]))])
+    step = np.diff(np.interp(t, odometry[:, 0], way), prepend=np.nan)
+    wheel = SensorEpochs(wheel_m=step, wheel_sigma_m=np.full(len(t), 0.03))
+    reference = interpolate_reference(log.time, *truth)
+    observed = np.isfinite(reference[:, 0]) & np.isfinite(log.code_m).any(axis=1)
+    arc = np.full(len(t), np.nan)
+    case = Case("smartloc", epochs, trajectory, reference, observed, arc, wheel)
+    print(f"smartloc single epochs: p50 {single.constrained.p50_m:.2f}, p95 {single.constrained.p95_m:.2f} m")
+    return case
+
+
+def cases(data: Path) -> Iterator[Case]:
+    for name, run in (
+        ("m8t", recordings_score.urbannav_m8t),
+        ("f9p", recordings_score.urbannav_f9p),
+        ("pixel", recordings_score.gsdc),
+        ("japan", recordings_score.japan),
+    ):
+        yield rinex_case(name, run, data)
+
+
+def figures_of(error: np.ndarray, sigma: np.ndarray | None = None) -> str:
+    known = np.isfinite(error)
+    text = (
+        f"rate {100 * known.mean():6.2f} %  p50 {np.nanmedian(error):5.2f}  p95 {np.nanpercentile(error, 95):6.2f}  "
+        f"max {np.nanmax(error):6.1f}  over 50 m {np.count_nonzero(error > 50.0)}"
+    )
+    return text if sigma is None else text + f"  error/sigma p95 {np.nanpercentile(error / sigma, 95):4.1f}"
+
+
+def show_figures(all_cases: list[Case]) -> None:
+    for case in all_cases:
+        if np.isfinite(case.single_arc_m).any():
+            print(
+                f"{case.name:9s} single epochs  {figures_of(straight_distance(case.single_arc_m, case.reference, case.trajectory)[case.observed])}"
+            )
+        for label, sensors in (("filter", None), ("with wheel", case.wheel)):
+            if label == "filter" or sensors is not None:
+                found = case.run(sensors=sensors)
+                error = case.error(found)[case.observed]
+                print(f"{case.name:9s} {label:13s}  {figures_of(error, found.sigma_m[case.observed])}")
+
+
+def show_ablation(all_cases: list[Case]) -> None:
+    for case in all_cases:
+        nothing = np.full(case.epochs.code_m.shape, np.nan)
+        variants = {
+            "all": case.epochs,
+            "without phases": replace(case.epochs, phase_m=nothing),
+            "without Dopplers": replace(case.epochs, rate_mps=nothing),
+            "codes alone": replace(case.epochs, phase_m=nothing, rate_mps=nothing),
+        }
+        for label, epochs in variants.items():
+            found = case.run(epochs)
+            error = case.error(found)[case.observed]
+            print(f"{case.name:9s} {label:17s}  {figures_of(error, found.sigma_m[case.observed])}")
+        found = case.run(degrees_of_freedom=1e6)
+        error = case.error(found)[case.observed]
+        print(f"{case.name:9s} {'not robust':17s}  {figures_of(error, found.sigma_m[case.observed])}")
+
+
+def show_gaps(all_cases: list[Case]) -> None:
+    """Windows without any satellite every 100 s; a wheel 1 % too large from the reference."""
+    for case in all_cases:
+        t = seconds(case.epochs.time - case.epochs.time[0])
+        step = np.linalg.norm(np.diff(case.reference, axis=0, prepend=np.nan), axis=1)
+        way = np.where(np.diff(t, prepend=np.nan) < 5.0, 0.99 * step, np.nan)
+        wheel = SensorEpochs(wheel_m=way, wheel_sigma_m=np.full(len(t), 0.05), wheel_sign="unknown")
+        for length in (30.0, 60.0):
+            for label, sensors in (("no sensor", None), ("wheel", wheel)):
+                leaving, ratio = [], []
+                for begin in np.arange(100.0, t[-1] - length - 30.0, 100.0):
+                    gap = (t >= begin) & (t < begin + length)
+                    blank = {
+                        name: np.where(gap[:, None], np.nan, getattr(case.epochs, name))
+                        for name in ("code_m", "phase_m", "rate_mps")
+                    }
+                    found = case.run(replace(case.epochs, **blank), sensors=sensors)
+                    last = int(np.flatnonzero(gap)[-1]) if gap.any() else 0
+                    error = case.error(found)[last]
+                    leaving.append(error)
+                    ratio.append(error / found.sigma_m[last])
+                if leaving:
+                    known = np.isfinite(leaving)
+                    print(
+                        f"{case.name:9s} {length:3.0f} s {label:10s} windows {len(leaving)}, "
+                        f"with a place {known.sum()}: "
+                        f"p50 {np.nanmedian(leaving):5.1f}  p95 {np.nanpercentile(leaving, 95):5.1f} m  "
+                        f"error/sigma p95 {np.nanpercentile(ratio, 95):4.1f}"
+                    )
+
+
+def show_starts(all_cases: list[Case]) -> None:
+    """Cold starts every 40 s: wrong places (over 50 m) after some time, and the probability given to them."""
+    for case in all_cases:
+        t = seconds(case.epochs.time - case.epochs.time[0])
+        wrong: dict[int, list[bool]] = {0: [], 10: [], 60: []}
+        sure: list[bool] = []
+        for begin in np.arange(0.0, t[-1] - 60.0, 40.0):
+            first = int(np.searchsorted(t, begin))
+            per_epoch = (
+                "time", "sat_ecef_m", "sat_velocity_mps", "code_m", "code_sigma_m", "phase_m", "phase_joined",
+                "rate_mps", "cn0_dbhz",
+            )  # fmt: skip
+            end = int(np.searchsorted(t, begin + 61.0))
+            part = replace(case.epochs, **{name: getattr(case.epochs, name)[first:end] for name in per_epoch})
+            found = case.run(part)
+            arc = along_track.on_line_m(found, case.trajectory)
+            error = straight_distance(arc, case.reference[first:end], case.trajectory)
+            for after in wrong:
+                at = int(np.searchsorted(t[first:end], begin + after))
+                if at < len(error) and np.isfinite(error[at]):
+                    wrong[after].append(bool(error[at] > 50.0))
+                    if found.probability[at] > 0.99:
+                        sure.append(bool(error[at] > 50.0))
+        counts = ", ".join(f"{after} s {sum(w)} of {len(w)}" for after, w in wrong.items())
+        print(f"{case.name:9s} wrong after {counts}; with probability over 0.99: {sum(sure)} of {len(sure)}")
+
+
+def show_levels(all_cases: list[Case]) -> None:
+    """Faults of one satellite from the middle on: errors over the level; without a fault first."""
+    for case in all_cases:
+        found = case.run(level="on")
+        ok = case.observed & np.isfinite(found.level_m)
+        error = case.error(found)
+        print(
+            f"{case.name:9s} no fault: level p50 {np.median(found.level_m[ok]):.1f}, p95 "
+            f"{np.percentile(found.level_m[ok], 95):.1f} m; over it {np.count_nonzero(error[ok] > found.level_m[ok])} "
+            f"of {ok.sum()}"
+        )
+        t = seconds(case.epochs.time - case.epochs.time[0])
+        used = np.isfinite(case.epochs.code_m)
+        often = np.argsort(-used[len(t) // 3 :].sum(axis=0), kind="stable")[:2]
+        beyond = trials = 0
+        for satellite in often.tolist():
+            begin = t[len(t) // 3]
+            since = np.maximum(t - begin, 0.0)
+            faults = {f"ramp {rate}": rate * since for rate in (0.1, 1.0)}
+            faults["step 50"] = np.where(t >= begin, 50.0, 0.0)
+            for bias in faults.values():
+                code = case.epochs.code_m.copy()
+                code[:, satellite] += np.minimum(bias, 300.0)
+                broken = case.run(replace(case.epochs, code_m=code), level="on")
+                good = case.observed & np.isfinite(broken.level_m)
+                beyond += int(np.count_nonzero(case.error(broken)[good] > broken.level_m[good]))
+                trials += 1
+        print(f"{case.name:9s} ramps of 0.1 and 1 m/s, steps of 50 m: {trials} trials, errors over the level {beyond}")
+
+
+def show_cost(all_cases: list[Case]) -> None:
+    for case in all_cases:
+        for label in ("off", "on"):
+            began = clock.process_time()
+            found = case.run(level=label)
+            spent = clock.process_time() - began
+            counts = {s.text: int((found.status == s).sum()) for s in TrackStatus if (found.status == s).any()}
+            print(f"{case.name:9s} level {label:3s} {1e3 * spent / len(found):5.2f} ms an epoch  {counts}")
+
+
+TABLES = {
+    "figures": show_figures,
+    "ablation": show_ablation,
+    "gaps": show_gaps,
+    "starts": show_starts,
+    "levels": show_levels,
+    "cost": show_cost,
+}
+
+
+def main() -> int:
+    data = Path(__file__).resolve().parents[2] / "shared" / "data"
+    if not data.is_dir():
+        print(f"the real recordings are not at {data}", file=sys.stderr)
+        return 1
+    asked = sys.argv[1:] or list(TABLES)
+    listed = list(cases(data))
+    for name in asked:
+        print(f"\n{name}")
+        TABLES[name]([*listed, smartloc_case(data)] if name == "figures" else listed)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
