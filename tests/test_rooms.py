@@ -23,6 +23,7 @@ FLOORS: Final[tuple[tuple[str, ...], ...]] = (
     ("pipeline",),
     ("run",),
     ("simulate", "reference"),
+    ("ground",),
     ("evaluate",),
     ("report",),
     ("cli",),

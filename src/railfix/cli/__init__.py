@@ -30,6 +30,7 @@ class _Program(LazyCommands):
         "plot-screens": "Plot each screen's metric against its limit.",
         "simulate": "Simulate runs with ground truth.",
         "report": "Write an HTML report on runs.",
+        "ground": "Monitor satellites by a reference triangle, demonstrate the ground side.",
         "map": "Check a track map, or make one from positions.",
     }
 

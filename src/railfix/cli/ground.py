@@ -1,0 +1,111 @@
+"""``railfix ground``: the ground side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from railfix.cli.command import Command, Commands
+from railfix.cli.console import console_of_tables, show_files
+from railfix.cli.options import OverwriteOption
+from railfix.core.errors import MismatchError, OutputError, SettingsError
+from railfix.run.output import check_output_file
+
+app = typer.Typer(
+    cls=Commands,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    name="ground",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Monitor satellites by a reference triangle, demonstrate the ground side.",
+)
+
+
+@app.callback()
+def ground() -> None:
+    """Monitor satellites by a reference triangle, demonstrate the ground side."""
+
+
+@app.command("monitor", cls=Command)
+def monitor(
+    logs: Annotated[
+        list[Path], typer.Argument(metavar="OBS OBS OBS", help="RINEX observation files of the three receivers.")
+    ],
+    *,
+    nav: Annotated[
+        list[Path], typer.Option("--nav", metavar="FILE", help="RINEX navigation file; repeat it for several.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for monitor.csv and triangle.png.")],
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LAT,LON,HEIGHT",
+            help="Known point of a receiver, in the order of the logs; from the headers of the logs without it.",
+        ),
+    ] = None,
+    radius: Annotated[float, typer.Option(metavar="M", help="Radius of the circle of allowable error.")] = 12.0,
+    side: Annotated[float, typer.Option(metavar="M", help="Largest deviation of the vector between two fixes.")] = 6.0,
+    late: Annotated[float, typer.Option(metavar="S", help="Time after which three fixes are late.")] = 3.0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Judge satellite positioning by three receivers at known points.
+
+    Single-point fixes from the same satellites are compared with the points by circles, and the vectors between the
+    fixes with those between the points. The first cause that stops the trains is latched and printed.
+
+    Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
+
+    Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
+    """
+    from railfix.ground.monitor import MonitorLimits
+    from railfix.ground.monitor_log import draw_triangle, monitor_log
+    from railfix.ground.station_fixes import station_fixes
+    from railfix.ground.triangle import TriangleLimits, Verdict
+    from railfix.io import read_navigation, read_observations
+
+    if len(logs) != 3:
+        raise SettingsError(f"{len(logs)} logs were given; a triangle has three receivers")
+    try:
+        limits, times = TriangleLimits(radius_m=radius, side_m=side), MonitorLimits(late_s=late)
+    except ValueError as error:
+        raise SettingsError(f"--radius, --side, --late: {str(error).splitlines()[-2].strip()}") from None
+    files = [out / "monitor.csv", out / "triangle.png"]
+    for path in files:
+        if path.parent.exists():
+            check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=[*logs, *nav])
+    observations = [read_observations(path) for path in logs]
+    if point:
+        from railfix.cli.cn0_curve import place_of
+
+        if len(point) != 3:
+            raise SettingsError(f"--point was given {len(point)} times; give it once for each receiver")
+        points = np.stack([place_of(text, "--point") for text in point])
+    else:
+        points = np.stack([log.header.approximate_ecef_m for log in observations])
+        for path, known in zip(logs, points, strict=True):
+            if not np.isfinite(known).all():
+                raise MismatchError(f"{path}: the header has no position; give the known points with --point")
+    fixes = station_fixes(observations, points, read_navigation(nav))
+    result = monitor_log(fixes, limits=limits, times=times)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        result.table().write_csv(files[0])
+        draw_triangle(files[1], result, limits=limits)
+    except OSError as error:
+        raise OutputError(f"{out}: cannot be written ({error.strerror})") from None
+    console = console_of_tables()
+    table = Table("verdict", "epochs")
+    for value, count in zip(*np.unique(result.triangle.verdict, return_counts=True), strict=True):
+        table.add_row(Verdict(int(value)).name.lower(), str(count))
+    console.print(table)
+    for time, order, cause, receiver in result.orders:
+        named = "" if receiver < 0 else f", receiver {receiver}"
+        console.print(f"{np.datetime_as_string(time, unit='s')} {order.value}: {cause.name.lower()}{named}")
+    if not result.orders:
+        console.print("no stop")
+    show_files(console, files)

@@ -1,0 +1,163 @@
+"""Fixes of three reference receivers from the same satellites, from their logs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, freeze_arrays
+from railfix.core.errors import MismatchError
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.gnss.orbits import satellite_states
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.config import Config
+from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
+from railfix.pipeline.received import known_from_start
+from railfix.positioning.normal_equations import Ranges, clock_groups
+from railfix.positioning.single_point import single_point
+from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
+from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m
+
+#: Median C/N0 over the satellites that is this far below that of the log counts as fallen [dB-Hz].
+FALLEN_DBHZ = 6.0
+#: Tags of different receivers that round to the same multiple of this are one epoch.
+SAME_EPOCH = np.timedelta64(100, "ms")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationFixes:
+    """Single-point positions of N receivers at T epochs, each epoch from the satellites common to all.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+        Epochs that at least one log has, rounded to 0.1 s.
+    points_m : ndarray, shape (N, 2) [m]
+        Known points, east and north of the first.
+    fixes_m : ndarray, shape (T, N, 2) [m]
+        NaN where a log has no epoch, or the common satellites are too few.
+    n_satellites : ndarray of int, shape (T,)
+    cn0_fallen : ndarray of bool, shape (T, N)
+    """
+
+    time: Datetimes
+    points_m: Floats
+    fixes_m: Floats
+    n_satellites: Integers
+    cn0_fallen: Masks
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+def station_fixes(
+    logs: list[Observations], points_ecef_m: Floats, navigation: Navigation, *, config: Config | None = None
+) -> StationFixes:
+    """Compute the fixes of the receivers of a triangle.
+
+    Parameters
+    ----------
+    logs : list of Observations, length N
+    points_ecef_m : ndarray, shape (N, 3) [m]
+        Known points of the antennas.
+    navigation : Navigation
+    config : Config, optional
+        Constellations, signals, mask, noise and atmosphere as in a run.
+
+    Raises
+    ------
+    MismatchError
+        The logs have no tag, or no channel, in common.
+    """
+    config = config or Config()
+    book = ChannelBook(config)
+    channels = [book.of(log, navigation) for log in logs]
+    names = [list(zip(c.satellite.tolist(), c.signal.tolist(), strict=True)) for c in channels]
+    common = [name for name in names[0] if all(name in other for other in names[1:])]
+    common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
+    if not common:
+        raise MismatchError("the logs have no satellite on the same signal in common; the same signals are needed")
+    epochs = [_rounded(log.time) for log in logs]
+    if not len(reduce(np.intersect1d, epochs)):
+        raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
+    time = reduce(np.union1d, epochs)
+    tags = np.repeat(time[None], len(logs), axis=0)
+    satellite, signal = (np.array(column) for column in zip(*common, strict=True))
+    shape = (len(logs), len(time), len(common))
+    code, cn0 = np.full((2, *shape), np.nan)
+    for k, (log, chosen, known) in enumerate(zip(logs, channels, names, strict=True)):
+        columns = chosen.columns[[known.index(name) for name in common]]
+        rows = np.searchsorted(time, epochs[k])
+        tags[k, rows] = log.time
+        code[k, rows], cn0[k, rows] = log.code_m[:, columns], log.cn0_dbhz[:, columns]
+    frequency = channels[0].frequency_hz[[names[0].index(name) for name in common]]
+    klobuchar = known_from_start(config, navigation=navigation).klobuchar
+    corrected, sigma, usable, position = np.empty(shape), np.empty(shape), np.empty(shape, bool), np.empty((*shape, 3))
+    for k, point in enumerate(points_ecef_m):
+        states = satellite_states(tags[k], satellite, signal, code[k], navigation, max_age_s=config.max_ephemeris_age_s)
+        seen = SeenFrom.of(np.broadcast_to(point, (len(time), 3)), states.position_ecef_m)
+        delays = modelled_delays(tags[k], seen, frequency, klobuchar=klobuchar, troposphere=config.troposphere)
+        clean = code[k] + states.clock_m - states.group_delay_m - delays.ionosphere_m - delays.troposphere_m
+        corrected[k], sigma[k] = clean, code_sigma_m(cn0[k], seen.elevation_deg, noise=config.noise)
+        plausible = (code[k] > PLAUSIBLE_CODE_M[0]) & (code[k] < PLAUSIBLE_CODE_M[1])
+        bad = states.no_record | states.too_old | states.unhealthy | (seen.elevation_deg < config.elevation.mask_deg)
+        usable[k], position[k] = plausible & ~bad & np.isfinite(clean) & np.isfinite(sigma[k]), states.position_ecef_m
+    there = np.stack([np.isin(time, epoch) for epoch in epochs])
+    # a receiver without an epoch takes no satellite away from the others: their own fixes still count
+    shared = (usable | ~there[:, :, None]).all(axis=0)
+    groups = clock_groups([name[0] for name in satellite.tolist()])
+    ranges = [
+        _ranges(position[k], corrected[k], sigma[k], usable[k] & shared, groups) for k in range(len(points_ecef_m))
+    ]
+    return fixes_of_ranges(time, ranges, points_ecef_m, cn0_fallen=_fallen(cn0))
+
+
+def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
+    """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    ranges : list of Ranges, length N
+    points_ecef_m : ndarray, shape (N, 3) [m]
+    cn0_fallen : ndarray of bool, shape (T, N)
+    """
+    latitude, longitude, _ = geodetic_from_ecef(points_ecef_m[0])
+    plane = enu_axes(latitude, longitude)[:2]
+    fixes = [
+        single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m
+        for item, point in zip(ranges, points_ecef_m, strict=True)
+    ]
+    return StationFixes(
+        time=time,
+        points_m=(points_ecef_m - points_ecef_m[0]) @ plane.T,
+        fixes_m=(np.stack(fixes, axis=1) - points_ecef_m[0]) @ plane.T,
+        n_satellites=np.stack([item.n_used for item in ranges]).max(axis=0),
+        cn0_fallen=cn0_fallen,
+    )
+
+
+def _rounded(time: Datetimes) -> Datetimes:
+    """Return tags rounded to `SAME_EPOCH`, shape (T,)."""
+    step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
+    return ((time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step).astype("datetime64[ns]")
+
+
+def _ranges(position: Floats, code: Floats, sigma: Floats, used: Masks, groups: tuple[slice, ...]) -> Ranges:
+    return Ranges(
+        sat_ecef_m=np.where(used[..., None], position, SOMEWHERE_ABOVE_M),
+        code_m=np.where(used, code, 0.0),
+        weight=np.where(used, 1.0 / sigma**2, 0.0),
+        groups=groups,
+    )
+
+
+def _fallen(cn0: Floats) -> Masks:
+    """Return where the median C/N0 of a receiver is far below its median over the log, shape (T, N)."""
+    level = np.where(np.isfinite(cn0), cn0, 0.0).sum(axis=2) / np.maximum(np.isfinite(cn0).sum(axis=2), 1)
+    usual = np.median(level, axis=1, keepdims=True)
+    return np.asarray((level < usual - FALLEN_DBHZ).T)

@@ -1,0 +1,275 @@
+"""Reference triangle: truth table, causes and times of faults put in, false stops against the rate that was set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from ground_triangle import PLAN_M, simulated_fixes
+from railfix.cli.ground import app
+from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, release
+from railfix.ground.monitor_log import monitor_log
+from railfix.ground.station_fixes import station_fixes
+from railfix.ground.triangle import (
+    SIDES,
+    STOPPING,
+    TriangleLimits,
+    Verdict,
+    _verdicts,
+    compare_triangle,
+    limits_for_false_stops,
+)
+from railfix.io import read_navigation, read_observations, write_observations
+from railfix.simulate import write_run
+from railfix.simulate.scenario import ReferenceStation
+from railfix.simulate.scenario_file import load_recipe
+
+pytestmark = pytest.mark.requirement("F1")
+
+LIMITS = TriangleLimits(radius_m=12.0, side_m=6.0)
+TIMES = MonitorLimits()
+
+
+def table_verdict(inside: tuple[bool, ...], small: tuple[bool, ...], coincide: bool) -> tuple[Verdict, int]:
+    """The table of docs/ground.md, written a second time by counting; sides are 01, 12, 20."""
+    outside, large = inside.count(False), small.count(False)
+    between = {frozenset({0, 2}): 0, frozenset({0, 1}): 1, frozenset({1, 2}): 2}
+    shared = between.get(frozenset(k for k in range(3) if not small[k]), -1) if large == 2 else -1
+    if outside == 0 and large == 0:
+        return Verdict.HEALTHY, -1
+    if outside == 0 and large in (1, 2):
+        return Verdict.RECEIVER_DRIFTING, shared
+    if outside == 1 and shared >= 0 and not inside[shared]:
+        return Verdict.ONE_RECEIVER, shared
+    if outside == 3 and large == 0:
+        return Verdict.SATELLITES_OR_JAMMING, -1
+    if outside >= 2 and coincide:
+        return Verdict.SPOOFING, -1
+    return Verdict.GROUND_LOST, -1
+
+
+def test_truth_table_of_all_combinations() -> None:
+    for *bits, coincide in product((True, False), repeat=7):
+        inside, small = tuple(bits[:3]), tuple(bits[3:])
+        verdict, receiver = _verdicts(
+            np.array([True]), np.array([inside]), np.array([small]), np.array([coincide]), np.array([False])
+        )
+        assert (Verdict(int(verdict[0])), int(receiver[0])) == table_verdict(inside, small, coincide)
+
+
+OUT, FAR = np.array([20.0, 0.0]), np.array([300.0, 40.0])
+
+
+@pytest.mark.parametrize(
+    ("moved", "verdict", "receiver"),
+    [
+        (np.zeros((3, 2)), Verdict.HEALTHY, -1),
+        (np.array([[0, 0], [8.0, 0], [0, 0]]), Verdict.RECEIVER_DRIFTING, 1),
+        (np.array([[0, 0], [0, 0], OUT]), Verdict.ONE_RECEIVER, 2),
+        (np.array([OUT, OUT, OUT]), Verdict.SATELLITES_OR_JAMMING, -1),
+        (FAR - PLAN_M, Verdict.SPOOFING, -1),
+        (PLAN_M[0] - PLAN_M, Verdict.SPOOFING, -1),
+        (np.array([OUT, OUT, [9.0, 0]]), Verdict.GROUND_LOST, -1),
+        (np.array([OUT, -OUT, [0, 0]]), Verdict.GROUND_LOST, -1),
+        (np.array([[12.5, 0], [8.0, 0], [8.0, 0]]), Verdict.GROUND_LOST, -1),
+        (np.array([[0, 0], [np.nan, 0], [0, 0]]), Verdict.MONITOR_LOST, -1),
+    ],
+)
+def test_moved_fixes(moved: np.ndarray, verdict: Verdict, receiver: int) -> None:
+    result = compare_triangle(PLAN_M, (PLAN_M + moved)[None], limits=LIMITS)
+    assert (Verdict(int(result.verdict[0])), int(result.receiver[0])) == (verdict, receiver)
+
+
+def test_distance_and_bearing_of_a_turned_triangle() -> None:
+    """A triangle turned clockwise by 2 deg about its first point: no length changes, every bearing does by 2 deg."""
+    turn = np.radians(-2.0)
+    turned = PLAN_M @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    result = compare_triangle(PLAN_M, turned[None], limits=LIMITS)
+    assert result.distance_error_m[0] == pytest.approx(np.zeros(3), abs=1e-9)
+    assert result.bearing_error_deg[0] == pytest.approx(np.full(3, 2.0), abs=1e-9)
+    lengths = [np.hypot(*(PLAN_M[b] - PLAN_M[a])) for a, b in SIDES]
+    assert result.side_error_m[0] == pytest.approx(2.0 * np.sin(np.radians(1.0)) * np.array(lengths))
+
+
+@given(
+    st.lists(st.floats(-1e7, 1e7) | st.just(float("nan")) | st.just(float("inf")), min_size=6, max_size=6),
+    st.integers(0, 5),
+)
+def test_nan_never_reads_as_inside(values: list[float], absent: int) -> None:
+    fixes = np.array(values).reshape(1, 3, 2)
+    fixes[0, absent // 2, absent % 2] = np.nan
+    with np.errstate(invalid="ignore"):
+        result = compare_triangle(PLAN_M, fixes, limits=LIMITS)
+    assert result.verdict[0] == Verdict.MONITOR_LOST
+
+
+def test_a_triangle_too_small_for_its_limits_is_rejected() -> None:
+    with pytest.raises(ValueError, match="shortest side"):
+        compare_triangle(PLAN_M / 40.0, PLAN_M[None], limits=LIMITS)
+
+
+@pytest.mark.parametrize("per_sample", [1e-2, 1e-3, 1e-4])
+def test_false_stops_stay_below_the_rate_that_was_set(per_sample: float) -> None:
+    """A million independent samples; Rayleigh tails of three circles make up half of the rate."""
+    stops_per_year = per_sample * 31_557_600.0 / 100.0
+    limits = limits_for_false_stops(3.0, 1.0, stops_per_year=stops_per_year)
+    rng, samples = np.random.default_rng(7), 1_000_000
+    common = rng.normal(0.0, np.sqrt(3.0**2 - 1.0**2), (samples, 1, 2))
+    own = rng.normal(0.0, 1.0, (samples, 3, 2))
+    result = compare_triangle(PLAN_M, PLAN_M + common + own, limits=limits)
+    stops = int(np.isin(result.verdict, list(STOPPING)).sum())
+    allowed = per_sample * samples
+    assert stops <= allowed
+    # one circle alone: the closed form
+    outside = int((result.error_m[:, 0] > limits.radius_m).sum())
+    expected = allowed / 6.0
+    assert abs(outside - expected) < 4.0 * np.sqrt(expected)
+    assert stops >= outside
+
+
+FAULTS = ("satellite ramp", "satellite clock step", "one receiver", "drift inside", "jamming", "spoofing")
+CAUSES = {
+    "satellite ramp": Verdict.SATELLITES_OR_JAMMING,
+    "satellite clock step": Verdict.SATELLITES_OR_JAMMING,
+    "one receiver": Verdict.ONE_RECEIVER,
+    "jamming": Verdict.JAMMING,
+    "spoofing": Verdict.SPOOFING,
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
+    """200 seeds; the fault begins at 20 s; the alert comes within 6 s of an error beyond the radius."""
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        common, moved = np.zeros((60, 9)), np.zeros((60, 3, 2))
+        since = np.clip(np.arange(60.0) - 19.0, 0.0, None)
+        satellite = int(rng.choice([1, 3, 4, 5, 6, 7]))  # errors of the lowest and of those abeam move a fix most
+        if fault == "satellite ramp":
+            common[:, satellite] = 6.0 * since
+        elif fault == "satellite clock step":
+            common[:, satellite] = np.where(since > 0, 150.0, 0.0)
+        elif fault == "one receiver":
+            moved[:, 1, 0] = np.where(since > 0, 30.0, 0.0)
+        elif fault == "drift inside":
+            moved[:, 2, 1] = np.minimum(0.5 * since, 9.5)
+        elif fault == "jamming":
+            moved[since > 0] = np.nan
+        else:
+            moved[since > 0] = FAR - PLAN_M
+        fixes = simulated_fixes(rng, common_m=common, moved_m=moved)
+        log = monitor_log(fixes, limits=LIMITS)
+        verdicts = log.triangle.verdict
+        assert (verdicts[:20] == Verdict.HEALTHY).all()
+        if fault == "drift inside":
+            # the circles alone, P3's method, see nothing; the sides of the raw fixes do
+            assert (log.triangle.error_m[:, 2][since >= 17] < LIMITS.radius_m).all()
+            assert log.orders == ()
+            named = log.triangle.receiver[since >= 19]
+            assert (named == 2).mean() > 0.9
+            continue
+        kinds = [order for _, order, _, _ in log.orders]
+        assert kinds == [Order.SUSPEND, Order.STOP]
+        stopped = (log.orders[0][0] - fixes.time[0]) / np.timedelta64(1, "s")
+        worst = np.nan_to_num(log.triangle.error_m).max(axis=1)
+        begun = 20.0 if fault == "jamming" else float(np.argmax(worst > LIMITS.radius_m))
+        assert begun <= stopped <= begun + 6.0
+        state = MonitorState(stopped=False)
+        for k, value in enumerate(verdicts.tolist()):
+            state, _ = advance(state, float(k), Verdict(value), receiver=int(log.triangle.receiver[k]), limits=TIMES)
+        assert state.cause is CAUSES[fault], seed
+        if fault == "one receiver":
+            assert state.receiver == 1
+
+
+def test_a_stop_is_latched_and_released_by_hand_after_healthy_time() -> None:
+    state, orders = advance(MonitorState(stopped=False), 1.0, Verdict.SPOOFING, limits=TIMES)
+    assert orders == (Order.SUSPEND, Order.STOP)
+    for now in range(2, 400):
+        before = release(state, float(now - 1), limits=TIMES)
+        assert before[2] is not None or now > 302
+        state, orders = advance(state, float(now), Verdict.HEALTHY, limits=TIMES)
+        assert orders == ()
+        assert state.stopped
+        assert state.cause is Verdict.SPOOFING
+    assert release(state, 410.0, limits=TIMES)[2] is not None  # the fixes are late
+    state, orders, reason = release(state, 399.0, limits=TIMES)
+    assert (state.stopped, orders, reason) == (False, (Order.RESUME,), None)
+
+
+def test_healthy_time_begins_again_after_an_absent_fix() -> None:
+    state, _ = advance(MonitorState(stopped=False), 0.0, Verdict.GROUND_LOST, limits=TIMES)
+    for now in range(1, 301):
+        state, _ = advance(state, float(now), None if now == 150 else Verdict.HEALTHY, limits=TIMES)
+    assert release(state, 300.0, limits=TIMES)[2] == "healthy for 149 s of the 300 s before a release"
+
+
+def test_nothing_from_a_receiver_stops_after_the_late_time() -> None:
+    state, _ = advance(MonitorState(stopped=False), 0.0, Verdict.HEALTHY, limits=TIMES)
+    state, orders = advance(state, 3.0, None, limits=TIMES)
+    assert orders == ()
+    state, orders = advance(state, 3.1, None, limits=TIMES)
+    assert orders == (Order.SUSPEND, Order.STOP)
+    assert state.cause is Verdict.MONITOR_LOST
+    with pytest.raises(ValueError, match="ran back"):
+        advance(replace(state, complete_s=5.0), 4.0, None, limits=TIMES)
+
+
+@pytest.fixture(scope="module")
+def triangle_logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
+    """Three logs of the simulator's reference station at three places, 60 s at 1 Hz."""
+    folder, logs = tmp_path_factory.mktemp("triangle"), []
+    base = load_recipe("commercial-run").scenario(changes={"duration_s": 60.0}).replaced(rate_hz=1.0, sensors=None)
+    for k, (chainage, lateral) in enumerate(((100.0, 50.0), (900.0, 50.0), (400.0, 600.0))):
+        station = ReferenceStation(chainage_m=chainage, lateral_m=lateral)
+        files = write_run(base.replaced(station=station), folder / str(k), packing="plain")
+        logs.append(files["station"])
+    return logs, files["nav"]
+
+
+def test_logs_of_the_simulator(triangle_logs: tuple[list[Path], Path], tmp_path: Path) -> None:
+    logs, nav = triangle_logs
+    options = ["--nav", str(nav), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, ["monitor", *map(str, logs), *options])
+    assert done.exit_code == 0, done.output
+    assert "no stop" in done.output
+    assert (tmp_path / "out" / "triangle.png").stat().st_size > 10_000
+
+
+def test_a_satellite_clock_step_in_the_logs(triangle_logs: tuple[list[Path], Path], tmp_path: Path) -> None:
+    logs, nav = triangle_logs
+    observations = [read_observations(path) for path in logs]
+    healthy = station_fixes(
+        observations, np.stack([o.header.approximate_ecef_m for o in observations]), read_navigation(nav)
+    )
+    assert np.isfinite(healthy.fixes_m).all()
+    strength = np.nan_to_num(observations[0].cn0_dbhz.mean(axis=0)) * (observations[0].signal == "1C")
+    name = observations[0].satellite[np.argsort(strength)[-3]]  # high enough to be used, low enough to move a fix
+    broken = []
+    for k, log in enumerate(observations):
+        code = log.code_m.copy()
+        code[30:, log.satellite == name] += 400.0
+        broken.append(tmp_path / f"{k}.rnx")
+        write_observations(replace(log, code_m=code), broken[-1])
+    options = ["--nav", str(nav), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, ["monitor", *map(str, broken), *options])
+    assert "suspend satellite positioning: satellites_or_jamming" in done.output, done.output
+    assert done.output.index("suspend") < done.output.index("stop:")
+
+
+def test_two_stations_of_a_recording_as_monitors(recordings: Path) -> None:
+    """Two GEONET stations, 2005, GPS: no fix leaves 12 m with six satellites."""
+    folder = recordings / "static" / "rtklib_geonet2005"
+    logs = [read_observations(folder / name) for name in ("07590920.05o", "30400920.05o")]
+    points = np.stack([log.header.approximate_ecef_m for log in logs])
+    fixes = station_fixes(logs, points, read_navigation([folder / "07590920.05n", folder / "30400920.05n"]))
+    error = np.hypot(*np.moveaxis(fixes.fixes_m - fixes.points_m, -1, 0))
+    assert (error[fixes.n_satellites >= 6] < LIMITS.radius_m).all()
+    assert np.isfinite(error).all(axis=1).mean() > 0.9
