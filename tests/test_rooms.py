@@ -22,7 +22,7 @@ FLOORS: Final[tuple[tuple[str, ...], ...]] = (
     ("tracking",),
     ("pipeline",),
     ("run",),
-    ("simulate", "reference"),
+    ("simulate", "reference", "live"),
     ("ground",),
     ("evaluate",),
     ("report",),

@@ -24,6 +24,7 @@ class _Program(LazyCommands):
         "ablate": "Compare choices of screens on a log: all, none, each alone, all but each.",
         "evaluate": "Compute errors of runs against references.",
         "reference": "Build a reference trajectory from fixed positions, gaps bridged.",
+        "live": "Position a train from its receivers' streams as they arrive.",
         "convert": "Write receiver logs as RINEX files.",
         "cn0-curve": "Fit the mean C/N0 over elevation of an antenna and receiver.",
         "error-model": "Model the pseudorange errors of a line from runs with references.",
@@ -84,6 +85,8 @@ def railfix(
     - 6: the track map was checked and has errors
     - 7: the run ended without a single position
     - 8: the output cannot be written
+    - 9: two channels of a live session gave different answers to the same input
+    - 9: two channels of `railfix live` gave different answers
 
     128 and the number of a signal: the program was ended by that signal (143 SIGTERM, 141 the reader of its
     output ended first).

@@ -15,6 +15,7 @@ code meaning
 6    the track map was checked and has errors
 7    the run ended without a single position
 8    the output cannot be written
+9    two channels of a live session gave different answers to the same input
 ==== =====================================================================
 """
 
@@ -87,3 +88,9 @@ class OutputError(RailfixError):
     """The output cannot be written."""
 
     exit_code = 8
+
+
+class ChannelsDisagreeError(RailfixError):
+    """Two channels of a live session gave different answers to the same input."""
+
+    exit_code = 9

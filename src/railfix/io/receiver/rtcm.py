@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Strings
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP, SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
 from railfix.io.receiver.bits import Field, fields, signed, unsigned
@@ -124,16 +124,20 @@ def bits_of(frames: Frames, chosen: Indices, length: int) -> Bytes:
     return np.unpackbits(np.where(inside, data, 0).astype(np.uint8), axis=1)
 
 
+def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
+    """Whether multiple signal messages are the last ones of their epoch (DF393 is 0), shape (len(chosen),)."""
+    return np.asarray(bits_of(frames, chosen, 56)[:, 54] == 0)
+
+
 def unfinished_epoch(frames: Frames) -> int | None:
     """Place of the first message of the last epoch, where more messages of that epoch are to follow (DF393)."""
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
         return None
-    head = bits_of(frames, chosen, 56)
-    more = head[:, 54] == 1
-    if not more[-1]:
+    last = completes_epoch(frames, chosen)
+    if last[-1]:
         return None
-    complete = np.flatnonzero(~more)
+    complete = np.flatnonzero(last)
     first = chosen[complete[-1] + 1] if len(complete) else chosen[0]
     return int(frames.frame_start[first])
 

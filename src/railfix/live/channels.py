@@ -1,0 +1,165 @@
+"""Two channels: the same input through two processes, every message compared byte by byte (P1 2.1).
+
+The second channel is a process of its own. Both get the same epochs, records and clock readings; each returns its
+messages with digests of its stages. At the first difference the output stops and the first stage that differs is named.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+from collections import Counter
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.errors import ChannelsDisagreeError
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.train_message import encode
+from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.settings import LiveSettings
+from railfix.pipeline.processor import EpochProcessor
+from railfix.ranges.sbas import SbasMessages
+
+#: Stages in the order of processing, by the arrays that tell them apart.
+STAGES: Final[dict[str, tuple[str, ...]]] = {
+    "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
+    "screens and exclusion": ("reason",),
+    "position": ("status", "chainage_m", "along_sigma_m", "residual_m"),
+}
+
+
+def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
+    """Digests of the stages and the message of each output."""
+    return [
+        {
+            **{
+                stage: _digest(
+                    [getattr(a, name) for a in output.result.antennas.values() for name in names]
+                    if output.result is not None
+                    else []
+                )
+                for stage, names in STAGES.items()
+            },
+            "filter": _digest([] if output.result is None else [t.chainage_m for t in output.result.fusion.values()]),
+            "message": encode(output.message).hex(),
+        }
+        for output in outputs
+    ]
+
+
+def _digest(arrays: list[Any]) -> str:
+    text = hashlib.sha256()
+    for array in arrays:
+        values = np.ascontiguousarray(array)
+        text.update(str((values.dtype, values.shape)).encode())
+        text.update(values.tobytes())
+    return text.hexdigest()
+
+
+def _second_channel(connection: Connection, processor: EpochProcessor, settings: LiveSettings) -> None:
+    """The second process: carries out calls until the connection closes."""
+    engine = LiveEngine(processor, settings)
+    while True:
+        try:
+            name, arguments, keywords = connection.recv()
+        except EOFError:
+            return
+        if name == "poll":
+            connection.send(digests(engine.poll(**keywords)))
+        else:
+            getattr(engine, name)(*arguments, **keywords)
+
+
+class TwoChannels:
+    """A `LiveEngine` with a second one beside it, in a process of its own.
+
+    Parameters
+    ----------
+    processor : EpochProcessor
+    settings : LiveSettings
+    """
+
+    def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
+        self.engine = LiveEngine(processor, settings)
+        context = multiprocessing.get_context("spawn")
+        self._connection, other = context.Pipe()
+        self._process = context.Process(target=_second_channel, args=(other, processor, settings), daemon=True)
+        self._process.start()
+        other.close()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Counts of the first channel."""
+        return self.engine.counts
+
+    @property
+    def settings(self) -> LiveSettings:
+        """Settings of both channels."""
+        return self.engine.settings
+
+    def learn(self, navigation: Navigation) -> None:
+        """As `LiveEngine.learn`."""
+        self.engine.learn(navigation)
+        self._call("learn", navigation)
+
+    def hear(self, messages: SbasMessages) -> None:
+        """As `LiveEngine.hear`."""
+        self.engine.hear(messages)
+        self._call("hear", messages)
+
+    def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
+        """As `LiveEngine.push`."""
+        self.engine.push(antenna, epoch, now_ns=now_ns)
+        self._call("push", antenna, epoch, now_ns=now_ns)
+
+    def wait_s(self, *, now_ns: int) -> float:
+        """As `LiveEngine.wait_s`."""
+        return self.engine.wait_s(now_ns=now_ns)
+
+    def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
+        """As `LiveEngine.poll`, after both channels have agreed.
+
+        Raises
+        ------
+        ChannelsDisagreeError
+            A message or a stage differs, or the second channel has ended.
+        """
+        self._call("poll", now_ns=now_ns, sent_ns=sent_ns)
+        outputs = self.engine.poll(now_ns=now_ns, sent_ns=sent_ns)
+        try:
+            theirs = self._connection.recv()
+        except (EOFError, OSError):
+            raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
+        compare(digests(outputs), theirs)
+        return outputs
+
+    def _call(self, name: str, *arguments: Any, **keywords: Any) -> None:
+        try:
+            self._connection.send((name, arguments, keywords))
+        except OSError:
+            raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
+
+    def close(self) -> None:
+        """End the second channel."""
+        self._connection.close()
+        self._process.join(timeout=5.0)
+        if self._process.is_alive():
+            self._process.terminate()
+
+
+def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:
+    """Raise at the first difference between the outputs of two channels.
+
+    Raises
+    ------
+    ChannelsDisagreeError
+    """
+    if len(ours) != len(theirs):
+        raise ChannelsDisagreeError(f"the channels disagree: {len(ours)} messages in one, {len(theirs)} in the other")
+    for one, other in zip(ours, theirs, strict=True):
+        for stage, digest in one.items():
+            if other.get(stage) != digest:
+                raise ChannelsDisagreeError(f"the channels disagree, first in the stage: {stage}; no message is sent")

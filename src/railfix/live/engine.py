@@ -1,0 +1,214 @@
+"""Live positioning: epochs of one or two antennas in, one result and one message a period out.
+
+The same `EpochProcessor` as for logs, fed one epoch at a time; its state is carried here. Nothing is read from files
+and nothing grows: at most a few epochs wait for their pair.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from railfix.core.timescale import GPS_EPOCH
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.train_message import TrainMessage
+from railfix.live.message import message_of, no_input_message
+from railfix.live.settings import LiveSettings
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import Result, State
+from railfix.ranges.sbas import SbasMessages
+
+#: Epochs of one antenna that may wait; more than that means the other antenna's clock is elsewhere.
+_LONGEST_QUEUE = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOutput:
+    """One message, and the result it was made from (None without input)."""
+
+    message: TrainMessage
+    result: Result | None
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """An epoch that waits for its pair; `heard` counts the data from satellites that came before it."""
+
+    epoch: Observations
+    arrived_ns: int
+    heard: int
+
+    @property
+    def tag_ns(self) -> int:
+        """Time tag, GPS time since 1980."""
+        return int((self.epoch.time[0] - GPS_EPOCH).astype(np.int64))
+
+
+class LiveEngine:
+    """Positions of epochs as they arrive.
+
+    Parameters
+    ----------
+    processor : EpochProcessor
+    settings : LiveSettings
+
+    Attributes
+    ----------
+    counts : Counter of str
+        Epochs by what became of them: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
+        "tag step", "restart", "no input".
+    """
+
+    def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
+        self.processor = processor
+        self.settings = settings
+        self.counts: Counter[str] = Counter()
+        self._antennas = tuple(processor.trajectories)
+        self._waiting: dict[str, deque[_Waiting]] = {name: deque() for name in self._antennas}
+        self._last_tag: dict[str, int] = {}
+        self._backward: dict[str, list[int]] = {name: [] for name in self._antennas}
+        self._done_ns = -1
+        self._state: State | None = None
+        self._from_satellites: deque[tuple[int, Navigation | None, SbasMessages | None]] = deque()
+        self._heard = 0
+        self._sequence = 0
+        self._due_ns: int | None = None
+        self._tolerance_ns = round(processor.config.antenna_pair.tag_tolerance_s * 1e9)
+
+    def learn(self, navigation: Navigation) -> None:
+        """Take navigation records; they are used from the next epoch on."""
+        self._heard += 1
+        self._from_satellites.append((self._heard, navigation, None))
+
+    def hear(self, messages: SbasMessages) -> None:
+        """Take SBAS messages; they are used from the next epoch on."""
+        self._heard += 1
+        self._from_satellites.append((self._heard, None, messages))
+
+    def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
+        """Take one epoch of an antenna.
+
+        Parameters
+        ----------
+        antenna : str
+        epoch : Observations
+            One epoch.
+        now_ns : int [ns]
+            Clock of the computer, on which `poll` is called.
+        """
+        if antenna not in self._waiting:
+            raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
+        waiting = _Waiting(epoch, now_ns, self._heard)
+        if self._due_ns is None:
+            self._due_ns = now_ns
+        if not self._in_order(antenna, waiting.tag_ns):
+            return
+        queue = self._waiting[antenna]
+        if len(queue) >= _LONGEST_QUEUE:
+            queue.popleft()
+            self.counts["dropped, too many waiting"] += 1
+        queue.append(waiting)
+
+    def _in_order(self, antenna: str, tag_ns: int) -> bool:
+        """Whether an epoch is new; a receiver that was restarted with older tags begins anew."""
+        last = self._last_tag.get(antenna)
+        if last is not None and tag_ns <= last:
+            self.counts["duplicate" if tag_ns == last else "out of order"] += 1
+            backward = self._backward[antenna]
+            backward.append(tag_ns)
+            rising = all(a < b for a, b in pairwise(backward))
+            if not rising:
+                self._backward[antenna] = [tag_ns]
+            if not rising or len(backward) < self.settings.restart_epochs:
+                return False
+            self._restart()
+        elif last is not None:
+            step = (tag_ns - last) % round(self.settings.period_s * 1e9)
+            if min(step, round(self.settings.period_s * 1e9) - step) > 500_000:
+                self.counts["tag step"] += 1
+        self._backward[antenna] = []
+        self._last_tag[antenna] = tag_ns
+        if tag_ns <= self._done_ns:
+            self.counts["late"] += 1
+            return False
+        return True
+
+    def _restart(self) -> None:
+        """Begin anew after a receiver's restart: only what was received from satellites is kept."""
+        self.counts["restart"] += 1
+        self._state = None if self._state is None else State(received=self._state.received)
+        self._done_ns = -1
+        for name in self._antennas:
+            self._waiting[name].clear()
+
+    def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
+        """Messages that are due: of complete pairs, of epochs that waited long enough, of periods without input.
+
+        Parameters
+        ----------
+        now_ns : int [ns]
+            The clock that `push` was given.
+        sent_ns : int [ns], optional
+            GPS time of sending for the message; without it the epoch's own time.
+        """
+        outputs = [self._processed(epochs, now_ns, sent_ns) for epochs in self._pairs(now_ns)]
+        period = round(self.settings.period_s * 1e9)
+        silent = not outputs and self._due_ns is not None and self.settings.no_input == "send"
+        if silent and self._due_ns is not None and now_ns - self._due_ns >= period + period // 2:
+            self.counts["no input"] += 1
+            self._sequence += 1
+            self._due_ns += period
+            last = max(self._last_tag.values(), default=0)
+            message = no_input_message(
+                self.settings, sequence=self._sequence, time_ns=last, sent_ns=last if sent_ns is None else sent_ns
+            )
+            outputs.append(LiveOutput(message=message, result=None))
+        return outputs
+
+    def wait_s(self, *, now_ns: int) -> float:
+        """Time after which `poll` has to be called again, if nothing arrives before [s]."""
+        times = [self.settings.period_s]
+        if self._due_ns is not None:
+            times.append((self._due_ns - now_ns) * 1e-9 + 1.5 * self.settings.period_s)
+        for queue in self._waiting.values():
+            if queue:
+                times.append((queue[0].arrived_ns - now_ns) * 1e-9 + self.settings.pair_wait_s)
+        return max(0.0, min(times))
+
+    def _pairs(self, now_ns: int) -> Iterator[dict[str, _Waiting]]:
+        """Epochs that can be processed, in order of their tags."""
+        while True:
+            heads = {name: queue[0] for name, queue in self._waiting.items() if queue}
+            if not heads:
+                return
+            first = min(heads.values(), key=lambda head: head.tag_ns)
+            together = {n: h for n, h in heads.items() if h.tag_ns - first.tag_ns <= self._tolerance_ns}
+            complete = len(together) == len(self._antennas) or len(heads) == len(self._antennas)
+            waited = (now_ns - first.arrived_ns) * 1e-9 >= self.settings.pair_wait_s
+            if not (complete or waited):
+                return
+            for name in together:
+                self._waiting[name].popleft()
+            if len(self._antennas) > 1:
+                self.counts["paired" if len(together) > 1 else f"{next(iter(together))} alone"] += 1
+            yield together
+
+    def _processed(self, heads: dict[str, _Waiting], now_ns: int, sent_ns: int | None) -> LiveOutput:
+        state, heard = self._state, max(head.heard for head in heads.values())
+        while self._from_satellites and self._from_satellites[0][0] <= heard:
+            _, navigation, messages = self._from_satellites.popleft()
+            _, state = self.processor.process({}, state, navigation=navigation, messages=messages)
+        epochs = {name: head.epoch for name, head in heads.items()}
+        result, self._state = self.processor.process(epochs, state)
+        self._done_ns = max(int((part.time[-1] - GPS_EPOCH).astype(np.int64)) for part in epochs.values())
+        self._sequence += 1
+        self._due_ns = now_ns
+        message = message_of(
+            result, self.settings, sequence=self._sequence, sent_ns=self._done_ns if sent_ns is None else sent_ns
+        )
+        return LiveOutput(message=message, result=result)

@@ -1,0 +1,124 @@
+"""Position messages from results of single epochs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.reasons import Status
+from railfix.core.timescale import GPS_EPOCH
+from railfix.integrity.protection import LevelStatus
+from railfix.io.train_message import MessageStatus, Source, TrainMessage
+from railfix.live.settings import LiveSettings
+from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.results import AntennaResult, Result
+from railfix.tracking import TrackStatus
+
+#: Sigmas that the speed's bound stands for: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
+_SPEED_K = 5.33
+_SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
+
+
+def no_input_message(settings: LiveSettings, *, sequence: int, time_ns: int, sent_ns: int) -> TrainMessage:
+    """The message of a period in which nothing was received."""
+    return TrainMessage(
+        train=settings.train,
+        sequence=sequence,
+        time_ns=time_ns,
+        sent_ns=sent_ns,
+        line=settings.line,
+        facing=settings.facing,
+        length_cm=_up_cm(settings.length_m),
+        status=MessageStatus.NO_INPUT,
+    )
+
+
+def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns: int) -> TrainMessage:
+    """The message of one processed epoch.
+
+    The place is that of the filter along the track where it runs, else that of the single epoch; of two antennas
+    the one with the smaller protection level. The bounds are the protection level of the single epoch around its own
+    place, widened by the distance of the filter's place from it, so that they hold for both.
+
+    Parameters
+    ----------
+    result : Result
+        Of one epoch.
+    settings : LiveSettings
+    sequence : int
+    sent_ns : int [ns]
+    """
+    name = min(result.antennas, key=lambda antenna: _level_m(result.antennas[antenna]))
+    antenna = result.antennas[name]
+    track = result.fusion.get(name)
+    sources = Source(0)
+    for used, other in result.antennas.items():
+        if other.n_used[-1] > 0:
+            sources |= _SOURCE_OF_ANTENNA.get(used, Source(0))
+    place, status = _place_and_status(antenna, track)
+    values: dict[str, object] = {}
+    level = _level_m(antenna)
+    single = float(antenna.chainage_m[-1])
+    if math.isfinite(place):
+        front = place + settings.facing * settings.front_offset_m
+        values["chainage_cm"] = round(front * 100.0)
+        bound = level + abs(place - single) + 0.01 if math.isfinite(single) else math.inf
+        if math.isfinite(bound):
+            values["over_cm"] = values["under_cm"] = _up_cm(bound)
+            values["protection_level_cm"] = _up_cm(level)
+        elif status is MessageStatus.POSITION:
+            status = MessageStatus.DOUBTFUL
+    if status is MessageStatus.COASTING and "over_cm" not in values:
+        status = MessageStatus.DOUBTFUL
+    if track is not None and len(track):
+        speed, sigma = float(track.tracked.speed_mps[-1]), float(track.tracked.speed_sigma_mps[-1])
+        if math.isfinite(speed):
+            values["speed_cmps"], values["speed_bound_cmps"] = round(speed * 100.0), _up_cm(_SPEED_K * sigma)
+        values["direction"], values["standstill"] = int(track.direction[-1]), bool(track.standstill[-1])
+        sources |= Source.DOPPLER | Source.CARRIER_PHASE if math.isfinite(speed) else Source(0)
+        probability = float(track.tracked.probability[-1])
+        if math.isfinite(probability):
+            values["track_permille"] = int(min(max(probability, 0.0), 1.0) * 1000.0)
+    return TrainMessage(
+        train=settings.train,
+        sequence=sequence,
+        time_ns=int((antenna.time[-1] - GPS_EPOCH).astype(np.int64)),
+        sent_ns=sent_ns,
+        line=settings.line,
+        facing=settings.facing,
+        length_cm=_up_cm(settings.length_m),
+        status=status,
+        sources=sources,
+        **values,  # type: ignore[arg-type]
+    )
+
+
+def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
+    """Place [m], NaN without one, and what it is worth."""
+    single = Status(int(antenna.status[-1]))
+    place = float(antenna.chainage_m[-1])
+    available = antenna.protection is None or antenna.protection.status[-1] != LevelStatus.ALARM
+    if track is None or not len(track) or not math.isfinite(float(track.chainage_m[-1])):
+        if not math.isfinite(place):
+            return place, MessageStatus.NO_POSITION
+        return place, MessageStatus.POSITION if single is Status.OK and available else MessageStatus.DOUBTFUL
+    filtered = float(track.chainage_m[-1])
+    status = TrackStatus(int(track.tracked.status[-1]))
+    if status is TrackStatus.COASTING:
+        return filtered, MessageStatus.COASTING
+    good = status is TrackStatus.TRACKING and single is Status.OK and available
+    return filtered, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
+
+
+def _level_m(antenna: AntennaResult) -> float:
+    """Protection level of the last epoch; infinite where there is none."""
+    if antenna.protection is None:
+        return math.inf
+    level = float(antenna.protection.level.level_m[-1])
+    return level if math.isfinite(level) else math.inf
+
+
+def _up_cm(value_m: float) -> int:
+    """Metres as centimetres, rounded up."""
+    return max(0, math.ceil(value_m * 100.0 - 1e-9))

@@ -1,0 +1,99 @@
+"""Bytes of one receiver as single epochs and navigation records, as they become complete."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from railfix.core.arrays import Bytes, Indices
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.io.receiver import rtcm, ubx
+from railfix.io.receiver.ephemerides import navigation_of
+from railfix.io.receiver.framing import find_frames
+from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.measurements import Tracking, observations_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReceiverState:
+    """State of a receiver's stream after some bytes."""
+
+    stream: StreamState = field(default_factory=StreamState)
+    tracking: Tracking = field(default_factory=Tracking)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Received:
+    """What some bytes completed.
+
+    Attributes
+    ----------
+    epochs : tuple of Observations
+        One epoch each, with the channels observed in it.
+    navigation : Navigation or None
+    skipped_bytes, bad_checksums : int
+    passed_over : mapping of str to int
+    """
+
+    epochs: tuple[Observations, ...]
+    navigation: Navigation | None
+    skipped_bytes: int
+    bad_checksums: int
+    passed_over: dict[str, int]
+
+
+def receive_bytes(data: bytes, state: ReceiverState) -> tuple[list[Received], ReceiverState]:
+    """What some bytes of a receiver complete, in the order of the stream; any cutting of the stream gives the same.
+
+    Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
+    """
+    kept = len(state.stream.rest)
+    ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
+    items, place = [], 0
+    for end in [*np.unique(ends[(ends > 0) & (ends < len(data))]).tolist(), len(data)]:
+        item, state = _receive(data[place:end], state)
+        place = end
+        items.append(item)
+    return items, state
+
+
+def epoch_ends(buffer: Bytes) -> Indices:
+    """Places after the messages that complete an epoch: RXM-RAWX, and the last MSM of an epoch."""
+    frames = find_frames(buffer, at_end=False)
+    raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
+    last = msm[rtcm.completes_epoch(frames, msm)]
+    return np.sort(np.concatenate([frames.end[raw] + 2, frames.end[last] + 3]))
+
+
+def _receive(data: bytes, state: ReceiverState) -> tuple[Received, ReceiverState]:
+    piece, stream = decode(data, state.stream)
+    observations, tracking = observations_of(piece.measurements, state.tracking)
+    records = piece.ephemerides
+    received = Received(
+        epochs=single_epochs(observations),
+        navigation=navigation_of(records) if records.records or records.klobuchar else None,
+        skipped_bytes=piece.skipped_bytes,
+        bad_checksums=piece.bad_checksums,
+        passed_over={**observations.skipped, **records.skipped},
+    )
+    return received, ReceiverState(stream=stream, tracking=tracking)
+
+
+def single_epochs(observations: Observations) -> tuple[Observations, ...]:
+    """Observations epoch by epoch, each with the channels that have a value in it."""
+    epochs = []
+    for k in range(len(observations)):
+        part = observations[k : k + 1]
+        seen = np.isfinite(part.code_m[0]) | np.isfinite(part.phase_cycles[0]) | np.isfinite(part.cn0_dbhz[0])
+        names = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
+        epochs.append(
+            replace(
+                part,
+                satellite=part.satellite[seen],
+                signal=part.signal[seen],
+                **{name: getattr(part, name)[:, seen] for name in names},
+            )
+        )
+    return tuple(epochs)

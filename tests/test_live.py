@@ -1,0 +1,381 @@
+"""Live positioning: the same answers as from logs, whatever way the bytes come; pairs, gaps, restarts; two channels."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+import railfix
+from railfix.cli import app
+from railfix.core.errors import ChannelsDisagreeError
+from railfix.core.timescale import GPS_EPOCH
+from railfix.gnss.observations import Observations
+from railfix.io.receiver import ubx
+from railfix.io.receiver.framing import find_frames
+from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
+from railfix.live.channels import TwoChannels, compare, digests
+from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.session import Metrics, run_session
+from railfix.live.settings import LiveSettings
+from railfix.live.sinks import nmea_bytes, tpv_bytes
+from railfix.live.sources import _Chunks, check_source
+from railfix.live.stream import ReceiverState, receive_bytes, single_epochs
+from railfix.simulate.demo_data import demo_files
+
+pytestmark = pytest.mark.requirement("A8")
+RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
+MS = 1_000_000
+EPOCHS = 150
+
+
+@pytest.fixture(scope="module")
+def logs() -> dict[str, tuple[Observations, ...]]:
+    """The first epochs of the demonstration, 10 Hz, antenna by antenna."""
+    files = demo_files()
+    return {name: single_epochs(railfix.read_observations(files[name])[:EPOCHS]) for name in ("front", "rear")}
+
+
+def processor(*antennas: str, **settings: object) -> railfix.EpochProcessor:
+    files = demo_files()
+    track, vehicle = railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"])
+    return railfix.EpochProcessor(
+        railfix.Config(**settings),
+        {name: railfix.antenna_trajectory(track, vehicle, name) for name in antennas or ("front", "rear")},
+        navigation=railfix.read_navigation(files["nav"]),
+    )
+
+
+@pytest.fixture(scope="module")
+def batch() -> railfix.Result:
+    files = demo_files()
+    whole = {name: railfix.read_observations(files[name])[:EPOCHS] for name in ("front", "rear")}
+    return processor().process(whole)[0]
+
+
+def tag_ns(epoch: Observations) -> int:
+    return int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
+
+
+def played(
+    engine: LiveEngine | TwoChannels, arrivals: Iterable[tuple[int, str, Observations]], *, until: int | None = None
+) -> list[LiveOutput]:
+    """Outputs of epochs that arrive at given instants [ns]; the clock steps by 5 ms between."""
+    arrivals = sorted(arrivals, key=lambda arrival: arrival[0])
+    outputs: list[LiveOutput] = []
+    now = arrivals[0][0]
+    for at, name, epoch in arrivals:
+        while now + 5 * MS < at:
+            now += 5 * MS
+            outputs += engine.poll(now_ns=now)
+        now = at
+        engine.push(name, epoch, now_ns=now)
+        outputs += engine.poll(now_ns=now)
+    while now < (until or now + 100 * MS):
+        now += 5 * MS
+        until = until or now + 100 * MS
+        outputs += engine.poll(now_ns=now)
+    return outputs
+
+
+def chainages(outputs: list[LiveOutput], name: str) -> dict[int, float]:
+    found = {}
+    for output in outputs:
+        if output.result is not None and name in output.result.antennas:
+            antenna = output.result.antennas[name]
+            found[int((antenna.time[-1] - GPS_EPOCH).astype(np.int64))] = float(antenna.chainage_m[-1])
+    return found
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_live_is_batch(logs: dict[str, tuple[Observations, ...]], batch: railfix.Result, seed: int) -> None:
+    """Two antennas, each epoch delayed at random by up to 25 ms: the rows of the log, within 1e-9 m."""
+    rng = np.random.default_rng(seed)
+    engine = LiveEngine(processor(), LiveSettings())
+    arrivals = [
+        (tag_ns(epoch) + int(rng.uniform(0, 25) * MS), name, epoch) for name, epochs in logs.items() for epoch in epochs
+    ]
+    outputs = played(engine, arrivals)
+    for name in logs:
+        live = chainages(outputs, name)
+        expected = batch.antennas[name]
+        assert len(live) == EPOCHS
+        got = np.array([live[int((t - GPS_EPOCH).astype(np.int64))] for t in expected.time])
+        assert np.array_equal(np.isnan(got), np.isnan(expected.chainage_m))
+        assert np.nanmax(np.abs(got - expected.chainage_m)) < 1e-9
+    assert engine.counts["paired"] == EPOCHS
+    assert [output.message.sequence for output in outputs] == list(range(1, len(outputs) + 1))
+
+
+def test_one_antenna_late_or_missing(logs: dict[str, tuple[Observations, ...]]) -> None:
+    """An epoch whose pair comes after 30 ms goes alone, and the late one is counted; each period has one message."""
+    engine = LiveEngine(processor(), LiveSettings())
+    arrivals = [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:60]]
+    arrivals += [
+        (tag_ns(epoch) + (45 * MS if 20 <= k < 30 else 5 * MS), "rear", epoch)
+        for k, epoch in enumerate(logs["rear"][:60])
+        if not 40 <= k < 45
+    ]
+    outputs = played(engine, arrivals)
+    assert engine.counts["front alone"] == 15
+    assert engine.counts["late"] == 10
+    assert engine.counts["paired"] == 45
+    assert sum(output.result is not None for output in outputs) == 60
+
+
+def test_periods_without_input_have_a_message(logs: dict[str, tuple[Observations, ...]]) -> None:
+    """A gap of 2 s at 10 Hz: 19 or 20 messages that say so, then positions again."""
+    engine = LiveEngine(processor("front"), LiveSettings())
+    epochs = [*logs["front"][:30], *logs["front"][50:80]]
+    outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in epochs])
+    silent = [o for o in outputs[:-1] if o.message.status is MessageStatus.NO_INPUT]
+    assert 19 <= len(silent) <= 21
+    assert outputs[40].message.status is MessageStatus.NO_INPUT
+    assert outputs[40].message.chainage_cm is None
+    assert sum(o.result is not None for o in outputs) == 60
+
+
+def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]]) -> None:
+    engine = LiveEngine(processor("front"), LiveSettings(restart_epochs=3))
+    first = list(logs["front"][60:90])
+    sequence = [*first[:10], first[9], first[5], *first[10:]]
+    at = tag_ns(first[0])
+    outputs = played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(sequence)])
+    assert engine.counts["duplicate"] == 1
+    assert engine.counts["out of order"] == 1
+    assert engine.counts["restart"] == 0
+    assert sum(o.result is not None for o in outputs) == len(first)
+    again = list(logs["front"][:20])  # the receiver comes back with older tags
+    later = played(engine, [(at + 10**10 + 100 * MS * k, "front", epoch) for k, epoch in enumerate(again)])
+    assert engine.counts["restart"] == 1
+    assert sum(o.result is not None for o in later) == 18  # the third epoch in a row begins anew
+
+
+def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> None:
+    from dataclasses import replace
+
+    engine = LiveEngine(processor("front"), LiveSettings())
+    epochs = [
+        replace(epoch, time=epoch.time + np.timedelta64(1 if k >= 10 else 0, "ms"))
+        for k, epoch in enumerate(logs["front"][:20])
+    ]
+    outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in epochs])
+    assert engine.counts["tag step"] == 1
+    assert sum(o.result is not None for o in outputs) == 20
+
+
+def ubx_line(log: Path, folder: Path) -> Path:
+    """A line of 1 km through the place that the receiver itself gives."""
+    data = np.frombuffer(gzip.decompress(log.read_bytes()), np.uint8)
+    fixes = ubx.positions(find_frames(data), railfix.read_observations(log).time)
+    latitude, longitude, height = (float(np.median(fixes[k])) for k in ("latitude_deg", "longitude_deg", "height_m"))
+    rows = [f"{latitude + 2e-5 * k:.9f},{longitude + 3e-5 * k:.9f},{height:.3f}" for k in range(-100, 101)]
+    path = folder / "line.csv"
+    path.write_text("# crs: EPSG:4979\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
+    return path
+
+
+async def serve_in_fragments(data: bytes, seed: int, server_ready: asyncio.Future[int]) -> None:
+    """One client gets the bytes in fragments of random length."""
+    rng = np.random.default_rng(seed)
+    done = asyncio.Event()
+
+    async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        place = 0
+        while place < len(data):
+            step = int(rng.integers(1, 3000))
+            writer.write(data[place : place + step])
+            await writer.drain()
+            place += step
+        writer.close()
+        done.set()
+
+    server = await asyncio.start_server(answer, "127.0.0.1", 0)
+    server_ready.set_result(server.sockets[0].getsockname()[1])
+    await done.wait()
+    server.close()
+
+
+def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) -> None:
+    """UBX with its own ephemerides over TCP in random fragments: the epochs of the file read live, bit for bit."""
+    log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
+    data = gzip.decompress(log.read_bytes())[:1_200_000]
+    part = tmp_path / "part.ubx"
+    part.write_bytes(data)
+    trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
+
+    async def session(source: str | None) -> list[LiveOutput]:
+        outputs: list[LiveOutput] = []
+        engine = LiveEngine(
+            railfix.EpochProcessor(railfix.Config(), trajectory), LiveSettings(period_s=1.0, no_input="skip")
+        )
+        if source is not None:
+            await run_session(engine, {"front": source}, [], speed=None, observe=outputs.append)
+            return outputs
+        ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+        server = asyncio.create_task(serve_in_fragments(data, 5, ready))
+        port = await ready
+        await run_session(engine, {"front": f"tcp://127.0.0.1:{port}"}, [], speed=None, observe=outputs.append)
+        await server
+        return outputs
+
+    from_file, from_socket = asyncio.run(session(str(part))), asyncio.run(session(None))
+    a, b = chainages(from_file, "front"), chainages(from_socket, "front")
+    assert list(a) == list(b)
+    assert len(a) > 150
+    assert np.isfinite(list(a.values())).sum() > 100
+    assert np.array_equal(list(a.values()), list(b.values()), equal_nan=True)
+
+
+def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_path: Path) -> None:
+    """A cold start: no position until subframes of enough satellites have been received whole."""
+    log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
+    data = gzip.decompress(log.read_bytes())
+    trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
+    engine = LiveEngine(
+        railfix.EpochProcessor(railfix.Config(), trajectory), LiveSettings(period_s=1.0, no_input="skip")
+    )
+    state, statuses, records = ReceiverState(), [], 0
+    for place in range(0, 500_000, 5_000):
+        items, state = receive_bytes(data[place : place + 5_000], state)
+        for received in items:
+            if received.navigation is not None:
+                engine.learn(received.navigation)
+                records += len(received.navigation.kepler)
+            for epoch in received.epochs:
+                engine.push("front", epoch, now_ns=tag_ns(epoch))
+                for output in engine.poll(now_ns=tag_ns(epoch)):
+                    assert output.result is not None
+                    placed = bool(np.isfinite(output.result.antennas["front"].chainage_m[-1]))
+                    statuses.append((records, placed))
+    assert not any(placed for known, placed in statuses if known < 3)
+    assert any(placed for _, placed in statuses)
+
+
+def test_two_channels_agree_and_a_difference_stops(logs: dict[str, tuple[Observations, ...]]) -> None:
+    channels = TwoChannels(processor("front"), LiveSettings())
+    try:
+        alone = LiveEngine(processor("front"), LiveSettings())
+        arrivals = [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:40]]
+        assert digests(played(channels, arrivals)) == digests(played(alone, arrivals))
+        # A fault in one channel alone: its engine gets an epoch that the other does not.
+        channels.engine.push("front", logs["front"][40], now_ns=tag_ns(logs["front"][40]))
+        with pytest.raises(ChannelsDisagreeError, match="messages in one"):
+            channels.poll(now_ns=tag_ns(logs["front"][40]))
+    finally:
+        channels.close()
+    ours = digests(played(LiveEngine(processor("front"), LiveSettings()), arrivals[:5]))
+    theirs = [dict(item) for item in ours]
+    theirs[3]["position"] = "0"
+    theirs[3]["message"] = "0"
+    with pytest.raises(ChannelsDisagreeError, match="first in the stage: position"):
+        compare(ours, theirs)
+
+
+def test_messages_of_the_demonstration(logs: dict[str, tuple[Observations, ...]]) -> None:
+    """Front end, bounds, speed and views of one message."""
+    settings = LiveSettings(train=9, line=2, facing=1, front_offset_m=2.0, length_m=20.0)
+    outputs = played(LiveEngine(processor(filter="track"), settings), [
+        (tag_ns(epoch), name, epoch) for name, epochs in logs.items() for epoch in epochs
+    ])  # fmt: skip
+    placed = [o for o in outputs if o.message.status is MessageStatus.POSITION]
+    assert len(placed) > 0.8 * EPOCHS
+    output = placed[-1]
+    message = output.message
+    assert (message.train, message.line, message.length_cm) == (9, 2, 2000)
+    assert message.over_cm == message.under_cm
+    assert message.over_cm is not None
+    assert message.protection_level_cm is not None
+    assert message.over_cm >= message.protection_level_cm > 0
+    assert output.result is not None
+    reference = float(next(iter(output.result.fusion.values())).chainage_m[-1])
+    assert abs(message.chainage_cm / 100.0 - 2.0 - reference) < 25.0  # of one of the antennas, 18.2 m apart
+    sentences = nmea_bytes(output).decode().splitlines()
+    assert [s[:6] for s in sentences] == ["$GPGGA", "$GPRMC", "$GPGST"]
+    for sentence in sentences:
+        body, checksum = sentence[1:].split("*")
+        value = 0
+        for character in body.encode():
+            value ^= character
+        assert f"{value:02X}" == checksum
+    fields = sentences[0].split(",")
+    latitude = float(fields[2][:2]) + float(fields[2][2:]) / 60.0
+    tpv = json.loads(tpv_bytes(output))
+    assert tpv["lat"] == pytest.approx(latitude, abs=1e-8)
+    assert (tpv["class"], tpv["mode"]) == ("TPV", 3)
+    assert Metrics().text({"paired": 3}).count("# TYPE") == 4
+
+
+def test_the_command_on_the_demonstration(tmp_path: Path) -> None:
+    """RINEX files replayed live: messages in JSON and CBOR, tables as `railfix run` writes them."""
+    files = demo_files()
+    lines, binary, out = tmp_path / "messages.jsonl", tmp_path / "messages.cbor", tmp_path / "out"
+    common = ["--track", str(files["track"]), "--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
+    log = ["--front", str(files["front"]), "--rear", str(files["rear"])]
+    words = ["live", *log, *common, "--live", "no_input=skip", "--send", f"json@{lines}", "--send", f"cbor@{binary}"]
+    done = RUNNER.invoke(app, [*words, "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    batch = RUNNER.invoke(app, ["run", *log, *common, "--out", str(tmp_path / "run")])
+    assert batch.exit_code == 0
+    live_rows, rows = (
+        pl.read_parquet(folder / "positions.parquet").sort("time_gpst", "antenna") for folder in (out, tmp_path / "run")
+    )
+    # In the log also epochs without a single code have a row; receivers send none.
+    rows = rows.join(live_rows.select("time_gpst", "antenna"), on=["time_gpst", "antenna"], how="semi")
+    assert live_rows.height == rows.height > 3_600
+    assert live_rows["status"].equals(rows["status"])
+    difference = (live_rows["chainage_m"] - rows["chainage_m"]).fill_nan(None).abs().max()
+    assert difference is not None
+    assert float(difference) < 1e-9
+    messages = [from_json(line) for line in lines.read_text().splitlines()]
+    assert decoded(binary.read_bytes()) == messages
+    assert [m.sequence for m in messages] == list(range(1, len(messages) + 1))
+    refused = RUNNER.invoke(app, [*words, "--out", str(tmp_path / "other")])
+    assert refused.exit_code == 8
+
+
+def decoded(data: bytes) -> list[TrainMessage]:
+    messages, place = [], 0
+    while place < len(data):
+        length = int.from_bytes(data[place : place + 2], "big")
+        messages.append(decode(data[place + 2 : place + 2 + length]))
+        place += 2 + length
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["--front", "tcp://nowhere"], 4, "expected a file, tcp://HOST:PORT"),
+        (["--front", "ntrip://host:2101"], 4, "MOUNT"),
+        (["--front", "missing.ubx"], 3, "no such file"),
+        (["--front", "tcp://127.0.0.1:9"], 3, "cannot be connected"),
+        (["--front", "FRONT", "--send", "xml@-"], 4, "FORM@TARGET"),
+        (["--front", "FRONT", "--send", "json@udp://nowhere"], 4, "FORM@TARGET"),
+        (["--front", "FRONT", "--live", "perod_s=1"], 4, "perod_s"),
+        (["--front", "FRONT", "--metrics", "9100"], 4, "HOST:PORT"),
+    ],
+)
+def test_what_is_wrong_is_one_sentence(words: list[str], code: int, says: str) -> None:
+    files = demo_files()
+    words = [str(files["front"]) if word == "FRONT" else word for word in words]
+    done = RUNNER.invoke(app, ["live", *words, "--track", str(files["track"])])
+    assert done.exit_code == code, done.output
+    assert says in " ".join(done.output.split())
+    assert "Traceback" not in done.output
+
+
+def test_sources_and_chunks_by_hand() -> None:
+    for good in ("-", "a.ubx", "tcp://localhost:1", "ntrip://u:p@localhost:2101/MOUNT", "serial:/dev/ttyS0?baud=9600"):
+        check_source(good)
+    chunks = _Chunks()
+    body: Any = b"".join(chunks.take(bytes([value])) for value in b"4\r\nWiki\r\n5;x=1\r\npedia\r\n0\r\n\r\n")
+    assert body == b"Wikipedia"
