@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -127,3 +131,22 @@ def test_a_folder_with_other_files_is_refused(folder: Path, tmp_path: Path) -> N
     (tmp_path / "mine.txt").write_text("mine")
     with ThreadPoolExecutor(1) as executor, pytest.raises(OutputError, match="nor that of a campaign"):
         run_campaign(folder / "campaign.toml", out=tmp_path, executor=executor)
+
+
+@pytest.mark.slow
+def test_a_killed_campaign_is_continued(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = [sys.executable, "-m", "railfix", "campaign", str(folder / "campaign.toml"), "--out", str(out)]
+    for _ in range(3):
+        with subprocess.Popen(words, start_new_session=True, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr is not None
+            process.stderr.readline()
+            os.killpg(process.pid, signal.SIGKILL)
+        assert process.returncode == -signal.SIGKILL
+    assert not (out / "campaign.csv").exists()
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert "4 of 4 runs, 1 failed" in done.stderr
+    table = pl.read_csv(out / "campaign.csv")
+    assert table["status"].to_list() == ["done", "done", "failed", "done"]
+    assert table["epochs"].to_list() == [400, 400, None, 200]
+    assert list(out.rglob(".railfix-*")) == []

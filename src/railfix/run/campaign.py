@@ -24,6 +24,7 @@ from railfix.run.driver import run_files
 from railfix.run.folder import read_record
 from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
+from railfix.run.output import check_folder
 
 #: A field in a pattern: ``{day}``.
 _FIELD: Final = re.compile(r"\{(\w+)\}")
@@ -188,6 +189,7 @@ def position_run(run: CampaignRun) -> dict[str, Any]:
     row: dict[str, Any] = {**run.fields, "status": "done", "error": None, "epochs": None, "positioning_rate": None}
     row |= {"ok_rate": None, "wall_s": None, "folder": str(run.out)}
     try:
+        check_folder(run.out, overwrite="replace")
         if not run.done:
             options = run.options.replaced(overwrite="replace")
             run_files(run.inputs, run.config, out=run.out, options=options)
