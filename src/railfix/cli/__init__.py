@@ -86,7 +86,6 @@ def railfix(
     - 7: the run ended without a single position
     - 8: the output cannot be written
     - 9: two channels of a live session gave different answers to the same input
-    - 9: two channels of `railfix live` gave different answers
 
     128 and the number of a signal: the program was ended by that signal (143 SIGTERM, 141 the reader of its
     output ended first).
