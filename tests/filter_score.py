@@ -48,7 +48,9 @@ class Case:
         sensors = changes.pop("sensors", None)
         assert sensors is None or isinstance(sensors, SensorEpochs)
         limits = TrackingLimits.model_validate(changes)
-        return track(epochs or self.epochs, Line.of(self.trajectory), limits=limits, sensors=sensors)[0]
+        return track(
+            self.epochs if epochs is None else epochs, Line.of(self.trajectory), limits=limits, sensors=sensors
+        )[0]
 
     def error(self, found: Tracked) -> np.ndarray:
         arc = along_track.on_line_m(found, self.trajectory)
@@ -131,9 +133,8 @@ def figures_of(error: np.ndarray, sigma: np.ndarray | None = None) -> str:
 def show_figures(all_cases: list[Case]) -> None:
     for case in all_cases:
         if np.isfinite(case.single_arc_m).any():
-            print(
-                f"{case.name:9s} single epochs  {figures_of(straight_distance(case.single_arc_m, case.reference, case.trajectory)[case.observed])}"
-            )
+            error = straight_distance(case.single_arc_m, case.reference, case.trajectory)
+            print(f"{case.name:9s} single epochs  {figures_of(error[case.observed])}")
         for label, sensors in (("filter", None), ("with wheel", case.wheel)):
             if label == "filter" or sensors is not None:
                 found = case.run(sensors=sensors)
@@ -203,6 +204,8 @@ def show_starts(all_cases: list[Case]) -> None:
                 "rate_mps", "cn0_dbhz",
             )  # fmt: skip
             end = int(np.searchsorted(t, begin + 61.0))
+            if end == first:
+                continue
             part = replace(case.epochs, **{name: getattr(case.epochs, name)[first:end] for name in per_epoch})
             found = case.run(part)
             arc = along_track.on_line_m(found, case.trajectory)

@@ -20,6 +20,7 @@ from railfix.evaluate import Score, along_track_error, interpolate_reference, sc
 from railfix.integrity.raim import Outcome as RaimOutcome
 from railfix.integrity.raim import constrained_model, exclude
 from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.along_track import on_line_m
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
@@ -40,6 +41,7 @@ TABLES = {
     "health and elevation only": parse_config({"screens": ["elevation"], "elevation": {"mask_deg": 15.0}}),
     "all screens, failed checks kept": parse_config({"elevation": {"mask_deg": 15.0}}),
     "all screens, failed checks dropped": parse_config({"failed_checks": "drop", "elevation": {"mask_deg": 15.0}}),
+    "all screens, and the filter along the track": parse_config({"filter": "track", "elevation": {"mask_deg": 15.0}}),
     "strict": parse_config({"preset": "strict", "elevation": {"mask_deg": 15.0}}),
     "p1 (its own mask, 20 deg)": parse_config({"preset": "p1"}),
 }
@@ -59,6 +61,7 @@ class Outcome:
     trajectory: Trajectory
     ranges: Ranges | None = None
     straight: Score | None = None
+    train: Score | None = None
 
 
 def trajectory_of(time: np.ndarray, ecef_m: np.ndarray) -> Trajectory:
@@ -75,7 +78,12 @@ def run_rinex(
     result, _ = processor.process({"front": read_observations(observations)})
     antenna = result.antennas["front"]
     reference = interpolate_reference(antenna.time, time, ecef)
-    return outcome(name, antenna, reference, trajectory)
+    found = outcome(name, antenna, reference, trajectory)
+    if not result.fusion:
+        return found
+    observed = np.isfinite(reference[:, 0]) & np.any((antenna.reason & 1) == 0, axis=1)
+    filtered = straight_distance(on_line_m(result.fusion["front"].tracked, trajectory), reference, trajectory)
+    return replace(found, train=score(filtered, observed))
 
 
 def outcome(name: str, antenna: AntennaResult, reference: np.ndarray, trajectory: Trajectory) -> Outcome:
@@ -263,6 +271,7 @@ def print_table(data: Path, config: Config) -> None:
             f"{o.name:26s} {a.epochs:6d} {100 * a.rate:7.2f} {a.p50_m:7.2f} {a.p95_m:7.2f} {a.max_m:7.1f} "
             f"{100 * a.wrong_place:8.2f}  | {100 * b.rate:20.2f} {b.p50_m:6.2f} {b.p95_m:6.2f}"
             + (f"  | {o.straight.p50_m:15.2f} {o.straight.p95_m:7.2f} {o.straight.max_m:7.1f}" if o.straight else "")
+            + (f"  | filter {o.train.p50_m:6.2f} {o.train.p95_m:6.2f} {o.train.max_m:6.1f}" if o.train else "")
         )
     together = np.concatenate([o.error_m for o in stations])
     pooled = score(together, np.ones(len(together), dtype=bool))

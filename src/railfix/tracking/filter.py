@@ -12,7 +12,7 @@ from railfix.core.timescale import seconds
 from railfix.tracking.bank import levelled
 from railfix.tracking.clocks import clocks_of_epoch, weighed
 from railfix.tracking.epochs import GnssEpochs, Previous, SensorEpochs
-from railfix.tracking.hypotheses import most_probable, surviving, with_map_error
+from railfix.tracking.hypotheses import most_probable, on_the_line, surviving, with_map_error
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
@@ -144,9 +144,10 @@ def _step(
         places = mean[:, Unknown.PLACE] + update.change[:, Unknown.PLACE]
         evidence = with_map_error(update.log_evidence, line.at(places)[0], state.log_probability, limits)
         log_probability = state.log_probability + evidence
+        after = on_the_line(mean + update.change, update.covariance, line, limits)
         state = replace(
             state,
-            mean=mean + update.change,
+            mean=after,
             covariance=update.covariance,
             log_probability=log_probability - np.logaddexp.reduce(log_probability),
             offset_known=known,

@@ -199,6 +199,23 @@ def with_map_error(log_evidence: Floats, ecef_m: Floats, log_probability: Floats
     return np.asarray(log_evidence[best] + share * (log_evidence - log_evidence[best]))
 
 
+def on_the_line(mean: Floats, covariance: Floats, line: Line, limits: TrackingLimits) -> Floats:
+    """Means with places a little beyond an end of the line put on it, shape (H, N).
+
+    Projection on the constraint along the correlations (D. Simon, Kalman filtering with state constraints, 2010); a
+    place within two sigmas of it is noise, and one further out than a start may be wrong is left: the map may end
+    before the line.
+    """
+    place = mean[:, Unknown.PLACE]
+    excess = np.clip(place, line.arc_m[0], line.arc_m[-1]) - place
+    sigma = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE])
+    excess = np.where((np.abs(excess) > 2.0 * sigma) & (np.abs(excess) <= limits.start_sigma_m), excess, 0.0)
+    if not excess.any():
+        return mean
+    gain = covariance[:, :, Unknown.PLACE] / covariance[:, Unknown.PLACE, Unknown.PLACE, None]
+    return np.asarray(mean + gain * excess[:, None])
+
+
 def most_probable(log_probability: Floats) -> int:
     """The hypothesis to go by: that of before, the first, unless another is `_SWITCH` times as probable."""
     best = int(np.argmax(log_probability))
