@@ -144,7 +144,8 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 def _rounded(time: Datetimes) -> Datetimes:
     """Return tags rounded to `SAME_EPOCH`, shape (T,)."""
     step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
-    return ((time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step).astype("datetime64[ns]")
+    rounded = (time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step
+    return np.asarray(rounded.astype("datetime64[ns]"))
 
 
 def _ranges(position: Floats, code: Floats, sigma: Floats, used: Masks, groups: tuple[slice, ...]) -> Ranges:

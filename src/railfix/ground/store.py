@@ -1,0 +1,137 @@
+"""Stored state of the centre: trains, authorities and the log, in SQLite (WAL) or another SQL database.
+
+Everything that is acknowledged or granted is committed before: a centre that is killed at any moment finds it again.
+"""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Any, Final, Self
+
+import sqlalchemy as sql
+from sqlalchemy import event
+
+from railfix.core.errors import InputFileError
+from railfix.ground.centre import TrainRecord, after_restart
+from railfix.io.train_message import decode, encode
+
+_META: Final = sql.MetaData()
+TRAINS: Final = sql.Table(
+    "trains",
+    _META,
+    sql.Column("train", sql.BigInteger, primary_key=True, autoincrement=False),
+    sql.Column("sequence", sql.BigInteger, nullable=False),
+    sql.Column("message", sql.LargeBinary),
+)
+DOCUMENTS: Final = sql.Table(
+    "documents",
+    _META,
+    sql.Column("name", sql.String(64), primary_key=True),
+    sql.Column("text", sql.Text, nullable=False),
+)
+LOG: Final = sql.Table(
+    "log",
+    _META,
+    sql.Column("number", sql.Integer, primary_key=True, autoincrement=True),
+    sql.Column("time_ns", sql.BigInteger, nullable=False),
+    sql.Column("train", sql.BigInteger),
+    sql.Column("text", sql.Text, nullable=False),
+)
+
+
+class Store:
+    """Stored state of a centre.
+
+    Parameters
+    ----------
+    url : str
+        SQLAlchemy address: ``sqlite:///centre.db``, ``postgresql+psycopg://...``.
+
+    Raises
+    ------
+    InputFileError
+        The database cannot be opened.
+    """
+
+    def __init__(self, url: str) -> None:
+        try:
+            self._engine = sql.create_engine(url)
+            if self._engine.dialect.name == "sqlite":
+                event.listen(self._engine, "connect", _durable)
+            _META.create_all(self._engine)
+        except (sql.exc.SQLAlchemyError, ImportError) as error:
+            raise InputFileError(url, f"cannot be opened as the centre's database ({error})") from None
+        self._connection = self._engine.connect()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the database."""
+        self._connection.close()
+        self._engine.dispose()
+
+    def save(self, record: TrainRecord) -> None:
+        """Commit the newest report of a train; afterwards it may be acknowledged."""
+        values = {
+            "sequence": record.sequence,
+            "message": None if record.message is None else encode(record.message),
+        }
+        self._put(TRAINS, {"train": record.train}, values)
+
+    def save_document(self, name: str, text: str) -> None:
+        """Commit a named text, for example the state of the interlocking."""
+        self._put(DOCUMENTS, {"name": name}, {"text": text})
+
+    def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
+        """Commit a line of the log."""
+        with self._connection.begin():
+            self._connection.execute(LOG.insert().values(time_ns=time_ns, train=train, text=text))
+
+    def records(self) -> dict[int, TrainRecord]:
+        """Return the records of all trains as after a restart."""
+        with self._connection.begin():
+            rows = self._connection.execute(sql.select(TRAINS)).all()
+        return {
+            row.train: after_restart(
+                TrainRecord(
+                    train=row.train,
+                    sequence=row.sequence,
+                    message=(message := None if row.message is None else decode(bytes(row.message))),
+                    shown_m=None if message is None or message.chainage_cm is None else message.chainage_cm / 100.0,
+                )
+            )
+            for row in rows
+        }
+
+    def document(self, name: str) -> str | None:
+        """Return a named text, None where there is none."""
+        with self._connection.begin():
+            return self._connection.execute(sql.select(DOCUMENTS.c.text).where(DOCUMENTS.c.name == name)).scalar()
+
+    def log(self, *, last: int = 100) -> list[tuple[int, int | None, str]]:
+        """Return the newest lines of the log, oldest first: time [ns], train, text."""
+        query = sql.select(LOG).order_by(LOG.c.number.desc()).limit(last)
+        with self._connection.begin():
+            rows = self._connection.execute(query).all()
+        return [(row.time_ns, row.train, row.text) for row in reversed(rows)]
+
+    def _put(self, table: sql.Table, key: dict[str, Any], values: dict[str, Any]) -> None:
+        where = [table.c[name] == value for name, value in key.items()]
+        with self._connection.begin():
+            done = self._connection.execute(table.update().where(*where).values(**values))
+            if done.rowcount == 0:
+                self._connection.execute(table.insert().values(**key, **values))
+
+
+def _durable(connection: Any, _record: object) -> None:
+    """Set a connection of SQLite to write-ahead logging, each commit on the disk before it returns."""
+    cursor = connection.cursor()
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=5000"):
+        cursor.execute(f"PRAGMA {pragma}")
+    cursor.close()
