@@ -168,6 +168,9 @@ def test_neighbours_pass_with_their_speed_and_headway() -> None:
     v = neighbour_clearance(train, many, time, side=1.0)
     assert (v > 0.0).mean() == pytest.approx(0.1, abs=0.003)
     np.testing.assert_allclose(v[:-500], v[500:], atol=1e-6)
+    # At 20 m/s toward rising chainage: a second later it is the same 20 m further on.
+    further = neighbour_clearance(train, replace(many, chainage_m=np.full(n, 320.0)), time + 1.0, side=1.0)
+    np.testing.assert_allclose(further, v, atol=1e-6)
     # 2.5 m off, 2 m over the antenna: hides up to atan(2 / 2.5) = 38.7 deg; left of the train nothing.
     inside = float(time[np.argmax(v)])
     for elevation, hidden in ((37.0, True), (41.0, False)):

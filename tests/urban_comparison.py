@@ -9,7 +9,7 @@ scenario `city` is calibrated on the Hong Kong recordings, Berlin and the Pixel 
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
@@ -370,7 +370,7 @@ def main() -> int:
         print_speed()
         return 0
     samples = [simulated(kind) for kind in ("none", "open", "suburban", "urban", "station", "canyon")]
-    samples.append(city())
+    samples += [city(), replace(city(seeds=(4, 5, 6)), name="sim. city, other seeds")]
     data = Path(__file__).resolve().parents[2] / "shared" / "data"
     if data.is_dir():
         samples += recordings(data)
