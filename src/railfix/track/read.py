@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from os import PathLike
 
+import numpy as np
+
 from railfix.core.errors import InputFileError, SettingsError
-from railfix.core.files import ending
+from railfix.core.files import ending, read_text
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
+from railfix.track.height_source import with_heights
 from railfix.track.heights import check_height_datum
+from railfix.track.ifc_file import read_ifc_segments
 from railfix.track.route import MAX_GAP_M, join
-from railfix.track.segment import Segment
+from railfix.track.segment import NO_HEIGHTS, Segment
 from railfix.track.track import Track
+from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
+from railfix.track.vector_file import geojson_has_heights, read_vector_segments
+from railfix.track.xml_files import read_xml_segments
 
 
 def read_track(
@@ -26,8 +34,13 @@ def read_track(
     sigma_plan_m: float | None = None,
     sigma_height_m: float | None = None,
     duplicates: str = "reject",
+    heights: str | PathLike[str] | None = None,
 ) -> Track:
-    """Read the centreline of a route from CSV (``.csv``) or GeoJSON (``.geojson``, ``.json``) files, plain or packed.
+    """Read the centreline of a route from map files.
+
+    CSV (``.csv``) and GeoJSON (``.geojson``, ``.json``), plain or packed; GeoPackage, Shapefile, FlatGeobuf, GML, GPX,
+    KML, DXF and OpenStreetMap through GDAL; alignments of IFC 4.3 (``.ifc``) and LandXML, and railML 3 (``.xml``,
+    ``.railml``).
 
     Parameters
     ----------
@@ -47,6 +60,8 @@ def read_track(
         Accuracy of the map; by default that of the file, else 0.30 m and 0.60 m (P1 4.1(3)).
     duplicates : {"reject", "keep"}
         Equal consecutive points are an error, or kept for `railfix.track.check_track`.
+    heights : path, optional
+        Second source of the heights of a map that has none; see `railfix.track.height_source.with_heights`.
 
     Returns
     -------
@@ -70,22 +85,65 @@ def read_track(
         raise SettingsError("no track map was given")
     segments: list[Segment] = []
     for file in files:
-        kind = ending(file)
-        if kind in (".geojson", ".json"):
-            segments += read_geojson_segments(
-                file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates
-            )
-        elif kind == ".csv":
-            segments.append(
-                read_csv_segment(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
-            )
-        else:
-            raise InputFileError(file, "a track map ends in .csv, .geojson or .json")
-    return join(
-        segments,
+        segments += read_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
+    flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
+    if flat and heights is None:
+        raise InputFileError(
+            flat[0].source,
+            "the coordinates have no height; make a 3-D map with 'railfix map route MAP --heights FILE', the file a "
+            "profile by chainage or a log of 3-D positions",
+        )
+    if heights is not None and len(flat) < len(segments):
+        raise SettingsError(f"{segments[0].source} has heights itself; --heights is for maps without")
+    track = join(
+        [replace(s, height_m=np.zeros(len(s.height_m))) if s.height_datum == NO_HEIGHTS else s for s in segments],
         name=name,
         height_datum_asked=height_datum,
         max_gap_m=max_gap_m,
         sigma_plan_m=sigma_plan_m,
         sigma_height_m=sigma_height_m,
+    )
+    if heights is None:
+        return track
+    raised = with_heights(track, heights, geoid=geoid)
+    return raised if sigma_height_m is None else replace(raised, sigma_height_m=sigma_height_m)
+
+
+def read_segments(
+    file: str | PathLike[str],
+    *,
+    crs: str | None = None,
+    height_datum: str | None = None,
+    geoid: str | None = None,
+    duplicates: str = "reject",
+) -> list[Segment]:
+    """Read the lines of one map file in their order; a file without heights gives segments without.
+
+    Parameters
+    ----------
+    file : path
+    crs, height_datum, geoid, duplicates
+        As for `read_track`.
+
+    Raises
+    ------
+    InputFileError
+        The file is not a map.
+    """
+    kind = ending(file)
+    if kind == ".csv":
+        return [read_csv_segment(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)]
+    if kind in (".geojson", ".json"):
+        if geojson_has_heights(read_text(file)):
+            return read_geojson_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
+        return read_vector_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+    if kind in VECTOR_ENDINGS:
+        return read_vector_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+    if kind == ".ifc":
+        return read_ifc_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+    if kind in (".xml", ".landxml", ".railml"):
+        return read_xml_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+    raise InputFileError(
+        file,
+        "a track map ends in .csv, .geojson or .json, .ifc, .xml, .landxml, .railml, " + ", ".join(VECTOR_ENDINGS),
     )

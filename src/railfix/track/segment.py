@@ -6,13 +6,15 @@ from dataclasses import dataclass
 
 from railfix.core.arrays import Floats
 
+#: `Segment.height_datum` of a segment without heights; they are NaN, or come from a second source.
+NO_HEIGHTS = "none"
 #: Optional attributes of each point of a map.
 ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """Points of one file or feature, in WGS 84 with ellipsoidal heights.
+    """Points of one file or feature, with ellipsoidal heights, or NaN where the file has none (`NO_HEIGHTS`).
 
     Attributes
     ----------

@@ -1,0 +1,125 @@
+"""Segments of a route from the alignment elements of a design file (IFC, LandXML)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from pyproj import CRS, Transformer
+
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.track.elements import CantElement, PlanElement, ProfileElement, alignment_points
+from railfix.track.frames import frame_degrees, older_datum_note
+from railfix.track.heights import check_height_datum, ellipsoidal_heights
+from railfix.track.segment import NO_HEIGHTS, Segment
+
+#: Margin about the area of use of a CRS [deg].
+_MARGIN_DEG: Final = 0.5
+
+
+def segment_of_design(
+    *,
+    path: str,
+    name: str,
+    plan: Sequence[PlanElement],
+    profile: Sequence[ProfileElement],
+    cant: Sequence[CantElement],
+    crs: str | None,
+    height_datum: str | None,
+    geoid: str | None,
+    grid: tuple[float, float, float, float, float, float] | None = None,
+    notes: tuple[str, ...] = (),
+) -> Segment:
+    """The points of one alignment as a segment.
+
+    Parameters
+    ----------
+    path, name : str
+    plan, profile, cant : sequences of elements
+        The profile may be empty: the segment has no heights then.
+    crs : str or None
+        Of the grid; required.
+    height_datum, geoid : str or None
+        Of the profile.
+    grid : tuple of float, optional
+        Easting, northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into
+        those of the grid.
+
+    Raises
+    ------
+    InputFileError
+        The alignment has no element, or no grid.
+    SettingsError
+        The height datum is missing.
+    """
+    if not plan:
+        raise InputFileError(path, f"alignment {name!r} has no element in plan")
+    if crs is None:
+        raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give --crs")
+    points, joints = alignment_points(plan, profile, cant)
+    xy, up, scale = points.xy_m, 0.0, 1.0
+    if grid is not None:
+        east, north, up, cosine, sine, scale = grid
+        xy = np.array([east, north]) + scale * xy @ np.array([[cosine, sine], [-sine, cosine]])
+    curvature = points.curvature
+    if grid is None and _within(crs, xy[:, ::-1]) and not _within(crs, xy):
+        # northing before easting turns the plane over, so a curve to the left in the file is one to the right
+        xy, curvature = xy[:, ::-1], -curvature
+        joints = (*joints, f"{name}: the file has northing before easting")
+    latitude, longitude, frame = frame_degrees(crs, xy[:, 0], xy[:, 1])
+    if not (np.isfinite(latitude).all() and np.isfinite(longitude).all()):
+        raise InputFileError(path, f"alignment {name!r}: coordinates lie outside the CRS {crs}; give the right --crs")
+    height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
+    if profile:
+        check_height_datum(height_datum)
+        if height_datum is None:
+            raise SettingsError(
+                f"{path}: the profile's height datum is missing; give --height-datum ellipsoidal or orthometric"
+            )
+        datum = height_datum
+        height, model = ellipsoidal_heights(
+            points.height_m + up, latitude, longitude, datum=datum, geoid=geoid, geoid_m=None, path=path
+        )
+    radius = np.full(len(latitude), np.inf)
+    bent = np.abs(curvature) > 1e-9
+    radius[bent] = -1.0 / curvature[bent] * scale
+    # the side of the cant follows from that of the curve; at the foot of a ramp it is that of the curve beside it
+    place = np.arange(len(radius))
+    side = np.ones(len(radius))
+    if bent.any():
+        nearest = np.searchsorted(place[bent], place).clip(0, bent.sum() - 1)
+        before = (nearest - 1).clip(0)
+        nearer = np.abs(place[bent][before] - place) < np.abs(place[bent][nearest] - place)
+        side = np.sign(curvature[bent])[np.where(nearer, before, nearest)]
+    return Segment(
+        source=f"{path} ({name})",
+        file=path,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        kilometrage_m=np.full(len(latitude), np.nan),
+        cant_m=points.cant_m * side,
+        radius_m=radius,
+        gradient_permille=points.gradient * 1e3,
+        crs=crs,
+        frame=frame,
+        height_datum=datum,
+        geoid=model,
+        metadata={"name": name},
+        notes=(*notes, *joints, *older_datum_note(crs)),
+    )
+
+
+def _within(crs: str, xy: Floats) -> bool:
+    """Whether coordinates lie in the area of use of a CRS; True where it has none."""
+    system = CRS.from_user_input(crs)
+    area = system.area_of_use
+    if area is None:
+        return True
+    transformer = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
+    longitude, latitude = (np.asarray(v) for v in transformer.transform(xy[:, 0], xy[:, 1]))
+    inside = (latitude > area.south - _MARGIN_DEG) & (latitude < area.north + _MARGIN_DEG)
+    inside &= (longitude > area.west - _MARGIN_DEG) & (longitude < area.east + _MARGIN_DEG)
+    return bool(inside.all())

@@ -1,0 +1,247 @@
+"""Elements of an alignment in plan, profile and cant, as design files have them.
+
+In plan an element has a curvature that runs from its first to its last value by a law (straight, arc, clothoid,
+Bloss, cosine, sine, Helmert); the direction is its integral in closed form, the place that of the direction by
+Gauss-Legendre quadrature. Profile and cant are closed forms. Lengths are those of the plan, directions are
+counter-clockwise from the x axis (easting), curvature is positive to the left, as in IFC 4.3 and LandXML.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Masks
+
+#: Share of the change of curvature or cant at a share t of the element, and its integral from 0 to t (IFC 4.3.2,
+#: IfcAlignmentHorizontalSegmentTypeEnum and IfcAlignmentCantSegmentTypeEnum).
+LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
+    "linear": (lambda t: t, lambda t: t**2 / 2.0),
+    "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
+    "cosine": (lambda t: (1.0 - np.cos(np.pi * t)) / 2.0, lambda t: t / 2.0 - np.sin(np.pi * t) / (2.0 * np.pi)),
+    "sine": (
+        lambda t: t - np.sin(2.0 * np.pi * t) / (2.0 * np.pi),
+        lambda t: t**2 / 2.0 + (np.cos(2.0 * np.pi * t) - 1.0) / (4.0 * np.pi**2),
+    ),
+    "helmert": (
+        lambda t: np.where(t < 0.5, 2.0 * t**2, -1.0 + 4.0 * t - 2.0 * t**2),
+        lambda t: np.where(t < 0.5, 2.0 * t**3 / 3.0, 1.0 / 6.0 - t + 2.0 * t**2 - 2.0 * t**3 / 3.0),
+    ),
+}
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+#: Longest piece of one quadrature [rad of direction]; 12 nodes are exact to rounding below it.
+_PIECE_RAD: Final = 0.5
+#: Steps of points of an alignment: chords stay within 1 cm of arcs down to 100 m radius.
+_CHORD_M: Final = 0.01
+_LONGEST_M: Final = 25.0
+#: Elements that begin further than this from the end of the one before are reported [m].
+_JOINT_M: Final = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanElement:
+    """One element in plan.
+
+    Attributes
+    ----------
+    x_m, y_m : float [m]
+        First point, easting and northing.
+    direction_rad : float [rad]
+        At the first point, counter-clockwise from the x axis.
+    first, last : float [1/m]
+        Curvature at the ends, positive to the left.
+    length_m : float [m]
+    law : str
+        Key of `LAWS`.
+    """
+
+    x_m: float
+    y_m: float
+    direction_rad: float
+    first: float
+    last: float
+    length_m: float
+    law: str = "linear"
+
+    def curvature_at(self, way_m: Floats) -> Floats:
+        """Curvature [1/m] at ways from the first point."""
+        return np.asarray(self.first + (self.last - self.first) * LAWS[self.law][0](way_m / self.length_m))
+
+    def direction_at(self, way_m: Floats) -> Floats:
+        """Direction [rad] at ways from the first point."""
+        change = (self.last - self.first) * self.length_m * LAWS[self.law][1](way_m / self.length_m)
+        return np.asarray(self.direction_rad + self.first * way_m + change)
+
+    def place_at(self, way_m: Floats) -> Floats:
+        """Easting and northing at ways from the first point, shape (n, 2) [m]."""
+        turn = max(abs(self.first), abs(self.last)) * self.length_m
+        pieces = max(2, 2 * int(np.ceil(turn / (2.0 * _PIECE_RAD))))  # even: Helmert's law has its knot in the middle
+        knots = np.linspace(0.0, self.length_m, pieces + 1)
+        whole = np.concatenate([np.zeros((1, 2)), np.cumsum(self._integral(knots[:-1], knots[1:]), axis=0)])
+        piece = np.clip(np.searchsorted(knots, way_m, side="right") - 1, 0, pieces - 1)
+        return np.asarray(np.array([self.x_m, self.y_m]) + whole[piece] + self._integral(knots[piece], way_m))
+
+    def _integral(self, start: Floats, end: Floats) -> Floats:
+        half = (end - start)[:, None] / 2.0
+        direction = self.direction_at(start[:, None] + half * (1.0 + _NODES))
+        return np.stack(
+            [(half * _WEIGHTS * np.cos(direction)).sum(axis=1), (half * _WEIGHTS * np.sin(direction)).sum(axis=1)],
+            axis=-1,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProfileElement:
+    """One element of the profile: gradient, circular arc or parabola.
+
+    Attributes
+    ----------
+    start_m, length_m : float [m]
+        Place and length in plan.
+    height_m : float [m]
+        At the start.
+    first, last : float
+        Gradient at the ends [m/m].
+    arc : str
+        ``"circle"`` or ``"parabola"``; a gradient is a parabola whose ends are equal.
+    """
+
+    start_m: float
+    length_m: float
+    height_m: float
+    first: float
+    last: float
+    arc: str = "parabola"
+
+    def height_at(self, place_m: Floats) -> Floats:
+        """Height [m] at places in plan."""
+        way = place_m - self.start_m
+        if self.arc == "parabola" or self.first == self.last:
+            return np.asarray(
+                self.height_m + self.first * way + (self.last - self.first) * way**2 / (2.0 * self.length_m)
+            )
+        sine = _sine(self.first) + (_sine(self.last) - _sine(self.first)) * way / self.length_m
+        radius = self.length_m / (_sine(self.last) - _sine(self.first))
+        return np.asarray(self.height_m - radius * (np.sqrt(1.0 - sine**2) - np.sqrt(1.0 - _sine(self.first) ** 2)))
+
+    def gradient_at(self, place_m: Floats) -> Floats:
+        """Gradient [m/m] at places in plan."""
+        share = (place_m - self.start_m) / self.length_m
+        if self.arc == "parabola" or self.first == self.last:
+            return np.asarray(self.first + (self.last - self.first) * share)
+        sine = _sine(self.first) + (_sine(self.last) - _sine(self.first)) * share
+        return np.asarray(sine / np.sqrt(1.0 - sine**2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CantElement:
+    """One element of the cant: heights of both rails over the profile at its ends, by a law of `LAWS` [m]."""
+
+    start_m: float
+    length_m: float
+    left_m: tuple[float, float]
+    right_m: tuple[float, float]
+    law: str = "linear"
+
+    def rails_at(self, place_m: Floats) -> tuple[Floats, Floats]:
+        """Heights of the left and the right rail over the profile [m]."""
+        share = LAWS[self.law][0](np.clip((place_m - self.start_m) / self.length_m, 0.0, 1.0))
+        left, right = (np.asarray(a + (b - a) * share) for a, b in (self.left_m, self.right_m))
+        return left, right
+
+
+def _sine(gradient: float) -> float:
+    return float(gradient / np.hypot(1.0, gradient))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentPoints:
+    """Points of an alignment in grid coordinates, n points.
+
+    Attributes
+    ----------
+    place_m : ndarray, shape (n,)
+        Length in plan from the start of the alignment.
+    xy_m : ndarray, shape (n, 2)
+        Easting and northing.
+    height_m : ndarray, shape (n,)
+        Middle between the rail tops; NaN without a profile.
+    curvature : ndarray, shape (n,) [1/m]
+        Positive to the left.
+    cant_m : ndarray, shape (n,)
+        Right rail above left rail; NaN without cant.
+    gradient : ndarray, shape (n,)
+        NaN without a profile.
+    """
+
+    place_m: Floats
+    xy_m: Floats
+    height_m: Floats
+    curvature: Floats
+    cant_m: Floats
+    gradient: Floats
+
+
+def alignment_at(
+    place_m: Floats, plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
+) -> AlignmentPoints:
+    """Points of an alignment at lengths in plan, shape (n,), within the plan's length.
+
+    Each element is evaluated from its own first point as the file has it, so an error of one is not carried on. At
+    a joint the later element holds. Beyond the profile its last gradient goes on; beyond the cant there is none.
+    """
+    starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
+    xy, curvature = np.zeros((len(place_m), 2)), np.zeros(len(place_m))
+    index = np.clip(np.searchsorted(starts, place_m, side="right") - 1, 0, len(plan) - 1)
+    for k, element in enumerate(plan):
+        rows = index == k
+        if rows.any():
+            way = place_m[rows] - starts[k]
+            xy[rows], curvature[rows] = element.place_at(way), element.curvature_at(way)
+    height, gradient = np.full(len(place_m), np.nan), np.full(len(place_m), np.nan)
+    for rows, k in _by_start(place_m, profile):
+        height[rows] = profile[k].height_at(place_m[rows])
+        gradient[rows] = profile[k].gradient_at(place_m[rows])
+    difference = np.full(len(place_m), np.nan)
+    for rows, k in _by_start(place_m, cant):
+        left, right = cant[k].rails_at(place_m[rows])
+        height[rows] += (left + right) / 2.0
+        difference[rows] = right - left
+    return AlignmentPoints(
+        place_m=place_m, xy_m=xy, height_m=height, curvature=curvature, cant_m=difference, gradient=gradient
+    )
+
+
+def _by_start(place_m: Floats, elements: Sequence[ProfileElement] | Sequence[CantElement]) -> list[tuple[Masks, int]]:
+    if not elements:
+        return []
+    index = np.searchsorted([element.start_m for element in elements], place_m, side="right") - 1
+    return [(np.clip(index, 0, None) == k, k) for k in np.unique(np.clip(index, 0, None))]
+
+
+def alignment_points(
+    plan: Sequence[PlanElement], profile: Sequence[ProfileElement], cant: Sequence[CantElement]
+) -> tuple[AlignmentPoints, tuple[str, ...]]:
+    """Points of an alignment such that chords stay within 1 cm of its arcs, and notes on joints that do not meet."""
+    length = sum(element.length_m for element in plan)
+    starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
+    places = [np.array([0.0, length]), starts]
+    for element, start in zip(plan, starts, strict=False):
+        bend = max(abs(element.first), abs(element.last))
+        step = min(_LONGEST_M, np.sqrt(8.0 * _CHORD_M / bend)) if bend else _LONGEST_M
+        places.append(start + np.linspace(0.0, element.length_m, int(np.ceil(element.length_m / step)) + 1))
+    places += [np.array([e.start_m, e.start_m + e.length_m]) for e in profile]
+    places += [np.array([e.start_m, e.start_m + e.length_m]) for e in cant]
+    place = np.unique(np.concatenate(places).clip(0.0, length))
+    place = place[np.concatenate([[True], np.diff(place) > 1e-3])]
+    gaps = [
+        float(np.hypot(*(before.place_at(np.array([before.length_m]))[0] - (after.x_m, after.y_m))))
+        for before, after in pairwise(plan)
+    ]
+    wide = [gap for gap in gaps if gap > _JOINT_M]
+    notes = (f"{len(wide)} of {len(gaps)} joints in plan do not meet, the widest by {max(wide):.3f} m",) if wide else ()
+    return alignment_at(place, plan, profile, cant), notes

@@ -1,0 +1,226 @@
+"""Alignments of IFC 4.3 files: the segments in plan, profile and cant, evaluated as `railfix.track.elements`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import read_text
+from railfix.track.design import segment_of_design
+from railfix.track.elements import CantElement, PlanElement, ProfileElement
+from railfix.track.segment import Segment
+
+_LAWS: Final = {
+    "LINE": "linear",
+    "CIRCULARARC": "linear",
+    "CLOTHOID": "linear",
+    "BLOSSCURVE": "bloss",
+    "COSINECURVE": "cosine",
+    "SINECURVE": "sine",
+    "HELMERTCURVE": "helmert",
+    "CONSTANTCANT": "linear",
+    "LINEARTRANSITION": "linear",
+}
+_ARCS: Final = {"CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle"}
+_TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
+_PREFIX: Final = {"MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "KILO": 1e3}
+
+
+@dataclass(frozen=True)
+class _Entity:
+    kind: str
+    values: list[Any]
+
+
+class _Step:
+    """Entities of a STEP physical file (ISO 10303-21) by number."""
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = str(path)
+        text = read_text(path)
+        if "ISO-10303-21" not in text[:200] or "DATA;" not in text:
+            raise InputFileError(path, "this is no IFC file in STEP form (ISO 10303-21)")
+        body = re.sub(r"/\*.*?\*/", "", text.split("DATA;", 1)[1], flags=re.S)
+        pattern = re.compile(r"#(\d+)\s*=\s*([A-Z0-9_]+)\s*(\((?:[^';]|'(?:[^']|'')*')*\))\s*;")
+        self.entities = {int(m[1]): _Entity(m[2], _values(m[3])) for m in pattern.finditer(body)}
+
+    def of_kind(self, kind: str) -> list[tuple[int, _Entity]]:
+        return [(number, entity) for number, entity in self.entities.items() if entity.kind == kind]
+
+    def at(self, reference: Any, *, what: str) -> _Entity:
+        if isinstance(reference, str) and reference.startswith("#") and int(reference[1:]) in self.entities:
+            return self.entities[int(reference[1:])]
+        raise InputFileError(self.path, f"{what} refers to {reference}, which the file does not have")
+
+
+def _values(text: str) -> list[Any]:
+    stack: list[list[Any]] = [[]]
+    for token in _TOKEN.findall(text):
+        if token == "(":
+            stack.append([])
+        elif token == ")":
+            inner = stack.pop()
+            stack[-1].append(inner)
+        elif token in ("$", "*"):
+            stack[-1].append(None)
+        elif token[0] == "'":
+            stack[-1].append(token[1:-1].replace("''", "'"))
+        elif token[0] in "+-0123456789":
+            stack[-1].append(float(token))
+        elif token != ",":
+            stack[-1].append(token)
+    return list(stack[0][0])
+
+
+def read_ifc_segments(
+    path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
+) -> list[Segment]:
+    """Read the alignments of an IFC file, one segment each.
+
+    The height is that of the middle between the rail tops: the profile and half the sum of both rails' cant (IFC
+    4.3.2, IfcSegmentedReferenceCurve). A constant cant whose two ends differ is taken as a linear transition.
+
+    Parameters
+    ----------
+    path : path
+    crs : str, optional
+        Of the grid, where the file has no IfcProjectedCRS.
+    height_datum, geoid : str, optional
+
+    Raises
+    ------
+    InputFileError
+        The file has no alignment, or one with elements that are not read.
+    """
+    step = _Step(path)
+    nested = {entity.values[4]: entity.values[5] for _, entity in step.of_kind("IFCRELNESTS")}
+    scale, angle = _units(step)
+    segments: list[Segment] = []
+    for number, alignment in step.of_kind("IFCALIGNMENT"):
+        layouts = {step.at(r, what=f"#{number}").kind: r for r in nested.get(f"#{number}", [])}
+        if "IFCALIGNMENTHORIZONTAL" not in layouts:
+            continue
+        elements: dict[str, list[_Entity]] = {}
+        for kind, reference in layouts.items():
+            parts = [step.at(r, what=kind) for r in nested.get(reference, [])]
+            elements[kind] = [step.at(p.values[7] if len(p.values) > 7 else None, what=p.kind) for p in parts]
+        name = alignment.values[2] or f"alignment {len(segments) + 1}"
+        try:
+            plan = [_plan(step, e, scale, angle) for e in elements["IFCALIGNMENTHORIZONTAL"]]
+            profile = [_profile(step, e, scale) for e in elements.get("IFCALIGNMENTVERTICAL", [])]
+            cant = [_cant(step, e, scale) for e in elements.get("IFCALIGNMENTCANT", [])]
+        except (TypeError, IndexError):
+            raise InputFileError(path, f"alignment {name!r}: a segment lacks a number that IFC 4.3 requires") from None
+        uneven = sum(_is_uneven(e) for e in elements.get("IFCALIGNMENTCANT", []))
+        notes = (
+            (f"{uneven} segments of constant cant have two values and are taken as linear transitions",)
+            if uneven
+            else ()
+        )
+        xy, system = _map_conversion(step)
+        segments.append(
+            segment_of_design(
+                path=str(path),
+                name=str(name),
+                plan=[p for p in plan if p.length_m > 0.0],
+                profile=[p for p in profile if p.length_m > 0.0],
+                cant=[c for c in cant if c.length_m > 0.0],
+                crs=crs or system,
+                height_datum=height_datum,
+                geoid=geoid,
+                grid=xy,
+                notes=notes,
+            )
+        )
+    if not segments:
+        raise InputFileError(path, "there is no IfcAlignment with a horizontal layout")
+    return segments
+
+
+def _units(step: _Step) -> tuple[float, float]:
+    """Metres of a length and radians of an angle in the file."""
+    length = angle = 1.0
+    assigned = {r for _, e in step.of_kind("IFCUNITASSIGNMENT") for r in e.values[0]}
+    for number, entity in step.entities.items():
+        if f"#{number}" not in assigned:
+            continue
+        if entity.kind == "IFCSIUNIT" and entity.values[1] == ".LENGTHUNIT.":
+            length = _PREFIX.get(str(entity.values[2]).strip("."), 1.0)
+        elif entity.kind == "IFCCONVERSIONBASEDUNIT":
+            factor = step.at(entity.values[3], what="a unit").values[0]
+            value = next((v for v in (factor if isinstance(factor, list) else [factor]) if isinstance(v, float)), None)
+            if value is None:
+                flat = [v for v in step.at(entity.values[3], what="a unit").values if isinstance(v, list)]
+                value = flat[0][0]
+            if entity.values[1] == ".LENGTHUNIT.":
+                length = value
+            elif entity.values[1] == ".PLANEANGLEUNIT.":
+                angle = value
+    return length, angle
+
+
+def _map_conversion(step: _Step) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
+    """Easting, northing, height, cosine, sine and scale of the IfcMapConversion, and the CRS it names."""
+    found = step.of_kind("IFCMAPCONVERSION")
+    if not found:
+        return None, None
+    values = found[0][1].values
+    system = step.at(values[1], what="IfcMapConversion").values[0]
+    east, north, up = (float(v) for v in values[2:5])
+    a, b = (1.0 if values[5] is None else values[5]), (0.0 if values[6] is None else values[6])
+    scale = values[7] if len(values) > 7 and values[7] is not None else 1.0
+    norm = float(np.hypot(a, b))
+    return (east, north, up, a / norm, b / norm, float(scale)), str(system)
+
+
+def _law(step: _Step, entity: _Entity, kinds: dict[str, str]) -> str:
+    kind = str(entity.values[-1]).strip(".")
+    if kind not in kinds:
+        raise InputFileError(step.path, f"{entity.kind} of kind {kind} is not read; known are {', '.join(kinds)}")
+    return kinds[kind]
+
+
+def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanElement:
+    point, direction, first, last, length = entity.values[2:7]
+    x, y = step.at(point, what=entity.kind).values[0][:2]
+    law = _law(step, entity, {k: v for k, v in _LAWS.items() if "CANT" not in k and k != "LINEARTRANSITION"})
+    return PlanElement(
+        x_m=x * scale,
+        y_m=y * scale,
+        direction_rad=direction * angle,
+        first=1.0 / (first * scale) if first else 0.0,
+        last=1.0 / (last * scale) if last else 0.0,
+        length_m=length * scale,
+        law=law,
+    )
+
+
+def _profile(step: _Step, entity: _Entity, scale: float) -> ProfileElement:
+    start, length, height, first, last = entity.values[2:7]
+    arc = _law(step, entity, _ARCS)
+    return ProfileElement(
+        start_m=start * scale, length_m=length * scale, height_m=height * scale, first=first, last=last, arc=arc
+    )
+
+
+def _cant(step: _Step, entity: _Entity, scale: float) -> CantElement:
+    start, length, left, left_end, right, right_end = entity.values[2:8]
+    law = _law(step, entity, {k: v for k, v in _LAWS.items() if k not in ("LINE", "CIRCULARARC", "CLOTHOID")})
+    return CantElement(
+        start_m=start * scale,
+        length_m=length * scale,
+        left_m=(left * scale, (left if left_end is None else left_end) * scale),
+        right_m=(right * scale, (right if right_end is None else right_end) * scale),
+        law=law,
+    )
+
+
+def _is_uneven(entity: _Entity) -> bool:
+    left, left_end, right, right_end = entity.values[4:8]
+    uneven = (left_end is not None and left_end != left) or (right_end is not None and right_end != right)
+    return entity.values[-1] == ".CONSTANTCANT." and uneven

@@ -1,0 +1,278 @@
+"""Alignments of LandXML 1.2 and track centrelines of railML 3, read with `lxml`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.errors import InputFileError
+from railfix.core.files import read_bytes
+from railfix.track.design import segment_of_design
+from railfix.track.elements import CantElement, PlanElement, ProfileElement
+from railfix.track.segment import Segment
+from railfix.track.vector_file import INSTALL, plan_segment
+
+_UNITS: Final = {"meter": 1.0, "millimeter": 1e-3, "foot": 0.3048, "USSurveyFoot": 1200.0 / 3937.0}
+_SPIRALS: Final = {"clothoid": "linear", "bloss": "bloss", "cosine": "cosine", "sinusoid": "sine"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relation:
+    """Connection of two net elements as railML 3 and RailTopoModel have it.
+
+    Attributes
+    ----------
+    name : str
+    first, second : str
+        Names of the elements.
+    first_end, second_end : int
+        0 where the start of the element is meant, 1 where its end.
+    navigable : bool
+        Whether trains pass from one to the other.
+    """
+
+    name: str
+    first: str
+    second: str
+    first_end: int
+    second_end: int
+    navigable: bool
+
+
+def _root(path: str | PathLike[str]) -> Any:
+    try:
+        from lxml import etree
+    except ImportError:
+        raise InputFileError(path, f"reading XML maps needs lxml; {INSTALL}") from None
+    try:
+        parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=True)
+        return etree.fromstring(read_bytes(path), parser)
+    except etree.XMLSyntaxError as error:
+        raise InputFileError(path, f"this is not XML ({error.msg})", line=error.lineno) from None
+
+
+def read_xml_segments(
+    path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
+) -> list[Segment]:
+    """Read the lines of a LandXML or railML 3 file as segments.
+
+    Raises
+    ------
+    InputFileError
+        The file is neither, or has no line.
+    """
+    root = _root(path)
+    kind = str(root.tag).rsplit("}", 1)[-1]
+    if kind == "LandXML":
+        return _landxml(str(path), root, crs, height_datum, geoid)
+    if kind == "railML":
+        return _railml(str(path), root, crs, height_datum, geoid)
+    raise InputFileError(path, f"the root element is {kind!r}; LandXML or railML (3) was expected")
+
+
+# --- LandXML -----------------------------------------------------------------
+
+
+def _landxml(path: str, root: Any, crs: str | None, height_datum: str | None, geoid: str | None) -> list[Segment]:
+    unit = root.find(".//{*}Metric")
+    unit = root.find(".//{*}Imperial") if unit is None else unit
+    scale = _UNITS.get(unit.get("linearUnit", "meter"), 1.0) if unit is not None else 1.0
+    system = root.find(".//{*}CoordinateSystem")
+    named = f"EPSG:{system.get('epsgCode')}" if system is not None and system.get("epsgCode") else None
+    segments = []
+    for number, alignment in enumerate(root.iterfind(".//{*}Alignment"), start=1):
+        name = alignment.get("name") or f"alignment {number}"
+        start = float(alignment.get("staStart") or 0.0) * scale
+        geometry = alignment.find("{*}CoordGeom")
+        if geometry is None:
+            continue
+        try:
+            plan = [_landxml_plan(path, e, scale) for e in geometry if isinstance(e.tag, str)]
+            profile = _landxml_profile(path, alignment.find(".//{*}ProfAlign"), scale, start)
+            cant = _landxml_cant(alignment.find(".//{*}Cant"), scale, start)
+        except (TypeError, ValueError, AttributeError):
+            raise InputFileError(path, f"alignment {name!r}: an element lacks a number that LandXML 1.2 has") from None
+        segments.append(
+            segment_of_design(
+                path=path,
+                name=name,
+                plan=plan,
+                profile=profile,
+                cant=cant,
+                crs=crs or named,
+                height_datum=height_datum,
+                geoid=geoid,
+            )
+        )
+    if not segments:
+        raise InputFileError(path, "there is no Alignment with CoordGeom in this LandXML file")
+    return segments
+
+
+def _point(element: Any, name: str, scale: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Easting and northing of a child; LandXML writes northing first."""
+    north, east = (float(v) for v in element.find(f"{{*}}{name}").text.split()[:2])
+    return np.array([east, north]) * scale
+
+
+def _landxml_plan(path: str, element: Any, scale: float) -> PlanElement:
+    kind = element.tag.rsplit("}", 1)[-1]
+    start, end = _point(element, "Start", scale), _point(element, "End", scale)
+    side = 1.0 if element.get("rot") == "ccw" else -1.0
+    if kind == "Line":
+        step = end - start
+        first = last = 0.0
+        direction, length, law = np.arctan2(step[1], step[0]), float(np.hypot(*step)), "linear"
+    elif kind == "Curve":
+        centre = _point(element, "Center", scale)
+        radius = float(np.hypot(*(start - centre)))
+        first = last = side / radius
+        arm, other = start - centre, end - centre
+        direction = np.arctan2(arm[1], arm[0]) + side * np.pi / 2.0
+        turn = side * (np.arctan2(other[1], other[0]) - np.arctan2(arm[1], arm[0]))
+        length, law = radius * float(turn % (2.0 * np.pi)), "linear"
+    elif kind == "Spiral" and element.get("spiType") in _SPIRALS:
+        middle = _point(element, "PI", scale)
+        first, last = (
+            0.0 if element.get(k) == "INF" else side / (float(element.get(k)) * scale)
+            for k in ("radiusStart", "radiusEnd")
+        )
+        direction = np.arctan2(*(middle - start)[::-1])
+        length, law = float(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
+    else:
+        kind = f"{kind} {element.get('spiType') or ''}".strip()
+        raise InputFileError(path, f"element {kind} is not read; Line, Curve and Spiral ({', '.join(_SPIRALS)}) are")
+    return PlanElement(
+        x_m=float(start[0]),
+        y_m=float(start[1]),
+        direction_rad=float(direction),
+        first=first,
+        last=last,
+        length_m=length,
+        law=law,
+    )
+
+
+def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> list[ProfileElement]:
+    """Elements of points of vertical intersection and the curves at them."""
+    if profile is None:
+        return []
+    points = []
+    for element in profile:
+        if not isinstance(element.tag, str):
+            continue
+        kind = element.tag.rsplit("}", 1)[-1]
+        if kind not in ("PVI", "ParaCurve", "CircCurve"):
+            raise InputFileError(path, f"profile element {kind} is not read; PVI, ParaCurve and CircCurve are")
+        place, height = (float(v) * scale for v in element.text.split()[:2])
+        points.append((kind, place - start, height, float(element.get("length") or 0.0) * scale))
+    elements: list[ProfileElement] = []
+    grades = [(b[2] - a[2]) / (b[1] - a[1]) for a, b in pairwise(points)]
+    at = points[0][1]
+    for k, grade in enumerate(grades):
+        _, place, height, half = points[k][0], points[k][1], points[k][2], points[k][3] / 2.0
+        if half and k:
+            begin = place - half
+            elements.append(
+                ProfileElement(
+                    start_m=begin,
+                    length_m=2.0 * half,
+                    height_m=height - grades[k - 1] * half,
+                    first=grades[k - 1],
+                    last=grade,
+                    arc="circle" if points[k][0] == "CircCurve" else "parabola",
+                )
+            )
+            at = place + half
+        end = points[k + 1][1] - (points[k + 1][3] / 2.0 if k + 1 < len(grades) else 0.0)
+        if end - at > 1e-6:
+            elements.append(
+                ProfileElement(
+                    start_m=at, length_m=end - at, height_m=height + grade * (at - place), first=grade, last=grade
+                )
+            )
+        at = end
+    return elements
+
+
+def _landxml_cant(cant: Any, scale: float, start: float) -> list[CantElement]:
+    """Elements between cant stations: the applied cant [mm], about the rail or the middle that the file names.
+
+    Without a name the outer rail is raised and the inner one stays at the profile, as track is built.
+    """
+    if cant is None:
+        return []
+    lowered = {"center": 0.5, "outsideRail": 1.0}.get(cant.get("rotationPoint", "insideRail"), 0.0)
+    stations = []
+    for element in cant.iterfind("{*}CantStation"):
+        value = float(element.get("appliedCant")) * 1e-3
+        # clockwise is a curve to the right: the left rail is the outer one
+        outer, inner = value * (1.0 - lowered), -value * lowered
+        rails = (outer, inner) if element.get("curvature") == "cw" else (inner, outer)
+        stations.append((float(element.get("station")) * scale - start, rails))
+    return [
+        CantElement(
+            start_m=a[0], length_m=b[0] - a[0], left_m=(a[1][0], b[1][0]), right_m=(a[1][1], b[1][1]), law="linear"
+        )
+        for a, b in pairwise(stations)
+        if b[0] > a[0]
+    ]
+
+
+# --- railML ------------------------------------------------------------------
+
+
+def _railml(path: str, root: Any, crs: str | None, height_datum: str | None, geoid: str | None) -> list[Segment]:
+    system = root.find(".//{*}geometricPositioningSystem")
+    definition = system.get("crsDefinition") if system is not None else None
+    named = definition.replace("urn:ogc:def:crs:", "").replace("::", ":") if definition else None
+    segments = []
+    for element in root.iterfind(".//{*}netElement"):
+        points: list[tuple[float, list[float]]] = []
+        for intrinsic in element.iterfind(".//{*}intrinsicCoordinate"):
+            place = intrinsic.find("{*}geometricCoordinate")
+            if place is not None:
+                xyz = [float(place.get(k)) for k in "xyz" if place.get(k) is not None]
+                points.append((float(intrinsic.get("intrinsicCoord")), xyz))
+        if len(points) < 2:
+            continue
+        size = min(len(xyz) for _, xyz in points)
+        ordered = np.array([xyz[:size] for _, xyz in sorted(points, key=lambda p: p[0])])
+        segments.append(
+            plan_segment(
+                ordered,
+                path=path,
+                name=str(element.get("id")),
+                crs=crs or named,
+                height_datum=height_datum,
+                geoid=geoid,
+            )
+        )
+    if not segments:
+        raise InputFileError(path, "no netElement of this railML file has geometric coordinates; railML 3 was expected")
+    return segments
+
+
+def read_railml_relations(path: str | PathLike[str]) -> list[Relation]:
+    """Read the net relations of a railML 3 file; empty for other XML files."""
+    root = _root(path)
+    relations = []
+    for item in root.iterfind(".//{*}netRelation"):
+        first, second = item.find("{*}elementA"), item.find("{*}elementB")
+        if first is None or second is None:
+            raise InputFileError(path, f"netRelation {item.get('id')} names no two elements", line=item.sourceline)
+        relations.append(
+            Relation(
+                name=str(item.get("id")),
+                first=str(first.get("ref")),
+                second=str(second.get("ref")),
+                first_end=int(float(item.get("positionOnA"))),
+                second_end=int(float(item.get("positionOnB"))),
+                navigable=str(item.get("navigability") or "both").lower() != "none",
+            )
+        )
+    return relations
