@@ -18,7 +18,7 @@ from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, write_place, write_rows
 from railfix.tracking.robust import Update, better_mode, first_weights, robust_update
-from railfix.tracking.rows import Channels, Kind, Rows, gnss_rows, joined, noise_of, sensor_rows
+from railfix.tracking.rows import DIRECTION_MPS, Channels, Kind, Rows, gnss_rows, joined, noise_of, sensor_rows
 from railfix.tracking.search import sought, with_satellites
 from railfix.tracking.state import CLOCKS, Bank, TrackState, Unknown
 
@@ -132,7 +132,8 @@ def _step(
         return replace(state, time=now if first else state.time)
     mean, covariance = state.mean, state.covariance
     noise = noise_of(channels, dt, limits, state.log_scale)
-    rows = _all_rows(channels, sensors, epoch, line, mean, mean[:, [Unknown.PLACE, Unknown.BEFORE]], dt, noise)
+    samples = (sensors, epoch, state.direction)
+    rows = _all_rows(channels, samples, line, mean, mean[:, [Unknown.PLACE, Unknown.BEFORE]], dt, noise)
     if rows.value.shape[1]:
         prior = covariance
         shifted, covariance, known = clocks_of_epoch(rows, channels, mean, covariance, state.offset_known)
@@ -140,7 +141,7 @@ def _step(
         mean, rows = shifted, replace(rows, value=rows.value - moved)
         weight = first_weights(rows, covariance, limits.degrees_of_freedom)
         innovation = rows.value
-        update = _settled(rows, weight, channels, sensors, epoch, line, mean, covariance, dt, noise, limits)
+        update = _settled(rows, weight, channels, samples, line, mean, covariance, dt, noise, limits)
         places = mean[:, Unknown.PLACE] + update.change[:, Unknown.PLACE]
         evidence = with_map_error(update.log_evidence, line.at(places)[0], state.log_probability, limits)
         log_probability = state.log_probability + evidence
@@ -167,8 +168,10 @@ def _step(
     elif state.bank is not None:
         means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits)
         state = replace(state, bank=replace(state.bank, mean=means, covariance=covariances))
+    speed = float(state.mean[most_probable(state.log_probability), Unknown.SPEED])
+    state = replace(state, direction=float(np.sign(speed)) if abs(speed) > DIRECTION_MPS else state.direction)
     aided = bool((rows.kind == Kind.CODE).any())
-    travel = abs(float(state.mean[most_probable(state.log_probability), Unknown.SPEED])) * dt
+    travel = abs(speed) * dt
     state = replace(state, unaided_m=0.0 if aided else state.unaided_m + travel)
     chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
     state = replace(
@@ -185,23 +188,24 @@ def _step(
 
 def _all_rows(
     channels: Channels,
-    sensors: SensorEpochs,
-    epoch: int,
+    samples: tuple[SensorEpochs, int, float],
     line: Line,
     mean: Floats,
     point: Floats,
     dt: float,
     noise: tuple[Floats, ...],
 ) -> Rows:
-    return joined(gnss_rows(channels, line, mean, point, dt, noise), sensor_rows(sensors, epoch, line, mean, dt))
+    return joined(
+        gnss_rows(channels, line, mean, point, dt, noise),
+        sensor_rows(samples[0], samples[1], line, mean, dt, samples[2]),
+    )
 
 
 def _settled(
     rows: Rows,
     weight: Floats,
     channels: Channels,
-    sensors: SensorEpochs,
-    epoch: int,
+    samples: tuple[SensorEpochs, int, float],
     line: Line,
     mean: Floats,
     covariance: Floats,
@@ -221,7 +225,7 @@ def _settled(
         if np.abs(after[:, 0] - point[:, 0]).max() < _MOVED_M:
             break
         point = after
-        rows = _all_rows(channels, sensors, epoch, line, mean, point, dt, noise)
+        rows = _all_rows(channels, samples, line, mean, point, dt, noise)
         update = robust_update(rows, covariance, update.weight, degrees=degrees, passes=passes)
     return update
 

@@ -33,6 +33,8 @@ from railfix.tracking.state import OFFSETS, SATELLITES, Unknown
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Standard gravity, enough for the share of it along a gradient [m/s2].
 _GRAVITY_MPS2: Final = 9.80665
+#: Slower than this a speed does not tell the direction [m/s].
+DIRECTION_MPS: Final = 0.5
 #: Shorter than this the tangent is the direction of a displacement [m].
 _CHORD_M: Final = 0.5
 
@@ -224,8 +226,14 @@ def gnss_rows(
     )
 
 
-def sensor_rows(sensors: SensorEpochs, epoch: int, line: Line, mean: Floats, dt: float) -> Rows | None:
-    """Rows of the sensors at one epoch, None without any."""
+def sensor_rows(
+    sensors: SensorEpochs, epoch: int, line: Line, mean: Floats, dt: float, direction: float
+) -> Rows | None:
+    """Rows of the sensors at one epoch, None without any.
+
+    `direction` is the sign of the last speed that told one, 0 before: an unsigned way takes it where the speed is
+    near 0, for a train that stood goes on.
+    """
     state = {unknown: mean[:, unknown] for unknown in Unknown}
     moved = state[Unknown.PLACE] - state[Unknown.BEFORE]
     listed: list[tuple[dict[Unknown, Any], Floats, float, Kind]] = []
@@ -236,7 +244,13 @@ def sensor_rows(sensors: SensorEpochs, epoch: int, line: Line, mean: Floats, dt:
     ):
         if way is not None and sigma is not None and np.isfinite(way[epoch]):
             unsigned = kind is Kind.WHEEL and sensors.wheel_sign == "unknown"
-            signed = float(way[epoch]) * (np.sign(state[Unknown.SPEED]) if unsigned else np.ones(len(mean)))
+            speed = state[Unknown.SPEED]
+            sign = (
+                np.where(np.abs(speed) > DIRECTION_MPS, np.sign(speed), direction) if unsigned else np.ones(len(mean))
+            )
+            if not sign.all():
+                continue
+            signed = float(way[epoch]) * sign
             value = signed * (1.0 + state[scale]) - moved
             coefficients = {Unknown.PLACE: 1.0, Unknown.BEFORE: -1.0, scale: -signed}
             listed.append((coefficients, value, float(sigma[epoch]), kind))

@@ -114,6 +114,8 @@ class TrackState:
         Where levels are asked for.
     unaided_m : float [m]
         Way since codes were used.
+    direction : float
+        Sign of the last speed that told one.
     """
 
     time: np.datetime64
@@ -131,6 +133,7 @@ class TrackState:
     log_scale: tuple[float, float] = (0.0, 0.0)
     bank: Bank | None = None
     unaided_m: float = 0.0
+    direction: float = 0.0
 
     @property
     def hypotheses(self) -> int:
