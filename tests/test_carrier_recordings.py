@@ -69,9 +69,9 @@ def test_in_towns_it_does_no_harm(recordings, name, p50):
     """Arcs of seconds, codes wrong by tens of metres: the median gains, the 95 % little."""
     got = scores(recorded(recordings, name))
     assert got["live"].p50_m < p50 * got["code"].p50_m
-    assert got["live"].p95_m < 1.02 * got["code"].p95_m
+    assert got["live"].p95_m < 1.05 * got["code"].p95_m
     assert got["hatch"].p50_m < 1.0 * got["code"].p50_m
-    assert got["hatch"].p95_m < 1.02 * got["code"].p95_m
+    assert got["hatch"].p95_m < 1.05 * got["code"].p95_m
 
 
 @pytest.mark.requirement("A5")

@@ -1,0 +1,328 @@
+"""Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
+
+``python tests/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
+``docs/bounds.md``: faults, maps, sigmas, starts, priors.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import polars as pl
+
+import recordings_truth
+from conftest import ROOT
+from railfix.core.arrays import Floats, Masks
+from railfix.core.geodesy import range_with_rotation
+from railfix.core.reasons import Status
+from railfix.core.timescale import seconds
+from railfix.evaluate import along_track_error, interpolate_reference
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.integrity.protection import LevelStatus
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config, parse_config
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
+from railfix.positioning.robust_fit import map_information
+from railfix.simulate.demo_data import demo_files
+from railfix.track import read_track
+from railfix.track.trajectory import Trajectory
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
+from recordings_score import trajectory_of
+
+DATA: Final = ROOT.parent / "shared" / "data" / "kinematic"
+SETTINGS: Final = parse_config({"elevation": {"mask_deg": 15.0}})
+SIZES_M: Final = (20.0, 50.0, 100.0)
+#: Offsets of the map: right of the line and up [m].
+OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
+_NORMAL_MEDIAN: Final = 0.6745
+
+
+@dataclass(frozen=True)
+class Case:
+    """A log, its line, and the reference position at each epoch (NaN where there is none)."""
+
+    observations: Observations
+    navigation: Navigation
+    trajectory: Trajectory
+    reference_ecef_m: Floats
+
+    def solved(
+        self, config: Config = SETTINGS, *, bias_m: Floats | None = None, line: Trajectory | None = None
+    ) -> AntennaResult:
+        """The front antenna's result, something added to its codes, on its own or another line."""
+        observations = self.observations
+        if bias_m is not None:
+            observations = replace(observations, code_m=observations.code_m + bias_m)
+        processor = EpochProcessor(config, {"front": line or self.trajectory}, navigation=self.navigation)
+        return processor.process({"front": observations})[0].antennas["front"]
+
+    def errors(self, result: AntennaResult) -> tuple[Floats, Floats]:
+        """Distance to the reference's point of the line, straight and along the line, shape (T,) each [m]."""
+        known = np.isfinite(self.reference_ecef_m[:, 0])
+        arc, _ = self.trajectory.nearest(np.nan_to_num(self.reference_ecef_m))
+        point = self.trajectory.at_arc(np.where(known, arc, np.nan))
+        straight = np.linalg.norm(self.trajectory.at_arc(result.arc_m) - point, axis=1)
+        along = np.abs(along_track_error(result.arc_m, self.reference_ecef_m, self.trajectory))
+        return np.where(known, straight, np.nan), along
+
+
+def demonstration() -> Case:
+    files = demo_files()
+    line = antenna_trajectory(read_track(files["track"]), read_vehicle(files["vehicle"]), "front")
+    truth = pl.read_csv(files["truth"]).filter(pl.col("antenna") == "front")
+    reference = truth.select("x_m", "y_m", "z_m").to_numpy()
+    return Case(read_observations(files["front"]), read_navigation(files["nav"]), line, reference)
+
+
+def recording(folder: str, log: str, navigation: str, truth: Callable[[Path], recordings_truth.Truth]) -> Case:
+    time, ecef = truth(DATA / folder)
+    observations = read_observations(DATA / folder / log)
+    reference = interpolate_reference(observations.time, time, ecef)
+    return Case(observations, read_navigation([DATA / folder / navigation]), trajectory_of(time, ecef), reference)
+
+
+@cache
+def cases() -> dict[str, Case]:
+    town, truths = "urbannav_tst", recordings_truth
+    return {
+        "demo": demonstration(),
+        "F9P": recording(
+            town, "20210517.light-urban.tste.ublox.f9p.obs", "hksc137c.nav", truths.urbannav_truth
+        ),
+        "M8T": recording(
+            town, "20210517.light-urban.tste.ublox.m8t.GC.obs", "hksc137c.nav", truths.urbannav_truth
+        ),
+        "Pixel": recording("gsdc_pixel5_a", "Pixel5_a.21o", "hour1180.21n", truths.gsdc_truth),
+        "Japan": recording(
+            "japan_mosaic_2021265_with_GEONET3034", "SEPT265G.21O", "SEPT2650.21P", truths.japan_truth
+        ),
+    }
+
+
+def bounds(result: AntennaResult) -> tuple[Floats, Masks]:
+    """Levels, infinite where the ranges contradict them; and epochs without an alarm or a doubt."""
+    protection = result.protection
+    assert protection is not None
+    level = np.where(protection.level.consistent, protection.level.level_m, np.inf)
+    return level, protection.status != LevelStatus.ALARM
+
+
+def fault_rows() -> Iterator[str]:
+    """Each satellite in turn too long by a constant, from the first epoch on and from the middle on."""
+    yield "                      median error [m]   largest, ok   excluded   available   over the level, no alarm"
+    yield "log    size since     median   worst          [m]          %           %"
+    for name, case in cases().items():
+        clean = case.solved()
+        straight, _ = case.errors(clean)
+        level, calm = bounds(clean)
+        yield _fault_row(name, "none", "", [(clean, straight, level, calm)])
+        used = np.flatnonzero((clean.reason == 0).mean(axis=0) > 0.2)
+        for size in SIZES_M:
+            for since, start in (("first", 0), ("middle", len(clean) // 2)):
+                found = []
+                for channel in used.tolist():
+                    bias = np.zeros(case.observations.code_m.shape)
+                    same = case.observations.satellite == case.observations.satellite[channel]
+                    bias[start:, same] = size
+                    result = case.solved(bias_m=bias)
+                    straight, _ = case.errors(result)
+                    straight = np.where(np.arange(len(result)) >= start, straight, np.nan)
+                    found.append((result, straight, *bounds(result)))
+                yield _fault_row(name, f"{size:g} m", since, found)
+
+
+def _fault_row(name: str, size: str, since: str, found: list[tuple[AntennaResult, Floats, Floats, Masks]]) -> str:
+    medians, largest, excluded, available, over = [], 0.0, [], [], 0
+    for result, error, level, calm in found:
+        judged = np.isfinite(error)
+        ok = judged & (result.status == Status.OK)
+        medians.append(float(np.median(error[judged])))
+        largest = max(largest, float(error[ok].max(initial=0.0)))
+        excluded.append(100.0 * float(result.raim.excluded[judged].any(axis=1).mean()))
+        assert result.protection is not None
+        available.append(100.0 * float((level[judged] <= 20.0).mean()))
+        over += int(np.count_nonzero(judged & calm & (error > level)))
+    return (
+        f"{name:6s} {size:>5s} {since:8s} {np.median(medians):7.2f} {max(medians):7.2f} {largest:12.1f} "
+        f"{np.median(excluded):10.1f} {np.median(available):11.1f} {over:12d}"
+    )
+
+
+def moved(line: Trajectory, across_m: float, up_m: float) -> Trajectory:
+    """The line beside and above its place."""
+    across = np.concatenate([line.across, line.across[-1:]])
+    up = np.concatenate([line.up, line.up[-1:]])
+    return replace(line, ecef_m=line.ecef_m + across_m * across + up_m * up)
+
+
+def map_rows() -> Iterator[str]:
+    """The map beside the line and above it: what the status, the statistic and the level say of it."""
+    yield "        map off by [m]      % of the epochs with a position          largest    median"
+    yield "log     right     up      ok  ambiguous   off map  map offset  other  statistic  level [m]"
+    for name, case in cases().items():
+        for across, up in OFFSETS_M:
+            result = case.solved(line=moved(case.trajectory, across, up))
+            has = np.isfinite(result.chainage_m)
+            shares = [
+                100.0 * float((result.status[has] == s).mean())
+                for s in (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET)
+            ]
+            statistic = result.map_offset.statistic
+            largest = float(np.nanmax(statistic)) if np.isfinite(statistic).any() else np.nan
+            level, _ = bounds(result)
+            yield (
+                f"{name:6s} {across:6d} {up:6d} {shares[0]:7.1f} {shares[1]:10.1f} {shares[2]:9.1f} {shares[3]:11.1f} "
+                f"{100.0 - sum(shares):6.1f} {largest:10.1f} {np.nanmedian(level):10.1f}"
+            )
+
+
+def sigma_rows() -> Iterator[str]:
+    """Errors over the stated sigma: epochs, and the median of blocks of 60 s."""
+    yield "                     error over along_sigma_m, along the line       straight        blocks of 60 s"
+    yield "log    epochs      p50    p68    p95                       p68    p95     over 2.4 at the median"
+    for name, case in cases().items():
+        result = case.solved()
+        straight, along = case.errors(result)
+        known = np.isfinite(straight) & np.isfinite(along)
+        ratio, other = along[known] / result.along_sigma_m[known], straight[known] / result.along_sigma_m[known]
+        block = (seconds(result.time[known] - result.time[0]) // 60.0).astype(int)
+        middles = np.array([np.median(ratio[block == b]) for b in np.unique(block)])
+        p50, p68, p95 = np.percentile(ratio, [50, 68, 95])
+        q68, q95 = np.percentile(other, [68, 95])
+        yield (
+            f"{name:6s} {known.sum():6d} {p50:8.2f} {p68:6.2f} {p95:6.2f} {q68:25.2f} {q95:6.2f} "
+            f"{(middles > 2.4).sum():10d} of {len(middles)}"
+        )
+
+
+def start_rows() -> Iterator[str]:
+    """Estimators of the scale of one epoch against each other: one satellite too long, over the clean scale."""
+    yield "demonstration, line fit of single epochs; scale with one satellite of each in turn too long, over that without"
+    yield "estimator                     clean     10 m: median   worst     20 m: median   worst    100 m: median   worst"
+    case = cases()["demo"]
+    clean = case.solved(parse_config({"screens": ["elevation"]}))
+    has = np.flatnonzero(np.isfinite(clean.constrained.arc_m))[::20]
+    columns = clean.columns
+    used = (clean.reason[has][:, columns] == 0) & np.isfinite(clean.sigma_m[has][:, columns])
+    ranges = Ranges(
+        sat_ecef_m=np.where(used[..., None], clean.satellites.position_ecef_m[has], 2.6e7),
+        code_m=np.where(used, clean.corrected_code_m[has][:, columns], 0.0),
+        weight=np.where(used, 1.0 / np.where(used, clean.sigma_m[has][:, columns], 1.0) ** 2, 0.0),
+        groups=(slice(0, len(columns)),),
+    )
+    # One clock: the offsets between constellations are taken out as the run knows them.
+    systems = np.array([name[0] for name in clean.satellite[columns].tolist()])
+    offset = np.zeros(used.shape)
+    for g, letter in enumerate(clean.clocks):
+        mine = np.isin(systems, ["G", "J"] if letter == "G" else [letter])
+        offset[:, mine] = clean.clock_offset_m[has][:, g, None]
+    ranges = replace(ranges, code_m=np.where(used, ranges.code_m - offset, 0.0))
+    arc = clean.constrained.arc_m[has]
+    place = case.trajectory.at_arc(arc)
+    prior = map_information(case.trajectory, np.maximum(clean.constrained.section[has], 0))
+    for name, estimate in ESTIMATORS.items():
+        base = estimate(ranges, place, prior)
+        cells = [f"{np.median(base):9.2f}"]
+        for size in (10.0, 20.0, 100.0):
+            ratios = []
+            for channel in np.flatnonzero(used.mean(axis=0) > 0.2).tolist():
+                code = ranges.code_m.copy()
+                code[:, channel] += np.where(used[:, channel], size, 0.0)
+                ratios.append(float(np.median(estimate(replace(ranges, code_m=code), place, prior) / base)))
+            cells.append(f"{np.median(ratios):16.2f} {max(ratios):7.2f}")
+        yield f"{name:24s} {' '.join(cells)}"
+
+
+def _scale(ranges: Ranges, place: Floats, prior: Floats, weight: Callable[[Floats], Floats] | None) -> Floats:
+    """Scale of each epoch: the median of the residuals without reweighting, else of what keeps its weight."""
+    used = ranges.weight > 0
+    factor, freedom = used.astype(float), np.maximum(ranges.n_used - 2, 1)
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
+    for _ in range(1 if weight is None else 5):
+        equations = normal_equations(replace(ranges, weight=ranges.weight * factor), place)
+        step = np.einsum("tij,tj->ti", inverse_3x3(equations.matrix + prior), equations.vector)
+        clock = equations.clock_m[:, 0] - np.einsum("ti,ti->t", step, equations.clock_slope[:, :, 0])
+        residual = ranges.code_m - distance + np.einsum("tmi,ti->tm", los, step) - clock[:, None]
+        size = np.where(used, np.abs(residual) * np.sqrt(ranges.weight), np.nan)
+        scale = np.nanmedian(size, axis=1) / _NORMAL_MEDIAN * np.sqrt(ranges.n_used / freedom)
+        if weight is None:
+            return np.asarray(scale)
+        factor = np.where(used, weight(np.nan_to_num(size / np.maximum(scale, 0.05)[:, None])), 0.0)
+    kept = factor > 0
+    squares = np.where(kept, np.nan_to_num(size) ** 2 * np.minimum(factor, 1.0), 0.0).sum(axis=1)
+    return np.asarray(np.sqrt(squares / np.maximum(factor.sum(axis=1) - 2.0, 1.0)))
+
+
+def _igg3(keep: float, reject: float) -> Callable[[Floats], Floats]:
+    def weight(size: Floats) -> Floats:
+        decline = keep / np.maximum(size, 1e-9) * ((reject - size) / (reject - keep)) ** 2
+        return np.where(size <= keep, 1.0, np.where(size < reject, decline, 0.0))
+
+    return weight
+
+
+#: Estimators of the scale of one epoch, by the name of their row.
+ESTIMATORS: Final[dict[str, Callable[[Ranges, Floats, Floats], Floats]]] = {
+    "root mean square": lambda r, p, m: _root_mean_square(r, p, m),
+    "median (MAD)": lambda r, p, m: _scale(r, p, m, None),
+    "Huber 1.5": lambda r, p, m: _scale(r, p, m, lambda u: np.where(u <= 1.5, 1.0, 1.5 / np.maximum(u, 1e-9))),
+    "IGG-III 1.5, 4": lambda r, p, m: _scale(r, p, m, _igg3(1.5, 4.0)),
+    "IGG-III 1, 3": lambda r, p, m: _scale(r, p, m, _igg3(1.0, 3.0)),
+    "IGG-III 2, 8.5": lambda r, p, m: _scale(r, p, m, _igg3(2.0, 8.5)),
+}
+
+
+def _root_mean_square(ranges: Ranges, place: Floats, prior: Floats) -> Floats:
+    equations = normal_equations(ranges, place)
+    step = np.einsum("tij,tj->ti", inverse_3x3(equations.matrix + prior), equations.vector)
+    least = equations.wsse - np.einsum("ti,ti->t", step, equations.vector)
+    return np.asarray(np.sqrt(np.maximum(least, 0.0) / np.maximum(ranges.n_used - 2, 1)))
+
+
+def prior_rows() -> Iterator[str]:
+    """The demonstration's levels by the prior of local faults, and with a prior of a constellation."""
+    yield "demonstration           levels   median [m]   within 20 m [%]"
+    case = cases()["demo"]
+    settings = {f"local_prior {p:g}": {"local_prior": p} for p in (1e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)}
+    settings |= {f"constellation E {p:g}": {"constellation_prior": {"E": p}} for p in (1e-5, 1e-4)}
+    for name, risk in settings.items():
+        result = case.solved(parse_config({"risk": risk}))
+        level, _ = bounds(result)
+        observed = result.status != Status.NO_OBSERVATION
+        assert result.protection is not None
+        finite = np.isfinite(result.protection.level.level_m)
+        median = float(np.median(result.protection.level.level_m[finite])) if finite.any() else np.nan
+        within = 100.0 * float((level[observed] <= 20.0).mean())
+        yield f"{name:22s} {finite.sum():7d} {median:12.2f} {within:17.1f}"
+
+
+PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
+    "faults": fault_rows,
+    "maps": map_rows,
+    "sigmas": sigma_rows,
+    "starts": start_rows,
+    "priors": prior_rows,
+}
+
+
+def main() -> int:
+    """Print one part, or all."""
+    if len(sys.argv) != 2 or sys.argv[1] not in PARTS or not DATA.is_dir():
+        print(f"give one of {', '.join(PARTS)}; the recordings are expected at {DATA}", file=sys.stderr)
+        return 1
+    for line in PARTS[sys.argv[1]]():
+        print(line, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
