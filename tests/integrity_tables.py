@@ -119,7 +119,7 @@ def bounds(result: AntennaResult) -> tuple[Floats, Masks]:
 def fault_rows() -> Iterator[str]:
     """Each satellite in turn too long by a constant, from the first epoch on and from the middle on."""
     yield "                      median error [m]   largest, ok   excluded   available   over the level, no alarm"
-    yield "log    size since     median   worst          [m]          %           %"
+    yield "log    size since     median   worst          [m]          %           %      ok   ambiguous"
     for name, case in cases().items():
         clean = case.solved()
         straight, _ = case.errors(clean)
@@ -141,7 +141,7 @@ def fault_rows() -> Iterator[str]:
 
 
 def _fault_row(name: str, size: str, since: str, found: list[tuple[AntennaResult, Floats, Floats, Masks]]) -> str:
-    medians, largest, excluded, available, over = [], 0.0, [], [], 0
+    medians, largest, excluded, available, over, doubtful = [], 0.0, [], [], 0, 0
     for result, error, level, calm in found:
         judged = np.isfinite(error)
         ok = judged & (result.status == Status.OK)
@@ -150,10 +150,12 @@ def _fault_row(name: str, size: str, since: str, found: list[tuple[AntennaResult
         excluded.append(100.0 * float(result.raim.excluded[judged].any(axis=1).mean()))
         assert result.protection is not None
         available.append(100.0 * float((level[judged] <= 20.0).mean()))
-        over += int(np.count_nonzero(judged & calm & (error > level)))
+        beyond = judged & calm & (error > level)
+        over += int(np.count_nonzero(beyond & (result.status == Status.OK)))
+        doubtful += int(np.count_nonzero(beyond & (result.status != Status.OK)))
     return (
         f"{name:6s} {size:>5s} {since:8s} {np.median(medians):7.2f} {max(medians):7.2f} {largest:12.1f} "
-        f"{np.median(excluded):10.1f} {np.median(available):11.1f} {over:12d}"
+        f"{np.median(excluded):10.1f} {np.median(available):11.1f} {over:7d} {doubtful:9d}"
     )
 
 

@@ -109,8 +109,8 @@ def protection_levels(
 def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
 
-    A level holds at the place where the ranges were linearised. Where another place explains them as well,
-    or the position is off the map, it is unavailable. Where a check has failed: alarm.
+    A level holds at the place where the ranges were linearised. Where another place explains them as well, it
+    is unavailable. Where a check has failed, or ranges and map contradict each other: alarm.
 
     Parameters
     ----------
@@ -127,7 +127,8 @@ def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Conf
         values[item.name] = np.where(has, value, np.nan) if value.dtype == np.float64 else value
     level = ProtectionLevel(**values)
     verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    verdict = np.where(np.isin(status, CHECK_FAILED), LevelStatus.ALARM, verdict)
-    doubtful = np.isin(status, [Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET])
+    alarming = np.isin(status, [*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET])
+    verdict = np.where(alarming, LevelStatus.ALARM, verdict)
+    doubtful = status == Status.AMBIGUOUS
     verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
     return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind, basis=protection.basis)
