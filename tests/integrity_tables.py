@@ -95,16 +95,10 @@ def cases() -> dict[str, Case]:
     town, truths = "urbannav_tst", recordings_truth
     return {
         "demo": demonstration(),
-        "F9P": recording(
-            town, "20210517.light-urban.tste.ublox.f9p.obs", "hksc137c.nav", truths.urbannav_truth
-        ),
-        "M8T": recording(
-            town, "20210517.light-urban.tste.ublox.m8t.GC.obs", "hksc137c.nav", truths.urbannav_truth
-        ),
+        "F9P": recording(town, "20210517.light-urban.tste.ublox.f9p.obs", "hksc137c.nav", truths.urbannav_truth),
+        "M8T": recording(town, "20210517.light-urban.tste.ublox.m8t.GC.obs", "hksc137c.nav", truths.urbannav_truth),
         "Pixel": recording("gsdc_pixel5_a", "Pixel5_a.21o", "hour1180.21n", truths.gsdc_truth),
-        "Japan": recording(
-            "japan_mosaic_2021265_with_GEONET3034", "SEPT265G.21O", "SEPT2650.21P", truths.japan_truth
-        ),
+        "Japan": recording("japan_mosaic_2021265_with_GEONET3034", "SEPT265G.21O", "SEPT2650.21P", truths.japan_truth),
     }
 
 
