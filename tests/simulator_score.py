@@ -103,7 +103,7 @@ def sensors() -> Iterator[Row]:
 
 def statistics() -> None:
     """Print the table."""
-    print("| error, alone | set | came back | off by |\n|---|---|---|---|")
+    print("| error, alone | set | estimated | difference |\n|---|---|---|---|")
     for part in (satellites, air, receivers, sensors):
         for name, given, found in part():
             print(f"| {name} | {given:.4g} | {found:.4g} | {100.0 * (found / given - 1.0):+.1f} % |")
