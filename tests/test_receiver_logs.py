@@ -302,3 +302,50 @@ def test_messages_of_what_cannot_be_read(recordings: Path, tmp_path: Path) -> No
     text = next((recordings / "kinematic").glob("japan*/SEPT265G.21O"))
     with pytest.raises(MismatchError, match="one kind"):
         railfix.read_observations([live / TWO_BANDS, text])
+
+
+def sfrbx(prn: int, octets: bytes) -> bytes:
+    """A UBX RXM-SFRBX frame of one SBAS message (eight words, left-aligned)."""
+    words = b"".join(octets[k : k + 4][::-1] for k in range(0, 32, 4))
+    return ubx_frame(0x0213, bytes([1, prn, 0, 0, 8, 0, 2, 0]) + words)
+
+
+def rawx(week: int, tow: float) -> bytes:
+    """A UBX RXM-RAWX frame without a measurement: an epoch."""
+    return ubx_frame(0x0215, np.float64(tow).tobytes() + week.to_bytes(2, "little") + bytes([18, 0, 1, 1, 0, 0]))
+
+
+def ubx_frame(kind: int, payload: bytes) -> bytes:
+    body = kind.to_bytes(2, "big") + len(payload).to_bytes(2, "little") + payload
+    a = b = 0
+    for value in body:
+        a = (a + value) & 255
+        b = (b + a) & 255
+    return b"\xb5\x62" + body + bytes([a, b])
+
+
+def test_sbas_messages_of_a_receiver(recordings: Path, tmp_path: Path) -> None:
+    """MSAS messages as a receiver passes them on: the same messages as from the file; damaged ones are left out."""
+    from railfix.core.timescale import to_week
+    from railfix.ranges.sbas import read_sbas
+    from railfix.ranges.sbas.messages import with_parity
+
+    known = read_sbas(recordings / "sbas" / "msas_20250215" / "046r_sbas_prn137.txt")
+    known = known.take(np.arange(200))
+    octets = with_parity(known.bits)
+    week, second = to_week(known.time)
+    data = b""
+    for k in range(200):
+        broken = bytearray(octets[k].tobytes())
+        broken[10] ^= 4 if k in (17, 90) else 0
+        data += rawx(int(week[k]), float(second[k])) + sfrbx(int(known.prn[k]), bytes(broken))
+    log = tmp_path / "sbas.ubx"
+    log.write_bytes(data)
+    read = read_sbas(log)
+    kept = np.delete(np.arange(200), [17, 90])
+    assert read.refused["parity"] == 2
+    assert read.time.tolist() == known.time[kept].tolist()
+    assert read.prn.tolist() == known.prn[kept].tolist()
+    assert read.type.tolist() == known.type[kept].tolist()
+    assert np.array_equal(read.bits[:, :28], known.bits[kept, :28])
+    assert set(read.parity_bits.tolist()) == {24}

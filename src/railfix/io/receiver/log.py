@@ -18,6 +18,7 @@ from railfix.io.receiver import rtcm, ubx
 from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
 from railfix.io.receiver.framing import Frames, find_frames
 from railfix.io.receiver.measurements import Measurements, Tracking, joined, observations_of
+from railfix.io.receiver.subframes import SbasFrames, sbas_frames
 
 _BLOCK_BYTES: Final = 1 << 22
 #: Bytes in which a log must show a frame with a valid checksum to be taken for one.
@@ -32,12 +33,14 @@ class Piece:
     ----------
     measurements : Measurements
     ephemerides : Assembled
+    sbas : SbasFrames
     skipped_bytes, bad_checksums, bytes : int
         Bytes outside frames, candidates whose checksum failed, bytes read.
     """
 
     measurements: Measurements
     ephemerides: Assembled
+    sbas: SbasFrames
     skipped_bytes: int = 0
     bad_checksums: int = 0
     bytes: int = 0
@@ -88,11 +91,12 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     msm = _without(frames) if np.isnat(time) else rtcm.msm_measurements(frames, time)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
-    records, subframes, messages = _ephemerides(frames, raw, time, state)
+    records, sbas, subframes, messages = _navigation(frames, raw, state)
     last = measurements.time[-1] if len(measurements.time) else time
     piece = Piece(
         measurements=measurements,
         ephemerides=records,
+        sbas=sbas,
         skipped_bytes=frames.skipped_bytes,
         bad_checksums=frames.bad_checksums,
         bytes=frames.consumed,
@@ -115,27 +119,27 @@ def _none(frames: Frames) -> Frames:
     return find_frames(frames.data[:0])
 
 
-def _ephemerides(
-    frames: Frames, raw: Measurements, time: np.datetime64, state: StreamState
-) -> tuple[Assembled, Unfinished, Unfinished]:
+def _navigation(
+    frames: Frames, raw: Measurements, state: StreamState
+) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
+    """Ephemerides and SBAS messages of a block."""
     subframes = ubx.sfrbx_subframes(frames)
     epochs_at = frames.frame_start[frames.of("ubx", ubx.RXM_RAWX)]
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
-    received = _time_at(subframes.order, epochs_at, raw.time, time)
+    received = _time_at(subframes.order, epochs_at, raw.time, state.time)
     first, unfinished = assembled(subframes, received, state.subframes)
     messages = sorted(rtcm.ephemeris_fields(frames))
-    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), epochs_at, raw.time, time)
+    at = _time_at(np.array([m[0] for m in messages], dtype=np.int64), epochs_at, raw.time, state.time)
     second, issued = assembled_rtcm(messages, at, state.messages)
-    return merged([first, second]), unfinished, issued
+    return merged([first, second]), sbas_frames(subframes, received), unfinished, issued
 
 
 def _time_at(places: np.ndarray, epochs_at: np.ndarray, epochs: Datetimes, before: np.datetime64) -> Datetimes:
-    """Time of the last epoch before each place of the stream; of the first one for places before it."""
+    """Time of the last epoch before each place of the stream; `before` for places before the first one here."""
     if not len(epochs):
         return np.full(len(places), before, dtype="datetime64[ns]")
     index = np.searchsorted(epochs_at, places) - 1
-    first = epochs[0] if np.isnat(before) else before
-    return np.where(index < 0, first, epochs[np.maximum(index, 0)])
+    return np.where(index < 0, before, epochs[np.maximum(index, 0)])
 
 
 def scan_pieces(

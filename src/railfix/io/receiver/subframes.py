@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Integers, Strings
+from railfix.core.arrays import Bytes, Datetimes, Integers, Strings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +48,36 @@ class Subframes:
             words=self.words[rows],
             order=self.order[rows],
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SbasFrames:
+    """SBAS messages as a receiver passes them on, N of them; parity and preamble not checked here.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (N,)
+        Epoch of the receiver before the message; NaT before it knew the time.
+    prn : ndarray of int, shape (N,)
+    octets : ndarray of uint8, shape (N, 32)
+        The 250 bits from the first preamble bit on, zero behind.
+    """
+
+    time: Datetimes
+    prn: Integers
+    octets: Bytes
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
+    """SBAS messages among subframes: eight words of 32 bits, left-aligned (UBX-22008968, 3.17.9)."""
+    rows = np.flatnonzero(np.char.startswith(subframes.satellite, "S"))
+    octets = subframes.words[rows, :8].astype(">u4").view(np.uint8).reshape(len(rows), 32).copy()
+    octets[:, 31] &= 0xC0
+    prn = np.array([100 + int(name[1:]) for name in subframes.satellite[rows].tolist()], dtype=np.int64)
+    return SbasFrames(time=time[rows], prn=prn, octets=octets)
 
 
 def packed_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:

@@ -1,7 +1,7 @@
 """SBAS: messages read and decoded, and the corrections that they give (RTCA DO-229D, appendix A)."""
 
 from railfix.ranges.sbas.corrections import SbasCorrections, SbasState, best_prn
-from railfix.ranges.sbas.files import read_sbas
+from railfix.ranges.sbas.files import from_receiver, read_sbas
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.results import IonosphereDelays, IonosphereState, SatelliteCorrections, SatelliteState
 from railfix.ranges.sbas.standard import SbasLimits
@@ -16,5 +16,6 @@ __all__ = [
     "SbasMessages",
     "SbasState",
     "best_prn",
+    "from_receiver",
     "read_sbas",
 ]

@@ -16,6 +16,8 @@ from railfix.core.arrays import Bytes, Integers, Masks
 from railfix.core.errors import InputFileError
 from railfix.core.files import BrokenLines, FilePath, read_text_lines
 from railfix.core.timescale import GPS_EPOCH, SECONDS_PER_WEEK
+from railfix.io.receiver.log import head_of, is_receiver_log, scan_pieces
+from railfix.io.receiver.subframes import SbasFrames
 from railfix.ranges.sbas.messages import ROW_BYTES, SbasMessages, carried_parity, message_parity, preamble_number
 from railfix.ranges.sbas.standard import GEO_PRNS
 
@@ -196,8 +198,8 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
     Parameters
     ----------
     paths : path or sequence of paths
-        RTKLIB (.sbs), EGNOS message server (.ems) or RINEX broadcast data (type B), recognised by their
-        content; plain, gzip or compress.
+        RTKLIB (.sbs), EGNOS message server (.ems), RINEX broadcast data (type B) or a receiver's log (UBX with
+        RXM-SFRBX of SBAS), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `refused` and
         named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
@@ -230,7 +232,36 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
     return log
 
 
+def from_receiver(frames: SbasFrames, *, source: str = "receiver") -> SbasMessages:
+    """SBAS messages as a receiver passes them on, parity and preamble checked.
+
+    Parameters
+    ----------
+    frames : SbasFrames
+        Messages before the receiver knew the time are left out, and counted under "line".
+    source : str
+        Name for notes and counts.
+    """
+    gathered = _Gathered()
+    _gather_frames(frames, 0, gathered)
+    return _checked(gathered, (source,)) if gathered.raw else SbasMessages.none()
+
+
+def _gather_frames(frames: SbasFrames, number: int, gathered: _Gathered) -> None:
+    dated = ~np.isnat(frames.time)
+    gathered.refused["line"] += int(np.count_nonzero(~dated))
+    since = (frames.time - GPS_EPOCH).astype(np.int64)
+    for row in np.flatnonzero(dated).tolist():
+        digits = frames.octets[row].tobytes().hex().upper()[:63]
+        gathered.raw.append(RawMessage(row + 1, int(since[row]), int(frames.prn[row]), -1, digits))
+        gathered.source.append(number)
+
+
 def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gathered) -> None:
+    if is_receiver_log(head_of(path)):
+        for piece in scan_pieces(path):
+            _gather_frames(piece.sbas, number, gathered)
+        return
     lines = read_text_lines(path)
     broken = 0
     for item in parse(path, kind_of_file(path, lines), lines):
