@@ -32,8 +32,8 @@ from railfix.io.reference_log import AntennaReference, read_reference
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
+from railfix.pipeline.level_stage import risk_of
 from railfix.pipeline.processor import AntennaResult
-from railfix.pipeline.protection_levels import risk_of
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import ClockTies, Ranges, clock_groups, fit
 from railfix.ranges.error_model import ErrorBins, ErrorModelFit, read_error_model, write_error_model

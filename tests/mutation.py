@@ -35,7 +35,7 @@ TESTS: Final = {
     "integrity": "raim_model protection_level stanford",
     "integrity/raim": "raim_model raim_detection raim_exclusion raim_reliability",
     "integrity/protection": "protection_level protection_risk protection_separation protection_sbas",
-    "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrying screen_columns pipeline",
+    "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrier_stage screen_columns pipeline",
 }
 _PAIRS: Final = (
     (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.BitAnd, ast.BitOr), (ast.And, ast.Or), (ast.Lt, ast.LtE),

@@ -76,7 +76,7 @@ def of_crescent(folder: Path) -> None:
     print(*log.notes, sep="\n")
     time = np.datetime64("2008-05-26T06:01:34", "ns") + np.arange(312) * np.timedelta64(1, "s")
     satellite = np.array(sorted(set(navigation.kepler.satellite.tolist())))
-    for incomplete in ("refuse", "inflate"):
+    for incomplete in ("reject", "inflate"):
         for prn in log.prns:
             engine = SbasCorrections.from_log(log, prn=prn, limits=SbasLimits(incomplete=incomplete))
             found = engine.satellites(time, satellite, navigation)

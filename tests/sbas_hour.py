@@ -26,7 +26,7 @@ from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.corrected_ranges import SOMEWHERE_ABOVE_M
-from railfix.pipeline.protection_levels import risk_of
+from railfix.pipeline.level_stage import risk_of
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.ranges.atmosphere import rtca_troposphere_sigma_m
 from railfix.ranges.error_model import ErrorModel, read_error_model

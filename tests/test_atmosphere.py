@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orbits_made import TOE
+from orbit_cases import TOE
 from railfix.core.arrays import read_only
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m

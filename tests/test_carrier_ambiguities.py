@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import carrier_made
+import carrier_cases
 import synthetic
 from phase_run import phase_run
 from railfix.core.geodesy import range_with_rotation
@@ -20,7 +20,7 @@ from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import ClockTies, Ranges
 from railfix.track.trajectory import Trajectory
 
-LINE = carrier_made.straight()
+LINE = carrier_cases.straight()
 CONSTANT = PhaseLimits(drift_m=0.0, correlation_s=0.0)
 WALKING = PhaseLimits(drift_m=0.02, hop_s=2.0, correlation_s=0.0)
 
@@ -120,8 +120,8 @@ def dense(
 @pytest.mark.parametrize("tied", [False, True])
 def test_equals_a_dense_least_squares(limits, clocks, tied):
     limits = limits.replaced(clocks=clocks)
-    arc, time = moving(6), carrier_made.times(6)
-    ranges, phases = carrier_made.observed(LINE, arc, arc_id=broken_arcs(6, 8))
+    arc, time = moving(6), carrier_cases.times(6)
+    ranges, phases = carrier_cases.observed(LINE, arc, arc_id=broken_arcs(6, 8))
     if tied:
         sigma = np.tile([0.0, 1.0], (6, 1))
         ranges = replace(ranges, ties=ClockTies(offset_m=np.tile([0.0, 5.5], (6, 1)), sigma_m=sigma))
@@ -137,8 +137,8 @@ def test_equals_a_dense_least_squares(limits, clocks, tied):
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("limits", [CONSTANT, WALKING])
 def test_the_last_epoch_of_a_run_is_that_of_the_past_alone(limits):
-    arc, time = moving(20), carrier_made.times(20)
-    ranges, phases = carrier_made.observed(LINE, arc, arc_id=broken_arcs(20, 8))
+    arc, time = moving(20), carrier_cases.times(20)
+    ranges, phases = carrier_cases.observed(LINE, arc, arc_id=broken_arcs(20, 8))
     live, _ = phase_positions(time, ranges, phases, LINE, arc + 3.0, limits=limits)
     for last in (1, 5, 12, 20):
         rows = np.arange(last)
@@ -152,9 +152,9 @@ def test_the_last_epoch_of_a_run_is_that_of_the_past_alone(limits):
 @given(seed=st.integers(0, 2**32 - 1), clocks=st.sampled_from(["own", "shared"]))
 @settings(max_examples=15, deadline=None)
 def test_exact_ranges_and_any_whole_cycles_give_the_place(seed, clocks):
-    arc, time = moving(12), carrier_made.times(12)
+    arc, time = moving(12), carrier_cases.times(12)
     cycles = np.random.default_rng(seed).integers(-50_000_000, 50_000_000, 64).astype(float)
-    ranges, phases = carrier_made.observed(
+    ranges, phases = carrier_cases.observed(
         LINE, arc, noise=0.0, seed=seed, cycles=cycles, arc_id=broken_arcs(12, 8),
         own_clock_m=300.0 if clocks == "own" else 0.0,
     )  # fmt: skip
@@ -167,7 +167,7 @@ def test_exact_ranges_and_any_whole_cycles_give_the_place(seed, clocks):
         assert np.nanmax(np.abs(found.code_residual_m)) < 1e-4
     if clocks == "shared":
         names = np.unique(phases.arc_id)
-        expected = dict(zip(names.tolist(), carrier_made.WAVELENGTH_M * cycles, strict=False))
+        expected = dict(zip(names.tolist(), carrier_cases.WAVELENGTH_M * cycles, strict=False))
         whole = [expected[int(i)] for i in run.arcs.arc_id]
         assert np.abs(run.arcs.ambiguity_m - whole).max() < 1e-3
 
@@ -175,8 +175,8 @@ def test_exact_ranges_and_any_whole_cycles_give_the_place(seed, clocks):
 @pytest.mark.requirement("A5")
 def test_exact_on_a_curved_line():
     line = synthetic.line(spacing_m=5.0)
-    arc, time = moving(30, 20.0), carrier_made.times(30)
-    ranges, phases = carrier_made.observed(line, arc, noise=0.0)
+    arc, time = moving(30, 20.0), carrier_cases.times(30)
+    ranges, phases = carrier_cases.observed(line, arc, noise=0.0)
     found = phase_run(time, ranges, phases, line, arc + 5.0)
     assert np.abs(found.arc_m - arc).max() < 1e-4
 
@@ -184,8 +184,8 @@ def test_exact_on_a_curved_line():
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("tied", [False, True])
 def test_without_phases_it_is_the_position_of_the_codes(tied):
-    arc, time = moving(40), carrier_made.times(40)
-    ranges, phases = carrier_made.observed(LINE, arc)
+    arc, time = moving(40), carrier_cases.times(40)
+    ranges, phases = carrier_cases.observed(LINE, arc)
     if tied:
         ties = ClockTies(offset_m=np.tile([0.0, 5.5], (40, 1)), sigma_m=np.tile([0.0, 1.0], (40, 1)))
         ranges = replace(ranges, ties=ties)
@@ -203,8 +203,8 @@ def test_without_phases_it_is_the_position_of_the_codes(tied):
 
 @pytest.mark.requirement("A5")
 def test_order_of_satellites_changes_nothing():
-    arc, time = moving(20), carrier_made.times(20)
-    ranges, phases = carrier_made.observed(LINE, arc, systems="GGGGGGG", arc_id=broken_arcs(20, 7))
+    arc, time = moving(20), carrier_cases.times(20)
+    ranges, phases = carrier_cases.observed(LINE, arc, systems="GGGGGGG", arc_id=broken_arcs(20, 7))
     order = np.random.default_rng(1).permutation(7)
     turned = replace(
         ranges, sat_ecef_m=ranges.sat_ecef_m[:, order], code_m=ranges.code_m[:, order], weight=ranges.weight[:, order]
@@ -231,12 +231,12 @@ def cut(time: np.ndarray, ranges: Ranges, phases: Phases, start: np.ndarray, siz
 @pytest.mark.parametrize("interval_s", [0.2, 30.0])
 def test_chunks_give_the_same(interval_s):
     epochs = 200
-    arc, time = moving(epochs, 3.0), carrier_made.times(epochs, interval_s)
+    arc, time = moving(epochs, 3.0), carrier_cases.times(epochs, interval_s)
     rng = np.random.default_rng(4)
     ids = broken_arcs(epochs, 8)
     begins = rng.random(ids.shape) < 0.05
     ids = np.where(ids >= 0, ids + np.cumsum(begins, axis=0), -1)
-    ranges, phases = carrier_made.observed(LINE, arc, arc_id=ids)
+    ranges, phases = carrier_cases.observed(LINE, arc, arc_id=ids)
     start = arc + rng.normal(0.0, 3.0, epochs)
     start[50:53] = np.nan
     whole, _ = phase_positions(time, ranges, phases, LINE, start)
@@ -254,8 +254,8 @@ def test_noise_falls_and_the_sigma_tells_it():
     """White noise, the map exact: errors over their noise sigma have rms 1, a run of 60 epochs averages by 5."""
     errors, sigmas, codes = [], [], []
     for seed in range(40):
-        arc, time = moving(60, 5.0), carrier_made.times(60)
-        ranges, phases = carrier_made.observed(LINE, arc, seed=seed)
+        arc, time = moving(60, 5.0), carrier_cases.times(60)
+        ranges, phases = carrier_cases.observed(LINE, arc, seed=seed)
         found, _ = phase_positions(time, ranges, phases, LINE, arc, limits=CONSTANT)
         errors.append(found.arc_m - arc)
         sigmas.append(found.noise_sigma_m)
@@ -269,11 +269,11 @@ def test_noise_falls_and_the_sigma_tells_it():
 @pytest.mark.requirement("A5")
 def test_a_map_that_is_off_does_not_average():
     """Antenna 0.3 m aside all the way: the error stays, and the sigma with the map covers it."""
-    arc, time = moving(60, 2.0), carrier_made.times(60)
+    arc, time = moving(60, 2.0), carrier_cases.times(60)
     section, _ = LINE.segment_at(arc)
     ratios = []
     for seed in range(12):
-        ranges, phases = carrier_made.observed(LINE, arc, noise=0.0, seed=seed)
+        ranges, phases = carrier_cases.observed(LINE, arc, noise=0.0, seed=seed)
         aside = LINE.at_arc(arc) + LINE.sigma_plan_m * LINE.across[section]
         off = synthetic.travelled_range(ranges.sat_ecef_m, aside[:, None, :]) - synthetic.travelled_range(
             ranges.sat_ecef_m, LINE.at_arc(arc)[:, None, :]
@@ -290,8 +290,8 @@ def test_a_map_that_is_off_does_not_average():
 @pytest.mark.requirement("A5")
 def test_few_codes_are_carried_by_the_phases():
     """After a minute two satellites' codes are left, all phases go on: the position stays."""
-    arc, time = moving(70, 8.0), carrier_made.times(70)
-    ranges, phases = carrier_made.observed(LINE, arc, systems="GGGGGGGG")
+    arc, time = moving(70, 8.0), carrier_cases.times(70)
+    ranges, phases = carrier_cases.observed(LINE, arc, systems="GGGGGGGG")
     weight = ranges.weight.copy()
     weight[60:, 2:] = 0.0
     found, _ = phase_positions(time, replace(ranges, weight=weight), phases, LINE, arc + 2.0)
@@ -300,9 +300,9 @@ def test_few_codes_are_carried_by_the_phases():
 
 
 def test_an_arc_unseen_for_long_begins_anew_however_the_log_is_cut():
-    time = np.r_[carrier_made.times(30), carrier_made.times(30) + np.timedelta64(700, "s")]
+    time = np.r_[carrier_cases.times(30), carrier_cases.times(30) + np.timedelta64(700, "s")]
     arc = np.full(60, 300.0)
-    ranges, phases = carrier_made.observed(LINE, arc)
+    ranges, phases = carrier_cases.observed(LINE, arc)
     whole, _ = phase_positions(time, ranges, phases, LINE, arc)
     alone, _ = phase_positions(
         time[30:], ranges.take(np.arange(30, 60)), phases.take(np.arange(30, 60)), LINE, arc[30:]
@@ -313,18 +313,18 @@ def test_an_arc_unseen_for_long_begins_anew_however_the_log_is_cut():
 
 def test_the_end_of_the_line_is_not_passed():
     arc = np.full(5, LINE.arc_m[-1])
-    ranges, phases = carrier_made.observed(LINE, arc)
-    found, _ = phase_positions(carrier_made.times(5), ranges, phases, LINE, arc - 1.0)
+    ranges, phases = carrier_cases.observed(LINE, arc)
+    found, _ = phase_positions(carrier_cases.times(5), ranges, phases, LINE, arc - 1.0)
     assert (found.arc_m <= LINE.arc_m[-1]).all()
 
 
 def test_no_epochs_and_wrong_shapes():
-    ranges, phases = carrier_made.observed(LINE, moving(4))
+    ranges, phases = carrier_cases.observed(LINE, moving(4))
     none = np.arange(0)
-    found, _ = phase_positions(carrier_made.times(0), ranges.take(none), phases.take(none), LINE, np.empty(0))
+    found, _ = phase_positions(carrier_cases.times(0), ranges.take(none), phases.take(none), LINE, np.empty(0))
     assert len(found.arc_m) == 0
     with pytest.raises(ValueError, match="shape"):
-        phase_run(carrier_made.times(4), ranges, phases.take(np.arange(3)), LINE, moving(4))
+        phase_run(carrier_cases.times(4), ranges, phases.take(np.arange(3)), LINE, moving(4))
     lost = replace(phases, arc_id=np.full(phases.arc_id.shape, -1))
     with pytest.raises(ValueError, match="arc"):
-        phase_run(carrier_made.times(4), ranges, lost, LINE, moving(4))
+        phase_run(carrier_cases.times(4), ranges, lost, LINE, moving(4))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import carrier_made
+import carrier_cases
 import synthetic
 from railfix.positioning.carrier import ContinuityLimits, ContinuityState, track_jumps
 from railfix.positioning.carrier.continuity import TrackJumps
@@ -21,9 +21,9 @@ def drive(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Time, place, place as codes see it, phases and satellites of a drive at 1 Hz along curves of 400 m radius."""
     arc = 100.0 + 15.0 * np.arange(EPOCHS) + 3.0 * np.sin(np.arange(EPOCHS) / 4.0)
-    ranges, phases = carrier_made.observed(LINE, arc, systems=SYSTEMS, noise=noise, seed=seed)
+    ranges, phases = carrier_cases.observed(LINE, arc, systems=SYSTEMS, noise=noise, seed=seed)
     near = arc + np.random.default_rng(seed).normal(0.0, start_sigma_m, EPOCHS)
-    return carrier_made.times(EPOCHS), arc, near, phases.phase_m, ranges.sat_ecef_m
+    return carrier_cases.times(EPOCHS), arc, near, phases.phase_m, ranges.sat_ecef_m
 
 
 def judged(time, near, phase, sats, state=None, slip=None, **limits) -> tuple[TrackJumps, ContinuityState]:
@@ -49,7 +49,7 @@ def test_slips_are_found_without_dopplers(cycles, channels):
     time, _, near, phase, sats = drive()
     slipped = phase.copy()
     for k, m in enumerate(channels):
-        slipped[20:, m] += cycles * (1 + k) * carrier_made.WAVELENGTH_M
+        slipped[20:, m] += cycles * (1 + k) * carrier_cases.WAVELENGTH_M
     found, _ = judged(time, near, slipped, sats)
     expected = np.zeros(phase.shape, dtype=bool)
     expected[20, channels] = True
@@ -89,7 +89,7 @@ def test_more_slips_than_may_be_taken_out_keep_none():
     time, _, near, phase, sats = drive()
     slipped = phase.copy()
     slipped[20:] += np.arange(8) ** 2 * 3.0
-    found, _ = judged(time, near, slipped, sats, refused=2)
+    found, _ = judged(time, near, slipped, sats, max_rejected=2)
     assert found.jump[20].all()
     assert not np.delete(found.jump, 20, axis=0).any()
     assert np.isnan(found.moved_m[20])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import carrier_made
+import carrier_cases
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import SlipLimits, SlipReason, find_slips, number_arcs
 from railfix.positioning.carrier.arcs import NO_ARC, channel_of
@@ -16,7 +16,7 @@ MILLISECOND_M = 299_792.458
 def with_cycles(obs: Observations, epoch: int, channel: int, cycles: float) -> Observations:
     phase = obs.phase_cycles.copy()
     phase[epoch:, channel] += cycles
-    return carrier_made.changed(obs, phase_cycles=phase)
+    return carrier_cases.changed(obs, phase_cycles=phase)
 
 
 def flagged(obs: Observations, **limits: float) -> np.ndarray:
@@ -26,7 +26,7 @@ def flagged(obs: Observations, **limits: float) -> np.ndarray:
 
 @pytest.mark.requirement("A5")
 def test_first_epoch_begins_all_arcs_and_a_clean_log_no_other():
-    slips, _ = find_slips(carrier_made.log())
+    slips, _ = find_slips(carrier_cases.log())
     assert slips.slip[0].all()
     assert (slips.reason[0] == SlipReason.FIRST).all()
     assert not slips.slip[1:].any()
@@ -38,19 +38,19 @@ def test_first_epoch_begins_all_arcs_and_a_clean_log_no_other():
 @pytest.mark.parametrize("cycles", [1, -1, 2, 10, 1000])
 @pytest.mark.parametrize("interval_s", [0.1, 1.0])
 def test_a_slip_is_found_where_it_is_and_nowhere_else(cycles, interval_s):
-    obs = with_cycles(carrier_made.log(interval_s=interval_s), 20, 3, cycles)
+    obs = with_cycles(carrier_cases.log(interval_s=interval_s), 20, 3, cycles)
     slips, _ = find_slips(obs)
     expected = np.zeros(obs.code_m.shape, dtype=bool)
     expected[0], expected[20, 3] = True, True
     assert np.array_equal(slips.slip, expected)
     assert slips.reason[20, 3] == SlipReason.DOPPLER
-    assert abs(slips.doppler_metric_m[20, 3]) == pytest.approx(abs(cycles) * carrier_made.WAVELENGTH_M, abs=0.1)
+    assert abs(slips.doppler_metric_m[20, 3]) == pytest.approx(abs(cycles) * carrier_cases.WAVELENGTH_M, abs=0.1)
 
 
 @pytest.mark.requirement("A5")
 def test_without_dopplers_only_what_the_code_can_see():
     """The limit of 10 m is 52 cycles; smaller slips are `track_jumps`' to find."""
-    log = carrier_made.log(doppler=False)
+    log = carrier_cases.log(doppler=False)
     found = {n: bool(flagged(with_cycles(log, 20, 3, n))[19, 3]) for n in (1, 10, 45, 60, 1000)}
     assert found == {1: False, 10: False, 45: False, 60: True, 1000: True}
     assert (find_slips(with_cycles(log, 20, 3, 1000))[0].reason[20, 3]) == SlipReason.CODE
@@ -58,7 +58,7 @@ def test_without_dopplers_only_what_the_code_can_see():
 
 @pytest.mark.requirement("A5")
 def test_exactly_at_the_limit_is_no_slip():
-    obs = with_cycles(carrier_made.log(), 20, 3, 1)
+    obs = with_cycles(carrier_cases.log(), 20, 3, 1)
     metric = abs(find_slips(obs)[0].doppler_metric_m[20, 3])
     wide = {"doppler_mps": 1e-12, "jerk_mps3": 1e-300}
     at = find_slips(obs, limits=SlipLimits(doppler_m=metric, **wide))[0].doppler_limit_m[20]
@@ -68,11 +68,11 @@ def test_exactly_at_the_limit_is_no_slip():
 
 @pytest.mark.requirement("A5")
 def test_what_the_receiver_and_the_log_say():
-    log = carrier_made.log()
+    log = carrier_cases.log()
     lock, phase, breaks = log.loss_of_lock.copy(), log.phase_cycles.copy(), log.break_before.copy()
     lock[10, 0], lock[20:23, 1], lock[30, 2], lock[35, 3] = 1, 2, 3, 4
     phase[40:43, 4], breaks[50] = np.nan, True
-    slips, _ = find_slips(carrier_made.changed(log, loss_of_lock=lock, phase_cycles=phase, break_before=breaks))
+    slips, _ = find_slips(carrier_cases.changed(log, loss_of_lock=lock, phase_cycles=phase, break_before=breaks))
     rows = {
         (10, 0): SlipReason.LOSS_OF_LOCK,
         (11, 0): SlipReason.JOINED,
@@ -95,7 +95,7 @@ def test_what_the_receiver_and_the_log_say():
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize(("gap_s", "reason"), [(30.0, SlipReason.JOINED), (32.0, SlipReason.GAP)])
 def test_a_gap_longer_than_the_limit_ends_all_arcs(gap_s, reason):
-    log = carrier_made.log()
+    log = carrier_cases.log()
     kept = np.r_[0:10, 10 + round(gap_s) : 60]
     part = Observations(
         time=log.time[kept], satellite=log.satellite, signal=log.signal, code_m=log.code_m[kept],
@@ -111,19 +111,19 @@ def test_a_gap_longer_than_the_limit_ends_all_arcs(gap_s, reason):
 @pytest.mark.parametrize("milliseconds", [1, -3])
 def test_clock_steps_are_no_slips(phases_step, tags_step, milliseconds):
     """Codes follow the tags; phases step with the codes or run on; tags stay regular or step too."""
-    log = carrier_made.log()
+    log = carrier_cases.log()
     step_s, rows = milliseconds * 1e-3, np.arange(len(log)) >= 30
     code, phase, time = log.code_m.copy(), log.phase_cycles.copy(), log.time.copy()
     code[rows] += milliseconds * MILLISECOND_M
     if phases_step:
-        phase[rows] += milliseconds * MILLISECOND_M / carrier_made.WAVELENGTH_M
+        phase[rows] += milliseconds * MILLISECOND_M / carrier_cases.WAVELENGTH_M
     if tags_step:
         time[rows] += np.timedelta64(round(step_s * 1e9), "ns")
     else:  # Measured earlier by the step than the regular tags say: ranges are of then.
-        early = step_s * -log.doppler_hz[rows] * carrier_made.WAVELENGTH_M
+        early = step_s * -log.doppler_hz[rows] * carrier_cases.WAVELENGTH_M
         code[rows] -= early
-        phase[rows] -= early / carrier_made.WAVELENGTH_M
-    obs = carrier_made.changed(log, code_m=code, phase_cycles=phase, time=time)
+        phase[rows] -= early / carrier_cases.WAVELENGTH_M
+    obs = carrier_cases.changed(log, code_m=code, phase_cycles=phase, time=time)
     slips, state = find_slips(obs)
     assert not slips.slip[1:].any()
     assert slips.clock_step_m[30] == pytest.approx(milliseconds * MILLISECOND_M, abs=70.0)
@@ -138,22 +138,22 @@ def test_clock_steps_are_no_slips(phases_step, tags_step, milliseconds):
 
 @pytest.mark.requirement("A5")
 def test_two_channels_cannot_tell_a_clock_step_from_slips():
-    log = carrier_made.log(channels=2)
+    log = carrier_cases.log(channels=2)
     code = log.code_m.copy()
     code[30:] += MILLISECOND_M
-    assert find_slips(carrier_made.changed(log, code_m=code))[0].slip[1:].sum() == 0  # Dopplers and phases agree
-    bare = carrier_made.changed(log, code_m=code, doppler_hz=np.full(code.shape, np.nan))
+    assert find_slips(carrier_cases.changed(log, code_m=code))[0].slip[1:].sum() == 0  # Dopplers and phases agree
+    bare = carrier_cases.changed(log, code_m=code, doppler_hz=np.full(code.shape, np.nan))
     assert find_slips(bare)[0].slip[30].all()
 
 
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("cut", [1, 7, 25])
 def test_chunks_give_the_same_bits(cut):
-    obs = with_cycles(carrier_made.log(), 20, 3, 5)
+    obs = with_cycles(carrier_cases.log(), 20, 3, 5)
     lock, code = obs.loss_of_lock.copy(), obs.code_m.copy()
     lock[25:28, 1] = 2
     code[40:] += MILLISECOND_M
-    obs = carrier_made.changed(obs, loss_of_lock=lock, code_m=code)
+    obs = carrier_cases.changed(obs, loss_of_lock=lock, code_m=code)
     whole, _ = find_slips(obs)
     state, arcs, parts, numbered = None, None, [], []
     for first in range(0, len(obs), cut):
@@ -170,7 +170,7 @@ def test_chunks_give_the_same_bits(cut):
 
 def test_channels_may_change_between_chunks():
     """A new channel begins; the others are joined whatever their order."""
-    obs = carrier_made.log(channels=5)
+    obs = carrier_cases.log(channels=5)
     order = [4, 2, 0, 1]
     first = Observations(
         time=obs.time[:30], satellite=obs.satellite[order], signal=obs.signal[order],
@@ -184,7 +184,7 @@ def test_channels_may_change_between_chunks():
 
 
 def test_a_carrier_of_unknown_frequency_has_no_phase():
-    obs = carrier_made.log(5, channels=4)
+    obs = carrier_cases.log(5, channels=4)
     frequency = np.full(4, 1_575.42e6)
     frequency[1] = np.nan
     slips, _ = find_slips(obs, frequency_hz=frequency)

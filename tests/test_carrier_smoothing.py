@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import carrier_made
+import carrier_cases
 from railfix.gnss.observations import Observations
 from railfix.positioning.carrier import Smoothed, SmoothingLimits, SmoothingState, find_slips, smooth_codes
 from railfix.positioning.carrier.recursion import linear_recursion
@@ -47,7 +47,7 @@ def test_linear_recursion_is_the_loop():
 @pytest.mark.parametrize("window_s", [10.0, 100.0])
 @pytest.mark.parametrize("epochs", [1, 2, 400])
 def test_equals_the_recursion_written_out(window_s, epochs):
-    obs = carrier_made.log(epochs)
+    obs = carrier_cases.log(epochs)
     slip = np.zeros(obs.code_m.shape, dtype=bool)
     slip[0] = True
     slip[epochs // 2, 2] = True
@@ -63,8 +63,8 @@ def test_equals_the_recursion_written_out(window_s, epochs):
 @pytest.mark.requirement("A5")
 @pytest.mark.parametrize("clocks", ["own", "shared"])
 def test_noise_falls_by_the_factor_that_it_tells(clocks):
-    obs = carrier_made.log(300, channels=40)
-    clean = carrier_made.log(300, channels=40, code_sigma_m=0.0)
+    obs = carrier_cases.log(300, channels=40)
+    clean = carrier_cases.log(300, channels=40, code_sigma_m=0.0)
     truth = find_slips(clean)[0].phase_m
     got = smoothed(obs, window_s=50.0, clocks=clocks)
     apart = got.code_m - truth
@@ -80,12 +80,12 @@ def test_noise_falls_by_the_factor_that_it_tells(clocks):
 @pytest.mark.requirement("A5")
 def test_codes_that_jump_together_are_smoothed_all_the_same():
     """As telephones do: 30 m of noise common to all codes of an epoch, absent from the phases."""
-    obs = carrier_made.log(200, channels=20)
+    obs = carrier_cases.log(200, channels=20)
     common = np.random.default_rng(8).normal(0.0, 30.0, (200, 1))
-    jumping = carrier_made.changed(obs, code_m=obs.code_m + common)
+    jumping = carrier_cases.changed(obs, code_m=obs.code_m + common)
 
     def spread(result: Smoothed) -> float:
-        apart = result.code_m - obs.phase_cycles * carrier_made.WAVELENGTH_M
+        apart = result.code_m - obs.phase_cycles * carrier_cases.WAVELENGTH_M
         late = (apart - apart.mean(axis=1, keepdims=True))[100:]
         return float(np.std(late - late.mean(axis=0)))
 
@@ -100,11 +100,11 @@ def test_codes_that_jump_together_are_smoothed_all_the_same():
 @pytest.mark.parametrize("cut", [1, 7, 100])
 @pytest.mark.parametrize("clocks", ["own", "shared"])
 def test_chunks_give_the_same(cut, clocks):
-    obs = carrier_made.log(400)
+    obs = carrier_cases.log(400)
     code, phase = obs.code_m.copy(), obs.phase_cycles.copy()
     code[50:60, 1], phase[100:103, 2], phase[200:, 3] = np.nan, np.nan, phase[200:, 3] + 50
     code[300, :] = np.nan
-    obs = carrier_made.changed(obs, code_m=code, phase_cycles=phase)
+    obs = carrier_cases.changed(obs, code_m=code, phase_cycles=phase)
     slips, _ = find_slips(obs)
     limits = SmoothingLimits(window_s=60.0, clocks=clocks)
     names = obs.satellite, obs.signal
@@ -126,10 +126,10 @@ def test_chunks_give_the_same(cut, clocks):
 
 @pytest.mark.requirement("A5")
 def test_what_absent_observations_do():
-    obs = carrier_made.log(40)
+    obs = carrier_cases.log(40)
     code, phase = obs.code_m.copy(), obs.phase_cycles.copy()
     code[20:23, 0], phase[20:23, 1], code[:5, 2] = np.nan, np.nan, np.nan
-    obs = carrier_made.changed(obs, code_m=code, phase_cycles=phase)
+    obs = carrier_cases.changed(obs, code_m=code, phase_cycles=phase)
     got = smoothed(obs)
     assert np.isfinite(got.code_m[20:23, 0]).all()  # the arc runs on in the phase
     assert np.array_equal(got.code_m[20:24, 1], code[20:24, 1])  # raw where no phase is, and where the arc begins
@@ -141,11 +141,11 @@ def test_what_absent_observations_do():
 
 @pytest.mark.requirement("A5")
 def test_a_millisecond_in_the_codes_alone_passes_through():
-    obs = carrier_made.log(100)
+    obs = carrier_cases.log(100)
     code, time = obs.code_m.copy(), obs.time.copy()
     code[50:] += 299_792.458
     time[50:] += np.timedelta64(1, "ms")
-    got = smoothed(carrier_made.changed(obs, code_m=code, time=time), clocks="shared")
+    got = smoothed(carrier_cases.changed(obs, code_m=code, time=time), clocks="shared")
     calm = smoothed(obs, clocks="shared")
     assert got.code_m[50:] - calm.code_m[50:] == pytest.approx(np.full((50, 8), 299_792.458), abs=1e-4)
 
@@ -156,7 +156,7 @@ def test_a_day_keeps_its_digits():
     t = np.arange(epochs)[:, None] * 30.0
     phase = np.repeat(2.0e7 + 4.0e3 * t, 2, axis=1)
     code = phase + 1.25e8
-    time = carrier_made.times(epochs, 30.0)
+    time = carrier_cases.times(epochs, 30.0)
     slip = np.zeros(phase.shape, dtype=bool)
     slip[0] = True
     got, _ = smooth_codes(time, np.array(["G01", "G02"]), np.array(["1C", "1C"]), code, phase, slip)

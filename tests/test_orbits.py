@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-import orbits_made
-from orbits_made import HOUR, KINDS, TOE, glonass, kepler, navigation
+import orbit_cases
+from orbit_cases import HOUR, KINDS, TOE, glonass, kepler, navigation
 from railfix.core.arrays import read_only
 from railfix.core.constants import (
     EARTH_ROTATION_RATE,
@@ -287,7 +287,7 @@ def test_no_epochs_and_no_records_are_allowed() -> None:
     nav = navigation({"satellite": "G05"})
     none = satellite_states(at([0.0])[:0], np.array(["G05"]), np.array(["1C"]), np.empty((0, 1)), nav)
     assert none.position_ecef_m.shape == (0, 1, 3)
-    empty = replace(nav, kepler=orbits_made.kepler())
+    empty = replace(nav, kepler=orbit_cases.kepler())
     found = states(empty, 0.0)
     assert found.no_record.all()
     assert np.isnan(found.position_ecef_m).all()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orbits_made import one_record
+from orbit_cases import one_record
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import satellite_states

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orbits_made import HOUR, TOE, kepler, navigation
+from orbit_cases import HOUR, TOE, kepler, navigation
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.orbits import SatelliteStates, satellite_states

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 import protection_oracle
 import raim_oracle as oracle
 from railfix.integrity.protection import RiskBudget, along_track_level
-from railfix.integrity.protection.separation import Separations, whole, without_constellation, without_one, without_two
+from railfix.integrity.protection.separation import (
+    Separations,
+    all_in_view,
+    without_constellation,
+    without_one,
+    without_two,
+)
 from railfix.integrity.raim import constrained_model
 from railfix.positioning.normal_equations import UNTIED_M
 
@@ -69,7 +75,7 @@ def test_every_subset_equals_solving_without_it(seed, system, scale, fault):
     n, bias = len(systems), np.random.default_rng(seed).uniform(0.0, 1.0, len(systems))
     if solved.all.sigma_m > 50.0:
         return
-    all_of = whole(model, np.array([scale]), bias[None])
+    all_of = all_in_view(model, np.array([scale]), bias[None])
     assert all_of.sigma_m[0] == pytest.approx(solved.all.sigma_m, rel=1e-7)
     singles = without_one(all_of)
     for c in range(n):
@@ -91,7 +97,7 @@ def test_subsets_that_leave_no_position_are_found():
     model = constrained_model(ranges, oracle.LINE, ARC)
     solved = protection_oracle.Resolved(oracle.problem_on_line(ranges, 0, ARC[0]), 1.0)
     first, second = np.triu_indices(3, 1)
-    twos = without_two(whole(model, np.ones(1), None), first, second)
+    twos = without_two(all_in_view(model, np.ones(1), None), first, second)
     assert [compare(twos, k, pair, solved, bias) for k, pair in enumerate(combinations(range(3), 2))] == [True] * 3
 
 
@@ -99,7 +105,7 @@ def test_pair_of_a_clock_of_its_own_is_left_out_whole():
     """Each of the two is useless without the other: both gone is the same as one gone."""
     ranges = oracle.made(ARC, "GGGGGGEE", seed=6, faults_m={7: 25.0})
     model = constrained_model(ranges, oracle.LINE, ARC)
-    all_of = whole(model, np.ones(1), None)
+    all_of = all_in_view(model, np.ones(1), None)
     pair = without_two(all_of, np.array([6]), np.array([7]))
     one = without_one(all_of)
     assert pair.moved_m[0, 0] == pytest.approx(one.moved_m[0, 6], rel=1e-9)

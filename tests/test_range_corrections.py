@@ -17,7 +17,7 @@ from railfix.core.geodesy import ecef_from_geodetic, range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.gnss.orbits import SatelliteStates
 from railfix.io.rinex import read_navigation, read_observations
-from railfix.pipeline import carrier_phase
+from railfix.pipeline import carrier_stage
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.positioning.normal_equations import Ranges
@@ -320,13 +320,13 @@ def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:
 def test_phases_have_the_weight_of_their_elevation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Weight of a phase: (sin(elevation) / sigma at the zenith)^2."""
     caught: list[Any] = []
-    inner = carrier_phase.phase_positions
+    inner = carrier_stage.phase_positions
 
     def phase_positions(time: np.ndarray, ranges: Ranges, phases: Any, *rest: Any, **limits: Any) -> Any:
         caught.append(phases.weight)
         return inner(time, ranges, phases, *rest, **limits)
 
-    monkeypatch.setattr(carrier_phase, "phase_positions", phase_positions)
+    monkeypatch.setattr(carrier_stage, "phase_positions", phase_positions)
     observations = cases.clean_observations()["front"][:20]
     result = cases.front_alone(observations, {"carrier": "float", "phase_sigma_m": 0.02, "screens": []})
     (weight,) = caught

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sbas_made as made
+import sbas_cases as cases
 from railfix.io.rinex.navigation import read_navigation
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, read_sbas
 from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S
@@ -25,7 +25,7 @@ OK, TIMED_OUT = SatelliteState.OK, SatelliteState.TIMED_OUT
 
 
 def at(*second: float) -> np.ndarray:
-    return made.START + np.array([round(s * 1e9) for s in second], dtype="timedelta64[ns]")
+    return cases.START + np.array([round(s * 1e9) for s in second], dtype="timedelta64[ns]")
 
 
 def base(*, until: int = 20, but: Sequence[str] = (), indicator: int = 0) -> Rows:
@@ -40,16 +40,16 @@ def base(*, until: int = 20, but: Sequence[str] = (), indicator: int = 0) -> Row
             if second == first or what not in but:
                 rows.append((second, 0, bits(second)))  # type: ignore[operator]
 
-    say("mask", 0, 100, lambda s: made.mask(s, NUMBERS))
-    say("factors", 1, 60, lambda s: made.factors(s, [indicator] * 2))
-    say("parameters", 2, 60, lambda s: made.parameters(s, rss_udre=1))
-    say("long", 3, 60, lambda s: made.long_term(s, [(1, 48, (1.0, -2.0, 3.0), 8), (2, 49, (0.5, 0.0, 0.0), 0)]))
-    say("fast", 4, 6, lambda s: made.fast(s, [1.5, -2.0], [3, 4], iodf=(s // 6) % 3))
+    say("mask", 0, 100, lambda s: cases.mask(s, NUMBERS))
+    say("factors", 1, 60, lambda s: cases.factors(s, [indicator] * 2))
+    say("parameters", 2, 60, lambda s: cases.parameters(s, rss_udre=1))
+    say("long", 3, 60, lambda s: cases.long_term(s, [(1, 48, (1.0, -2.0, 3.0), 8), (2, 49, (0.5, 0.0, 0.0), 0)]))
+    say("fast", 4, 6, lambda s: cases.fast(s, [1.5, -2.0], [3, 4], iodf=(s // 6) % 3))
     return rows
 
 
 def engine(rows: Rows, limits: SbasLimits = OFF, **options: object) -> SbasCorrections:
-    return SbasCorrections.from_log(made.made(rows), limits=limits, **options)  # type: ignore[arg-type]
+    return SbasCorrections.from_log(cases.message_log(rows), limits=limits, **options)  # type: ignore[arg-type]
 
 
 def states(rows: Rows, *second: float, limits: SbasLimits = OFF, satellite: int = 0) -> list[int]:
@@ -87,8 +87,8 @@ def test_parts_of_a_millisecond_are_no_way_into_the_past() -> None:
 
 @pytest.mark.parametrize("year", [1998, 2014, 2034, 2060])
 def test_any_year_will_do(year: int) -> None:
-    log = made.made(base())
-    shift = np.datetime64(f"{year}-06-01", "ns") - made.START
+    log = cases.message_log(base())
+    shift = np.datetime64(f"{year}-06-01", "ns") - cases.START
     ours = SbasCorrections.from_log(replace(log, time=log.time + shift), limits=OFF)
     assert ours.satellites(at(3.9, 10.0, 29.0) + shift, SATELLITE).state[:, 0].tolist() == [
         SatelliteState.NO_FAST,
@@ -122,7 +122,7 @@ def test_time_outs_are_exact(
 def test_fast_corrections_time_out_by_their_indicator(indicator: int, mode: str) -> None:
     """Alarms (IODF 3) renew the UDREI and leave the fast correction to its own time-out (table A-8)."""
     rows = base(until=250, but=["fast"], indicator=indicator)
-    rows += [(s, 0, made.integrity(s, [3, 4], (3, 3, 3, 3))) for s in range(5, 250, 6)]
+    rows += [(s, 0, cases.integrity(s, [3, 4], (3, 3, 3, 3))) for s in range(5, 250, 6)]
     last = 4 + FAST_TIMEOUT_S[mode][indicator]
     limits = SbasLimits(range_rate="off", mode=mode)  # type: ignore[arg-type]
     assert states(rows, last, last + 0.001, limits=limits) == [OK, TIMED_OUT]
@@ -130,8 +130,8 @@ def test_fast_corrections_time_out_by_their_indicator(indicator: int, mode: str)
 
 def test_type_6_of_the_same_issue_renews_the_correction_of_another_does_not() -> None:
     rows = base(until=60, but=["fast"], indicator=15)
-    same = rows + [(s, 0, made.integrity(s, [2, 4])) for s in range(10, 60, 6)]
-    other = rows + [(s, 0, made.integrity(s, [2, 4], (1, 1, 1, 1))) for s in range(10, 60, 6)]
+    same = rows + [(s, 0, cases.integrity(s, [2, 4])) for s in range(10, 60, 6)]
+    other = rows + [(s, 0, cases.integrity(s, [2, 4], (1, 1, 1, 1))) for s in range(10, 60, 6)]
     assert states(same, 50) == [OK]
     assert states(other, 16, 17) == [OK, TIMED_OUT]
     assert engine(same).satellites(at(9.0, 10.0), SATELLITE).udrei[:, 0].tolist() == [3, 2]
@@ -140,14 +140,14 @@ def test_type_6_of_the_same_issue_renews_the_correction_of_another_does_not() ->
 
 
 def test_an_alarm_stops_a_satellite_at_once() -> None:
-    rows = [*base(), (11.0, 0, made.integrity(11, [15, 14], (3, 3, 3, 3)))]
+    rows = [*base(), (11.0, 0, cases.integrity(11, [15, 14], (3, 3, 3, 3)))]
     found = engine(rows).satellites(at(10.9, 11.0, 16.0), SATELLITE)
     assert found.state[:, 0].tolist() == [OK, SatelliteState.DO_NOT_USE, OK]
     assert found.state[:, 1].tolist() == [OK, SatelliteState.NOT_MONITORED, OK]
 
 
 def test_a_large_udrei_is_named() -> None:
-    rows = [*base(), (11.0, 0, made.fast(11, [1.5, -2.0], [12, 13], iodf=2))]
+    rows = [*base(), (11.0, 0, cases.fast(11, [1.5, -2.0], [12, 13], iodf=2))]
     assert states(rows, 12.0) == [SatelliteState.UDREI_TOO_LARGE]
     assert states(rows, 12.0, limits=SbasLimits(range_rate="off", mode="en_route")) == [OK]
     assert states(rows, 12.0, limits=SbasLimits(range_rate="off", mode="en_route", max_udrei=11)) == [
@@ -157,11 +157,11 @@ def test_a_large_udrei_is_named() -> None:
 
 def test_corrections_of_another_mask_are_not_used() -> None:
     """Wrong IODP: counted, never applied; with the mask of that issue they are, for its satellites."""
-    wrong = [*base(until=9), (9.0, 0, made.fast(9, [100.0], [0], iodp=2))]
+    wrong = [*base(until=9), (9.0, 0, cases.fast(9, [100.0], [0], iodp=2))]
     found = engine(wrong).satellites(at(9.5), SATELLITE)
     assert found.fast_m[0, 0] == 1.5
     assert engine(wrong).unused["fast corrections without a mask of their IODP"] == 13
-    right = [*base(until=9), (9.0, 0, made.mask(9, [7, 9], 2)), (10.0, 0, made.fast(10, [5.0, 6.0], [1, 2], iodp=2))]
+    right = [*base(until=9), (9.0, 0, cases.mask(9, [7, 9], 2)), (10.0, 0, cases.fast(10, [5.0, 6.0], [1, 2], iodp=2))]
     found = engine(right).satellites(at(9.5, 10.5), SATELLITE)
     assert found.state[:, 0].tolist() == [SatelliteState.NOT_IN_MASK] * 2
     assert found.fast_m[:, 1].tolist() == [-2.0, 5.0]
@@ -171,14 +171,14 @@ def test_corrections_of_another_mask_are_not_used() -> None:
 def test_a_fast_correction_goes_with_its_mask() -> None:
     """The long-term correction is of the new mask already, the fast one still of the old, which times out first."""
     rows = [row for row in base(until=620, but=["mask"]) if row[2][1] >> 2 != 2 or row[0] < 599]
-    rows.append((590.0, 0, made.mask(590, NUMBERS, 1)))
-    rows.append((599.0, 0, made.long_term(599, [(1, 48, (1.0, -2.0, 3.0), 8)], 1)))
+    rows.append((590.0, 0, cases.mask(590, NUMBERS, 1)))
+    rows.append((599.0, 0, cases.long_term(599, [(1, 48, (1.0, -2.0, 3.0), 8)], 1)))
     assert states(rows, 600.0, 600.001) == [OK, TIMED_OUT]
 
 
 def test_type_24_corrects_like_types_2_and_25() -> None:
     rows = [row for row in base(until=20, but=["long", "fast"]) if row[0] not in (3, 4)]
-    rows.append((5.0, 0, made.mixed(5, [1.5, -2.0], [3, 4], [(1, 48, (1.0, -2.0, 3.0), 8), (2, 49, (0.5, 0, 0), 0)])))
+    rows.append((5.0, 0, cases.mixed(5, [1.5, -2.0], [3, 4], [(1, 48, (1.0, -2.0, 3.0), 8), (2, 49, (0.5, 0, 0), 0)])))
     mixed, separate = engine(rows), engine(base())
     ours, theirs = mixed.satellites(at(6.0), SATELLITE), separate.satellites(at(6.0), SATELLITE)
     for name in ("state", "fast_m", "position_m", "clock_s", "iode", "udrei"):
@@ -188,7 +188,7 @@ def test_type_24_corrects_like_types_2_and_25() -> None:
 def test_velocity_code_1_moves_the_correction() -> None:
     """Hand-worked: 64 s after its reference time, rates of 2^-11 m/s and 2^-39."""
     rows = [row for row in base() if row[0] != 3]
-    rows.append((3.0, 0, made.moving(3, 1, 48, (1.0, -2.0, 3.0), (16, -32, 0), 8, 5, 43_200 - 48)))
+    rows.append((3.0, 0, cases.moving(3, 1, 48, (1.0, -2.0, 3.0), (16, -32, 0), 8, 5, 43_200 - 48)))
     found = engine(rows).satellites(at(16.0), SATELLITE)
     assert found.position_m[0, 0] == pytest.approx([1.0 + 64 * 16 / 2048, -2.0 - 64 * 32 / 2048, 3.0], abs=1e-12)
     assert found.clock_s[0, 0] == pytest.approx(8 * 2.0**-31 + 64 * 5 * 2.0**-39, abs=1e-18)
@@ -197,7 +197,7 @@ def test_velocity_code_1_moves_the_correction() -> None:
 def test_the_rate_is_that_of_two_corrections() -> None:
     """1.5 m, then 2.5 m 6 s later: 1/6 m/s from the first bit of the second on."""
     rows = [row for row in base(until=5, indicator=5) if row[0] != 4]
-    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=0)), (10.0, 0, made.fast(10, [2.5], [3], iodf=1))]
+    rows += [(4.0, 0, cases.fast(4, [1.5], [3], iodf=0)), (10.0, 0, cases.fast(10, [2.5], [3], iodf=1))]
     limits = SbasLimits()
     found = engine(rows, limits).satellites(at(9.0, 10.0, 13.0), SATELLITE)
     assert found.state[:, 0].tolist() == [SatelliteState.NO_RANGE_RATE, OK, OK]
@@ -213,7 +213,7 @@ def test_the_rate_is_that_of_two_corrections() -> None:
                                                         (2, 1, True), (0, 2, True), (1, 1, True)])  # fmt: skip
 def test_a_rate_grows_where_the_issues_do_not_follow_each_other(first: int, second: int, grows: bool) -> None:
     rows = [row for row in base(until=5, indicator=5) if row[0] != 4]
-    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=first)), (10.0, 0, made.fast(10, [2.5], [3], iodf=second))]
+    rows += [(4.0, 0, cases.fast(4, [1.5], [3], iodf=first)), (10.0, 0, cases.fast(10, [2.5], [3], iodf=second))]
     found = engine(rows, SbasLimits()).satellites(at(13.0), SATELLITE)
     assert found.rate_growth_m[0, 0] == pytest.approx(0.0002 * 78.0 / 4.0 * 4.0 if grows else 0.0)
 
@@ -222,8 +222,8 @@ def test_after_an_alarm_the_rate_is_over_half_the_time_out() -> None:
     """a = 0.0006 (time-out 42 s), IODF 3 at 34 s: 10 and 16 s are equally near to 34 - 21 s, the later one is taken."""
     rows = [row for row in base(until=5, indicator=8) if row[0] != 4]
     sent = {4: 0.0, 10: 1.0, 16: 5.0, 22: 6.0, 28: 6.5}
-    rows += [(s, 0, made.fast(s, [v], [3], iodf=(s // 6) % 3)) for s, v in sent.items()]
-    rows.append((34, 0, made.fast(34, [8.0], [3], iodf=3)))
+    rows += [(s, 0, cases.fast(s, [v], [3], iodf=(s // 6) % 3)) for s, v in sent.items()]
+    rows.append((34, 0, cases.fast(34, [8.0], [3], iodf=3)))
     found = engine(rows, SbasLimits()).satellites(at(36.0), SATELLITE)
     assert found.rate_mps[0, 0] == pytest.approx((8.0 - 5.0) / 18.0)
     assert found.rate_growth_m[0, 0] == pytest.approx(0.0006 * 3.0 / 2.0 * 3.0)
@@ -234,24 +234,24 @@ def test_after_an_alarm_the_rate_is_over_half_the_time_out() -> None:
 def test_a_rate_carries_no_further_than_eight_times_its_base() -> None:
     """Two corrections 6 s apart carry 48 s from the first bit; alarms keep the UDREI alive meanwhile."""
     rows = [row for row in base(until=5, indicator=5) if row[0] != 4]
-    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=0)), (10.0, 0, made.fast(10, [2.5], [3], iodf=1))]
-    rows += [(s, 0, made.integrity(s, [3, 4], (3, 3, 3, 3))) for s in range(12, 70, 6)]
+    rows += [(4.0, 0, cases.fast(4, [1.5], [3], iodf=0)), (10.0, 0, cases.fast(10, [2.5], [3], iodf=1))]
+    rows += [(s, 0, cases.integrity(s, [3, 4], (3, 3, 3, 3))) for s in range(12, 70, 6)]
     assert states(rows, 57.0, 57.001, limits=SbasLimits()) == [OK, SatelliteState.NO_RANGE_RATE]
 
 
 def test_a_rate_is_not_made_of_corrections_too_far_apart() -> None:
     """The shortest time-out of the mask counts: 18 s of the other satellite's ai 13."""
     rows = [row for row in base(until=5) if row[0] not in (1, 4)]
-    rows.append((1.0, 0, made.factors(1, [5, 13])))
-    rows += [(4.0, 0, made.fast(4, [1.5], [3], iodf=0)), (22.0, 0, made.fast(22, [2.5], [3], iodf=1))]
+    rows.append((1.0, 0, cases.factors(1, [5, 13])))
+    rows += [(4.0, 0, cases.fast(4, [1.5], [3], iodf=0)), (22.0, 0, cases.fast(22, [2.5], [3], iodf=1))]
     assert states(rows, 22.0, limits=SbasLimits()) == [OK]
-    rows[-1] = (23.0, 0, made.fast(23, [2.5], [3], iodf=1))
+    rows[-1] = (23.0, 0, cases.fast(23, [2.5], [3], iodf=1))
     assert states(rows, 23.0, limits=SbasLimits()) == [SatelliteState.NO_RANGE_RATE]
 
 
 def test_a_rate_is_not_made_across_a_pause_of_monitoring() -> None:
     rows = [row for row in base(until=5, indicator=5) if row[0] != 4]
-    rows += [(s, 0, made.fast(s, [1.5], [g], iodf=i)) for s, g, i in ((4, 3, 0), (10, 14, 1), (16, 3, 2), (22, 3, 0))]
+    rows += [(s, 0, cases.fast(s, [1.5], [g], iodf=i)) for s, g, i in ((4, 3, 0), (10, 14, 1), (16, 3, 2), (22, 3, 0))]
     assert states(rows, 4, 10, 16, 22, limits=SbasLimits()) == [
         SatelliteState.NO_RANGE_RATE,
         SatelliteState.NOT_MONITORED,
@@ -263,18 +263,18 @@ def test_a_rate_is_not_made_across_a_pause_of_monitoring() -> None:
 def test_degradation_by_hand() -> None:
     """A.4.5.1 with numbers: a = 0.0002, latency 2 s, IODF out of turn, B_rrc 0.04 m, two steps of 0.3 m."""
     rows: Rows = [
-        (0, 0, made.mask(0, NUMBERS)),
-        (1, 0, made.factors(1, [5, 0], latency=2)),
-        (3, 0, made.long_term(3, [(1, 48, (1.0, -2.0, 3.0), 8)])),
-        (4, 0, made.fast(4, [1.5], [3], iodf=0)),
-        (10, 0, made.fast(10, [2.5], [3], iodf=2)),
+        (0, 0, cases.mask(0, NUMBERS)),
+        (1, 0, cases.factors(1, [5, 0], latency=2)),
+        (3, 0, cases.long_term(3, [(1, 48, (1.0, -2.0, 3.0), 8)])),
+        (4, 0, cases.fast(4, [1.5], [3], iodf=0)),
+        (10, 0, cases.fast(10, [2.5], [3], iodf=2)),
     ]
     fast = 0.0002 / 2.0 * (6.0 + 1.0 + 2.0) ** 2
     rate = (0.0002 * 78.0 / 4.0 + 0.04 / 6.0) * 7.0
     long = 2 * 0.3
     for squares in (0, 1):
         said = {"brrc": 20, "cltc_v0": 150, "iltc_v0": 7, "rss_udre": squares}
-        found = engine([*rows, (2, 0, made.parameters(2, **said))], SbasLimits()).satellites(at(16.0), SATELLITE)
+        found = engine([*rows, (2, 0, cases.parameters(2, **said))], SbasLimits()).satellites(at(16.0), SATELLITE)
         assert found.fast_growth_m[0, 0] == pytest.approx(fast)
         assert found.rate_growth_m[0, 0] == pytest.approx(rate)
         assert found.long_term_growth_m[0, 0] == pytest.approx(long)
@@ -286,15 +286,15 @@ def test_degradation_by_hand() -> None:
 def test_degradation_of_a_moving_correction_by_hand() -> None:
     """0 inside the interval after the reference time, else a step and a ramp."""
     rows = [row for row in base(until=40) if row[0] not in (2, 3)]
-    rows.append((2.0, 0, made.parameters(2, cltc_lsb=100, cltc_v1=400, iltc_v1=10)))
-    rows.append((3.0, 0, made.moving(3, 1, 48, (1.0, -2.0, 3.0), (0, 0, 0), 8, 0, 43_200 + 16)))
+    rows.append((2.0, 0, cases.parameters(2, cltc_lsb=100, cltc_v1=400, iltc_v1=10)))
+    rows.append((3.0, 0, cases.moving(3, 1, 48, (1.0, -2.0, 3.0), (0, 0, 0), 8, 0, 43_200 + 16)))
     found = engine(rows).satellites(at(6.0, 20.0, 36.0), SATELLITE)
     assert found.long_term_growth_m[:, 0] == pytest.approx([0.2 + 0.02 * 10.0, 0.0, 0.2 + 0.02 * 10.0])
 
 
 def test_en_route_adds_its_own_term_to_what_precision_approach_would_not_use() -> None:
     rows = [row for row in base(until=20) if row[0] != 2]
-    rows.append((2.0, 0, made.parameters(2, cer=3)))
+    rows.append((2.0, 0, cases.parameters(2, cer=3)))
     limits = SbasLimits(range_rate="off", mode="en_route")
     found = engine(rows, limits).satellites(at(28.0, 29.0), SATELLITE)
     assert found.en_route_m[:, 0].tolist() == [0.0, 1.5]
@@ -317,8 +317,8 @@ def test_the_covariance_scales_sigma_along_the_line_of_sight() -> None:
     """R = 2^(3-5) [[4, 2, 0, 1], [0, 8, 0, 0], [0, 0, 4, -2], [0, 0, 0, 6]], I = (0.6, 0, 0.8, 1), C = 0.5."""
     rows = [row for row in base() if row[0] != 2]
     rows += [
-        (2.0, 0, made.parameters(2, ccovariance=5)),
-        (5.0, 0, made.covariance(5, 1, 3, (4, 8, 4, 6), (2, 0, 1, 0, 0, -2))),
+        (2.0, 0, cases.parameters(2, ccovariance=5)),
+        (5.0, 0, cases.covariance(5, 1, 3, (4, 8, 4, 6), (2, 0, 1, 0, 0, -2))),
     ]
     ours = engine(rows, SbasLimits(range_rate="off", incomplete="inflate"))
     found = ours.satellites(at(10.0), SATELLITE)
@@ -333,7 +333,7 @@ def test_the_covariance_scales_sigma_along_the_line_of_sight() -> None:
 @pytest.mark.parametrize(("mode", "last"), [("precision", 245), ("en_route", 365)])
 def test_covariances_time_out(mode: str, last: int) -> None:
     """While any is in force every satellite needs one; the last that times out ends that."""
-    rows = [*base(until=last + 10), (5.0, 0, made.covariance(5, 1, 3, (4, 8, 4, 6), (2, 0, 1, 0, 0, -2)))]
+    rows = [*base(until=last + 10), (5.0, 0, cases.covariance(5, 1, 3, (4, 8, 4, 6), (2, 0, 1, 0, 0, -2)))]
     limits = SbasLimits(range_rate="off", mode=mode)  # type: ignore[arg-type]
     assert states(rows, last, last + 0.001, limits=limits, satellite=1) == [SatelliteState.NO_DEGRADATION, OK]
     assert engine(rows, limits).satellites(at(last, last + 0.001), SATELLITE).covariance[:, 0].tolist() == [0, -1]
@@ -343,8 +343,8 @@ def test_regions_of_service_by_hand() -> None:
     """A rectangle of priority 0 with factor 2, half of one of priority 1 with factor 5; 100 outside."""
     rows = base()
     rows += [
-        (5.0, 0, made.service(5, inside=4, outside=15, regions=[(40, 130, 30, 140, 1)], messages=2, number=1)),
-        (11.0, 0, made.service(11, inside=7, outside=15, regions=[(40, 130, 20, 150, 0)], messages=2, number=2,
+        (5.0, 0, cases.service(5, inside=4, outside=15, regions=[(40, 130, 30, 140, 1)], messages=2, number=1)),
+        (11.0, 0, cases.service(11, inside=7, outside=15, regions=[(40, 130, 20, 150, 0)], messages=2, number=2,
                                priority=1)),
     ]  # fmt: skip
     latitude, longitude = np.array([35.0, 39.0, 31.0, 35.0, 50.0]), np.array([135.0, 149.0, 131.0, 145.0, 135.0])
@@ -366,8 +366,8 @@ def test_regions_of_service_by_hand() -> None:
 def test_of_regions_of_equal_priority_the_smaller_factor_counts(first: int, second: int) -> None:
     regions = [(40, 130, 30, 140, 1)]
     rows = base()
-    rows += [(5.0, 0, made.service(5, inside=first, outside=15, regions=regions, messages=2, number=1, priority=2)),
-             (11.0, 0, made.service(11, inside=second, outside=15, regions=regions, messages=2, number=2,
+    rows += [(5.0, 0, cases.service(5, inside=first, outside=15, regions=regions, messages=2, number=1, priority=2)),
+             (11.0, 0, cases.service(11, inside=second, outside=15, regions=regions, messages=2, number=2,
                                     priority=2))]  # fmt: skip
     ours = engine(rows)
     found = ours.satellites(at(12.0), SATELLITE)
@@ -376,8 +376,8 @@ def test_of_regions_of_equal_priority_the_smaller_factor_counts(first: int, seco
 
 def test_a_new_issue_of_regions_counts_when_it_is_whole() -> None:
     """Until then the old one does."""
-    old = made.service(5, inside=4, outside=15, regions=[(40, 130, 30, 140, 1)], issue=1)
-    new = [made.service(s, inside=7, outside=15, regions=[(40, 130, 30, 140, 1)], issue=2, messages=2, number=n)
+    old = cases.service(5, inside=4, outside=15, regions=[(40, 130, 30, 140, 1)], issue=1)
+    new = [cases.service(s, inside=7, outside=15, regions=[(40, 130, 30, 140, 1)], issue=2, messages=2, number=n)
            for s, n in ((9, 1), (11, 2))]  # fmt: skip
     rows = [*base(), (5.0, 0, old), (9.0, 0, new[0]), (11.0, 0, new[1])]
     ours, time = engine(rows), at(10.0, 11.0)
@@ -387,7 +387,7 @@ def test_a_new_issue_of_regions_counts_when_it_is_whole() -> None:
 
 
 def test_type_0_stops_the_geo_for_a_minute_and_clears_what_it_said() -> None:
-    rows = [*base(until=200), (30.5, 0, made.message(0, 30))]
+    rows = [*base(until=200), (30.5, 0, cases.message(0, 30))]
     stopped = SatelliteState.GEO_STOPPED
     assert states(rows, 30.4, 30.5, 90.4) == [OK, stopped, stopped]
     # Mask, factors, parameters and long-term corrections come again by 123 s.
@@ -397,7 +397,7 @@ def test_type_0_stops_the_geo_for_a_minute_and_clears_what_it_said() -> None:
 
 
 def test_type_0_may_stand_for_type_2() -> None:
-    rows = [*base(until=9), (9.0, 0, made.fast(9, [4.0], [2], kind=0, iodf=1)), (15.0, 0, made.message(0, 15))]
+    rows = [*base(until=9), (9.0, 0, cases.fast(9, [4.0], [2], kind=0, iodf=1)), (15.0, 0, cases.message(0, 15))]
     limits = SbasLimits(range_rate="off", type0="as_type2")
     found = engine(rows, limits).satellites(at(10.0, 15.0), SATELLITE)
     assert found.fast_m[0, 0] == 4.0
@@ -410,8 +410,8 @@ def test_two_geos_do_not_mix() -> None:
     """One GEO's masks and corrections never reach the other's; the better one is taken and named."""
     one = [(s, 129, b) for s, _, b in base(until=10)]
     two = [(s, 137, b) for s, _, b in base(until=40)]
-    two = [(s, p, made.fast(int(s), [3.0, 3.5], [3, 4], iodf=int(s) // 6 % 3) if s >= 4 else b) for s, p, b in two]
-    log = made.made(one + two)
+    two = [(s, p, cases.fast(int(s), [3.0, 3.5], [3, 4], iodf=int(s) // 6 % 3) if s >= 4 else b) for s, p, b in two]
+    log = cases.message_log(one + two)
     best = SbasCorrections.from_log(log, limits=OFF)
     assert best.prn == 137
     assert "best SBAS PRN by usable fast corrections: 137" in " ".join(best.notes)
@@ -450,18 +450,18 @@ def test_an_older_issue_serves_where_the_newest_has_no_record(recordings: Path) 
     navigation = read_navigation(recordings / "sbas" / "msas_20080526_crescent" / "cres_20080526.bin.nav")
     rows = [row for row in base(until=30) if row[0] != 3]
     rows += [
-        (3.0, 0, made.long_term(3, [(1, 48, (1.0, 0.0, 0.0), 0)])),
-        (9.0, 0, made.long_term(9, [(1, 99, (2.0, 0.0, 0.0), 0)])),
+        (3.0, 0, cases.long_term(3, [(1, 48, (1.0, 0.0, 0.0), 0)])),
+        (9.0, 0, cases.long_term(9, [(1, 99, (2.0, 0.0, 0.0), 0)])),
     ]
-    log = made.made(rows)
-    shift = np.datetime64("2008-05-26T06:30:00", "ns") - made.START
+    log = cases.message_log(rows)
+    shift = np.datetime64("2008-05-26T06:30:00", "ns") - cases.START
     ours = SbasCorrections.from_log(replace(log, time=log.time + shift), limits=OFF)
     found = ours.satellites(at(10.0) + shift, SATELLITE, navigation)
     assert (found.state[0, 0], found.iode[0, 0], found.position_m[0, 0, 0]) == (OK, 48, 1.0)
     assert ours.satellites(at(10.0) + shift, SATELLITE).iode[0, 0] == 99
     later = [(s, p, b) for s, p, b in base(until=260) if b[1] >> 2 != 25]
-    later += [rows[-2], *((s, 0, made.long_term(s, [(1, 99, (2.0, 0.0, 0.0), 0)])) for s in (9, 100, 200))]
-    log = made.made(later)
+    later += [rows[-2], *((s, 0, cases.long_term(s, [(1, 99, (2.0, 0.0, 0.0), 0)])) for s in (9, 100, 200))]
+    log = cases.message_log(later)
     ours = SbasCorrections.from_log(replace(log, time=log.time + shift), limits=OFF)
     found = ours.satellites(at(243.0, 243.001) + shift, SATELLITE, navigation)
     assert found.state[:, 0].tolist() == [OK, SatelliteState.IODE_MISMATCH]
@@ -523,9 +523,9 @@ def test_any_bits_give_corrections_or_a_reason(seed: int) -> None:
 
 
 def test_a_log_without_corrections_refuses_everything() -> None:
-    found = engine([(0, 0, made.message(63, 0))]).satellites(at(1.0), SATELLITE)
+    found = engine([(0, 0, cases.message(63, 0))]).satellites(at(1.0), SATELLITE)
     assert set(found.state.ravel().tolist()) == {SatelliteState.NO_MASK}
-    empty = engine([(0, 0, made.mask(0, NUMBERS))])
+    empty = engine([(0, 0, cases.mask(0, NUMBERS))])
     assert empty.satellites(at(1.0), SATELLITE).state.tolist() == [
         [SatelliteState.NO_FAST, SatelliteState.NO_FAST, SatelliteState.NOT_IN_MASK]
     ]
@@ -547,10 +547,12 @@ def test_misspelt_limits_are_refused() -> None:
 
 
 def test_a_satellite_of_sbas_needs_no_long_term_correction_and_gets_none_of_another() -> None:
-    rows = [(1.0, 0, made.mask(1, [1, 129])), (2.0, 0, made.fast(2, [1.0, 2.0], [3, 3]))]
-    rows.append((3.0, 0, made.long_term(3, [(1, 40, (8.0, 4.0, 2.0), 100.0)])))
-    engine = SbasCorrections(made.made(rows), prn=137, limits=SbasLimits(range_rate="off", incomplete="inflate"))
-    time = made.START + np.array([5], dtype="timedelta64[s]").astype("timedelta64[ns]")
+    rows = [(1.0, 0, cases.mask(1, [1, 129])), (2.0, 0, cases.fast(2, [1.0, 2.0], [3, 3]))]
+    rows.append((3.0, 0, cases.long_term(3, [(1, 40, (8.0, 4.0, 2.0), 100.0)])))
+    engine = SbasCorrections(
+        cases.message_log(rows), prn=137, limits=SbasLimits(range_rate="off", incomplete="inflate")
+    )
+    time = cases.START + np.array([5], dtype="timedelta64[s]").astype("timedelta64[ns]")
     found = engine.satellites(time, np.array(["G01", "S29"]))
     assert found.state.tolist() == [[SatelliteState.OK, SatelliteState.OK]]
     assert found.position_m[0].tolist() == [[8.0, 4.0, 2.0], [0.0, 0.0, 0.0]]
@@ -561,11 +563,11 @@ def test_a_satellite_of_sbas_needs_no_long_term_correction_and_gets_none_of_anot
 @pytest.mark.parametrize(("earlier", "expected"), [(2.0, 0.0), (3.0, (0.0058 * 1.0 / 2.0 + 1.0 / 5.0) * 2.0)])
 def test_a_rate_after_an_alarm_does_not_degrade_over_half_the_time_out(earlier: float, expected: float) -> None:
     """Time-out 12 s (ai = 15), Brrc 1 m, IODF 3: nothing over exactly 6 s, (a |5 - 6| / 2 + Brrc / 5) t over 5 s."""
-    rows = [(0.5, 0, made.mask(0, [1])), (0.6, 0, made.factors(0, [15])), (0.7, 0, made.parameters(0, brrc=500))]
-    rows.append((0.8, 0, made.long_term(0, [(1, 40, (0.0, 0.0, 0.0), 0.0)])))
-    rows += [(earlier, 0, made.fast(2, [1.0], [3])), (8.0, 0, made.fast(2, [4.0], [3], iodf=3))]
-    engine = SbasCorrections(made.made(rows), prn=137)
-    time = made.START + np.array([9], dtype="timedelta64[s]").astype("timedelta64[ns]")
+    rows = [(0.5, 0, cases.mask(0, [1])), (0.6, 0, cases.factors(0, [15])), (0.7, 0, cases.parameters(0, brrc=500))]
+    rows.append((0.8, 0, cases.long_term(0, [(1, 40, (0.0, 0.0, 0.0), 0.0)])))
+    rows += [(earlier, 0, cases.fast(2, [1.0], [3])), (8.0, 0, cases.fast(2, [4.0], [3], iodf=3))]
+    engine = SbasCorrections(cases.message_log(rows), prn=137)
+    time = cases.START + np.array([9], dtype="timedelta64[s]").astype("timedelta64[ns]")
     found = engine.satellites(time, np.array(["G01"]))
     assert found.state.item() == SatelliteState.OK
     assert found.rate_mps.item() == pytest.approx(3.0 / (8.0 - earlier))

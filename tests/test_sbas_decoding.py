@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import sbas_made as made
+import sbas_cases as cases
 from railfix.ranges.sbas import SbasMessages, decode, read_sbas
 
 pytestmark = pytest.mark.requirement("C1")
@@ -119,7 +119,7 @@ def test_almanacs_agree_with_the_navigation_message(log: SbasMessages) -> None:
 def test_network_time_by_hand() -> None:
     fields = [(-5, 24), (123_456, 32), (30, 8), (49, 8), (18, 8), (137, 8), (7, 8), (18, 8), (3, 3), (302_400, 20),
               (305, 10)]  # fmt: skip
-    decoded = decode.decode(made.made([(0, 0, made.message(12, 0, *fields))]), 12)
+    decoded = decode.decode(cases.message_log([(0, 0, cases.message(12, 0, *fields))]), 12)
     shown = SimpleNamespace(**{name: value[0] for name, value in decoded.items()})
     assert (shown.drift, shown.offset_s) == (-5 * 2.0**-50, 123_456 * 2.0**-30)
     assert (shown.reference_s, shown.reference_week, shown.leap_s) == (30 * 4096.0, 49, 18)
@@ -129,8 +129,8 @@ def test_network_time_by_hand() -> None:
 
 def test_reference_times_cross_midnight() -> None:
     """A time of day of the other side of midnight is of the day that lies nearer."""
-    bits = made.moving(0, 1, 48, (0.0, 0.0, 0.0), (0, 0, 0), 0, 0, 86_384)
+    bits = cases.moving(0, 1, 48, (0.0, 0.0, 0.0), (0, 0, 0), 0, 0, 86_384)
     midnight = np.datetime64("2025-02-16T00:00:10", "ns")
-    base = made.made([(0, 0, bits)])
+    base = cases.message_log([(0, 0, bits)])
     log = SbasMessages(**{**vars(base), "time": np.array([midnight])})
     assert decode.long_term(log)["reference"][0] == np.datetime64("2025-02-15T23:59:44")

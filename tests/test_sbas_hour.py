@@ -11,7 +11,7 @@ import sbas_hour
 from railfix.core.constants import FREQUENCY_L1
 from railfix.core.geodesy import elevation_azimuth, enu_axes, geodetic_from_ecef
 from railfix.pipeline.config import parse_config
-from railfix.pipeline.protection_levels import risk_of
+from railfix.pipeline.level_stage import risk_of
 from railfix.ranges.atmospheric_delays import SeenFrom
 from railfix.ranges.sbas import SatelliteState
 from railfix.ranges.sbas_delays import sbas_delays

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-import sbas_made as made
+import sbas_cases as cases
 from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.sbas import IonosphereDelays, IonosphereState, SbasCorrections, SbasLimits
 from railfix.ranges.sbas.grid import BANDS, CELLS_OF_POINT, POINT_OF_BIT, point_number
@@ -31,16 +31,16 @@ def grid(
     cells: dict[int, dict[tuple[int, int], tuple[float, int]]], *, iodi: int = 0, sent: int = 0, **ten: int
 ) -> Rows:
     """Masks and delays: band -> point -> (delay [m], GIVEI); degradation of type 10 in raw numbers."""
-    rows: Rows = [(sent, 0, made.parameters(sent, **ten))]
+    rows: Rows = [(sent, 0, cases.parameters(sent, **ten))]
     second = sent + 1
     for band, points in cells.items():
         bits = bits_of(band, list(points))
-        rows.append((second, 0, made.grid_mask(second, band, bits, iodi, bands=len(cells))))
+        rows.append((second, 0, cases.grid_mask(second, band, bits, iodi, bands=len(cells))))
         ordered = [value for _, value in sorted(zip(bits, points.values(), strict=True))]
         for block in range(-(-len(ordered) // 15)):
             second += 1
             part = ordered[15 * block : 15 * block + 15]
-            delays = made.grid_delay(second, band, block, [d for d, _ in part], [g for _, g in part], iodi)
+            delays = cases.grid_delay(second, band, block, [d for d, _ in part], [g for _, g in part], iodi)
             rows.append((second, 0, delays))
         second += 1
     return rows
@@ -48,8 +48,8 @@ def grid(
 
 def overhead(rows: Rows, latitude: float, longitude: float, second: float = 30.0) -> IonosphereDelays:
     """Delay straight up: the pierce point is the place."""
-    engine = SbasCorrections.from_log(made.made(rows))
-    time = np.array([made.START + np.timedelta64(round(second * 1000), "ms")])
+    engine = SbasCorrections.from_log(cases.message_log(rows))
+    time = np.array([cases.START + np.timedelta64(round(second * 1000), "ms")])
     return engine.ionosphere(time, np.array([latitude]), np.array([longitude]), ZENITH, np.zeros((1, 1)))
 
 
@@ -215,8 +215,8 @@ def test_the_pierce_point_lies_on_the_layer_in_the_direction_of_the_satellite() 
 
 def test_a_slant_delay_is_longer_by_the_obliquity() -> None:
     rows = grid(square((2.0, 0), (2.0, 0), (2.0, 0), (2.0, 0)))
-    engine = SbasCorrections.from_log(made.made(rows))
-    time = np.array([made.START + np.timedelta64(30, "s")])
+    engine = SbasCorrections.from_log(cases.message_log(rows))
+    time = np.array([cases.START + np.timedelta64(30, "s")])
     found = engine.ionosphere(
         time, np.array([37.5]), np.array([137.5]), np.array([[60.0, 0.0, -5.0]]), np.zeros((1, 3))
     )
@@ -263,15 +263,15 @@ def test_time_outs_are_exact(kind: int, last: int, then: IonosphereState) -> Non
 def test_delays_of_another_mask_are_not_used() -> None:
     """IODI: a block for a mask that was not sent is counted and left."""
     rows = grid(square(*FOUR))
-    rows.append((20, 0, made.grid_delay(20, 7, 0, [9.0] * 15, [0] * 15, iodi=1)))
+    rows.append((20, 0, cases.grid_delay(20, 7, 0, [9.0] * 15, [0] * 15, iodi=1)))
     assert overhead(rows, 35.0, 135.0).delay_m.item() == 1.0
-    engine = SbasCorrections.from_log(made.made(rows))
+    engine = SbasCorrections.from_log(cases.message_log(rows))
     assert engine.unused["grid delays without a mask of their IODI"] == 15
     # With its mask it is: the first point of the new mask is another.
-    rows.append((19, 0, made.grid_mask(19, 7, bits_of(7, [(40, 135)]), 1)))
+    rows.append((19, 0, cases.grid_mask(19, 7, bits_of(7, [(40, 135)]), 1)))
     assert overhead(rows, 40.0, 135.0).state.item() == IonosphereState.NO_GRID
-    rows += [(21, 0, made.grid_mask(21, 7, bits_of(7, [(35, 135), (40, 135)]), 1)),
-             (22, 0, made.grid_delay(22, 7, 0, [7.0, 8.0], [0, 0], iodi=1))]  # fmt: skip
+    rows += [(21, 0, cases.grid_mask(21, 7, bits_of(7, [(35, 135), (40, 135)]), 1)),
+             (22, 0, cases.grid_delay(22, 7, 0, [7.0, 8.0], [0, 0], iodi=1))]  # fmt: skip
     assert overhead(rows, 35.0, 135.0).delay_m.item() == 7.0
 
 
@@ -280,21 +280,21 @@ def test_a_delay_goes_with_its_mask() -> None:
     rows = grid(square(*[(2.0, 2)] * 4))
     rows += [(1100 + s, p, b) for s, p, b in rows if b[1] >> 2 in (10, 26)]
     rows += [
-        (1110, 0, made.grid_mask(1110, band, bits_of(band, [(35, o), (40, o)]), 1)) for band, o in ((7, 135), (8, 140))
+        (1110, 0, cases.grid_mask(1110, band, bits_of(band, [(35, o), (40, o)]), 1)) for band, o in ((7, 135), (8, 140))
     ]
     assert overhead(rows, 37.5, 137.5, 1201.0).state.item() == OK
     assert overhead(rows, 37.5, 137.5, 1201.001).state.item() == IonosphereState.TIMED_OUT
 
 
 def test_type_0_stops_the_grid_too() -> None:
-    rows = [*grid(square(*FOUR)), (20, 0, made.message(0, 20))]
+    rows = [*grid(square(*FOUR)), (20, 0, cases.message(0, 20))]
     assert overhead(rows, 38.0, 136.0, 19.0).state.item() == OK
     assert overhead(rows, 38.0, 136.0, 79.0).state.item() == IonosphereState.GEO_STOPPED
     assert overhead(rows, 38.0, 136.0, 81.0).state.item() == IonosphereState.NO_GRID
 
 
 def test_without_a_grid_there_is_no_delay() -> None:
-    found = overhead([(0, 0, made.message(63, 0))], 38.0, 136.0)
+    found = overhead([(0, 0, cases.message(63, 0))], 38.0, 136.0)
     assert found.state.item() == IonosphereState.NO_GRID
     assert np.isnan(found.delay_m.item())
 
@@ -323,7 +323,7 @@ def test_limits_of_the_height_are_kept() -> None:
 
 def test_precision_of_the_mode_does_not_touch_the_grid() -> None:
     rows = again(grid(square(*[(2.0, 2)] * 4)), 10, 400)
-    engine = SbasCorrections.from_log(made.made(rows), limits=SbasLimits(mode="en_route"))
-    time = np.array([made.START + np.timedelta64(360, "s"), made.START + np.timedelta64(361, "s")])
+    engine = SbasCorrections.from_log(cases.message_log(rows), limits=SbasLimits(mode="en_route"))
+    time = np.array([cases.START + np.timedelta64(360, "s"), cases.START + np.timedelta64(361, "s")])
     place = np.full(2, 37.5), np.full(2, 137.5), np.full((2, 1), 90.0), np.zeros((2, 1))
     assert engine.ionosphere(time, *place).state[:, 0].tolist() == [OK, IonosphereState.NO_DEGRADATION]

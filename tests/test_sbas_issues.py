@@ -5,26 +5,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import orbits_made as made
+import orbit_cases as cases
 from railfix.gnss.orbits.issue_of_data import issue_records
 from railfix.gnss.orbits.states import satellite_states
 
 pytestmark = pytest.mark.requirement("C1")
 
-HOUR = made.HOUR
+HOUR = cases.HOUR
 SATELLITE = np.array(["G05", "G09", "E11", "R01"])
 #: G05: issues 7, 8, and 7 again a day later; sent two hours before the reference time.
-RECORDS = made.navigation(
-    {"satellite": "G05", "iode": 7, "toe": made.TOE, "transmitted": made.TOE - 2 * HOUR},
-    {"satellite": "G05", "iode": 8, "toe": made.TOE + 2 * HOUR, "transmitted": made.TOE, "m0": 0.4},
-    {"satellite": "G05", "iode": 7, "toe": made.TOE + 24 * HOUR, "transmitted": made.TOE + 22 * HOUR, "m0": 0.9},
-    {"satellite": "G09", "iode": 8, "toe": made.TOE},
-    {"satellite": "E11", "iode": 7, "toe": made.TOE},
+RECORDS = cases.navigation(
+    {"satellite": "G05", "iode": 7, "toe": cases.TOE, "transmitted": cases.TOE - 2 * HOUR},
+    {"satellite": "G05", "iode": 8, "toe": cases.TOE + 2 * HOUR, "transmitted": cases.TOE, "m0": 0.4},
+    {"satellite": "G05", "iode": 7, "toe": cases.TOE + 24 * HOUR, "transmitted": cases.TOE + 22 * HOUR, "m0": 0.9},
+    {"satellite": "G09", "iode": 8, "toe": cases.TOE},
+    {"satellite": "E11", "iode": 7, "toe": cases.TOE},
 )
 
 
 def rows(hours: float, *issue: int) -> list[int]:
-    time = np.array([made.TOE + np.timedelta64(round(hours * 3.6e12), "ns")])
+    time = np.array([cases.TOE + np.timedelta64(round(hours * 3.6e12), "ns")])
     wanted = np.array([[*issue, *[-1] * (4 - len(issue))]])
     return issue_records(RECORDS, SATELLITE, time, wanted)[0].tolist()
 
@@ -46,7 +46,7 @@ def test_of_one_issue_the_nearest_in_its_validity_counts() -> None:
 
 def test_states_are_those_of_the_record_asked_for() -> None:
     """As if the file held no other record of the satellite; -1 leaves the choice as it is, to the last bit."""
-    time = np.array([made.TOE + HOUR])
+    time = np.array([cases.TOE + HOUR])
     signal, code = np.array(["1C", "1C", "1C", "1C"]), np.full((1, 4), 2.3e7)
     usual = satellite_states(time, SATELLITE, signal, code, RECORDS)
     left = satellite_states(time, SATELLITE, signal, code, RECORDS, record=np.full((1, 4), -1))
@@ -62,7 +62,7 @@ def test_states_are_those_of_the_record_asked_for() -> None:
     ):
         assert np.array_equal(getattr(usual, name), getattr(left, name), equal_nan=True), name
     asked = satellite_states(time, SATELLITE, signal, code, RECORDS, record=np.array([[0, -1, -1, -1]]))
-    alone = satellite_states(time, SATELLITE, signal, code, made.one_record(RECORDS, 0))
+    alone = satellite_states(time, SATELLITE, signal, code, cases.one_record(RECORDS, 0))
     assert asked.record[0].tolist() == [0, 3, 4, -1]
     assert np.array_equal(asked.position_ecef_m[0, 0], alone.position_ecef_m[0, 0])
     assert np.array_equal(asked.clock_m[0, 0], alone.clock_m[0, 0])
@@ -72,8 +72,8 @@ def test_states_are_those_of_the_record_asked_for() -> None:
 
 
 def test_a_record_not_yet_sent_is_flagged() -> None:
-    late = made.navigation({"satellite": "G05", "iode": 8, "toe": made.TOE, "transmitted": made.TOE + HOUR})
-    time = np.array([made.TOE + HOUR // 2, made.TOE + HOUR])
+    late = cases.navigation({"satellite": "G05", "iode": 8, "toe": cases.TOE, "transmitted": cases.TOE + HOUR})
+    time = np.array([cases.TOE + HOUR // 2, cases.TOE + HOUR])
     states = satellite_states(time, SATELLITE[:1], np.array(["1C"]), np.full((2, 1), 2.3e7), late,
                               record=np.zeros((2, 1), dtype=np.int64))  # fmt: skip
     assert states.future_record[:, 0].tolist() == [True, False]
@@ -81,5 +81,5 @@ def test_a_record_not_yet_sent_is_flagged() -> None:
 
 def test_shapes_are_told() -> None:
     with pytest.raises(ValueError, match=r"record has shape \(1, 2\), expected \(1, 1\)"):
-        satellite_states(np.array([made.TOE]), SATELLITE[:1], np.array(["1C"]), np.full((1, 1), 2.3e7), RECORDS,
+        satellite_states(np.array([cases.TOE]), SATELLITE[:1], np.array(["1C"]), np.full((1, 1), 2.3e7), RECORDS,
                          record=np.zeros((1, 2), dtype=np.int64))  # fmt: skip

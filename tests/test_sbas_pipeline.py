@@ -24,8 +24,8 @@ from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
+from railfix.pipeline.level_stage import level_facts, protection_levels
 from railfix.pipeline.processor import AntennaResult
-from railfix.pipeline.protection_levels import level_facts, protection_levels
 from railfix.pipeline.results import AntennaState, State
 from railfix.pipeline.solve import place_on_line
 from railfix.positioning.map_offset import MapOffset

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sbas_made as made
+import sbas_cases as cases
 from railfix.core.errors import InputFileError
 from railfix.core.timescale import from_week, to_week
 from railfix.ranges.sbas import SbasMessages, read_sbas
@@ -37,11 +37,11 @@ def parity_by_division(bits: np.ndarray) -> int:
 def some_messages() -> np.ndarray:
     return np.array(
         [
-            made.mask(0, [1, 5, 32, 129]),
-            made.fast(1, [1.5, -2.0], [3, 4]),
-            made.moving(2, 1, 48, (1.0, -2.0, 3.0), (1, -2, 3), 4, -5, 43_200),
-            made.grid_mask(3, 8, [1, 2, 200]),
-            made.message(63, 4),
+            cases.mask(0, [1, 5, 32, 129]),
+            cases.fast(1, [1.5, -2.0], [3, 4]),
+            cases.moving(2, 1, 48, (1.0, -2.0, 3.0), (1, -2, 3), 4, -5, 43_200),
+            cases.grid_mask(3, 8, [1, 2, 200]),
+            cases.message(63, 4),
         ]
     )
 
@@ -83,13 +83,13 @@ def as_rinex(log: SbasMessages) -> str:
 
 def a_log() -> SbasMessages:
     messages = [
-        made.mask(0, [1, 5, 32]),
-        made.fast(1, [1.5, -2.0], [3, 4]),
-        made.message(63, 2),
-        made.message(62, 3),
-        made.parameters(4, brrc=7),
+        cases.mask(0, [1, 5, 32]),
+        cases.fast(1, [1.5, -2.0], [3, 4]),
+        cases.message(63, 2),
+        cases.message(62, 3),
+        cases.parameters(4, brrc=7),
     ]
-    return made.made([(second, 0, bits) for second, bits in enumerate(messages)], prn=124)
+    return cases.message_log([(second, 0, bits) for second, bits in enumerate(messages)], prn=124)
 
 
 def test_the_parity_is_the_remainder_of_the_division() -> None:
@@ -120,7 +120,7 @@ def test_a_bit_flipped_anywhere_is_refused(tmp_path: Path) -> None:
         path.write_text("\n".join([good, *text]))
         log = read_sbas(path)
         assert len(log) == 1
-        assert log.refused["parity"] == 250
+        assert log.rejected["parity"] == 250
 
 
 @pytest.mark.parametrize("write", [lambda log: as_rtklib(log, count=64), as_ems, as_rinex])
@@ -153,7 +153,7 @@ def test_a_broken_record_of_rinex_takes_no_other_with_it(tmp_path: Path) -> None
     path = tmp_path / "broken.b"
     path.write_text("\n".join([*lines[:8], "what is this", *lines[8:]]))
     read = read_sbas(path, broken_lines="count")
-    assert read.refused["line"] == 2
+    assert read.rejected["line"] == 2
     assert read.type.tolist() == [2, 63, 62, 10]
 
 
@@ -186,22 +186,22 @@ def test_a_damaged_message_among_cut_ones_is_refused(tmp_path: Path) -> None:
     path.write_text("".join(f"2353 {i} 124 {log.type[i]} : {digits(damaged[i], 58)}\n" for i in range(len(log))))
     read = read_sbas(path)
     assert set(read.parity_bits.tolist()) == {6}
-    assert read.refused["parity"] == 1
+    assert read.rejected["parity"] == 1
     assert read.type.tolist() == [1, 63, 62, 10]
 
 
 def test_a_wrong_preamble_is_counted(tmp_path: Path) -> None:
-    bits = np.array([made.message(63, 0), made.message(63, 1)])
+    bits = np.array([cases.message(63, 0), cases.message(63, 1)])
     bits[0, 0] = 0x00
     bits[:, 28] &= 0xC0
     path = tmp_path / "preamble.sbs"
     path.write_text("".join(f"2353 {i} 137 63 : {digits(bits[i], 58)}\n" for i in range(2)))
     log = read_sbas(path)
-    assert log.refused == {"line": 0, "parity": 0, "preamble": 1, "duplicate": 0}
+    assert log.rejected == {"line": 0, "parity": 0, "preamble": 1, "duplicate": 0}
 
 
 def test_preambles_out_of_turn_are_told(tmp_path: Path) -> None:
-    rows = [f"2353 {s} 137 63 : {digits(made.message(63, s + (s > 7)), 64)}" for s in range(10)]
+    rows = [f"2353 {s} 137 63 : {digits(cases.message(63, s + (s > 7)), 64)}" for s in range(10)]
     path = tmp_path / "turn.sbs"
     path.write_text("\n".join(rows))
     assert "2 of 10 messages are out of turn" in " ".join(read_sbas(path).notes)
@@ -212,16 +212,16 @@ def test_the_same_message_from_two_files_counts_once(tmp_path: Path) -> None:
     (tmp_path / "b.ems").write_text(as_ems(a_log()))
     log = read_sbas([tmp_path / "a.sbs", tmp_path / "b.ems"])
     assert len(log) == 5
-    assert log.refused["duplicate"] == 5
+    assert log.rejected["duplicate"] == 5
     assert sum(log.account().values()) == 10
 
 
 BROKEN = {
     "letters": ("2353 3 137 63 : 53FCxx", "no 'week tow prn type"),
     "length": ("2353 3 137 63 : 53FC00", "6 hexadecimal digits"),
-    "prn": (f"2353 3 12 63 : {digits(made.message(63, 0), 64)}", "PRN 12 sends no SBAS"),
-    "type": (f"2353 3 137 62 : {digits(made.message(63, 0), 64)}", "type 62 is written, the message says 63"),
-    "time": (f"2353 604800 137 63 : {digits(made.message(63, 0), 64)}", "no GPS time"),
+    "prn": (f"2353 3 12 63 : {digits(cases.message(63, 0), 64)}", "PRN 12 sends no SBAS"),
+    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "type 62 is written, the message says 63"),
+    "time": (f"2353 604800 137 63 : {digits(cases.message(63, 0), 64)}", "no GPS time"),
 }
 
 
@@ -235,7 +235,7 @@ def test_a_broken_line_is_named(tmp_path: Path, fault: str) -> None:
     assert caught.value.line == 6
     log = read_sbas(path, broken_lines="count")
     assert len(log) == 5
-    assert log.refused["line"] == 1
+    assert log.rejected["line"] == 1
     assert words in " ".join(log.notes)
 
 
@@ -266,7 +266,7 @@ def test_every_recorded_message_is_accounted_for(recordings: Path, name: str, me
     assert sum(account.values()) == messages == len(path.read_text().splitlines())
     assert sum(n for what, n in account.items() if "type" in what and "not decoded" not in what) == decoded
     assert np.isin(log.type, DECODED).sum() == decoded
-    assert not any("refused" in what and n for what, n in account.items())
+    assert not any("rejected" in what and n for what, n in account.items())
     assert (log.time[1:] >= log.time[:-1]).all()
 
 
@@ -280,8 +280,8 @@ def test_names_tell_qzss_from_sbas() -> None:
     assert type_name(43, 186).startswith("L1S disaster report")
     assert type_name(43, 137) == "reserved"
     assert type_name(26, 186) == type_name(26, 137) == "ionospheric delays"
-    rows = [(0, 186, made.message(43, 0)), (1, 186, made.message(1, 1))]
-    assert list(made.made(rows).account()) == [
+    rows = [(0, 186, cases.message(43, 0)), (1, 186, cases.message(1, 1))]
+    assert list(cases.message_log(rows).account()) == [
         "QZSS L1S 186 type 1 PRN mask",
         "QZSS L1S 186 type 43 L1S disaster report of the Japan Meteorological Agency, not decoded",
     ]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import sbas_made as made
+import sbas_cases as cases
 from railfix.io.rinex import read_navigation
 from railfix.ranges.sbas import SatelliteState, SbasCorrections, SbasLimits, SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.standard import KEPT_S, LONGEST_FAST_S
@@ -22,7 +22,7 @@ OFF = SbasLimits(range_rate="off", incomplete="inflate")
 def answers(corrections: SbasCorrections, time: np.ndarray, navigation=None) -> list[np.ndarray]:
     """Everything that corrections give at epochs, for directions that depend on the epoch alone."""
     fixes = corrections.satellites(time, SATELLITES, navigation)
-    second = (time - made.START) / np.timedelta64(1, "s")
+    second = (time - cases.START) / np.timedelta64(1, "s")
     azimuth = (second[:, None] * 7.0 + np.arange(len(SATELLITES)) * 11.0) % 360.0
     elevation = 5.0 + (second[:, None] * 3.0 + np.arange(len(SATELLITES)) * 5.0) % 85.0
     place = tuple(np.full(len(time), value) for value in PLACE)
@@ -67,20 +67,20 @@ def test_forgetting_changes_nothing_over_a_day_of_messages() -> None:
     rows: list[tuple[float, int, np.ndarray]] = []
     for hour in range(30):
         base = 3600.0 * hour
-        rows += [(base + s, 0, made.mask(0, [1, 2, 3], iodp=hour % 4)) for s in (1.0, 300.0)]
-        rows += [(base + s, 0, made.fast(2, [1.0 + hour, 2.0, -1.0], [3, 4, 5], iodp=hour % 4)) for s in (10.0, 70.0)]
+        rows += [(base + s, 0, cases.mask(0, [1, 2, 3], iodp=hour % 4)) for s in (1.0, 300.0)]
+        rows += [(base + s, 0, cases.fast(2, [1.0 + hour, 2.0, -1.0], [3, 4, 5], iodp=hour % 4)) for s in (10.0, 70.0)]
         rows += [
-            (base + 20.0, 0, made.parameters(0, cer=3, ccovariance=hour)),
-            (base + 21.0, 0, made.factors(0, [1] * 3)),
+            (base + 20.0, 0, cases.parameters(0, cer=3, ccovariance=hour)),
+            (base + 21.0, 0, cases.factors(0, [1] * 3)),
         ]
         still = [(slot, 40, (1.0, 2.0, hour / 8.0), 3.0) for slot in (1, 2)]
-        rows.append((base + 30.0, 0, made.long_term(0, still, iodp=hour % 4)))
-        rows.append((base + 40.0, 0, made.integrity(0, [3, 4, 5])))
-    rows.append((5.0, 0, made.service(0, inside=2, outside=9, regions=[(40, 130, 30, 145, 1)], messages=2)))
-    rows.append((6.0, 0, made.service(0, inside=3, outside=9, regions=[(60, 0, 50, 20, 1)], messages=2, number=2)))
-    rows.append((80_000.0, 0, made.service(0, inside=3, outside=9, regions=[(60, 0, 50, 20, 1)], messages=2, number=2)))
-    messages = made.made(rows)
-    time = made.START + (np.arange(0, 30 * 3600, 15) * 10**9).astype("timedelta64[ns]")
+        rows.append((base + 30.0, 0, cases.long_term(0, still, iodp=hour % 4)))
+        rows.append((base + 40.0, 0, cases.integrity(0, [3, 4, 5])))
+    rows.append((5.0, 0, cases.service(0, inside=2, outside=9, regions=[(40, 130, 30, 145, 1)], messages=2)))
+    second = cases.service(0, inside=3, outside=9, regions=[(60, 0, 50, 20, 1)], messages=2, number=2)
+    rows += [(6.0, 0, second), (80_000.0, 0, second)]
+    messages = cases.message_log(rows)
+    time = cases.START + (np.arange(0, 30 * 3600, 15) * 10**9).astype("timedelta64[ns]")
     for limits in (OFF, SbasLimits()):
         expected = answers(SbasCorrections(messages, prn=137, limits=limits), time)
         found, most = arriving(messages, time, 97, limits)
@@ -91,30 +91,32 @@ def test_forgetting_changes_nothing_over_a_day_of_messages() -> None:
 
 
 def test_before_any_message_nothing_is_corrected() -> None:
-    found = SbasState(prn=137).corrections.satellites(np.array([made.START]), SATELLITES)
+    found = SbasState(prn=137).corrections.satellites(np.array([cases.START]), SATELLITES)
     assert (found.state == SatelliteState.NO_MASK).all()
-    other = SbasState(prn=129).received(made.made([(1.0, 137, made.mask(0, [1]))]))
+    other = SbasState(prn=129).received(cases.message_log([(1.0, 137, cases.mask(0, [1]))]))
     assert len(other.messages) == 0
 
 
 def test_messages_of_an_earlier_time_take_their_place() -> None:
     """Portions that overlap in time give the log in the order of reception, whose files stay told apart."""
-    first = made.made([(1.0, 0, made.mask(0, [1])), (9.0, 0, made.fast(0, [1.0], [3]))])
-    later = replace(made.made([(5.0, 0, made.fast(0, [2.0], [4]))]), sources=("another",), refused={"line": 2})
+    first = cases.message_log([(1.0, 0, cases.mask(0, [1])), (9.0, 0, cases.fast(0, [1.0], [3]))])
+    later = replace(
+        cases.message_log([(5.0, 0, cases.fast(0, [2.0], [4]))]), sources=("another",), rejected={"line": 2}
+    )
     joined = first.joined(later)
     assert joined.time.tolist() == sorted(joined.time.tolist())
-    assert [joined.sources[number] for number in joined.source] == ["made", "another", "made"]
-    assert (joined.refused, len(first)) == ({"line": 2}, 2)
+    assert [joined.sources[number] for number in joined.source] == ["cases", "another", "made"]
+    assert (joined.rejected, len(first)) == ({"line": 2}, 2)
     assert first.joined(SbasMessages.none()) is first
 
 
 def test_a_fast_correction_is_not_used_after_an_hour_however_often_type_6_renews_it() -> None:
-    rows = [(float(s), 0, made.mask(0, [1])) for s in range(1, 4000, 300)]
-    rows += [(2.0, 0, made.fast(0, [1.0], [3]))]
-    rows += [(float(s), 0, made.integrity(0, [3])) for s in range(8, 4000, 6)]
-    rows += [(float(s), 0, made.long_term(0, [(1, 40, (0.0, 0.0, 0.0), 0.0)])) for s in range(3, 4000, 100)]
-    corrections = SbasCorrections(made.made(rows), prn=137, limits=OFF)
-    time = made.START + np.array([3600, 3602, 3603], dtype="timedelta64[s]").astype("timedelta64[ns]")
+    rows = [(float(s), 0, cases.mask(0, [1])) for s in range(1, 4000, 300)]
+    rows += [(2.0, 0, cases.fast(0, [1.0], [3]))]
+    rows += [(float(s), 0, cases.integrity(0, [3])) for s in range(8, 4000, 6)]
+    rows += [(float(s), 0, cases.long_term(0, [(1, 40, (0.0, 0.0, 0.0), 0.0)])) for s in range(3, 4000, 100)]
+    corrections = SbasCorrections(cases.message_log(rows), prn=137, limits=OFF)
+    time = cases.START + np.array([3600, 3602, 3603], dtype="timedelta64[s]").astype("timedelta64[ns]")
     found = corrections.satellites(time, np.array(["G01"])).state[:, 0]
     assert found.tolist() == [SatelliteState.OK, SatelliteState.OK, SatelliteState.TIMED_OUT]
     assert KEPT_S > LONGEST_FAST_S + 600.0

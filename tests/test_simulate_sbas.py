@@ -140,7 +140,7 @@ def test_messages_are_lost_and_come_back_from_their_file(simulation: Simulation,
     read = read_sbas(tmp_path / "messages.sbs")
     assert (read.time == lossy.time).all()
     assert (read.bits[:, :29] == lossy.bits[:, :29]).all()
-    assert not sum(read.refused.values())
+    assert not sum(read.rejected.values())
 
 
 def test_a_value_that_does_not_fit_its_field_is_an_error() -> None:

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from orbits_made import TOE, kepler, navigation
+from orbit_cases import TOE, kepler, navigation
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError
 from railfix.gnss.navigation import PreciseEphemeris

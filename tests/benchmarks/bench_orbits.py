@@ -18,7 +18,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from orbits_made import TOE, navigation
+from orbit_cases import TOE, navigation
 from railfix.gnss.navigation import Navigation, PreciseEphemeris
 from railfix.gnss.orbits import satellite_states
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m

@@ -17,7 +17,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import orbits_made
+import orbit_cases
 import pyrtklib_orbits
 
 #: Seconds of the epochs after toe.
@@ -29,13 +29,13 @@ KLOBUCHAR = [1.1176e-08, 2.2352e-08, -1.1921e-07, -5.9605e-08, 1.2902e05, 1.6384
 
 def states() -> list[dict[str, object]]:
     found = []
-    kepler = orbits_made.kepler(*[{"satellite": name} for name in orbits_made.KINDS])
-    glonass = orbits_made.glonass({"satellite": "R07"})
+    kepler = orbit_cases.kepler(*[{"satellite": name} for name in orbit_cases.KINDS])
+    glonass = orbit_cases.glonass({"satellite": "R07"})
     ephemerides = [(str(s), pyrtklib_orbits.kepler_ephemeris(kepler, i)) for i, s in enumerate(kepler.satellite)]
     ephemerides += [("R07", pyrtklib_orbits.glonass_ephemeris(glonass, 0))]
     for name, ephemeris in ephemerides:
         for seconds in GLONASS_S if name == "R07" else KEPLER_S:
-            time = orbits_made.TOE + np.timedelta64(round(seconds * 1e9), "ns")
+            time = orbit_cases.TOE + np.timedelta64(round(seconds * 1e9), "ns")
             position, clock = pyrtklib_orbits.state(ephemeris, time, CODE_M)
             found.append({"satellite": name, "after_toe_s": seconds, "position_ecef_m": position, "clock_m": clock})
     return found
@@ -50,7 +50,7 @@ def delays() -> dict[str, list[dict[str, object]]]:
     ionosphere = [
         {"after_toe_s": t, "latitude_deg": a, "longitude_deg": b, "elevation_deg": e, "azimuth_deg": z,
          "delay_m": pyrtklib_orbits.ionosphere_m(
-             orbits_made.TOE + np.timedelta64(t, "s"), (a, b), e, z, KLOBUCHAR)}
+             orbit_cases.TOE + np.timedelta64(t, "s"), (a, b), e, z, KLOBUCHAR)}
         for t, (a, b), e, z in product(
             (0, 9000, 40_000), ((35.0, 139.0), (-70.0, -60.0), (0.0, 10.0), (75.0, 179.5)),
             (5.0, 35.0, 90.0), (0.0, 123.0, 300.0),

@@ -178,8 +178,8 @@ def evaluate_run(
     options: EvaluationOptions | None = None,
 ) -> Evaluation:
     """Evaluate one run against its reference trajectory; see `evaluate_runs`."""
-    one = RunAndReference(run=run, reference=reference)
-    return evaluate_runs([one], sections=sections, files=files, options=options)
+    item = RunAndReference(run=run, reference=reference)
+    return evaluate_runs([item], sections=sections, files=files, options=options)
 
 
 def evaluate_runs(
@@ -225,13 +225,13 @@ def evaluate_runs(
     labels = configurations([_settings(part.folder) for part in parts], [part.configuration for part in parts])
     tables = []
     for number, (part, name, label) in enumerate(zip(parts, names, labels, strict=True)):
-        whole = pl.concat([antenna.table for antenna in part.antennas.values()], how="diagonal").with_columns(
+        table = pl.concat([antenna.table for antenna in part.antennas.values()], how="diagonal").with_columns(
             run=pl.lit(name),
             configuration=pl.lit(label),
             line=pl.lit(part.folder.line_name),
             block=pl.col("block") + number * _BLOCKS_APART,
         )
-        tables.append(whole)
+        tables.append(table)
     epochs = pl.concat(tables, how="diagonal")
     epochs = epochs.select(*EPOCH_COLUMNS, *protection_columns(epochs))
     evaluated = tuple(_evaluated(*item) for item in zip(parts, names, labels, strict=True))
@@ -241,7 +241,7 @@ def evaluate_runs(
         figures=_figures(epochs, options),
         intervals=_intervals(epochs),
         levels=level_table(epochs, list(KEYS)),
-        integrity=integrity_of(epochs, [one for one in map(_levelled, parts, names) if one is not None], options),
+        integrity=integrity_of(epochs, [run for run in map(_levelled, parts, names) if run is not None], options),
         options=options,
         inputs=tuple({entry["path"]: entry for run in evaluated for entry in run.inputs}.values()),
     )
@@ -290,12 +290,12 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
     ]
     if stretches is not None:
         notes += [
-            f"{name}: the sections tell the environment of {found.from_sections} of "
-            f"{int(found.table['in_reference'].sum())} epochs, the reference comes before them"
-            for name, found in antennas.items()
+            f"{name}: the sections give the environment of {antenna.from_sections} of "
+            f"{int(antenna.table['in_reference'].sum())} epochs, the reference comes before them"
+            for name, antenna in antennas.items()
         ]
     if folder.level_kind == UNKNOWN_KIND:
-        notes.append("run.json does not tell what the protection levels rest on; they are named unknown")
+        notes.append("run.json does not state the basis of the protection levels; their kind is unknown")
     if folder.level_kind is not None and "protection_status" not in folder.positions.columns:
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
     more = [note for antenna in antennas.values() for note in antenna.errors.notes]
@@ -321,27 +321,29 @@ def reference_beside(run: RunFolder) -> Path:
     if not logs:
         raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
     folder = logs[0].parent
-    found = [folder / name for name in BESIDE_THE_LOG if (folder / name).is_file()]
-    if not found:
+    paths = [folder / name for name in BESIDE_THE_LOG if (folder / name).is_file()]
+    if not paths:
         raise InputFileError(
             folder, f"holds no reference ({', '.join(BESIDE_THE_LOG)}) beside the log of {run.path}; name the file"
         )
-    if len(found) > 1:
-        names = " and ".join(path.name for path in found)
+    if len(paths) > 1:
+        names = " and ".join(path.name for path in paths)
         raise InputFileError(folder, f"holds {names} beside the log of {run.path}; name the one to use")
-    return found[0]
+    return paths[0]
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str | None]) -> list[str]:
     """A name for the settings of each run: its preset and the settings that differ between the runs."""
-    keys = dict.fromkeys(key for one in settings for key in one)
-    differ = [key for key in keys if key != "preset" and len({str(one.get(key)) for one in settings}) > 1]
+    keys = dict.fromkeys(key for run_settings in settings for key in run_settings)
+    differ = [
+        key for key in keys if key != "preset" and len({str(run_settings.get(key)) for run_settings in settings}) > 1
+    ]
     if len(settings) == 1:
         differ = ["screens"]
     names = []
-    for one, label in zip(settings, given, strict=True):
-        parts = [f"{key}: {one[key] if one.get(key) not in (None, '') else 'none'}" for key in differ]
-        names.append(label or "; ".join([str(one.get("preset", "unknown preset")), *parts]))
+    for run_settings, label in zip(settings, given, strict=True):
+        parts = [f"{key}: {run_settings[key] if run_settings.get(key) not in (None, '') else 'none'}" for key in differ]
+        names.append(label or "; ".join([str(run_settings.get("preset", "unknown preset")), *parts]))
     return names
 
 
@@ -373,10 +375,10 @@ def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
         path=part.folder.path,
         table=part.folder.table,
         reference=part.reference,
-        method={antenna: found.errors.method for antenna, found in part.antennas.items()},
-        speed_from={antenna: found.speed_from for antenna, found in part.antennas.items()},
-        outside={antenna: found.outside for antenna, found in part.antennas.items()},
-        step_s={antenna: found.step_s for antenna, found in part.antennas.items()},
+        method={name_of: epochs.errors.method for name_of, epochs in part.antennas.items()},
+        speed_from={name_of: epochs.speed_from for name_of, epochs in part.antennas.items()},
+        outside={name_of: epochs.outside for name_of, epochs in part.antennas.items()},
+        step_s={name_of: epochs.step_s for name_of, epochs in part.antennas.items()},
         protection=part.folder.protection,
         settings=part.folder.settings,
         inputs=tuple(part.inputs),
@@ -417,8 +419,8 @@ def _with_all(epochs: pl.DataFrame) -> pl.DataFrame:
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:
     """Of every run and antenna, and of every configuration where there are several runs."""
-    found = interval_table(epochs, list(KEYS))
+    table = interval_table(epochs, list(KEYS))
     if epochs["run"].n_unique() < 2:
-        return found
+        return table
     pooled = interval_table(epochs, ["configuration", "antenna"])
-    return pl.concat([found, pooled.with_columns(run=pl.lit(ALL), line=pl.lit(ALL)).select(found.columns)])
+    return pl.concat([table, pooled.with_columns(run=pl.lit(ALL), line=pl.lit(ALL)).select(table.columns)])

@@ -248,7 +248,7 @@ def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: Eva
     """
     own = {run.alarm_limit_m for run in runs if run.alarm_limit_m is not None}
     limits = sorted({*options.alarm_limits_m, *own})
-    found = {}
+    by_kind = {}
     for kind in dict.fromkeys(run.kind for run in runs):
         mine = [run for run in runs if run.kind == kind]
         rows: list[dict[str, Any]] = []
@@ -256,8 +256,8 @@ def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: Eva
             for part in epochs.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
                 rows += _counted(part, run, limits, options)
         names = pl.col("run").is_in([run.name for run in mine])
-        found[kind] = Integrity(stanford=_pooled(rows), beyond=_beyond(epochs.filter(names), kind))
-    return found
+        by_kind[kind] = Integrity(stanford=_pooled(rows), beyond=_beyond(epochs.filter(names), kind))
+    return by_kind
 
 
 def _counted(
@@ -267,7 +267,7 @@ def _counted(
     keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
     groups = [(ALL, ALL, part)]
     environments = part.filter("in_reference").partition_by("environment", maintain_order=True)
-    groups += [("environment", str(one["environment"][0]), one) for one in environments]
+    groups += [("environment", str(part["environment"][0]), part) for part in environments]
     for grouping, group, mine in groups:
         spanned = mine.filter("in_reference")
         for levels_of in LEVELS_OF:
@@ -289,8 +289,11 @@ def _counted(
                     "beyond": len(diagram.beyond),
                     "beyond_blocks": int(np.count_nonzero(diagram.blocks.misleading)),
                 }
-                for one in diagram.continuity:
-                    row |= {f"windows_{one.window_s:g}_s": one.windows, f"kept_{one.window_s:g}_s": one.kept}
+                for window in diagram.continuity:
+                    row |= {
+                        f"windows_{window.window_s:g}_s": window.windows,
+                        f"kept_{window.window_s:g}_s": window.kept,
+                    }
                 yield row
 
 
@@ -303,20 +306,20 @@ def _pooled(rows: list[dict[str, Any]]) -> pl.DataFrame:
         parts += [part.with_columns(run=pl.lit(ALL), line=pl.lit(ALL)) for part in parts]
     named = [*KEYS, "grouping", "group", "levels_of", "alarm_limit_m"]
     counts = [name for name in parts[0].columns if name not in named and name != "own_limit"]
-    whole = pl.concat(parts).group_by(named, maintain_order=True).agg(pl.col("own_limit").all(), pl.col(counts).sum())
+    sums = pl.concat(parts).group_by(named, maintain_order=True).agg(pl.col("own_limit").all(), pl.col(counts).sum())
     windows = [f"{name}_{window:g}_s" for window in WINDOWS_S for name in ("windows", "kept")]
-    whole = whole.with_columns(pl.when(pl.col("grouping") == ALL).then(pl.col(name)).alias(name) for name in windows)
+    sums = sums.with_columns(pl.when(pl.col("grouping") == ALL).then(pl.col(name)).alias(name) for name in windows)
     shares = {
         "availability": ("available", "epochs"),
         "availability_of_observed": ("available", "observed"),
         "beyond_share": ("beyond", "judged"),
         **{f"continuity_{window:g}_s": (f"kept_{window:g}_s", f"windows_{window:g}_s") for window in WINDOWS_S},
     }
-    whole = whole.with_columns(
+    sums = sums.with_columns(
         pl.when(pl.col(below) > 0).then(pl.col(above) / pl.col(below)).alias(name)
         for name, (above, below) in shares.items()
     )
-    return whole.select(*KEYS, *STANFORD_COLUMNS)
+    return sums.select(*KEYS, *STANFORD_COLUMNS)
 
 
 def _beyond(epochs: pl.DataFrame, kind: str) -> pl.DataFrame:

@@ -14,7 +14,7 @@ from polars.exceptions import PolarsError
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
-from railfix.pipeline.protection_levels import KINDS
+from railfix.pipeline.level_stage import KINDS
 from railfix.run.folder import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions has.

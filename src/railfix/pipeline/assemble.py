@@ -11,7 +11,7 @@ from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.protection_levels import judged
+from railfix.pipeline.level_stage import judged
 from railfix.pipeline.reason_table import reason_of_all_channels, satellites_rejected
 from railfix.pipeline.results import AntennaResult
 from railfix.pipeline.solution import Solution

@@ -144,7 +144,7 @@ class Config(ScreenSettings):
         Test of the map against the 3-D positions of the last minutes.
     sbas : tuple of path
         Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
-        one are refused. None: no SBAS.
+        one are rejected. None: no SBAS.
     sbas_prn : int or "best"
         GEO whose messages are used; "best" is the one with the most usable fast corrections.
     sbas_limits : SbasLimits

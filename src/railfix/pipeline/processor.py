@@ -18,7 +18,7 @@ from railfix.gnss.observations import Observations
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.along_track import AlongTrack, FilterState, along_track
 from railfix.pipeline.assemble import antenna_result, with_coordinates
-from railfix.pipeline.carrier_phase import CarrierState, smoothed, with_slips
+from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges

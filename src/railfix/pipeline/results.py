@@ -14,7 +14,7 @@ from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.pipeline.along_track import AlongTrack, FilterState
-from railfix.pipeline.carrier_phase import CarrierState
+from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import Constrained
@@ -68,9 +68,9 @@ class ProtectionResult:
     status : ndarray of int8, shape (T,)
         `protection.LevelStatus` against `Config.alarm_limit_m`.
     kind : str
-        Hypotheses of the levels: "sbas" or "separation" (`protection_levels.KINDS`).
+        Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
     basis : str
-        "measured" or "indicative": whether the priors were measured on the line (`protection_levels.BASES`).
+        "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
     """
 
     level: ProtectionLevel

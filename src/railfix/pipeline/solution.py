@@ -12,11 +12,11 @@ from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
 from railfix.integrity.raim import LinearModel, Outcome, constrained_model
-from railfix.pipeline.carrier_phase import CarrierState, code_and_phase
+from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
-from railfix.pipeline.protection_levels import protection_levels
+from railfix.pipeline.level_stage import protection_levels
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of

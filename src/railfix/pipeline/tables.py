@@ -18,7 +18,7 @@ from railfix.core.reasons import Reason, Status, reason_text
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import AlongTrack, innovations
-from railfix.pipeline.protection_levels import BASES, KINDS
+from railfix.pipeline.level_stage import BASES, KINDS
 from railfix.pipeline.results import AntennaResult, Result
 from railfix.screens import SCREENS
 
@@ -224,18 +224,18 @@ _OF_LEVEL: Final = {
 
 def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
     """The protection level, its parts, and what it means; all null where it is off."""
-    found, epochs = result.protection, len(result)
+    protection, epochs = result.protection, len(result)
     words = {
-        "protection_cause": (CAUSE_TYPE, None if found is None else found.level.cause),
-        "protection_status": (LEVEL_STATUS_TYPE, None if found is None else found.status),
+        "protection_cause": (CAUSE_TYPE, None if protection is None else protection.level.cause),
+        "protection_status": (LEVEL_STATUS_TYPE, None if protection is None else protection.status),
     }
     columns = {
-        name: float_column(np.full(epochs, np.nan) if found is None else getattr(found.level, field))
+        name: float_column(np.full(epochs, np.nan) if protection is None else getattr(protection.level, field))
         for name, field in _OF_LEVEL.items()
     }
-    named = pl.Series(values=[None if found is None else found.kind], dtype=KIND_TYPE)
+    named = pl.Series(values=[None if protection is None else protection.kind], dtype=KIND_TYPE)
     columns["protection_kind"] = named.new_from_index(0, epochs)
-    basis = pl.Series(values=[None if found is None else found.basis], dtype=BASIS_TYPE)
+    basis = pl.Series(values=[None if protection is None else protection.basis], dtype=BASIS_TYPE)
     columns["protection_basis"] = basis.new_from_index(0, epochs)
     for name, (kind, values) in words.items():
         if values is None:
@@ -259,8 +259,8 @@ def positions_table(result: Result) -> pl.DataFrame:
         Columns of `POSITION_COLUMNS`.
     """
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
-    whole = pl.concat(parts)
-    return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
+    table = pl.concat(parts)
+    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
 
 
 def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack | None = None) -> pl.DataFrame:
@@ -342,8 +342,8 @@ def observations_table(result: Result) -> pl.DataFrame:
         Columns of `OBSERVATION_COLUMNS`.
     """
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
-    whole = pl.concat(parts)
-    return whole if len(parts) == 1 else whole.sort("time_gpst", maintain_order=True)
+    table = pl.concat(parts)
+    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
 
 
 def rounded(table: pl.DataFrame) -> pl.DataFrame:

@@ -115,10 +115,12 @@ def tie_clocks(
         weight = np.zeros(epochs)
         difference = np.zeros(epochs)
         if base >= 0:
-            one, two = ranges.weight[:, ranges.groups[g]], ranges.weight[:, ranges.groups[base]]
-            usable = (np.count_nonzero(one, axis=1) >= 2) & (np.count_nonzero(two, axis=1) >= 2)
+            weights, base_weights = ranges.weight[:, ranges.groups[g]], ranges.weight[:, ranges.groups[base]]
+            usable = (np.count_nonzero(weights, axis=1) >= 2) & (np.count_nonzero(base_weights, axis=1) >= 2)
             usable &= np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
-            variance = misfit * (1.0 / np.maximum(one.sum(axis=1), 1e-12) + 1.0 / np.maximum(two.sum(axis=1), 1e-12))
+            variance = misfit * (
+                1.0 / np.maximum(weights.sum(axis=1), 1e-12) + 1.0 / np.maximum(base_weights.sum(axis=1), 1e-12)
+            )
             weight = np.where(usable, fresh / np.where(usable, variance, 1.0), 0.0)
             difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)
         start = np.array([information.get(letter, 0.0), moment.get(letter, 0.0)])

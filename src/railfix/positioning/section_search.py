@@ -105,7 +105,7 @@ class Section:
     other_vertex : ndarray of int, shape (T,)
         Where that other place is; -1 when there is none.
     evaluations : ndarray of int, shape (T,)
-        Points whose q was looked at.
+        Points whose q was computed.
     """
 
     vertex: Indices
@@ -193,15 +193,15 @@ def search(
     radius = _ball(index, point, weight_norm, freedom, limits)
     in_ball = np.flatnonzero(np.isfinite(radius))
     if len(in_ball):
-        found = _in_ball(ranges, index, point, weight_norm, in_ball, radius[in_ball])
-        candidates.append(found)
+        part = _in_ball(ranges, index, point, weight_norm, in_ball, radius[in_ball])
+        candidates.append(part)
     coarse = np.flatnonzero(~np.isfinite(radius) & _searchable(ranges))
     if len(coarse):
-        found, looked = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
-        evaluations[coarse] += looked
-        candidates.append(found)
-    for found in candidates:
-        np.add.at(evaluations, found.epoch, 1)
+        part, tried = _coarse_to_fine(ranges, index, weight_norm, freedom, limits, coarse)
+        evaluations[coarse] += tried
+        candidates.append(part)
+    for part in candidates:
+        np.add.at(evaluations, part.epoch, 1)
     if predicted is not None:
         candidates = [_near(part, index.trajectory, predicted, limits) for part in candidates]
     return _decide(epochs, candidates, index.trajectory, freedom, limits, evaluations)
@@ -234,8 +234,8 @@ def _ball(
     at = np.flatnonzero(np.isfinite(point.ecef_m[:, 0]))
     if not len(at):
         return radius
-    found, vertex = index.tree.query(point.ecef_m[at])
-    distance = np.asarray(found, dtype=np.float64)
+    nearest_m, vertex = index.tree.query(point.ecef_m[at])
+    distance = np.asarray(nearest_m, dtype=np.float64)
     delta = index.trajectory.ecef_m[vertex] - point.ecef_m[at]
     form = np.einsum("ti,tij,tj->t", delta, point.matrix[at], delta)
     bend = weight_norm[at] * _bend(distance)
@@ -298,7 +298,7 @@ def _coarse_to_fine(
     """Return the points that fit as well as noise allows, by dropping stretches of line that fit too badly."""
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)
-    looked = np.zeros(len(ranges), dtype=np.int64)
+    tried = np.zeros(len(ranges), dtype=np.int64)
     top = len(index.levels[-1].middle)
     epoch, node = np.repeat(epochs, top), np.tile(np.arange(top), len(epochs))
     q = np.empty(0)
@@ -306,7 +306,7 @@ def _coarse_to_fine(
         stretches = index.levels[level]
         q = fit(ranges.take(epoch), points[stretches.middle[node]])
         np.minimum.at(upper, epoch, q)
-        np.add.at(looked, epoch, 1)
+        np.add.at(tried, epoch, 1)
         reach = upper + limits.threshold * np.maximum(1.0, upper / freedom)
         nearest = np.maximum(
             np.sqrt(q) - weight_norm[epoch] * (1.0 + 2.0 * _ROTATION_GRADIENT) * stretches.radius_m[node], 0.0
@@ -320,7 +320,7 @@ def _coarse_to_fine(
             exists = node < below
             epoch, node = epoch[exists], node[exists]
     equations = normal_equations(ranges.take(epoch), points[node])
-    return _Candidates(epoch, node, q, -equations.vector, equations.matrix), looked[epochs]
+    return _Candidates(epoch, node, q, -equations.vector, equations.matrix), tried[epochs]
 
 
 def _floor(candidates: _Candidates, trajectory: Trajectory, which: Indices) -> Floats:
@@ -353,32 +353,32 @@ def _decide(
     vertex = np.full(epochs, -1, dtype=np.intp)
     other = np.full(epochs, -1, dtype=np.intp)
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
-    for found in parts:
-        starts = np.flatnonzero(np.concatenate([[True], found.epoch[1:] != found.epoch[:-1]]))
-        count = np.diff(np.concatenate([starts, [len(found.epoch)]]))
-        at = found.epoch[starts]
-        least = np.minimum.reduceat(found.q, starts)
+    for part in parts:
+        starts = np.flatnonzero(np.concatenate([[True], part.epoch[1:] != part.epoch[:-1]]))
+        count = np.diff(np.concatenate([starts, [len(part.epoch)]]))
+        at = part.epoch[starts]
+        least = np.minimum.reduceat(part.q, starts)
         # First of equals, as argmin picks.
-        is_best = found.q == np.repeat(least, count)
-        best = np.minimum.reduceat(np.where(is_best, np.arange(len(found.q)), len(found.q)), starts)
-        vertex[at], q[at] = found.vertex[best], least
+        is_best = part.q == np.repeat(least, count)
+        best = np.minimum.reduceat(np.where(is_best, np.arange(len(part.q)), len(part.q)), starts)
+        vertex[at], q[at] = part.vertex[best], least
 
-        joined = (found.epoch[1:] == found.epoch[:-1]) & (found.vertex[1:] == found.vertex[:-1] + 1)
-        before = np.concatenate([[np.inf], np.where(joined, found.q[:-1], np.inf)])
-        after = np.concatenate([np.where(joined, found.q[1:], np.inf), [np.inf]])
-        apart = np.abs(trajectory.arc_m[found.vertex] - np.repeat(trajectory.arc_m[found.vertex[best]], count))
-        minimum = np.flatnonzero((found.q <= before) & (found.q <= after) & (apart > limits.separation_m))
+        joined = (part.epoch[1:] == part.epoch[:-1]) & (part.vertex[1:] == part.vertex[:-1] + 1)
+        before = np.concatenate([[np.inf], np.where(joined, part.q[:-1], np.inf)])
+        after = np.concatenate([np.where(joined, part.q[1:], np.inf), [np.inf]])
+        apart = np.abs(trajectory.arc_m[part.vertex] - np.repeat(trajectory.arc_m[part.vertex[best]], count))
+        minimum = np.flatnonzero((part.q <= before) & (part.q <= after) & (apart > limits.separation_m))
         if not len(minimum):
             continue
-        floor = np.full(len(found.q), np.inf)
-        floor[minimum] = _floor(found, trajectory, minimum)
+        floor = np.full(len(part.q), np.inf)
+        floor[minimum] = _floor(part, trajectory, minimum)
         lowest = np.minimum.reduceat(floor, starts)
         has = np.isfinite(lowest)
         second = np.minimum.reduceat(
             np.where(floor == np.repeat(lowest, count), np.arange(len(floor)), len(floor)), starts
         )[has]
-        own = _floor(found, trajectory, best[has])
+        own = _floor(part, trajectory, best[has])
         variance = np.maximum(1.0, own / freedom[at[has]])
         excess[at[has]] = (lowest[has] - own) / variance
-        other[at[has]] = found.vertex[second]
+        other[at[has]] = part.vertex[second]
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)

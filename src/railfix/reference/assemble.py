@@ -139,11 +139,11 @@ def _bridged_by(evidence: Evidence, rows: Indices) -> dict[str, int]:
     code = np.zeros(len(rows), dtype=np.int64)
     for i, mask in enumerate(measured.values()):
         code |= _near(t[mask], t[rows]).astype(np.int64) << i
-    found = {}
+    counts = {}
     for c in np.unique(code).tolist():
         name = " and ".join(name for i, name in enumerate(measured) if c >> i & 1) or "nothing"
-        found[name] = int((code == c).sum())
-    return found
+        counts[name] = int((code == c).sum())
+    return counts
 
 
 def _near(known_s: Floats, at_s: Floats) -> Masks:

@@ -194,18 +194,21 @@ class _Builder:
         self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]], wheel: Wheel | None, fixes: Fixes
     ) -> tuple[ReferenceSettings, dict[str, Any]]:
         """Return the settings with sensor errors estimated from the log's own fixes, and where each came from."""
-        settings, told, good = self.settings, {}, fixes.good
+        settings, sources, good = self.settings, {}, fixes.good
         joined = self._joined(speeds)
         if joined is not None and len(joined.time) > 1:
-            found = self._closings(fixes, *joined.way(fixes.time[good]))
-            settings = settings.replaced(doppler_bias_mps=lasting_error_mps(found, settings))
-            told["doppler"] = {"lasting_error_mps": settings.doppler_bias_mps, "lasting_error_from": _told_by(found)}
+            misclosures = self._closings(fixes, *joined.way(fixes.time[good]))
+            settings = settings.replaced(doppler_bias_mps=lasting_error_mps(misclosures, settings))
+            sources["doppler"] = {
+                "lasting_error_mps": settings.doppler_bias_mps,
+                "lasting_error_from": _source_of(misclosures),
+            }
         if wheel is not None:
             way = wheel.distance_m(fixes.time[good], self._hint(fixes.time[good], joined, fixes))
-            found = self._closings(fixes, way, np.full(len(way), 0.0), reading_m=wheel.reading_sigma_m)
-            settings = settings.replaced(slip_m=slip_m(found, settings))
-            told["pulses"] = {"slip_m": settings.slip_m, "slip_from": _told_by(found)}
-        return settings, told
+            misclosures = self._closings(fixes, way, np.full(len(way), 0.0), reading_m=wheel.reading_sigma_m)
+            settings = settings.replaced(slip_m=slip_m(misclosures, settings))
+            sources["pulses"] = {"slip_m": settings.slip_m, "slip_from": _source_of(misclosures)}
+        return settings, sources
 
     def _closings(self, fixes: Fixes, way: Floats, variance: Floats, *, reading_m: float = 0.0) -> Closings:
         good = fixes.good
@@ -217,13 +220,15 @@ class _Builder:
     def _good(self, fixes: Fixes) -> Indices:
         good = fixes.good
         if len(good) < 2:
-            told = ", ".join(f"{count} {what}" for what, count in fixes.counts().items() if count)
+            rejected = ", ".join(f"{count} {what}" for what, count in fixes.counts().items() if count)
             lacks = (
                 "; without a vehicle file the track itself is taken as the antenna's path"
                 if TRACK_AS_PATH in self.trajectory.notes
                 else ""
             )
-            raise NoPositionError(f"{self.name}: fewer than two good fixes ({told}); no reference can be made{lacks}")
+            raise NoPositionError(
+                f"{self.name}: fewer than two good fixes ({rejected}); no reference can be made{lacks}"
+            )
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:
@@ -233,7 +238,7 @@ class _Builder:
 
     def _speeds(self, time: Datetimes, place_m: Floats) -> dict[str, tuple[Speeds, DopplerSpeed]]:
         """Doppler speeds of every receiver, seen from places along this antenna's path."""
-        found = {}
+        speeds_of = {}
         for name, dopplers in self._sources().items():
             t = _since(dopplers.time, time)
             arc = np.interp(t, _since(time, time), place_m, left=np.nan, right=np.nan)
@@ -247,8 +252,8 @@ class _Builder:
             speeds = Speeds(
                 time=dopplers.time[rows], speed_mps=solved.speed_mps[rows], sigma_mps=solved.sigma_mps[rows]
             )
-            found[name] = (speeds, solved)
-        return found
+            speeds_of[name] = (speeds, solved)
+        return speeds_of
 
     def _joined(self, speeds: Mapping[str, tuple[Speeds, DopplerSpeed]]) -> Speeds | None:
         """All receivers' speeds as one."""
@@ -338,7 +343,7 @@ class _Builder:
         speeds: Mapping[str, tuple[Speeds, DopplerSpeed]],
         wheel: Wheel | None,
         smoothed: Smoothed,
-        told: Mapping[str, Mapping[str, Any]],
+        sources: Mapping[str, Mapping[str, Any]],
     ) -> dict[str, Any]:
         """Return the estimated parameters as plain values."""
         facts: dict[str, Any] = {"doppler": None, "pulses": None, "acceleration": None}
@@ -354,7 +359,7 @@ class _Builder:
                     }
                     for name, (part, solved) in speeds.items()
                 },
-                **told.get("doppler", {}),
+                **sources.get("doppler", {}),
             }
         if wheel is not None:
             facts["pulses"] = {
@@ -363,15 +368,15 @@ class _Builder:
                 "kind": wheel.pulses.kind,
                 "direction": "from the table" if wheel.pulses.signed else "from Dopplers and fixes",
                 "scale_correction": -float(smoothed.wheel_scale[-1]),
-                **told["pulses"],
+                **sources["pulses"],
             }
         if self.data.acceleration is not None:
             facts["acceleration"] = {"kind": self.data.acceleration.kind, "facing": self.data.facing}
         return facts
 
 
-def _told_by(found: Closings) -> str:
-    return f"{len(found)} windows between fixes" if len(found) >= WINDOWS else "settings"
+def _source_of(misclosures: Closings) -> str:
+    return f"{len(misclosures)} windows between fixes" if len(misclosures) >= WINDOWS else "settings"
 
 
 def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:

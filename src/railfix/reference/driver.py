@@ -142,12 +142,12 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
         navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
         for name, paths in inputs.logs.items():
             log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines)
-            found = dopplers_of_log(
+            antenna_dopplers = dopplers_of_log(
                 concatenate(list(log.parts())), navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS
             )
             notes += log.problems
-            if np.isfinite(found.rate_mps).any():
-                dopplers[name] = found
+            if np.isfinite(antenna_dopplers.rate_mps).any():
+                dopplers[name] = antenna_dopplers
                 continue
             problem = "has no Doppler of a satellite with an orbit"
             if inputs.pulses is None and inputs.acceleration is None:
@@ -160,8 +160,8 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
     if vehicle is not None:
         facing = 1 if vehicle.facing == "rising" else -1
         if len(vehicle.antennas) == 2:
-            one, other = (np.array([a.along_m, a.across_m, a.up_m]) for a in vehicle.antennas.values())
-            distance = float(np.linalg.norm(one - other))
+            first, second = (np.array([a.along_m, a.across_m, a.up_m]) for a in vehicle.antennas.values())
+            distance = float(np.linalg.norm(first - second))
     elif inputs.acceleration is not None:
         notes.append("no vehicle file: the accelerometer's front is taken to point to rising chainage")
     data = ReferenceData(

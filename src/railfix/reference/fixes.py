@@ -141,14 +141,14 @@ def _reject(rejection: Bits, mask: Masks, reason: Rejection) -> None:
     rejection[mask & (rejection == 0)] |= reason
 
 
-def judge_pair(one: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
+def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
     """The rows of one antenna by their distance to the other antenna's at the same instant (P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
-    rejection, spacing = one.rejection.copy(), np.full(len(one), np.nan)
-    paired = np.zeros(len(one), dtype=np.bool_)
+    rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
+    paired = np.zeros(len(fixes), dtype=np.bool_)
     if len(rows):
         there = other.time[rows].astype(np.int64)
-        here = one.time.astype(np.int64)
+        here = fixes.time.astype(np.int64)
         after = np.clip(np.searchsorted(there, here), 1, max(len(there) - 1, 1))
         after = np.minimum(after, len(there) - 1)
         before = np.maximum(after - 1, 0)
@@ -157,13 +157,13 @@ def judge_pair(one: Fixes, other: Fixes, distance_m: float, settings: ReferenceS
         # At 30 m/s a millisecond between the two receivers' tags is 3 cm: the other one is moved to the same instant.
         late_s = (here - there[nearest]) / 1e9
         moved = other.ecef_m[rows[nearest]] + late_s[:, None] * _velocity(other.time[rows], other.ecef_m[rows])[nearest]
-        apart = np.linalg.norm(one.ecef_m - moved, axis=1) - distance_m
+        apart = np.linalg.norm(fixes.ecef_m - moved, axis=1) - distance_m
         spacing = np.where(paired, apart, np.nan)
     if settings.unpaired == "reject":
         _reject(rejection, ~paired, Rejection.UNPAIRED)
     with np.errstate(invalid="ignore"):
         _reject(rejection, np.abs(spacing) > settings.spacing_m, Rejection.SPACING)
-    return replace(one, rejection=rejection, spacing_m=spacing)
+    return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
 def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
@@ -173,7 +173,7 @@ def _velocity(time: Datetimes, ecef_m: Floats) -> Floats:
     return np.asarray(np.gradient(ecef_m, seconds(time - time[0]), axis=0))
 
 
-#: The other antenna's row counts in a pair whatever this very check said of it.
+#: The other antenna's row counts in a pair whatever this check gave it.
 _OF_THE_PAIR: Final = Rejection.UNPAIRED | Rejection.SPACING
 
 
@@ -183,7 +183,7 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
     rejection = fixes.rejection.copy()
     arc, lateral, height, sigma = (np.full(len(fixes), np.nan) for _ in range(4))
     if len(rows):
-        found = match(
+        matched = match(
             fixes.time[rows],
             fixes.ecef_m[rows],
             trajectory,
@@ -191,8 +191,8 @@ def judge_place(fixes: Fixes, trajectory: Trajectory, settings: ReferenceSetting
             height_m=settings.height_m,
             max_speed_mps=settings.max_speed_mps,
         )
-        arc[rows], lateral[rows], height[rows] = found.arc_m, found.lateral_m, found.height_m
-        sigma[rows] = _along_sigma(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory, found, settings)
+        arc[rows], lateral[rows], height[rows] = matched.arc_m, matched.lateral_m, matched.height_m
+        sigma[rows] = _along_sigma(fixes.sigma_enu_m[rows], fixes.ecef_m[rows], trajectory, matched, settings)
         missed = np.isnan(arc) & (rejection == 0)
         _reject(rejection, missed & ~(np.abs(lateral) <= settings.lateral_m), Rejection.OFF_TRACK)
         _reject(rejection, missed & ~(np.abs(height) <= settings.height_m), Rejection.OFF_HEIGHT)
@@ -207,8 +207,8 @@ def _along_sigma(
     """Standard deviation along the track from those east, north and up."""
     latitude, longitude, _ = geodetic_from_ecef(ecef_m)
     direction = np.einsum("fij,fj->fi", enu_axes(latitude, longitude), trajectory.tangent[matched.section])
-    told = np.sqrt(np.sum((direction * sigma_enu_m) ** 2, axis=1))
-    return np.where(np.isnan(told), settings.fix_sigma_m, np.maximum(told, settings.fix_floor_m))
+    sigma = np.sqrt(np.sum((direction * sigma_enu_m) ** 2, axis=1))
+    return np.where(np.isnan(sigma), settings.fix_sigma_m, np.maximum(sigma, settings.fix_floor_m))
 
 
 def judge_travel(
@@ -239,7 +239,7 @@ def judge_travel(
     def agrees(i: Indices, j: Indices) -> Masks:
         spread = np.abs(variance[j] - variance[i]) + fixes.sigma_m[rows[i]] ** 2 + fixes.sigma_m[rows[j]] ** 2
         limit = settings.travel_m + settings.travel_share * np.abs(way[j] - way[i]) + _TRAVEL_SIGMAS * np.sqrt(spread)
-        # Where nothing measured the way nothing is refused.
+        # Where the distance travelled was not measured, nothing is rejected.
         return np.asarray(~(np.abs(offset[j] - offset[i]) > limit))
 
     keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), settings.travel_hold_s)

@@ -336,32 +336,32 @@ def closings(
     )
 
 
-def lasting_error_mps(found: Closings, settings: ReferenceSettings) -> float:
+def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
     """Standard deviation of the time-correlated Doppler speed error [m/s], from the closing errors.
 
     What the noise of single speeds and of the fixes does not explain is the lasting part. That of the settings
     where fewer than `WINDOWS` windows are there.
     """
-    if len(found) < WINDOWS:
+    if len(misclosures) < WINDOWS:
         return settings.doppler_bias_mps
     tau = settings.doppler_bias_s
-    ratio = float(np.median(found.duration_s)) / tau
+    ratio = float(np.median(misclosures.duration_s)) / tau
     gain = 2.0 * tau**2 * (ratio - 1.0 + np.exp(-ratio))
-    return float(np.sqrt(max(found.excess_m2() / gain, _LEAST_LASTING_MPS**2)))
+    return float(np.sqrt(max(misclosures.excess_m2() / gain, _LEAST_LASTING_MPS**2)))
 
 
-def slip_m(found: Closings, settings: ReferenceSettings) -> float:
+def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     """Random error of the wheel [m per square root of m], from the closing errors.
 
     Its scale is taken off first. That of the settings where fewer than `WINDOWS` windows in motion are there.
     """
-    moving = np.abs(found.way_m) > 1.0
+    moving = np.abs(misclosures.way_m) > 1.0
     if moving.sum() < WINDOWS:
         return settings.slip_m
-    error, way = found.error_m[moving], found.way_m[moving]
+    error, way = misclosures.error_m[moving], misclosures.way_m[moving]
     error = error - float(np.median(error / way)) * way
     excess = float(np.quantile(error**2 / np.abs(way), 0.8)) / _CHI2_80
-    excess -= float(np.median(found.white_m2[moving] / np.abs(way)))
+    excess -= float(np.median(misclosures.white_m2[moving] / np.abs(way)))
     return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
 
 

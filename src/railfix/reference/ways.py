@@ -78,14 +78,14 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
     ndarray of datetime64[ns], shape (N,)
         From the first row to the last; no step is longer than one and a half of the rows' usual one.
     """
-    whole = rows
+    merged = rows
     for other in others:
         new = other[(other > rows[0]) & (other < rows[-1])]
-        whole = np.union1d(whole, new[nearest(whole, new) < 0])
+        merged = np.union1d(merged, new[nearest(merged, new) < 0])
     usual = float(np.median(seconds(np.diff(rows))))
-    step = seconds(np.diff(whole))
+    step = seconds(np.diff(merged))
     pieces = np.where(step > 1.5 * usual, np.ceil(step / usual - 1e-6), 1.0).astype(np.int64)
     first = np.repeat(np.arange(len(step)), pieces)
     number = np.arange(len(first)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    filled = whole[first] + timedelta(step[first] * number / pieces[first])
-    return np.append(filled, whole[-1])
+    filled = merged[first] + timedelta(step[first] * number / pieces[first])
+    return np.append(filled, merged[-1])

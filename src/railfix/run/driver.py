@@ -17,8 +17,8 @@ from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
+from railfix.pipeline.level_stage import basis_of, level_facts, risk_of
 from railfix.pipeline.processor import EpochProcessor, State
-from railfix.pipeline.protection_levels import basis_of, level_facts, risk_of
 from railfix.pipeline.tables import observations_table, positions_table, rounded
 from railfix.pipeline.train_table import train_table
 from railfix.run.checks import (
@@ -290,11 +290,11 @@ def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
             yield f"{name}: skipped: {skipped}"
 
 
-def _notes_of_levels(config: Config, tally: Tally, found: Mapping[str, Levels]) -> Iterator[str]:
+def _notes_of_levels(config: Config, tally: Tally, levels: Mapping[str, Levels]) -> Iterator[str]:
     """Return notes on assumptions of the protection levels that this run contradicts."""
-    if not found:
+    if not levels:
         return
-    for name, of_antenna in found.items():
+    for name, of_antenna in levels.items():
         if of_antenna.without_budget:
             yield (
                 f"{name}: {of_antenna.without_budget} epochs without a protection level, where more than three faults "

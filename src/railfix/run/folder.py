@@ -43,10 +43,10 @@ class RunRecord:
         InputFileError
             It is missing or not a table.
         """
-        found = self.record.get(name)
-        if not isinstance(found, dict):
+        table = self.record.get(name)
+        if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
-        return found
+        return table
 
     @cached_property
     def config(self) -> Config:
@@ -66,9 +66,10 @@ class RunRecord:
     def inputs(self) -> RunInputs:
         """Input files, where they are now."""
         entries = [str(entry["input"]) for entry in self.entries]
-        one = ("vehicle", "config", "cn0_curve", "error_model", "truth")
+        single_files = ("vehicle", "config", "cn0_curve", "error_model", "truth")
         values = {
-            name: self.located(name)[0] if name in one else tuple(self.located(name)) for name in dict.fromkeys(entries)
+            name: self.located(name)[0] if name in single_files else tuple(self.located(name))
+            for name in dict.fromkeys(entries)
         }
         return self._this_version(lambda: validated(RunInputs, values, source="inputs"))
 

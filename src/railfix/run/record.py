@@ -114,7 +114,7 @@ def run_record(
     tally : Tally
     sigma : mapping of str to AlongSigma
     protection : mapping
-        Assumptions of the protection levels (`railfix.pipeline.protection_levels.level_facts`).
+        Assumptions of the protection levels (`railfix.pipeline.level_stage.level_facts`).
     found_levels : mapping of str to Levels
     notes : sequence of str
     wall_s : float

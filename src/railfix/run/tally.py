@@ -130,18 +130,18 @@ class AntennaTally:
 
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""
-        found = result.map_offset
-        if not np.isfinite(found.statistic).any():
+        offset = result.map_offset
+        if not np.isfinite(offset.statistic).any():
             return
-        worst = int(np.nanargmax(found.statistic))
-        if self.map_offset is None or found.statistic[worst] > self.map_offset.statistic:
+        worst = int(np.nanargmax(offset.statistic))
+        if self.map_offset is None or offset.statistic[worst] > self.map_offset.statistic:
             self.map_offset = MapOffsetFound(
                 time=result.time[worst],
-                across_m=float(found.across_m[worst]),
-                up_m=float(found.up_m[worst]),
-                across_sigma_m=float(found.across_sigma_m[worst]),
-                up_sigma_m=float(found.up_sigma_m[worst]),
-                statistic=float(found.statistic[worst]),
+                across_m=float(offset.across_m[worst]),
+                up_m=float(offset.up_m[worst]),
+                across_sigma_m=float(offset.across_sigma_m[worst]),
+                up_sigma_m=float(offset.up_sigma_m[worst]),
+                statistic=float(offset.statistic[worst]),
             )
 
     def _add_reasons(self, result: AntennaResult) -> None:

@@ -32,7 +32,7 @@ _STEP_M: Final = 0.5
 #: Rounds of the integration on the ellipsoid: each gains the factor (length / Earth radius).
 _ROUNDS: Final = 8
 
-#: Pattern of the made test line: length [m], radius at its end [m] (right positive), cant at its end [m].
+#: Pattern of the simulated test line: length [m], radius at its end [m] (right positive), cant at its end [m].
 #: Curvature and cant run linearly from the element before.
 PATTERN: Final = (
     (90.0, np.inf, 0.0),
@@ -209,7 +209,7 @@ def _of_knots(settings: LineSettings, knots: Knots, file: FileLine | None = None
 
 
 def _pattern_knots(length_m: float) -> Knots:
-    """The pattern of the made test line, repeated and every second time mirrored, to the length asked for."""
+    """The pattern of the simulated test line, repeated and every second time mirrored, to the length asked for."""
     repeats = int(np.ceil(length_m / PATTERN_LENGTH_M - 1e-12))
     lengths, radii, cants = (np.array(column) for column in zip(*PATTERN, strict=True))
     side = np.repeat(np.where(np.arange(repeats) % 2 == 0, 1.0, -1.0), len(lengths))

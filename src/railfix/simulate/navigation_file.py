@@ -40,13 +40,13 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     MismatchError
         The scenario's time is not within the file's records, or the file lacks Klobuchar's coefficients.
     """
-    whole = read_navigation(path)
-    if "G" not in whole.klobuchar and scenario.sky.ionosphere_scale > 0.0:
+    navigation = read_navigation(path)
+    if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
         raise MismatchError(
             f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; take another file, "
             "or set sky.ionosphere_scale to 0"
         )
-    records = _believed(whole.kepler, scenario.sky.systems)
+    records = _believed(navigation.kepler, scenario.sky.systems)
     first = scenario.start
     last = first + np.timedelta64(round(scenario.duration_s * 1e9), "ns")
     kept = [rows for name in np.unique(records.satellite) if len(rows := _serving(records, str(name), first, last))]
@@ -59,9 +59,9 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     return Navigation(
         kepler=_rows(records, np.concatenate(kept)),
         glonass=no_glonass(),
-        klobuchar={"G": whole.klobuchar["G"]} if "G" in whole.klobuchar else {"G": np.zeros(8)},
-        leap_seconds=int(gpst_minus_utc(first)) if whole.leap_seconds is None else whole.leap_seconds,
-        sources=whole.sources,
+        klobuchar={"G": navigation.klobuchar["G"]} if "G" in navigation.klobuchar else {"G": np.zeros(8)},
+        leap_seconds=int(gpst_minus_utc(first)) if navigation.leap_seconds is None else navigation.leap_seconds,
+        sources=navigation.sources,
     )
 
 
@@ -69,11 +69,11 @@ def no_glonass() -> GlonassRecords:
     """Empty GLONASS records; GLONASS is not simulated."""
     none, times = np.empty(0), np.empty(0, dtype="datetime64[ns]")
     vectors = np.empty((0, 3))
-    whole = np.empty(0, dtype=np.int64)
+    integers = np.empty(0, dtype=np.int64)
     return GlonassRecords(
         satellite=np.empty(0, dtype="<U3"), toe=times, transmitted=times, clock_bias_s=none, relative_frequency=none,
-        position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=whole,
-        frequency_channel=whole, age_days=none,
+        position_ecef_m=vectors, velocity_ecef_mps=vectors, acceleration_ecef_mps2=vectors, health=integers,
+        frequency_channel=integers, age_days=none,
     )  # fmt: skip
 
 
@@ -94,8 +94,8 @@ def _believed(records: KeplerRecords, systems: str) -> KeplerRecords:
         for table in (_SERVES_S, _SENT_BEFORE_S)
     )
     early = records.toe - records.transmitted
-    told = ~np.isnat(records.transmitted) & (np.abs(early) <= serves)
-    return replace(records, transmitted=np.where(told, records.transmitted, records.toe - before))
+    plausible = ~np.isnat(records.transmitted) & (np.abs(early) <= serves)
+    return replace(records, transmitted=np.where(plausible, records.transmitted, records.toe - before))
 
 
 def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:

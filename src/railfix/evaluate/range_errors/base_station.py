@@ -16,7 +16,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate.range_errors.robust_clock import robust_clock
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
-from railfix.pipeline.carrier_phase import CarrierState, smoothed, with_slips
+from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.corrected_ranges import correct_ranges
 from railfix.pipeline.processor import EpochProcessor

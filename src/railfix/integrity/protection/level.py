@@ -36,7 +36,7 @@ from railfix.integrity.protection.risk import (
 )
 from railfix.integrity.protection.separation import (
     Separations,
-    whole,
+    all_in_view,
     without_constellation,
     without_constellation_and_one,
     without_one,
@@ -298,63 +298,81 @@ def _level_of_block(
     map_bias: Floats | None,
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
-    all_of = whole(model, scale, bias, map_bias)
-    sigma = all_of.sigma_m
+    full = all_in_view(model, scale, bias, map_bias)
+    sigma = full.sigma_m
     k_fault_free, k_false_alarm = one_sided_k(plan.fault_free[rows] / 2.0), plan.k_false_alarm[rows]
-    fault_free = k_fault_free * sigma + all_of.bias_m
-    prior = np.take_along_axis(plan.prior[rows], all_of.channel, axis=1) * all_of.used
+    fault_free = k_fault_free * sigma + full.bias_m
+    prior = np.take_along_axis(plan.prior[rows], full.channel, axis=1) * full.used
 
-    singles, single_prior = [without_one(all_of)], [prior]
+    single_separations, single_prior = [without_one(full)], [prior]
     for c, (_, members) in enumerate(plan.groups):
-        singles.append(without_constellation(model, members, all_of, bias))
+        single_separations.append(without_constellation(model, members, full, bias))
         single_prior.append(plan.group_prior[rows, c : c + 1])
-    one = _part(_beside(singles), np.concatenate(single_prior, axis=1), plan.one[rows], k_false_alarm, sigma)
+    single_fault = _part(
+        _beside(single_separations), np.concatenate(single_prior, axis=1), plan.one[rows], k_false_alarm, sigma
+    )
 
     n, pairs = prior.shape[1], plan.pairs[rows]
     first, second = np.triu_indices(n, 1)
-    doubles, double_prior = [], []
+    double_separations, double_prior = [], []
     if pairs.any() and n > 1:
-        doubles.append(without_two(all_of, first, second))
+        double_separations.append(without_two(full, first, second))
         double_prior.append(prior[:, first] * prior[:, second] * pairs[:, None])
     for c, (_, members) in enumerate(plan.groups):
-        of_group = members[all_of.channel] & all_of.used
-        doubles.append(without_constellation_and_one(all_of, of_group))
+        of_group = members[full.channel] & full.used
+        double_separations.append(without_constellation_and_one(full, of_group))
         double_prior.append(plan.group_prior[rows, c : c + 1] * prior * ~of_group)
-    two = _nothing(len(rows))
-    if doubles:
+    double_fault = _nothing(len(rows))
+    if double_separations:
         every = np.concatenate(double_prior, axis=1)
-        two = _part(_beside(doubles), every, plan.two[rows], k_false_alarm, sigma)
+        double_fault = _part(_beside(double_separations), every, plan.two[rows], k_false_alarm, sigma)
 
-    three, of_three = _nothing(len(rows)), np.zeros(len(rows))
+    triple_fault, of_three = _nothing(len(rows)), np.zeros(len(rows))
     triples = plan.triples[rows]
     if triples.any() and n > 2:
         triple = np.array(list(combinations(range(n), 3)), dtype=np.intp)
         triple_prior = prior[:, triple].prod(axis=2) * triples[:, None]
         of_three = np.where(triples, (plan.fault_free[rows] + plan.one[rows] + plan.two[rows]) / 3.0, 0.0)
-        three = _part(without_three(all_of, triple), triple_prior, of_three, k_false_alarm, sigma)
+        triple_fault = _part(without_three(full, triple), triple_prior, of_three, k_false_alarm, sigma)
 
-    noise = Tails(offset_m=all_of.bias_m[:, None], sigma_m=sigma[:, None], weight=np.full((len(rows), 1), 2.0))
-    left = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] + of_three
-    left = left - one.unchecked - two.unchecked - three.unchecked
-    left = left - np.where(pairs, 0.0, pair_sum(prior))
-    above = np.maximum(np.maximum(fault_free, one.level_m), np.maximum(two.level_m, three.level_m))
-    level, spender = least_level(above, [noise, one.tails, two.tails, three.tails], left)
+    noise = Tails(offset_m=full.bias_m[:, None], sigma_m=sigma[:, None], weight=np.full((len(rows), 1), 2.0))
+    remaining_risk = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] + of_three
+    remaining_risk = remaining_risk - single_fault.unchecked - double_fault.unchecked - triple_fault.unchecked
+    remaining_risk = remaining_risk - np.where(pairs, 0.0, pair_sum(prior))
+    above = np.maximum(
+        np.maximum(fault_free, single_fault.level_m), np.maximum(double_fault.level_m, triple_fault.level_m)
+    )
+    level, spender = least_level(
+        above, [noise, single_fault.tails, double_fault.tails, triple_fault.tails], remaining_risk
+    )
     result.level_m[rows], result.sigma_m[rows] = level, sigma
-    result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = fault_free, one.level_m, two.level_m
-    result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k_fault_free, one.k, two.k
+    result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = (
+        fault_free,
+        single_fault.level_m,
+        double_fault.level_m,
+    )
+    result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = (
+        k_fault_free,
+        single_fault.k,
+        double_fault.k,
+    )
     result.k_false_alarm[rows] = k_false_alarm
-    result.separation[rows] = np.maximum(np.maximum(one.separation, two.separation), three.separation)
+    result.separation[rows] = np.maximum(
+        np.maximum(single_fault.separation, double_fault.separation), triple_fault.separation
+    )
     result.consistent[rows] = result.separation[rows] <= 1.0
     at = np.arange(len(rows))
-    single = (one.worst >= 0) & (one.worst < n)
-    result.worst_one[rows] = np.where(single, all_of.channel[at, np.where(single, one.worst, 0)], -1)
+    has_single = (single_fault.worst >= 0) & (single_fault.worst < n)
+    result.worst_one[rows] = np.where(has_single, full.channel[at, np.where(has_single, single_fault.worst, 0)], -1)
     letters = np.array([*(letter for letter, _ in plan.groups), ""])
-    result.worst_constellation[rows] = letters[np.where(one.worst >= n, one.worst - n, len(plan.groups))]
+    result.worst_constellation[rows] = letters[
+        np.where(single_fault.worst >= n, single_fault.worst - n, len(plan.groups))
+    ]
     if n > 1:
-        pair = (two.worst >= 0) & (two.worst < len(first)) & bool(pairs.any())
-        places = np.stack([first, second], axis=1)[np.where(pair, two.worst, 0)]
-        found = np.take_along_axis(all_of.channel, places, axis=1)
-        result.worst_two[rows] = np.where(pair[:, None], found, -1)
+        has_pair = (double_fault.worst >= 0) & (double_fault.worst < len(first)) & bool(pairs.any())
+        places = np.stack([first, second], axis=1)[np.where(has_pair, double_fault.worst, 0)]
+        channels = np.take_along_axis(full.channel, places, axis=1)
+        result.worst_two[rows] = np.where(has_pair[:, None], channels, -1)
     infinite = np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET)
     spent_on = np.where(spender == _OF_TRIPLES, Cause.THREE_FAULTS, spender)
     result.cause[rows] = np.where(np.isinf(level), infinite, spent_on)

@@ -26,7 +26,7 @@ _NO_EFFECT: Final = 1e-6
 
 
 @dataclass(frozen=True)
-class Whole:
+class AllInView:
     """The position of all satellites: T epochs, n channels in use side by side."""
 
     channel: Indices  # (T, n) channel of the model
@@ -72,7 +72,9 @@ def scaled(variance_m2: Floats, map_m: Floats, scale: Floats) -> Floats:
     return np.asarray(np.maximum(square * (variance_m2 - from_map) + from_map, 0.0))
 
 
-def whole(model: LinearModel, scale: Floats, bias_m: Floats | None, map_bias_m: Floats | None = None) -> Whole:
+def all_in_view(
+    model: LinearModel, scale: Floats, bias_m: Floats | None, map_bias_m: Floats | None = None
+) -> AllInView:
     """The parts that every subset asks for.
 
     Parameters
@@ -90,7 +92,7 @@ def whole(model: LinearModel, scale: Floats, bias_m: Floats | None, map_bias_m: 
     if bias_m is not None:
         range_bias = np.take_along_axis(np.abs(bias_m) * model.root_weight, parts.channel, axis=1)
         range_bias = np.where(parts.used, range_bias, 0.0)
-    return Whole(
+    return AllInView(
         channel=parts.channel,
         used=parts.used,
         projector=parts.projector,
@@ -105,38 +107,36 @@ def whole(model: LinearModel, scale: Floats, bias_m: Floats | None, map_bias_m: 
     )
 
 
-def without_one(all_of: Whole) -> Separations:
+def without_one(full: AllInView) -> Separations:
     """Each channel left out, K = n."""
-    share, gain = np.einsum("tii->ti", all_of.projector), all_of.gain_m
+    share, gain = np.einsum("tii->ti", full.projector), full.gain_m
     checked = share > LEAST_REDUNDANCY
     weight = np.where(checked, gain / np.where(checked, share, 1.0), 0.0)
-    blind = ~checked & (np.abs(gain) > _NO_EFFECT * np.sqrt(all_of.variance_m2)[:, None])
+    blind = ~checked & (np.abs(gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
     bias = np.zeros(gain.shape)
-    if all_of.range_bias is not None:
-        left = gain[:, None, :] - weight[:, :, None] * all_of.projector
-        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
-    return _separations(
-        all_of, weight * gain, weight[..., None] * all_of.map_gain_m, -weight * all_of.residual, bias, blind
-    )
+    if full.range_bias is not None:
+        left = gain[:, None, :] - weight[:, :, None] * full.projector
+        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
+    return _separations(full, weight * gain, weight[..., None] * full.map_gain_m, -weight * full.residual, bias, blind)
 
 
-def without_two(all_of: Whole, first: Indices, second: Indices) -> Separations:
+def without_two(full: AllInView, first: Indices, second: Indices) -> Separations:
     """Pairs of places (K,) in the compact arrays left out.
 
     Two that only check each other (both of a clock of their own) have a singular S_JJ. Where the error
     that no residual shows does not move the position, what the residuals show of the pair is used; where it
     does, nothing bounds it.
     """
-    n, gain = all_of.channel.shape[1], all_of.gain_m
-    share = np.einsum("tii->ti", all_of.projector)
+    n, gain = full.channel.shape[1], full.gain_m
+    share = np.einsum("tii->ti", full.projector)
     a, c = share[:, first], share[:, second]
-    b = np.take(all_of.projector.reshape(-1, n * n), first * n + second, axis=1)
-    one, two = gain[:, first], gain[:, second]
+    b = np.take(full.projector.reshape(-1, n * n), first * n + second, axis=1)
+    gain_1, gain_2 = gain[:, first], gain[:, second]
     product = a * c
     determinant = product - b * b
     regular = (np.minimum(a, c) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
     inverse = 1.0 / np.where(regular, determinant, 1.0)
-    weight_one, weight_two = (c * one - b * two) * inverse, (a * two - b * one) * inverse
+    weight_1, weight_2 = (c * gain_1 - b * gain_2) * inverse, (a * gain_2 - b * gain_1) * inverse
     blind = np.zeros(regular.shape, dtype=bool)
     if not regular.all():
         t, k = np.nonzero(~regular)
@@ -144,31 +144,29 @@ def without_two(all_of: Whole, first: Indices, second: Indices) -> Separations:
         x, y = np.sqrt(np.maximum(a[t, k], 0.0)), np.copysign(np.sqrt(np.maximum(c[t, k], 0.0)), b[t, k])
         size = x**2 + y**2
         seen = size > LEAST_REDUNDANCY
-        hidden = np.where(seen, np.abs(y * one[t, k] - x * two[t, k]), np.hypot(one[t, k], two[t, k]))
-        limit = _NO_EFFECT * np.sqrt(all_of.variance_m2[t]) * np.where(seen, np.sqrt(size), 1.0)
+        hidden = np.where(seen, np.abs(y * gain_1[t, k] - x * gain_2[t, k]), np.hypot(gain_1[t, k], gain_2[t, k]))
+        limit = _NO_EFFECT * np.sqrt(full.variance_m2[t]) * np.where(seen, np.sqrt(size), 1.0)
         blind[t, k] = hidden > limit
-        shown = np.where(seen, (x * one[t, k] + y * two[t, k]) / np.where(seen, size, 1.0) ** 2, 0.0)
-        weight_one[t, k], weight_two[t, k] = x * shown, y * shown
-    moved = -(weight_one * all_of.residual[:, first] + weight_two * all_of.residual[:, second])
-    response = (
-        weight_one[..., None] * all_of.map_gain_m[:, first] + weight_two[..., None] * all_of.map_gain_m[:, second]
-    )
-    bias = np.zeros(one.shape)
-    if all_of.range_bias is not None:
-        left = gain[:, None, :] - weight_one[..., None] * all_of.projector[:, first]
-        left -= weight_two[..., None] * all_of.projector[:, second]
-        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
-    return _separations(all_of, weight_one * one + weight_two * two, response, moved, bias, blind)
+        shown = np.where(seen, (x * gain_1[t, k] + y * gain_2[t, k]) / np.where(seen, size, 1.0) ** 2, 0.0)
+        weight_1[t, k], weight_2[t, k] = x * shown, y * shown
+    moved = -(weight_1 * full.residual[:, first] + weight_2 * full.residual[:, second])
+    response = weight_1[..., None] * full.map_gain_m[:, first] + weight_2[..., None] * full.map_gain_m[:, second]
+    bias = np.zeros(gain_1.shape)
+    if full.range_bias is not None:
+        left = gain[:, None, :] - weight_1[..., None] * full.projector[:, first]
+        left -= weight_2[..., None] * full.projector[:, second]
+        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
+    return _separations(full, weight_1 * gain_1 + weight_2 * gain_2, response, moved, bias, blind)
 
 
-def without_three(all_of: Whole, members: Indices) -> Separations:
+def without_three(full: AllInView, members: Indices) -> Separations:
     """Triples of places (K, 3) in the compact arrays left out.
 
     Where S_JJ is singular (satellites of a clock of their own), the direction that no residual shows must not move
     the position; where it does, nothing bounds it.
     """
-    n, gain = all_of.channel.shape[1], all_of.gain_m
-    flat = all_of.projector.reshape(-1, n * n)
+    n, gain = full.channel.shape[1], full.gain_m
+    flat = full.projector.reshape(-1, n * n)
     i, j, k = members.T
     a, b, c = (np.take(flat, m * n + m, axis=1) for m in (i, j, k))
     d, e, f = (np.take(flat, m * n + o, axis=1) for m, o in ((i, j), (i, k), (j, k)))
@@ -179,39 +177,43 @@ def without_three(all_of: Whole, members: Indices) -> Separations:
     least = np.minimum(np.minimum(a, b), c)
     regular = (least > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * a * b * c)
     inverse = 1.0 / np.where(regular, determinant, 1.0)
-    one, two, three = gain[:, i], gain[:, j], gain[:, k]
+    gain_1, gain_2, gain_3 = gain[:, i], gain[:, j], gain[:, k]
     weights = np.stack(
-        [aa * one + dd * two + ee * three, dd * one + bb * two + ff * three, ee * one + ff * two + cc * three]
+        [
+            aa * gain_1 + dd * gain_2 + ee * gain_3,
+            dd * gain_1 + bb * gain_2 + ff * gain_3,
+            ee * gain_1 + ff * gain_2 + cc * gain_3,
+        ]
     )
     weights *= inverse
-    used = all_of.used[:, i] & all_of.used[:, j] & all_of.used[:, k]
+    used = full.used[:, i] & full.used[:, j] & full.used[:, k]
     blind = np.zeros(regular.shape, dtype=bool)
     t, at = np.nonzero(~regular & used)
     if len(t):
         places = members[at]
-        part = all_of.projector[t[:, None, None], places[:, :, None], places[:, None, :]]
+        part = full.projector[t[:, None, None], places[:, :, None], places[:, None, :]]
         values, vectors = np.linalg.eigh(part)
         shown = values > LEAST_REDUNDANCY
         share = np.einsum("sij,si->sj", vectors, np.take_along_axis(gain[t], places, axis=1))
         hidden = np.sqrt((np.where(shown, 0.0, share) ** 2).sum(axis=1))
-        blind[t, at] = hidden > _NO_EFFECT * np.sqrt(all_of.variance_m2[t])
+        blind[t, at] = hidden > _NO_EFFECT * np.sqrt(full.variance_m2[t])
         solved = np.where(shown, share / np.where(shown, values, 1.0), 0.0)
         weights[:, t, at] = np.einsum("sij,sj->is", vectors, solved)
-    square, moved, bias = np.zeros(one.shape), np.zeros(one.shape), np.zeros(one.shape)
-    response = np.zeros((*one.shape, 2))
+    square, moved, bias = np.zeros(gain_1.shape), np.zeros(gain_1.shape), np.zeros(gain_1.shape)
+    response = np.zeros((*gain_1.shape, 2))
     for place, weight in zip((i, j, k), weights, strict=True):
         square += weight * gain[:, place]
-        moved -= weight * all_of.residual[:, place]
-        response += weight[..., None] * all_of.map_gain_m[:, place]
-    if all_of.range_bias is not None:
+        moved -= weight * full.residual[:, place]
+        response += weight[..., None] * full.map_gain_m[:, place]
+    if full.range_bias is not None:
         left = np.repeat(gain[:, None, :], len(members), axis=1)
         for place, weight in zip((i, j, k), weights, strict=True):
-            left -= weight[..., None] * all_of.projector[:, place]
-        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
-    return _separations(all_of, np.maximum(square, 0.0), response, moved, bias, blind)
+            left -= weight[..., None] * full.projector[:, place]
+        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
+    return _separations(full, np.maximum(square, 0.0), response, moved, bias, blind)
 
 
-def without_constellation(model: LinearModel, members: Masks, all_of: Whole, bias_m: Floats | None) -> Separations:
+def without_constellation(model: LinearModel, members: Masks, full: AllInView, bias_m: Floats | None) -> Separations:
     """A whole constellation left out, K = 1: the information of the rest, inverted (3 x 3).
 
     Its channels share a clock. With ``S' = I - R K R^T`` of the clocks alone, r the 1/sigma of the members
@@ -254,16 +256,16 @@ def without_constellation(model: LinearModel, members: Masks, all_of: Whole, bia
         response += ((1.0 + more * mass) * (row * pull).sum(axis=1))[:, None] * between
         bias = (np.abs(np.where(members, 0.0, response)) * np.abs(bias_m) * model.root_weight).sum(axis=1)
     return _separations(
-        all_of,
+        full,
         (row[:, 0] - covariance[:, 0, 0])[:, None],
-        (-row[:, 1:] * prior - all_of.map_m)[:, None],
+        (-row[:, 1:] * prior - full.map_m)[:, None],
         moved[:, None],
         bias[:, None],
         blind[:, None],
     )
 
 
-def without_constellation_and_one(all_of: Whole, members: Masks) -> Separations:
+def without_constellation_and_one(full: AllInView, members: Masks) -> Separations:
     """A whole constellation left out with each channel of the others, K = n.
 
     What leaving out the constellation J makes of the projector, the residuals and the gains of the rest,
@@ -276,33 +278,33 @@ def without_constellation_and_one(all_of: Whole, members: Masks) -> Separations:
     members : ndarray of bool, shape (T, n)
         Places of the constellation in the compact arrays; some epochs may have none.
     """
-    mask, rest = members.astype(np.float64), all_of.used & ~members
-    projector, gain = all_of.projector, all_of.gain_m
+    mask, rest = members.astype(np.float64), full.used & ~members
+    projector, gain = full.projector, full.gain_m
     values, vectors = np.linalg.eigh(projector * mask[:, :, None] * mask[:, None, :])
     some = values > LEAST_REDUNDANCY
     inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
     inverse *= mask[:, :, None] * mask[:, None, :]
     hidden = np.einsum("tij,ti->tj", vectors * mask[:, :, None], gain * mask) * ~some
-    blind = np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(all_of.variance_m2)
+    blind = np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(full.variance_m2)
     across = projector @ inverse  # (T, n, n): of the rest onto the constellation
     pull = np.einsum("tij,tj->ti", inverse, gain)
     square = (pull * gain).sum(axis=1)
-    moved = -(pull * all_of.residual).sum(axis=1)
-    response = np.einsum("ti,tij->tj", pull, all_of.map_gain_m)
+    moved = -(pull * full.residual).sum(axis=1)
+    response = np.einsum("ti,tij->tj", pull, full.map_gain_m)
     left_gain = rest * (gain - np.einsum("tij,tj->ti", across, gain))
-    left_residual = rest * (all_of.residual - np.einsum("tij,tj->ti", across, all_of.residual))
-    left_map = rest[..., None] * (all_of.map_gain_m - across @ all_of.map_gain_m)
+    left_residual = rest * (full.residual - np.einsum("tij,tj->ti", across, full.residual))
+    left_map = rest[..., None] * (full.map_gain_m - across @ full.map_gain_m)
     left_projector = (projector - across @ projector) * (rest[:, :, None] & rest[:, None, :])
     share = np.einsum("tii->ti", left_projector)
     checked = share > LEAST_REDUNDANCY
     weight = np.where(checked, left_gain / np.where(checked, share, 1.0), 0.0)
     bias = np.zeros(gain.shape)
-    if all_of.range_bias is not None:
+    if full.range_bias is not None:
         left = left_gain[:, None, :] - weight[:, :, None] * left_projector
-        bias = np.einsum("tki,ti->tk", np.abs(left), all_of.range_bias)
-    alone = ~checked & (np.abs(left_gain) > _NO_EFFECT * np.sqrt(all_of.variance_m2)[:, None])
+        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
+    alone = ~checked & (np.abs(left_gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
     return _separations(
-        all_of,
+        full,
         np.maximum(square[:, None] + weight * left_gain, 0.0),
         response[:, None] + weight[..., None] * left_map,
         moved[:, None] - weight * left_residual,
@@ -312,13 +314,13 @@ def without_constellation_and_one(all_of: Whole, members: Masks) -> Separations:
 
 
 def _separations(
-    all_of: Whole, square: Floats, response: Floats, moved: Floats, bias: Floats, blind: Masks
+    full: AllInView, square: Floats, response: Floats, moved: Floats, bias: Floats, blind: Masks
 ) -> Separations:
     """From the variance of the distance (T, K), and its response to the map error (T, K, 2)."""
-    apart = np.sqrt(scaled(square, response, all_of.scale))
-    whole_response = all_of.map_m[:, None] + response
-    total = scaled(all_of.variance_m2[:, None] + square, whole_response, all_of.scale)
-    of_map = np.abs((whole_response * all_of.map_bias[:, None]).sum(axis=2))
+    apart = np.sqrt(scaled(square, response, full.scale))
+    whole_response = full.map_m[:, None] + response
+    total = scaled(full.variance_m2[:, None] + square, whole_response, full.scale)
+    of_map = np.abs((whole_response * full.map_bias[:, None]).sum(axis=2))
     return Separations(
         sigma_m=np.where(blind, np.inf, np.sqrt(total)),
         separation_sigma_m=np.where(blind, np.inf, apart),

@@ -129,9 +129,9 @@ class LinearModel:
         Q, ``Q P Q`` comes from the prior P and ``Q - Q P Q`` from the ranges.
         """
         k = self.interest
-        whole = self.covariance_m2
-        map_part = (whole @ self.prior @ whole)[:, :k, :k]
-        return np.asarray(scale[:, None, None] ** 2 * (whole[:, :k, :k] - map_part) + map_part)
+        covariance = self.covariance_m2
+        map_part = (covariance @ self.prior @ covariance)[:, :k, :k]
+        return np.asarray(scale[:, None, None] ** 2 * (covariance[:, :k, :k] - map_part) + map_part)
 
 
 @dataclass(frozen=True, kw_only=True)

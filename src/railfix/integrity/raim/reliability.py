@@ -149,8 +149,8 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
     values, which = np.unique(freedom, return_inverse=True)
-    found = [_noncentrality(int(v), limits.false_alarm, limits.missed_detection) if v >= 1 else np.nan for v in values]
-    return np.array(found, dtype=np.float64)[which].reshape(freedom.shape)
+    roots = [_noncentrality(int(v), limits.false_alarm, limits.missed_detection) if v >= 1 else np.nan for v in values]
+    return np.array(roots, dtype=np.float64)[which].reshape(freedom.shape)
 
 
 @lru_cache(maxsize=1024)
@@ -231,8 +231,8 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
         return np.asarray(c * first[..., k] * first[..., m] - b * cross + a * second[..., k] * second[..., m])
 
     wide = parts.gain_m.shape[2] == 2
-    whole = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
-    squared = np.where(regular, whole / np.where(regular, determinant, 1.0), 0.0)
+    largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
+    squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
     # Errors that no residual shows at all: (sqrt c, -+ sqrt a). Without effect on the position the pair
     # adds nothing to its single satellites.

@@ -35,7 +35,7 @@ class ContinuityLimits(Settings):
         curve of 300 m radius, and by 0.0025 on a vertical one of 2000 m.
     sigmas : float
         A channel is out from so many standard deviations of its own residual on.
-    refused : int
+    max_rejected : int
         Largest number of channels rejected; where more would be, no channel continues.
     max_gap_s : float
         Longest interval that is judged.
@@ -47,7 +47,7 @@ class ContinuityLimits(Settings):
     across_share: float = Field(default=0.02, gt=0)
     up_share: float = Field(default=0.003, gt=0)
     sigmas: float = Field(default=4.5, gt=0)
-    refused: int = Field(default=8, ge=0)
+    max_rejected: int = Field(default=8, ge=0)
     max_gap_s: float = Field(default=31.0, gt=0)
 
 
@@ -164,14 +164,14 @@ def track_jumps(
             sat_ecef_m=read_only(sat_ecef_m[-1].copy()),
             arc_m=float(arc_m[-1]),
         )
-    found = TrackJumps(
+    jumps = TrackJumps(
         jump=jump,
         metric_m=np.where(judged, residual, np.nan),
         judged=judged,
         moved_m=np.where(known, way + step, np.nan),
         moved_sigma_m=np.where(known, np.sqrt(np.where(known, variance, 1.0)), np.nan),
     )
-    return found, after
+    return jumps, after
 
 
 def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, Floats, Floats]:
@@ -207,7 +207,7 @@ def _consistent(
         # One that was taken out for another's sake comes back.
         back = judged[at] & (_fitted(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
         kept[at], again = _worst_out(*part, back, limits)
-        decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.refused)
+        decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.max_rejected)
         fit = _fitted(design, change, kept, sigma, prior)
     return kept, fit.residual, fit.step, fit.variance, decided
 
@@ -243,7 +243,7 @@ def _worst_out(
     """Kept channels after taking out the worst one by one, and where the rest agrees."""
     kept = kept.copy()
     active = np.arange(len(kept))
-    for _ in range(limits.refused + 1):
+    for _ in range(limits.max_rejected + 1):
         fit = _fitted(design[active], change[active], kept[active], sigma[active], prior[active])
         size = np.where(kept[active], fit.size, 0.0)
         worst = np.argmax(size, axis=1)

@@ -180,9 +180,9 @@ def smooth_codes(
     gain = np.where(has & (count <= 1), 1.0, gain)
     keep = np.where(begins, 0.0, 1.0 - gain)
     drive = gain * np.where(has, difference - base, 0.0)
-    one = np.ones((1, len(channels)))
-    offset = linear_recursion(np.concatenate([one, keep]), np.concatenate([offset0[None], drive]))[1:]
-    variance = linear_recursion(np.concatenate([one, keep**2]), np.concatenate([variance0[None], gain**2]))[1:]
+    unchanged = np.ones((1, len(channels)))
+    offset = linear_recursion(np.concatenate([unchanged, keep]), np.concatenate([offset0[None], drive]))[1:]
+    variance = linear_recursion(np.concatenate([unchanged, keep**2]), np.concatenate([variance0[None], gain**2]))[1:]
 
     runs = has_phase & (count >= 1)
     smoothed = np.where(runs, phase_m + (base + offset + apart[1:, None]), code_m)

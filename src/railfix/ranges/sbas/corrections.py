@@ -182,7 +182,7 @@ class SbasCorrections:
                 fast.udrei > limits.largest_udrei,
                 long.missing,
                 long.mismatch,
-                incomplete & (limits.incomplete == "refuse"),
+                incomplete & (limits.incomplete == "reject"),
                 fast.no_rate,
             ],
             [
@@ -276,7 +276,7 @@ class SbasCorrections:
         -------
         ndarray, shape (T, K)
             1 where the GEO sends neither; NaN where the service messages are incomplete and
-            incomplete data are refused.
+            incomplete data are rejected.
         """
         factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)
         along = delta_udre_covariance(self._tables, time, corrections.covariance, line_of_sight)

@@ -83,10 +83,10 @@ def parse(path: str, kind: str, lines: Sequence[str]) -> Iterator[RawMessage | I
 
 
 def _rtklib(path: str, number: int, line: str) -> RawMessage | InputFileError:
-    found = _RTKLIB.fullmatch(line)
-    if found is None:
+    fields = _RTKLIB.fullmatch(line)
+    if fields is None:
         return InputFileError(path, f"{line[:40]!r} is no 'week tow prn type : hexadecimal message'", line=number)
-    week, tow, prn, kind, digits = found.groups()
+    week, tow, prn, kind, digits = fields.groups()
     seconds = float(tow)
     if not (0 < int(week) < 10_000 and 0.0 <= seconds < SECONDS_PER_WEEK):
         return InputFileError(path, f"week {week}, time of week {tow} is no GPS time", line=number)
@@ -95,12 +95,12 @@ def _rtklib(path: str, number: int, line: str) -> RawMessage | InputFileError:
 
 
 def _ems(path: str, number: int, line: str) -> RawMessage | InputFileError:
-    found = _EMS.fullmatch(line)
-    if found is None:
+    fields = _EMS.fullmatch(line)
+    if fields is None:
         return InputFileError(
             path, f"{line[:40]!r} is no 'prn yy mm dd hh mm ss type hexadecimal message'", line=number
         )
-    prn, date, second, kind, digits = found.groups()
+    prn, date, second, kind, digits = fields.groups()
     try:
         time = _instant(date, second)
     except ValueError:
@@ -118,13 +118,13 @@ def _parse_rinex(path: str, lines: Sequence[str]) -> Iterator[RawMessage | Input
     while at < len(rest):
         number, text = rest[at]
         at += 1
-        found = _RINEX_HEAD.fullmatch(text.strip())
-        if found is None:
+        fields = _RINEX_HEAD.fullmatch(text.strip())
+        if fields is None:
             yield InputFileError(path, f"{text.strip()[:40]!r} is no 'prn yy mm dd hh mm ss'", line=number)
             while at < len(rest) and _RINEX_HEAD.fullmatch(rest[at][1].strip()) is None:
                 at += 1
             continue
-        prn, date, second, band, length = found.groups()
+        prn, date, second, band, length = fields.groups()
         count = int(length or 32)
         body = rest[at : at + -(-count // _RINEX_BYTES)]
         digits = "".join("".join(row[7:].split()) for _, row in body)[: 2 * count]
@@ -188,7 +188,7 @@ class _Gathered:
 
     raw: list[RawMessage] = field(default_factory=list)
     source: list[int] = field(default_factory=list)
-    refused: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
 
 
@@ -201,7 +201,7 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
         RTKLIB (.sbs), EGNOS message server (.ems), RINEX broadcast data (type B) or a receiver's log (UBX with
         RXM-SFRBX of SBAS), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
-        A line that is no message stops the reading, or is counted under "line" in `refused` and
+        A line that is no message stops the reading, or is counted under "line" in `rejected` and
         named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
         left out and counted in either case.
 
@@ -227,8 +227,8 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
         raise InputFileError(", ".join(sources), "holds no SBAS message that can be read")
     log = _checked(gathered, sources)
     if not len(log):
-        counts = ", ".join(f"{number} by {reason}" for reason, number in sorted(log.refused.items()))
-        raise InputFileError(", ".join(sources), f"has no SBAS message left: refused {counts}")
+        counts = ", ".join(f"{number} by {reason}" for reason, number in sorted(log.rejected.items()))
+        raise InputFileError(", ".join(sources), f"has no SBAS message left: rejected {counts}")
     return log
 
 
@@ -276,7 +276,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
                 gathered.notes.append(f"{item}; passed over")
     if broken > 1:
         gathered.notes.append(f"{path}: {broken} lines were passed over")
-    gathered.refused["line"] += broken
+    gathered.rejected["line"] += broken
 
 
 def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
@@ -290,8 +290,8 @@ def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     wrong = _wrong_parity(bits, carried)
     preamble = preamble_number(bits)
     stray = (preamble < 0) & ~wrong
-    gathered.refused["parity"] += int(wrong.sum())
-    gathered.refused["preamble"] += int(stray.sum())
+    gathered.rejected["parity"] += int(wrong.sum())
+    gathered.rejected["preamble"] += int(stray.sum())
     since = np.array([item.time_ns for item in raw], dtype=np.int64).astype("timedelta64[ns]")
     log = SbasMessages(
         time=np.asarray(GPS_EPOCH + since, dtype="datetime64[ns]"),
@@ -307,10 +307,10 @@ def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     kept = kept.take(np.lexsort((kept.prn, kept.time)))
     repeated = np.zeros(len(kept), dtype=bool)
     repeated[1:] = (kept.time[1:] == kept.time[:-1]) & (kept.prn[1:] == kept.prn[:-1])
-    gathered.refused["duplicate"] += int(repeated.sum())
+    gathered.rejected["duplicate"] += int(repeated.sum())
     kept = kept.take(~repeated)
     notes = [*gathered.notes, *_parity_notes(sources, source, carried), *_order_notes(kept)]
-    return replace(kept, refused=dict(gathered.refused), notes=tuple(notes))
+    return replace(kept, rejected=dict(gathered.rejected), notes=tuple(notes))
 
 
 def _carried_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:

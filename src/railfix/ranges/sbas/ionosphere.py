@@ -110,14 +110,14 @@ def _choose(
             lambda points, when: grid.in_mask(points, when[:, None]), span[at], corners, time[at], ROWS * COLUMNS
         )
         u, v = (longitude[at] - w) / b, (latitude[at] - s) / h
-        found = np.asarray(inside.all(axis=1))
+        inside_cell = np.asarray(inside.all(axis=1))
         for missing in range(4):
             three = np.flatnonzero((inside.sum(axis=1) == 3) & ~inside[:, missing])
             if len(three):
-                found[three] |= (triangle_weights(u[three], v[three], missing) >= 0.0).all(axis=1)
-        chosen = at[found]
-        point[chosen] = np.where(inside, corners, _NO_POINT)[found]
-        x[chosen], y[chosen] = u[found], v[found]
+                inside_cell[three] |= (triangle_weights(u[three], v[three], missing) >= 0.0).all(axis=1)
+        chosen = at[inside_cell]
+        point[chosen] = np.where(inside, corners, _NO_POINT)[inside_cell]
+        x[chosen], y[chosen] = u[inside_cell], v[inside_cell]
         open_[chosen] = False
     return point, x, y
 
@@ -147,8 +147,10 @@ def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude
     belt = np.stack([(1.0 - y) * (1.0 - x), (1.0 - y) * x, y * (1.0 - u), y * u], axis=1)
     v = (np.abs(latitude) - 85.0) / 10.0
     weights = np.where(cap[:, None], _square_weights((longitude - coarse) / 90.0 * (1.0 - 2.0 * v) + v, v), belt)
-    found = np.asarray(grid.in_mask(point, time[:, None]).all(axis=1))
-    return np.where(found[:, None], point, _NO_POINT), np.where(found[:, None], weights, np.nan).reshape(count, 4)
+    inside_cell = np.asarray(grid.in_mask(point, time[:, None]).all(axis=1))
+    return np.where(inside_cell[:, None], point, _NO_POINT), np.where(inside_cell[:, None], weights, np.nan).reshape(
+        count, 4
+    )
 
 
 def ionosphere(

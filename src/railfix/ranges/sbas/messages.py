@@ -113,7 +113,7 @@ class SbasMessages:
         1-based line of the file.
     sources : tuple of str
         Files.
-    refused : mapping of str to int
+    rejected : mapping of str to int
         Messages left out, by reason: "parity", "preamble", "line", "duplicate".
     notes : tuple of str
         Warnings for the reader of the results, one sentence each.
@@ -127,7 +127,7 @@ class SbasMessages:
     source: Integers
     line: Integers
     sources: tuple[str, ...] = ()
-    refused: Mapping[str, int] = field(default_factory=dict)
+    rejected: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -153,7 +153,7 @@ class SbasMessages:
         -------
         dict of str to int
             "MSAS 137 type 2 fast corrections": 600, "MSAS 137 type 63 null, not decoded": 569,
-            "refused: parity": 0 ... The values sum to the messages of the files.
+            "rejected: parity": 0 ... The values sum to the messages of the files.
         """
         counts = Counter(zip(self.prn.tolist(), self.type.tolist(), strict=True))
         rows = {
@@ -161,7 +161,7 @@ class SbasMessages:
             + ("" if kind in DECODED else ", not decoded"): number
             for (prn, kind), number in sorted(counts.items())
         }
-        return rows | {f"refused: {reason}": number for reason, number in sorted(self.refused.items())}
+        return rows | {f"rejected: {reason}": number for reason, number in sorted(self.rejected.items())}
 
     def of(self, prn: int) -> SbasMessages:
         """Messages of one PRN; the counts of rejected messages are those of all PRNs."""
@@ -191,7 +191,7 @@ class SbasMessages:
         return SbasMessages(
             **{name: values[order] for name, values in joined.items()},
             sources=sources,
-            refused=dict(Counter(self.refused) + Counter(later.refused)),
+            rejected=dict(Counter(self.rejected) + Counter(later.rejected)),
             notes=tuple(dict.fromkeys((*self.notes, *later.notes))),
         )
 
@@ -202,4 +202,4 @@ class SbasMessages:
             for item in fields(self)
             if isinstance(getattr(self, item.name), np.ndarray)
         }
-        return SbasMessages(**arrays, sources=self.sources, refused=self.refused, notes=self.notes)
+        return SbasMessages(**arrays, sources=self.sources, rejected=self.rejected, notes=self.notes)

@@ -332,7 +332,7 @@ class ServiceTable:
         self.values: Decoded = service(messages)
         self.time = messages.time[self.values["row"]]
         self._limit = limits.timeout_s("service")
-        self._refuse = limits.incomplete == "refuse"
+        self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
         """Factor on sigma UDRE at places; the newest complete set of messages of one issue counts.
@@ -345,7 +345,7 @@ class ServiceTable:
         factor : ndarray, shape (T,)
             NaN where the GEO sends no type 27.
         incomplete : ndarray of bool, shape (T,)
-            A set of type 27 is incomplete and incomplete data are refused.
+            A set of type 27 is incomplete and incomplete data are rejected.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1
@@ -354,7 +354,7 @@ class ServiceTable:
             at = at[seconds(time[at] - self.time[last]) <= self._limit]
             rows = self._complete(last)
             if rows is None:
-                incomplete[at], factor[at] = self._refuse, np.nan if self._refuse else 1.0
+                incomplete[at], factor[at] = self._reject, np.nan if self._reject else 1.0
             else:
                 factor[at] = self._of_set(rows, latitude_deg[at], longitude_deg[at])
         return factor, incomplete

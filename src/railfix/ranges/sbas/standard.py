@@ -158,7 +158,7 @@ class SbasLimits(Settings):
     range_rate : {"mops", "off"}
         Fast corrections change with the rate of the last two of them (default; DO-229D, A.4.4.3), or
         stay as sent.
-    incomplete : {"refuse", "inflate"}
+    incomplete : {"reject", "inflate"}
         A satellite whose degradation data (types 7, 10, and 28 where it is sent) are missing gets no
         sigma and is rejected (default: precision approach), or has sigma UDRE plus 8 m (DO-229D, J.2.2),
         and the shortest time-out of fast corrections.
@@ -171,7 +171,7 @@ class SbasLimits(Settings):
     mode: Literal["precision", "en_route"] = "precision"
     type0: Literal["stop", "as_type2"] = "stop"
     range_rate: Literal["mops", "off"] = "mops"
-    incomplete: Literal["refuse", "inflate"] = "refuse"
+    incomplete: Literal["reject", "inflate"] = "reject"
     max_udrei: int | None = Field(default=None, ge=0, le=13)
     message_s: float = Field(default=1.0, ge=0.0, le=2.0)
 

@@ -1,4 +1,4 @@
-"""SBAS messages made field by field, to order: those of the simulator's encoder, and types that it does not send."""
+"""SBAS messages built field by field: those of the simulator's encoder, and types that it does not send."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from railfix.simulate.sbas.encode import (
 START = np.datetime64("2025-02-15T12:00:00", "ns")
 
 
-def made(rows: Sequence[tuple[float, int, np.ndarray]], prn: int = 137) -> SbasMessages:
+def message_log(rows: Sequence[tuple[float, int, np.ndarray]], prn: int = 137) -> SbasMessages:
     """Log of (second of reception, PRN or 0 for the usual one, message) in the order of time."""
     rows = sorted(rows, key=lambda row: row[0])
     bits = np.array([row[2] for row in rows], dtype=np.uint8).reshape(-1, 32)
@@ -37,7 +37,7 @@ def made(rows: Sequence[tuple[float, int, np.ndarray]], prn: int = 137) -> SbasM
         parity_bits=np.full(count, 24),
         source=np.zeros(count, dtype=np.int64),
         line=np.arange(1, count + 1),
-        sources=("made",),
+        sources=("cases",),
     )
 
 
@@ -94,9 +94,9 @@ __all__ = [
     "grid_mask",
     "integrity",
     "long_term",
-    "made",
     "mask",
     "message",
+    "message_log",
     "mixed",
     "moving",
     "parameters",
