@@ -105,7 +105,7 @@ def test_messages_of_an_earlier_time_take_their_place() -> None:
     )
     joined = first.joined(later)
     assert joined.time.tolist() == sorted(joined.time.tolist())
-    assert [joined.sources[number] for number in joined.source] == ["cases", "another", "made"]
+    assert [joined.sources[number] for number in joined.source] == ["cases", "another", "cases"]
     assert (joined.rejected, len(first)) == ({"line": 2}, 2)
     assert first.joined(SbasMessages.none()) is first
 
