@@ -1,0 +1,222 @@
+"""Absolute places from changes of gradient and curvature (P2 2.3): features of a map, and where a measured one lies.
+
+P2 takes the points where gradient or curvature change, not their values: slow biases do not matter then. A place is
+accepted on two conditions of P2 (its distance to the features before agrees with the database; the other quantity
+fits there) and one more: no other place of the window explains the measurement nearly as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from pydantic import Field
+
+from railfix.core.arrays import Floats
+from railfix.core.settings import Settings
+from railfix.track.trajectory import Trajectory
+
+#: Quantities of a feature.
+Quantity = Literal["gradient", "curvature"]
+QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
+
+
+class FeatureLimits(Settings):
+    """What a feature is, and when a measured one is accepted.
+
+    Attributes
+    ----------
+    step_m : float
+        Spacing of the series along the line.
+    base_m : float
+        Length over which a change is taken: about that between the bogies of a vehicle, which rounds what is shorter.
+    gradient_change, curvature_change_1pm : float
+        Least change: 3 permille, and from straight to a radius of 1000 m.
+    half_length_m : float
+        Length of line before and behind a feature that is compared.
+    likelihood_ratio : float
+        Of the place found to any other place of the window.
+    gap_sigmas : float
+        Disagreement with the distance to the last accepted feature.
+    fit_limit : float
+        Mean square of the other quantity's residual over its variance.
+    scale_sigma : float
+        Of a way by wheel, as a share.
+    """
+
+    step_m: float = Field(default=1.0, gt=0)
+    base_m: float = Field(default=15.0, gt=0)
+    gradient_change: float = Field(default=0.003, gt=0)
+    curvature_change_1pm: float = Field(default=1e-3, gt=0)
+    half_length_m: float = Field(default=60.0, gt=0)
+    likelihood_ratio: float = Field(default=1e3, gt=1)
+    gap_sigmas: float = Field(default=3.0, gt=0)
+    fit_limit: float = Field(default=3.0, gt=0)
+    scale_sigma: float = Field(default=2e-3, gt=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineSeries:
+    """Gradient and curvature along a line, N places `FeatureLimits.step_m` apart.
+
+    Attributes
+    ----------
+    arc_m : ndarray, shape (N,) [m]
+    gradient : ndarray, shape (N,)
+        Climb over horizontal length in rising arc length.
+    curvature_1pm : ndarray, shape (N,) [1/m]
+        + to the right in rising arc length.
+    """
+
+    arc_m: Floats
+    gradient: Floats
+    curvature_1pm: Floats
+
+    def of(self, quantity: Quantity) -> Floats:
+        """Values of one quantity."""
+        return self.gradient if quantity == "gradient" else self.curvature_1pm
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feature:
+    """A change of gradient or curvature.
+
+    Attributes
+    ----------
+    arc_m : float [m]
+    quantity : {"gradient", "curvature"}
+    change : float
+    """
+
+    arc_m: float
+    quantity: Quantity
+    change: float
+
+
+def line_series(trajectory: Trajectory, *, limits: FeatureLimits | None = None) -> LineSeries:
+    """Return gradient and curvature of a trajectory over chords of `base_m`, as a vehicle on two bogies has them."""
+    limits = limits or FeatureLimits()
+    half = 0.5 * limits.base_m
+    arc = np.arange(half, float(trajectory.arc_m[-1]) - half, limits.step_m)
+    front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)
+    index = trajectory.segment_at(arc)[0]
+    chord = front - rear
+    up = trajectory.up[index]
+    climb = (chord * up).sum(axis=1)
+    flat = chord - climb[:, None] * up
+    gradient = climb / np.linalg.norm(flat, axis=1)
+    ahead = flat[1:] / np.linalg.norm(flat[1:], axis=1, keepdims=True)
+    behind = flat[:-1] / np.linalg.norm(flat[:-1], axis=1, keepdims=True)
+    turn = -(np.cross(behind, ahead) * up[1:]).sum(axis=1) / limits.step_m
+    return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=np.concatenate([turn[:1], turn]))
+
+
+def map_features(series: LineSeries, *, limits: FeatureLimits | None = None) -> list[Feature]:
+    """Return the features of a line in order: where gradient or curvature change most within `base_m`."""
+    limits = limits or FeatureLimits()
+    lag = max(round(limits.base_m / limits.step_m), 1)
+    found = []
+    for quantity, least in (("gradient", limits.gradient_change), ("curvature", limits.curvature_change_1pm)):
+        values = series.gradient if quantity == "gradient" else series.curvature_1pm
+        change = values[2 * lag :] - values[: -2 * lag] if len(values) > 2 * lag else np.empty(0)
+        size = np.abs(change)
+        while len(size) and size.max() >= least:
+            k = int(np.argmax(size))
+            name: Quantity = "gradient" if quantity == "gradient" else "curvature"
+            found.append(Feature(arc_m=float(series.arc_m[k + lag]), quantity=name, change=float(change[k])))
+            size[max(k - 2 * lag, 0) : k + 2 * lag + 1] = 0.0
+    return sorted(found, key=lambda feature: feature.arc_m)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Located:
+    """Where a measured series lies on the line.
+
+    Attributes
+    ----------
+    verdict : {"accepted", "ambiguous", "none"}
+    arc_m : float [m]
+        Of the middle of the series; NaN unless accepted.
+    sigma_m : float [m]
+        ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity.
+    reason : str
+        Why it is not accepted.
+    """
+
+    verdict: Literal["accepted", "ambiguous", "none"]
+    arc_m: float
+    sigma_m: float
+    reason: str = ""
+
+
+def locate(
+    measured: LineSeries,
+    line: LineSeries,
+    predicted_m: float,
+    sigma_m: float,
+    *,
+    quantity: Quantity,
+    noise: tuple[float, float],
+    last: tuple[float, float, float] | None = None,
+    limits: FeatureLimits | None = None,
+) -> Located:
+    """Return the place of a measured stretch by maximum likelihood within four sigmas of the predicted one.
+
+    A constant offset of the quantity is free: a bias of the sensor does not matter.
+
+    Parameters
+    ----------
+    measured : LineSeries
+        Over travelled way in rising arc length, `arc_m` about the predicted place (0 in its middle).
+    line : LineSeries
+    predicted_m, sigma_m : float [m]
+        Place of the middle of the stretch as known before.
+    quantity : {"gradient", "curvature"}
+        By which it is placed; the other one must fit there.
+    noise : tuple of float
+        Standard deviations of the two quantities in one step.
+    last : tuple of float, optional
+        Place of the last accepted feature, its sigma, and the way by wheel since [m].
+    limits : FeatureLimits, optional
+    """
+    limits = limits or FeatureLimits()
+    offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + limits.step_m, 0.25 * limits.step_m)
+    at = predicted_m + offsets[:, None] + measured.arc_m
+    expected = np.interp(at, line.arc_m, line.of(quantity))
+    residual = measured.of(quantity) - expected
+    residual = residual - residual.mean(axis=1, keepdims=True)
+    spread = noise[QUANTITIES.index(quantity)]
+    likelihood = -0.5 * (residual**2).sum(axis=1) / spread**2
+    slope = np.gradient(expected[int(np.argmax(likelihood))], limits.step_m)
+    information = float(((slope - slope.mean()) ** 2).sum()) / spread**2
+    best = int(np.argmax(likelihood))
+    if information < 16.0 / sigma_m**2:
+        return Located(verdict="none", arc_m=np.nan, sigma_m=np.nan, reason="no change sharper than the prediction")
+    sigma = float(1.0 / np.sqrt(information))
+    place = predicted_m + float(offsets[best]) + _vertex(likelihood, best) * 0.25 * limits.step_m
+    apart = np.abs(offsets - offsets[best]) > max(5.0 * sigma, 2.0 * limits.step_m)
+    if best in (0, len(offsets) - 1):
+        return Located(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="best at the edge of the window")
+    if apart.any() and likelihood[best] - likelihood[apart].max() < np.log(limits.likelihood_ratio):
+        return Located(verdict="ambiguous", arc_m=np.nan, sigma_m=sigma, reason="another place fits nearly as well")
+    other: Quantity = QUANTITIES[1 - QUANTITIES.index(quantity)]
+    rest = measured.of(other) - np.interp(place + measured.arc_m, line.arc_m, line.of(other))
+    misfit = float(((rest - rest.mean()) ** 2).mean()) / noise[QUANTITIES.index(other)] ** 2
+    if misfit > limits.fit_limit:
+        return Located(verdict="none", arc_m=np.nan, sigma_m=sigma, reason=f"the {other} does not fit there")
+    if last is not None:
+        gap = place - last[0]
+        allowed = limits.gap_sigmas * np.sqrt(sigma**2 + last[1] ** 2 + (limits.scale_sigma * last[2]) ** 2)
+        if abs(gap - last[2]) > allowed:
+            return Located(verdict="none", arc_m=np.nan, sigma_m=sigma, reason="distance to the last feature disagrees")
+    return Located(verdict="accepted", arc_m=place, sigma_m=sigma)
+
+
+def _vertex(values: Floats, best: int) -> float:
+    """Offset in steps of the vertex of the parabola through a maximum and its neighbours."""
+    if best in (0, len(values) - 1):
+        return 0.0
+    left, middle, right = values[best - 1 : best + 2]
+    bend = left - 2.0 * middle + right
+    return 0.0 if bend == 0.0 else float(np.clip(0.5 * (left - right) / bend, -0.5, 0.5))

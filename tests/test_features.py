@@ -1,0 +1,124 @@
+"""Places from changes of gradient and curvature, on a line with known ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from railfix.motion.features import FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from tracking_cases import bent_line
+
+NOISE = (2e-4, 1e-4)
+#: Way between P2's points A to D (table 1) [m].
+POINTS = np.cumsum([300.0, 62.65, 361.32, 375.22])
+
+
+def _line(*, repeated: bool = False) -> LineSeries:
+    """Gradient changes at P2's points; with `repeated` twice the same change 40 m apart."""
+    arc = np.arange(0.0, 1500.0, 1.0)
+    points = np.array([500.0, 540.0]) if repeated else POINTS
+    changes = [0.01, 0.01] if repeated else [0.012, -0.02, 0.015, -0.010]
+    gradient = sum(c / (1.0 + np.exp(-(arc - p) / 3.0)) for p, c in zip(points, changes, strict=True))
+    if repeated:
+        gradient = 0.01 / (1.0 + np.exp(-(arc - 500.0) / 3.0)) - 0.01 / (1.0 + np.exp(-(arc - 520.0) / 3.0))
+        gradient += 0.01 / (1.0 + np.exp(-(arc - 540.0) / 3.0)) - 0.01 / (1.0 + np.exp(-(arc - 560.0) / 3.0))
+    curvature = np.where(arc > 900.0, 1.0 / 800.0, 0.0)
+    return LineSeries(arc_m=arc, gradient=gradient, curvature_1pm=curvature)
+
+
+def _measured(line: LineSeries, place: float, seed: int, *, half: float = 60.0, bias: float = 0.004) -> LineSeries:
+    random = np.random.default_rng(seed)
+    way = np.arange(-half, half + 0.5, 1.0)
+    return LineSeries(
+        arc_m=way,
+        gradient=np.interp(place + way, line.arc_m, line.gradient) + bias + NOISE[0] * random.normal(size=len(way)),
+        curvature_1pm=np.interp(place + way, line.arc_m, line.curvature_1pm) + NOISE[1] * random.normal(size=len(way)),
+    )
+
+
+def _locate(line: LineSeries, place: float, predicted: float, seed: int, **more: object) -> Located:
+    return locate(
+        _measured(line, place, seed),
+        line,
+        predicted,
+        8.0,
+        quantity="gradient",
+        noise=NOISE,
+        **more,  # type: ignore[arg-type]
+    )
+
+
+@pytest.mark.requirement("E3")
+def test_gaps_between_the_points_repeat_as_in_table_1() -> None:
+    line = _line()
+    runs = []
+    for seed in (1, 2):
+        found = [_locate(line, p, p + 5.0, 10 * seed + k) for k, p in enumerate(POINTS)]
+        assert all(f.verdict == "accepted" for f in found), found
+        runs.append(np.array([f.arc_m for f in found]))
+    pairs = [(0, 1), (1, 2), (2, 3), (1, 3), (0, 3)]
+    differences = [(runs[0][b] - runs[0][a]) - (runs[1][b] - runs[1][a]) for a, b in pairs]
+    assert np.abs(differences).max() < 0.5
+    assert np.sqrt(np.mean(np.square(differences))) < 0.25
+
+
+@pytest.mark.requirement("E3")
+def test_error_of_the_place_within_its_own_sigma() -> None:
+    line = _line()
+    z = []
+    for seed in range(60):
+        found = _locate(line, POINTS[1], POINTS[1] - 4.0, seed)
+        z.append((found.arc_m - POINTS[1]) / found.sigma_m)
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+@pytest.mark.requirement("E3")
+def test_two_equal_features_in_the_window_are_refused() -> None:
+    line = _line(repeated=True)
+    measured = _measured(line, 510.0, 3, half=15.0)
+    found = locate(measured, line, 530.0, 12.0, quantity="gradient", noise=NOISE)
+    assert found.verdict == "ambiguous"
+
+
+@pytest.mark.requirement("E3")
+def test_a_shifted_database_is_refused_by_the_gap() -> None:
+    line = _line()
+    first = _locate(line, POINTS[1], POINTS[1] + 2.0, 4)
+    shifted = LineSeries(
+        arc_m=line.arc_m,
+        gradient=np.interp(line.arc_m - np.where(line.arc_m > 550.0, 5.0, 0.0), line.arc_m, line.gradient),
+        curvature_1pm=line.curvature_1pm,
+    )
+    measured = _measured(line, POINTS[2], 5)
+    way = POINTS[2] - POINTS[1]
+    last = (first.arc_m, first.sigma_m, float(way))
+    found = locate(measured, shifted, POINTS[2], 8.0, quantity="gradient", noise=NOISE, last=last)
+    assert (found.verdict, found.reason) == ("none", "distance to the last feature disagrees")
+    assert _locate(line, POINTS[2], POINTS[2], 5, last=last).verdict == "accepted"
+
+
+@pytest.mark.requirement("E3")
+def test_the_other_quantity_must_fit() -> None:
+    line = _line()
+    wrong = LineSeries(arc_m=line.arc_m, gradient=line.gradient, curvature_1pm=np.where(line.arc_m > 365.0, 2e-3, 0.0))
+    found = locate(_measured(line, POINTS[1], 6), wrong, POINTS[1], 8.0, quantity="gradient", noise=NOISE)
+    assert found.verdict == "none"
+    assert "curvature" in found.reason
+
+
+@pytest.mark.requirement("E3")
+def test_a_straight_level_line_has_no_features_and_places_nothing() -> None:
+    arc = np.arange(0.0, 1000.0, 1.0)
+    flat = LineSeries(arc_m=arc, gradient=0.0 * arc, curvature_1pm=0.0 * arc)
+    assert map_features(flat) == []
+    assert _locate(flat, 500.0, 503.0, 1).verdict == "none"
+
+
+@pytest.mark.requirement("E3")
+def test_features_of_a_map_are_where_the_line_bends() -> None:
+    series = line_series(bent_line(1500.0, turn_deg=60.0))
+    middle = (series.arc_m > 600.0) & (series.arc_m < 900.0)
+    assert np.median(series.curvature_1pm[middle]) == pytest.approx(np.radians(60.0) / 500.0, rel=0.05)
+    found = [f for f in map_features(series, limits=FeatureLimits()) if f.quantity == "curvature"]
+    assert min(abs(f.arc_m - 500.0) for f in found) < 20.0
+    assert min(abs(f.arc_m - 1000.0) for f in found) < 20.0
