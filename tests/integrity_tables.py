@@ -201,9 +201,9 @@ def sigma_rows() -> Iterator[str]:
 
 
 def start_rows() -> Iterator[str]:
-    """Estimators of the scale of one epoch against each other: one satellite too long, over the clean scale."""
-    yield "demonstration, line fit of single epochs; scale with one satellite of each in turn too long, over that without"
-    yield "estimator                     clean     10 m: median   worst     20 m: median   worst    100 m: median   worst"
+    """Estimators of the scale of one epoch against each other."""
+    yield "demonstration, line fit of single epochs; scale with one satellite in turn too long, over that without"
+    yield f"{'estimator':24s}     clean" + "".join(f"{f'{size} m: median':>17s}   worst" for size in (10, 20, 100))
     case = cases()["demo"]
     clean = case.solved(parse_config({"screens": ["elevation"]}))
     has = np.flatnonzero(np.isfinite(clean.constrained.arc_m))[::20]
