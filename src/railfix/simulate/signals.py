@@ -311,13 +311,7 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
     scenario, settings = simulation.scenario, simulation.scenario.receiver
     by_satellite, now, path_rate, ionosphere_rate = _geometry(simulation, receiver.antenna, time)
     column, scale, wavelength = receiver.column, receiver.scale, receiver.wavelength_m
-    geometry = replace(
-        by_satellite,
-        satellite=receiver.names,
-        signal=receiver.signals,
-        elevation_deg=now.elevation_deg[:, column],
-        azimuth_deg=now.azimuth_deg[:, column],
-    )
+    geometry = _of_channels(by_satellite, receiver)
     tags = seconds(time - scenario.start)
     ionosphere = scale * now.ionosphere_m[:, column]
     clock = SPEED_OF_LIGHT * simulation.clock_s(receiver.antenna, tags)
@@ -371,6 +365,17 @@ def _piece(simulation: Simulation, receiver: Receiver, time: Datetimes) -> Piece
         code_sigma_m=sigma,
         clean_code_m=code,
         error_m=error + extra + receiver.group_delay_error_m,
+    )
+
+
+def _of_channels(geometry: Geometry, receiver: Receiver) -> Geometry:
+    """Geometry of a receiver's channels from that of the satellites."""
+    return replace(
+        geometry,
+        satellite=receiver.names,
+        signal=receiver.signals,
+        elevation_deg=geometry.elevation_deg[:, receiver.column],
+        azimuth_deg=geometry.azimuth_deg[:, receiver.column],
     )
 
 

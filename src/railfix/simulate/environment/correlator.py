@@ -102,26 +102,31 @@ def tracked(
     late = np.asarray(delay / chip_m, dtype=np.float32)
     error = _zero(real, imaginary, late, follow, spacing_chips)
     triangle = _triangle(error - late)
-    heard = triangle * follow
-    power = (real * heard).sum(axis=0) ** 2 + (imaginary * heard).sum(axis=0) ** 2
+    followed = triangle * follow
+    power = (real * followed).sum(axis=0) ** 2 + (imaginary * followed).sum(axis=0) ** 2
     power += (((1.0 - follow**2) * triangle**2) * (real**2 + imaginary**2)).sum(axis=0)
-    heard = triangle / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
-    real, imaginary = real * heard, imaginary * heard
-    carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
-    turned = np.arctan2(
-        quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
-    )
-    pulled = (carrier * (real * rate).sum(axis=0) + quadrature * (imaginary * rate).sum(axis=0)) / np.maximum(
-        carrier**2 + quadrature**2, 1e-18
-    )
+    passed = triangle / np.sqrt(1.0 + (turning_hz / carrier_loop_hz) ** 2)
+    angle, pulled = _carrier(real * passed, imaginary * passed, rate, anchor)
     limit = np.abs(rate * (strength > 0.05 * size)).max(axis=0)
     return Tracked(
         code_m=first + error * chip_m,
-        phase_m=first - turned * wavelength_m / (2.0 * np.pi),
+        phase_m=first - angle * wavelength_m / (2.0 * np.pi),
         rate_mps=first_rate + np.clip(pulled, -limit, limit),
         gain_db=20.0 * np.log10(np.maximum(np.sqrt(power) * size, 1e-9)),
         main=main,
     )
+
+
+def _carrier(real: Singles, imaginary: Singles, rate_mps: Floats, anchor: Complexes) -> tuple[Floats, Floats]:
+    """Phase of the sum of the paths [rad], and its rate beyond the main path's [m/s], at constant amplitudes."""
+    carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
+    angle = np.arctan2(
+        quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag
+    )
+    pulled = (carrier * (real * rate_mps).sum(axis=0) + quadrature * (imaginary * rate_mps).sum(axis=0)) / np.maximum(
+        carrier**2 + quadrature**2, 1e-18
+    )
+    return angle, pulled
 
 
 def _triangle(x: Singles) -> Singles:
