@@ -1,0 +1,286 @@
+"""Intervals, authorities, routes and points of a single line with passing loops.
+
+A pure state machine. Occupied by a train is the interval from its last safe rear end to the end of its authority.
+Authorities are only ever extended, up to the nearest of: another train's interval, points that are not locked and
+detected for the train, the end of its route; less a margin. It is not a national rule book: no shunting, no overlaps
+behind signals, no level crossings, no degraded working by hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Final
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+from railfix.ground.layout import Layout, PointName, overlap
+from railfix.io.train_message import MessageStatus, TrainMessage
+
+
+class Rule(Enum):
+    """Rules of the interlocking, of its store and on board; tests take each out in turn."""
+
+    TRAIN_AHEAD = "an authority ends before the interval of another train"
+    SAFE_REAR = "the interval begins at the rear end, with length and over-reading amount"
+    SEQUENCE = "older reports are rejected, and a safe rear end never moves back"
+    DIRECTION = "a section is given to one direction at a time"
+    POINTS_LOCKED = "points under an interval or a route do not move"
+    POINTS_DETECTED = "an authority ends before points that are not detected in their position"
+    PERSISTENCE = "granted authorities survive a restart of the centre"
+    SUPERVISION = "a train is braked before the end of its authority"
+
+
+ALL_RULES: Final = frozenset(Rule)
+
+
+class InterlockingLimits(Settings):
+    """Limits of the interlocking.
+
+    Attributes
+    ----------
+    margin_m : float [m]
+        Kept between the end of an authority and what limits it.
+    release_s : float [s]
+        Points are released this long after the safe rear end has passed them.
+    """
+
+    margin_m: float = Field(default=20.0, ge=0)
+    release_s: float = Field(default=3.0, ge=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainInterval:
+    """Interval and route of a train.
+
+    Attributes
+    ----------
+    train : int
+    direction : {-1, 1}
+    rear_m, front_m : float [m]
+        Last safe rear and front ends.
+    end_m : float [m]
+        End of the authority.
+    sequence : int
+        Newest report.
+    tracks : mapping of int to int
+        Track in each station of the route.
+    station : int
+        Station where the route ends.
+    standstill : bool
+    """
+
+    train: int
+    direction: int
+    rear_m: float
+    front_m: float
+    end_m: float
+    sequence: int
+    tracks: Mapping[int, int]
+    station: int
+    standstill: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointState:
+    """Points as the interlocking knows them.
+
+    Attributes
+    ----------
+    wanted : {1, 2}
+        Track they are commanded to.
+    detected : {1, 2} or None
+        Track they are detected at; None while they move.
+    locked : mapping of int to float or None
+        Trains that lock them: None until the train's rear end has passed, then the time of release [s].
+    """
+
+    wanted: int = 1
+    detected: int | None = 1
+    locked: Mapping[int, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interlocking:
+    """State of the interlocking.
+
+    Attributes
+    ----------
+    trains : mapping of int to TrainInterval
+    points : mapping of PointName to PointState
+    stopped : bool
+        True while no authority is extended and no route set: satellite positioning is suspended.
+    """
+
+    trains: Mapping[int, TrainInterval]
+    points: Mapping[PointName, PointState]
+    stopped: bool = False
+
+
+def interval_of(train: TrainInterval) -> tuple[float, float]:
+    """Return rear end and furthest end of the occupied interval [m]."""
+    return train.rear_m, max(train.end_m * train.direction, train.front_m * train.direction) * train.direction
+
+
+def report_received(
+    state: Interlocking, message: TrainMessage, layout: Layout, *, rules: frozenset[Rule] = ALL_RULES
+) -> Interlocking:
+    """Return the state after a position report.
+
+    A train that looks the other way than before has changed ends; that counts only at a standstill with its interval
+    inside a station.
+    """
+    known = state.trains.get(message.train)
+    placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0
+    if known is None or not placed or message.chainage_cm is None:
+        return state
+    if Rule.SEQUENCE in rules and message.sequence <= known.sequence:
+        return state
+    front, facing = message.chainage_cm / 100.0, message.facing
+    behind = ((message.over_cm or 0) + message.length_cm) / 100.0 if Rule.SAFE_REAR in rules else 0.0
+    rear, ahead = front - facing * behind, front + facing * (message.under_cm or 0) / 100.0
+    if facing == known.direction:
+        if Rule.SEQUENCE in rules:  # a wider bound moves no rear end back either
+            rear = facing * max(facing * rear, facing * known.rear_m)
+        train = replace(known, rear_m=rear, front_m=ahead, sequence=message.sequence, standstill=message.standstill)
+    else:
+        if not message.standstill or layout.station_at(*sorted((rear, ahead))) != known.station:
+            return state
+        train = replace(
+            known,
+            direction=facing,
+            rear_m=rear,
+            front_m=ahead,
+            end_m=ahead,
+            sequence=message.sequence,
+            standstill=True,
+            tracks={known.station: known.tracks[known.station]},
+        )
+    return replace(state, trains={**state.trains, train.train: train})
+
+
+def points_reported(state: Interlocking, point: PointName, detected: int | None) -> Interlocking:
+    """Return the state after a detection of points."""
+    return replace(state, points={**state.points, point: replace(state.points[point], detected=detected)})
+
+
+def route_requested(
+    state: Interlocking, train: int, layout: Layout, *, rules: frozenset[Rule] = ALL_RULES
+) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
+    """Return the state with a route to the next station, the points to be moved, and the reason of a refusal."""
+    here = state.trains[train]
+    begin, direction = here.station, here.direction
+    target = begin + direction
+    if state.stopped:
+        return state, (), "satellite positioning is suspended"
+    if not 0 <= target < len(layout.stations):
+        return state, (), "there is no station ahead"
+    track = 1 if direction > 0 else 2
+    section = min(begin, target)
+    for other in state.trains.values():
+        if other.train == train:
+            continue
+        stays = other.station == target or other.direction != direction
+        if other.tracks.get(target) == track and stays and _in_station(other, target, layout):
+            return state, (), f"track {track} of {layout.stations[target].name} is taken by train {other.train}"
+        if Rule.DIRECTION in rules and other.direction != direction and _uses_section(other, section, layout):
+            return state, (), f"train {other.train} comes the other way"
+    needs: dict[PointName, int] = {(begin, direction): here.tracks[begin], (target, -direction): track}
+    points, moved = dict(state.points), []
+    for name, wanted in needs.items():
+        point = points[name]
+        if point.wanted != wanted:
+            if Rule.POINTS_LOCKED in rules and (point.locked or _under_interval(state, name, layout)):
+                return state, (), f"points {layout.stations[name[0]].name} are locked"
+            moved.append(name)
+            point = replace(point, wanted=wanted, detected=None)
+        points[name] = replace(point, locked={**point.locked, train: None})
+    routed = replace(here, tracks={**here.tracks, target: track}, station=target)
+    return replace(state, trains={**state.trains, train: routed}, points=points), tuple(moved), None
+
+
+def _in_station(train: TrainInterval, station: int, layout: Layout) -> bool:
+    """Return whether a train's interval or route still needs its track in a station."""
+    first, last = layout.stations[station].begin_m, layout.stations[station].end_m
+    return train.rear_m < last if train.direction > 0 else train.rear_m > first
+
+
+def _uses_section(train: TrainInterval, section: int, layout: Layout) -> bool:
+    """Return whether a train's route or interval lies between a station and the next, their points left out."""
+    first, last = layout.stations[section].end_m, layout.stations[section + 1].begin_m
+    low, high = sorted(interval_of(train))
+    routed = {section, section + 1} <= set(train.tracks) and (
+        train.rear_m < last if train.direction > 0 else train.rear_m > first
+    )
+    return routed or (low < last and high > first)
+
+
+def _under_interval(state: Interlocking, point: PointName, layout: Layout) -> bool:
+    """Return whether points lie under a train's interval."""
+    zone = [(0, *layout.zone_m(point))]
+    return any(overlap(layout.pieces(*interval_of(t), t.tracks), zone) for t in state.trains.values())
+
+
+def released(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
+    """Return the state with the points released that safe rear ends have passed long enough ago."""
+    points = dict(state.points)
+    for name, point in state.points.items():
+        if not point.locked:
+            continue
+        low, high = layout.zone_m(name)
+        locked: dict[int, float | None] = {}
+        for train, since in point.locked.items():
+            known = state.trains[train]
+            passed = known.rear_m >= high if known.direction > 0 else known.rear_m <= low
+            due = None if not passed else now_s + limits.release_s if since is None else since
+            if due is None or due > now_s:
+                locked[train] = due
+        if locked != point.locked:
+            points[name] = replace(point, locked=locked)
+    return replace(state, points=points)
+
+
+def extended(
+    state: Interlocking, layout: Layout, *, limits: InterlockingLimits, rules: frozenset[Rule] = ALL_RULES
+) -> Interlocking:
+    """Return the state with every authority extended as far as it may be."""
+    if state.stopped:
+        return state
+    for number in state.trains:
+        train = state.trains[number]
+        end = _limit_m(state, train, layout, limits=limits, rules=rules)
+        if train.direction * (end - train.end_m) > 0.0:
+            state = replace(state, trains={**state.trains, number: replace(train, end_m=end)})
+    return state
+
+
+def _limit_m(
+    state: Interlocking, train: TrainInterval, layout: Layout, *, limits: InterlockingLimits, rules: frozenset[Rule]
+) -> float:
+    """Return the furthest end of a train's authority [m]."""
+    direction = train.direction
+    inner = layout.stations[train.station].inner_m
+    end = direction * (inner[1] if direction > 0 else inner[0])
+    for name, point in state.points.items():
+        low, high = layout.zone_m(name)
+        near, far = (low, high) if direction > 0 else (-high, -low)
+        if far <= direction * train.rear_m or near >= end:
+            continue
+        wanted = train.tracks.get(name[0])
+        ready = train.train in point.locked and point.wanted == wanted
+        ready &= point.detected == wanted or Rule.POINTS_DETECTED not in rules
+        # points that the train stands on, locked by its passage, do not limit it
+        if not ready:
+            end = min(end, near)
+    if Rule.TRAIN_AHEAD in rules:
+        path = layout.pieces(train.rear_m, direction * end, train.tracks)
+        for other in state.trains.values():
+            if other.train == train.train:
+                continue
+            for lane, low, high in layout.pieces(*interval_of(other), other.tracks):
+                for mine, first, last in path:
+                    if mine == lane and low < last and first < high:
+                        end = min(end, direction * (low if direction > 0 else high))
+    return direction * (end - limits.margin_m)

@@ -1,0 +1,184 @@
+"""Intervals, authorities, routes and points: no overlap in seeded traffic, and each rule is needed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from railfix.ground.interlocking import (
+    ALL_RULES,
+    Interlocking,
+    InterlockingLimits,
+    PointState,
+    Rule,
+    TrainInterval,
+    extended,
+    points_reported,
+    released,
+    report_received,
+    route_requested,
+)
+from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.layout import Layout, LoopStation, overlap
+from railfix.ground.traffic import traffic
+from railfix.io.train_message import MessageStatus, TrainMessage
+
+pytestmark = [pytest.mark.requirement("F4"), pytest.mark.requirement("F5")]
+
+#: A 0 to 400 m, B 2000 to 2400 m; points of 50 m, tracks 50 to 350 m and 2050 to 2350 m.
+LAYOUT = Layout(
+    stations=(
+        LoopStation(name="A", begin_m=0.0, end_m=400.0, points_m=50.0),
+        LoopStation(name="B", begin_m=2000.0, end_m=2400.0, points_m=50.0),
+    )
+)
+LIMITS = InterlockingLimits(margin_m=20.0, release_s=3.0)
+
+
+def interval(train: int, direction: int, front: float, track: int, station: int) -> TrainInterval:
+    return TrainInterval(
+        train=train, direction=direction, rear_m=front - direction * 110.0, front_m=front + direction * 5.0,
+        end_m=front + direction * 5.0, sequence=0, tracks={station: track}, station=station,
+    )  # fmt: skip
+
+
+def message(train: int, sequence: int, front_m: float, facing: int = 1) -> TrainMessage:
+    return TrainMessage(
+        train=train, sequence=sequence, time_ns=1, sent_ns=1, line=1, chainage_cm=round(front_m * 100), over_cm=1000,
+        under_cm=500, facing=facing, standstill=True, status=MessageStatus.POSITION, length_cm=10_000,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def state() -> Interlocking:
+    """Train 1 up in A on track 1, train 2 down in B on track 2."""
+    trains = {1: interval(1, 1, 330.0, 1, 0), 2: interval(2, -1, 2070.0, 2, 1)}
+    return Interlocking(trains=trains, points={name: PointState() for name in LAYOUT.points()})
+
+
+def test_pieces_of_an_interval() -> None:
+    assert LAYOUT.pieces(300.0, 2100.0, {0: 2, 1: 1}) == [(2, 300.0, 350.0), (0, 350.0, 2050.0), (3, 2050.0, 2100.0)]
+    assert LAYOUT.pieces(2100.0, 300.0, {0: 2}) == LAYOUT.pieces(300.0, 2100.0, {0: 2})
+    assert LAYOUT.pieces(-20.0, 60.0, {}) == [(0, -20.0, 50.0), (1, 50.0, 60.0)]
+    assert not overlap(LAYOUT.pieces(100.0, 300.0, {0: 1}), LAYOUT.pieces(100.0, 300.0, {0: 2}))
+    assert overlap(LAYOUT.pieces(100.0, 360.0, {0: 1}), LAYOUT.pieces(351.0, 500.0, {0: 2}))
+
+
+def test_a_route_by_hand(state: Interlocking) -> None:
+    """Train 1 from A to track 1 of B: no points have to move; the authority ends 20 m before the end of track 1."""
+    routed, moved, reason = route_requested(state, 1, LAYOUT)
+    assert (moved, reason) == ((), None)
+    assert extended(routed, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(2350.0 - 20.0)
+    # now train 2 may neither have the section nor, without that rule, the points
+    assert route_requested(routed, 2, LAYOUT)[2] == "train 1 comes the other way"
+    without = ALL_RULES - {Rule.DIRECTION}
+    assert "locked" in (route_requested(routed, 2, LAYOUT, rules=without)[2] or "")
+    assert route_requested(replace(state, stopped=True), 1, LAYOUT)[2] == "satellite positioning is suspended"
+
+
+def test_an_authority_ends_before_points_until_they_are_detected(state: Interlocking) -> None:
+    """Train 2 leaves track 2: both points move, then the authority passes them."""
+    routed, moved, reason = route_requested(state, 2, LAYOUT)
+    assert (set(moved), reason) == ({(1, -1), (0, 1)}, None)
+    assert extended(routed, LAYOUT, limits=LIMITS).trains[2].end_m == 2065.0  # 2050 + 20 m is no extension
+    near = extended(points_reported(routed, (1, -1), 2), LAYOUT, limits=LIMITS)
+    assert near.trains[2].end_m == pytest.approx(400.0 + 20.0)
+    through = extended(points_reported(near, (0, 1), 2), LAYOUT, limits=LIMITS)
+    assert through.trains[2].end_m == pytest.approx(50.0 + 20.0)
+
+
+def test_a_follower_ends_before_the_safe_rear_of_the_train_ahead(state: Interlocking) -> None:
+    ahead = replace(interval(3, 1, 1500.0, 1, 0), tracks={0: 1, 1: 1}, station=1)
+    state = replace(state, trains={1: state.trains[1], 3: ahead})
+    routed, _, reason = route_requested(state, 1, LAYOUT)
+    assert "taken by train 3" in (reason or "")  # it has no route onwards yet
+    follower = replace(state.trains[1], tracks={0: 1, 1: 1}, station=1)
+    points = {name: PointState(locked={1: None, 3: None}) for name in LAYOUT.points()}
+    both = replace(routed, trains={1: follower, 3: ahead}, points=points)
+    assert extended(both, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1390.0 - 20.0)
+    later = report_received(both, message(3, 1, 1600.0), LAYOUT)
+    assert later.trains[3].rear_m == pytest.approx(1600.0 - 110.0)
+    assert extended(later, LAYOUT, limits=LIMITS).trains[1].end_m == pytest.approx(1490.0 - 20.0)
+
+
+def test_points_are_released_after_the_rear_end_and_the_time(state: Interlocking) -> None:
+    routed, _, _ = route_requested(state, 1, LAYOUT)
+    assert 1 in released(routed, 10.0, LAYOUT, limits=LIMITS).points[0, 1].locked
+    passed = report_received(routed, message(1, 1, 520.0), LAYOUT)  # safe rear 410 m, points end at 400 m
+    waiting = released(passed, 20.0, LAYOUT, limits=LIMITS)
+    assert 1 in released(waiting, 22.9, LAYOUT, limits=LIMITS).points[0, 1].locked
+    done = released(waiting, 23.0, LAYOUT, limits=LIMITS)
+    assert done.points[0, 1].locked == {}
+    assert 1 in done.points[1, -1].locked
+
+
+def test_reports_that_change_nothing(state: Interlocking) -> None:
+    state = report_received(state, message(1, 5, 335.0), LAYOUT)
+    assert report_received(state, message(1, 5, 340.0), LAYOUT) == state
+    assert report_received(state, message(1, 4, 340.0), LAYOUT) == state
+    assert report_received(state, message(9, 9, 340.0), LAYOUT) == state
+    lost = TrainMessage(train=1, sequence=9, time_ns=1, sent_ns=1, line=1)
+    assert report_received(state, lost, LAYOUT) == state
+    # changed ends: only inside the station
+    assert report_received(state, message(1, 6, 345.0, facing=-1), LAYOUT).trains[1].direction == 1
+    turned = report_received(state, message(1, 6, 200.0, facing=-1), LAYOUT).trains[1]
+    assert (turned.direction, turned.rear_m, turned.end_m) == (-1, 310.0, 195.0)
+
+
+def test_stored_text_gives_the_same_state(state: Interlocking) -> None:
+    routed, _, _ = route_requested(state, 2, LAYOUT)
+    assert from_json(to_json(routed)) == routed
+
+
+def violations(seeds: range, steps: int, rules: frozenset[Rule] = ALL_RULES) -> tuple[Counter[str], int]:
+    counted: Counter[str] = Counter()
+    routes = 0
+    for seed in seeds:
+        run = traffic(seed, rules=rules)
+        for _ in range(steps):
+            run.step()
+            if run.violations and rules != ALL_RULES:
+                break
+        counted += run.violations
+        routes += run.arrivals
+    return counted, routes
+
+
+@pytest.mark.parametrize(
+    ("seeds", "steps"),
+    [(range(24), 250), pytest.param(range(1000), 600, marks=pytest.mark.slow)],
+    ids=["24 runs", "1000 runs"],
+)
+def test_no_overlap_in_traffic_of_eight_trains(seeds: range, steps: int) -> None:
+    """Loss 30 %, delays to 8 s, outages, stops of the centre, sensor failures."""
+    counted, routes = violations(seeds, steps)
+    assert counted == Counter()
+    assert routes > 8 * len(seeds)
+
+
+#: Seeds whose run shows that the rule is needed.
+NEEDED = {
+    Rule.TRAIN_AHEAD: (1, "intervals overlap"),
+    Rule.SAFE_REAR: (0, "train outside its interval"),
+    Rule.SEQUENCE: (1, "intervals overlap"),
+    Rule.POINTS_LOCKED: (1, "points moved under a train"),
+    Rule.POINTS_DETECTED: (13, "train on moving points"),
+    Rule.PERSISTENCE: (1, "train outside its interval"),
+    Rule.SUPERVISION: (0, "train outside its interval"),
+}
+
+
+@pytest.mark.parametrize("rule", NEEDED, ids=lambda rule: rule.name.lower())
+def test_without_a_rule_the_traffic_breaks_an_invariant(rule: Rule) -> None:
+    seed, kind = NEEDED[rule]
+    counted, _ = violations(range(seed, seed + 1), 300, ALL_RULES - {rule})
+    assert counted[kind] > 0
+
+
+def test_the_direction_of_a_section_is_a_second_defence_behind_the_points() -> None:
+    """Opposing trains use different tracks at both ends, so locked points already keep one of them out."""
+    assert violations(range(3), 150, ALL_RULES - {Rule.DIRECTION})[0] == Counter()
+    counted, _ = violations(range(1, 2), 150, ALL_RULES - {Rule.DIRECTION, Rule.POINTS_LOCKED})
+    assert counted["trains overlap"] > 0
