@@ -26,7 +26,9 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "A5": "carrier phase beside code in the constrained model",
         "A6": "conventional position (3-D single point, nearest point of the trajectory) as the yardstick",
         "A7": "RINEX 2, 3, 4 observations and navigation of five systems, plain or packed, and SP3",
-        "A8": "live epoch processor at 10 Hz with the code of the batch",
+        "A8": "live epoch processor at 10 Hz with the code of the batch; receiver streams in, messages out; two channels",
+        "A9": "reference frames and epochs of maps: ETRS89, JGD2011, NAD83(2011), GDA2020, ITRF",
+        "A10": "network of tracks with switches; routes over it; positions that name their track",
     },
     "Multipath screens": {
         "B0": "elevation mask, satellite health, age of the ephemeris",
@@ -36,7 +38,7 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "B4": "fault detection and exclusion of up to two satellites",
         "B5": "positions of two antennas against their spacing along the track",
         "B6": "chi-square RAIM with detectable bias, slope and protection level",
-        "B7": "every refused observation and every epoch without a position has its reason; the reasons add up",
+        "B7": "every rejected observation and every epoch without a position has its reason; the reasons add up",
     },
     "Integrity": {
         "C1": "SBAS messages and corrections",
@@ -48,7 +50,7 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "D1": "reference position from RTK, axle pulses, Doppler and acceleration",
         "D2": "figures of merit: signed along-track error, positioning rate, positioning interval",
         "D3": "one report with the pictures of any run, for a browser",
-        "D4": "simulator of a train on a track with cant, two antennas and satellites; RINEX and the truth",
+        "D4": "simulator of a train on a track with cant, two antennas and satellites; RINEX and ground truth",
     },
     "On-board sensors": {
         "E1": "pitch, slip and slide, low speed and rolling from inertial sensor and tachometer",
@@ -62,6 +64,12 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "F1": "reference triangle of receivers: circles, shape, cause, stop command",
         "F2": "control centre: position reports, timeout, simulated running, resynchronisation",
         "F3": "redundant encrypted links with fail-over",
+        "F4": "running intervals: no two occupied ones ever overlap",
+        "F5": "routes: position reports set and lock points and signals",
+    },
+    "Scale and use": {
+        "G1": "campaigns: hundreds of logs on many cores or machines, resumable, one table of results",
+        "G2": "notebooks: stages and results as arrays, polars, pandas, xarray; pictures at hand",
     },
 }
 
