@@ -32,7 +32,7 @@ class _Program(LazyCommands):
         "simulate": "Simulate runs with ground truth.",
         "report": "Write an HTML report on runs.",
         "ground": "Monitor satellites by a reference triangle, demonstrate the ground side.",
-        "map": "Check a track map, or make one from positions.",
+        "map": "Check a track map, make one, or put positions on a network.",
     }
 
 

@@ -1,4 +1,4 @@
-"""``railfix map``: check a track map, or make one from good positions."""
+"""``railfix map``: check a track map, make one, and networks of tracks."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.table import Table
 
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
+from railfix.cli.map_network import columns_of, match_command, network, route
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.io.position_log import read_positions
@@ -34,7 +35,7 @@ app = typer.Typer(
     name="map",
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Check a track map before positions on it are used, or make one from positions.",
+    help="Check a track map, make one from positions or of a network, and put positions on a network.",
 )
 
 #: Findings printed before the rest is only counted.
@@ -149,7 +150,7 @@ def from_positions_command(
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[positions])
-    log = read_positions(positions, columns=_columns(column or []))
+    log = read_positions(positions, columns=columns_of(column))
     track, thinned = from_position_log(
         log,
         spacing_m=spacing,
@@ -161,21 +162,16 @@ def from_positions_command(
     _print_thinned(track, thinned, len(log), out)
 
 
+app.command("network", cls=Command)(network)
+app.command("route", cls=Command)(route)
+app.command("match", cls=Command)(match_command)
+
+
 def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{path}: the folder cannot be made ({error.strerror})") from None
-
-
-def _columns(pairs: list[str]) -> dict[str, str]:
-    columns: dict[str, str] = {}
-    for pair in pairs:
-        ours, equals, theirs = pair.partition("=")
-        if not equals or not ours.strip() or not theirs.strip():
-            raise SettingsError(f"--column {pair!r}: expected NAME=COLUMN, for example latitude_deg=Lat")
-        columns[ours.strip()] = theirs.strip()
-    return columns
 
 
 def _qualities(text: str | None) -> list[int] | None:

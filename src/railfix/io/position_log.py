@@ -98,7 +98,7 @@ def _read_csv(path: str | PathLike[str], columns: dict[str, str]) -> PositionLog
     unknown = sorted(set(columns) - set(CSV_COLUMNS))
     if unknown:
         raise SettingsError(f"{path}: column {unknown[0]!r} is unknown; expected one of {', '.join(CSV_COLUMNS)}")
-    return positions_of_table(_renamed(read_named_columns(path), columns))
+    return positions_of_table(renamed(read_named_columns(path), columns))
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
@@ -135,7 +135,8 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     )
 
 
-def _renamed(table: NamedColumns, columns: dict[str, str]) -> NamedColumns:
+def renamed(table: NamedColumns, columns: dict[str, str]) -> NamedColumns:
+    """Give columns of a table the names that railfix has for them; see `read_positions`."""
     cells = dict(table.cells)
     for ours, theirs in columns.items():
         if theirs not in table.cells:

@@ -86,6 +86,30 @@ def read_track(
     segments: list[Segment] = []
     for file in files:
         segments += read_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
+    return track_of_segments(
+        segments,
+        heights=heights,
+        geoid=geoid,
+        name=name,
+        height_datum=height_datum,
+        max_gap_m=max_gap_m,
+        sigma_plan_m=sigma_plan_m,
+        sigma_height_m=sigma_height_m,
+    )
+
+
+def track_of_segments(
+    segments: Sequence[Segment],
+    *,
+    heights: str | PathLike[str] | None = None,
+    geoid: str | None = None,
+    name: str | None = None,
+    height_datum: str | None = None,
+    max_gap_m: float = MAX_GAP_M,
+    sigma_plan_m: float | None = None,
+    sigma_height_m: float | None = None,
+) -> Track:
+    """Join segments to a track, with heights from a second source where they have none; see `read_track`."""
     flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
     if flat and heights is None:
         raise InputFileError(

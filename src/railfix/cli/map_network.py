@@ -1,0 +1,244 @@
+"""``railfix map network``, ``map route`` and ``map match``: networks of tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from railfix.cli.console import console_of_tables, show_notes
+from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.core.errors import MapQualityError, MismatchError, SettingsError
+from railfix.core.files import write_whole
+from railfix.run.options import TrackReading
+from railfix.run.output import check_output_file
+from railfix.track import write_track_csv
+from railfix.track.network import TOLERANCE_M, Network, read_network
+from railfix.track.network_check import check_network
+from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions, route_of
+from railfix.track.read import track_of_segments
+
+#: Findings printed before the rest is only counted.
+_SHOWN = 40
+
+Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
+Tolerance = Annotated[
+    float, typer.Option(metavar="M", help="Ends nearer than this are one point, where the file has no connections.")
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=COLUMN", help="Column of a CSV log under another name; may be repeated."),
+]
+
+
+def columns_of(pairs: list[str] | None) -> dict[str, str]:
+    """Names of columns in railfix and in the file, of ``NAME=COLUMN`` texts."""
+    columns: dict[str, str] = {}
+    for pair in pairs or []:
+        ours, equals, theirs = pair.partition("=")
+        if not equals or not ours.strip() or not theirs.strip():
+            raise SettingsError(f"--column {pair!r}: expected NAME=COLUMN, for example latitude_deg=Lat")
+        columns[ours.strip()] = theirs.strip()
+    return columns
+
+
+def _network(maps: list[Path], reading: TrackReading, tolerance: float) -> Network:
+    if not tolerance > 0.0:
+        raise SettingsError("--tolerance must be positive")
+    return read_network(
+        maps, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid, tolerance_m=tolerance
+    )
+
+
+@from_models
+def network(
+    maps: Maps,
+    *,
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate")],
+    tolerance: Tolerance = TOLERANCE_M,
+    out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Check a network of tracks and print its faults.
+
+    Checked: gaps between ends, connections that do not meet, dead ends, kinks at switches, tracks nearer to each
+    other than vehicles need.
+
+    Example: `railfix map network tracks.gpkg --out network.png`
+
+    Exit codes as `railfix --help` says; 6 where the network has gaps, kinks, or connections that do not meet.
+    """
+    if out is not None:
+        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=maps)
+    tracks = _network(maps, reading, tolerance)
+    quality = check_network(tracks)
+    console = console_of_tables()
+    console.print(
+        f"{quality.tracks} tracks, {quality.length_m / 1e3:,.1f} km, {quality.switches} switches, {quality.ends} ends "
+        f"without connection, {quality.parts} separate part(s)"
+    )
+    show_notes(console, dict.fromkeys([*tracks.notes, *(n for t in tracks.tracks for n in t.notes)]))
+    if quality.findings:
+        table = Table("kind", "latitude", "longitude", "finding", show_edge=False)
+        for finding in quality.findings[:_SHOWN]:
+            table.add_row(finding.kind, f"{finding.latitude_deg:.6f}", f"{finding.longitude_deg:.6f}", finding.sentence)
+        console.print(table)
+        if len(quality.findings) > _SHOWN:
+            console.print(f"... and {len(quality.findings) - _SHOWN} more")
+    if out is not None:
+        from railfix.report.plots.network import plot_network
+
+        plot_network(tracks, out, quality=quality)
+        console.print(f"picture: {out}", markup=False, soft_wrap=True)
+    faults = [f for f in quality.findings if f.kind in ("gap", "joint", "kink")]
+    if faults:
+        raise MapQualityError(f"the network has {len(faults)} fault(s), the first: {faults[0].sentence}")
+
+
+@from_models
+def route(
+    maps: Maps,
+    *,
+    out: Annotated[Path, typer.Option(metavar="TRACK.csv", help="Track map to write.")],
+    tracks: Annotated[
+        str | None, typer.Option(metavar="NAME,NAME...", help="Tracks to pass, in order; others between are found.")
+    ] = None,
+    via: Annotated[
+        list[str] | None, typer.Option(metavar="LAT,LON", help="A point to pass; repeat it in the order of travel.")
+    ] = None,
+    positions: Annotated[Path | None, typer.Option(metavar="LOG", help="Positions of a run on the route.")] = None,
+    heights: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Heights of a map without: CSV by chainage_m or kilometrage_m, or positions of a run."
+        ),
+    ] = None,
+    column: Columns = None,
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate")],
+    tolerance: Tolerance = TOLERANCE_M,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Make the track map of one route from a network or any map file.
+
+    The route is named by its tracks, by points that it passes, or found from the positions of a run.
+
+    Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
+
+    Exit codes as `railfix --help` says; 5 where no route leads from one place to the next.
+    """
+    ways = [w for w in (tracks, via, positions) if w]
+    if len(ways) > 1:
+        raise SettingsError("give one of --tracks, --via and --positions")
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=maps)
+    net = _network(maps, reading, tolerance)
+    if tracks:
+        passed = net.shortest_route([net.index_of(name.strip()) for name in tracks.split(",")])
+    elif via:
+        passed = net.shortest_route([_track_at(net, text) for text in via])
+    elif positions is not None:
+        log = read_plan_positions(positions, columns=columns_of(column))
+        passed = route_of(net, match(net, log))
+        if not passed:
+            raise MismatchError(f"{positions}: no position lies near a track of the network")
+    elif len(net.tracks) == 1:
+        passed = [0]
+    else:
+        raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
+    track = track_of_segments([net.tracks[k] for k in passed], heights=heights, geoid=reading.geoid)
+    write_track_csv(track, out)
+    console = console_of_tables()
+    console.print(f"route: {', '.join(net.names[k] for k in passed)}", markup=False, soft_wrap=True)
+    console.print(f"{len(track)} points, {track.chainage_m[-1]:,.1f} m")
+    show_notes(console, track.provenance.notes)
+    console.print(f"track map: {out}", markup=False, soft_wrap=True)
+
+
+def _track_at(net: Network, text: str) -> int:
+    try:
+        latitude, longitude = (float(v) for v in text.split(","))
+    except ValueError:
+        raise SettingsError(f"--via {text!r}: expected LATITUDE,LONGITUDE in degrees, for example 50.8,4.5") from None
+    near = net.near(np.array([latitude]), np.array([longitude]), within_m=200.0, most=1)
+    if near.track[0, 0] < 0:
+        raise MismatchError(f"--via {text}: no track within 200 m")
+    return int(near.track[0, 0])
+
+
+@from_models
+def match_command(
+    maps: Maps,
+    *,
+    log: Annotated[Path, typer.Option(metavar="LOG", help="Positions: .pos, NMEA, GPX, or CSV with named columns.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Positions on the network to write.")],
+    picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
+    sigma: Annotated[
+        float, typer.Option(metavar="M", help="Sigma of the distance from the track, map included.")
+    ] = 2.0,
+    column: Columns = None,
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate")],
+    tolerance: Tolerance = TOLERANCE_M,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.
+
+    Positions are taken in the frame of the map. Positions far from all tracks have none.
+
+    Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
+
+    Exit codes as `railfix --help` says.
+    """
+    if not sigma > 0.0:
+        raise SettingsError("--sigma must be positive")
+    for target in [out] if picture is None else [out, picture]:
+        check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log])
+    net = _network(maps, reading, tolerance)
+    positions = read_plan_positions(log, columns=columns_of(column))
+    matched = match(net, positions, sigma_m=sigma)
+    write_whole(out, _matched_csv(net, positions, matched))
+    console = console_of_tables()
+    on = matched.track >= 0
+    console.print(
+        f"{len(on)} positions, {on.sum()} on a track ({on.mean():.1%}), {(np.abs(matched.offset_m) <= 5.0).mean():.1%} "
+        f"within 5 m of it; {(matched.probability < 0.9).sum()} with a probability below 0.9"
+    )
+    show_notes(console, net.notes)
+    if picture is not None:
+        from railfix.report.plots.network import plot_network
+
+        plot_network(net, picture, run=(positions, matched))
+        console.print(f"picture: {picture}", markup=False, soft_wrap=True)
+    console.print(f"positions: {out}", markup=False, soft_wrap=True)
+
+
+def _matched_csv(net: Network, log: PlanLog, matched: Matched) -> str:
+    names = (*net.names, "")
+    kilometrage = np.full(len(matched.track), np.nan)
+    for k in np.unique(matched.track[matched.track >= 0]):
+        rows = matched.track == k
+        way = net.chainage_m[net.first_point[k] : net.first_point[k + 1]]
+        kilometrage[rows] = np.interp(matched.chainage_m[rows], way, net.tracks[k].kilometrage_m)
+    other = np.where(matched.candidates.track == matched.track[:, None], -1.0, matched.probabilities)
+    second = np.argmax(other, axis=1)
+    rows_of = np.arange(len(second))
+    next_track = np.where(other[rows_of, second] > 0.0, matched.candidates.track[rows_of, second], -1)
+    lines = [
+        "time_gpst,latitude_deg,longitude_deg,track,chainage_m,kilometrage_m,offset_m,probability,next_track,"
+        "next_probability,unmapped_probability"
+    ]
+    unmapped = np.clip(1.0 - matched.probabilities.sum(axis=1), 0.0, 1.0)
+
+    def number(value: float, digits: int) -> str:
+        return "" if np.isnan(value) else f"{value:.{digits}f}"
+
+    for k in range(len(second)):
+        quoted = [f'"{names[t]}"' if "," in names[t] else names[t] for t in (int(matched.track[k]), int(next_track[k]))]
+        lines.append(
+            f"{'' if np.isnat(log.time[k]) else log.time[k]},{number(log.latitude_deg[k], 9)},"
+            f"{number(log.longitude_deg[k], 9)},{quoted[0]},{number(matched.chainage_m[k], 3)},"
+            f"{number(kilometrage[k], 3)},{number(matched.offset_m[k], 3)},{matched.probability[k]:.6f},{quoted[1]},"
+            f"{max(other[k, second[k]], 0.0):.6f},{unmapped[k]:.6f}"
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,401 @@
+"""A network of tracks: track centrelines, the connections of their ends, and routes through it (P1 4.2(1)).
+
+Connections are those that the file states (net relations of railML 3 and RailTopoModel, as the Belgian
+infrastructure manager publishes them), else ends nearer to each other than a tolerance. A train passes from one
+track to another only over a connection that is navigable: of a switch the stem and each leg, never the two legs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from os import PathLike
+from typing import Final, cast
+
+import networkx as nx
+import numpy as np
+from scipy.spatial import cKDTree
+
+from railfix.core.arrays import Floats, Indices, read_only
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import ending
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.track.polyline import project_on_segments
+from railfix.track.read import read_segments
+from railfix.track.segment import NO_HEIGHTS, Segment
+from railfix.track.vector_file import read_layers
+from railfix.track.xml_files import Relation, read_railml_relations
+
+#: Ends nearer than this are one point, where the file states no connection [m].
+TOLERANCE_M: Final = 0.5
+#: Largest change of direction between two tracks that a train passes [rad]; the legs of a switch differ by about pi.
+_LARGEST_TURN_RAD: Final = np.radians(60.0)
+#: Way over which the direction of an end is taken [m].
+_DIRECTION_M: Final = 10.0
+#: Ways searched before the whole network is [m].
+_NEAR_WAY_M: Final = 5_000.0
+#: Spacing of the samples of the spatial index [m].
+_SAMPLE_M: Final = 50.0
+#: Nearest samples examined for each position.
+_SAMPLES: Final = 48
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """Connection of the end of a track with the end of another; ends are 0 (first point) and 1 (last)."""
+
+    first: int
+    first_end: int
+    second: int
+    second_end: int
+    navigable: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Candidates:
+    """Tracks near positions, n positions with up to m tracks each, nearest first.
+
+    Attributes
+    ----------
+    track : ndarray of int, shape (n, m)
+        -1 where there are fewer tracks.
+    chainage_m, offset_m : ndarray, shape (n, m)
+        Along the track from its first point, and distance in plan, positive to the right; NaN and infinite where
+        there is no track.
+    """
+
+    track: Indices
+    chainage_m: Floats
+    offset_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """Tracks and their connections.
+
+    Attributes
+    ----------
+    tracks : tuple of Segment
+        Each from one end or switch to the next; heights may be missing (`NO_HEIGHTS`).
+    links : tuple of Link
+    notes : tuple of str
+        How connections were found.
+    """
+
+    tracks: tuple[Segment, ...]
+    links: tuple[Link, ...]
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tracks, those of the file; repeated ones numbered."""
+        seen: dict[str, int] = {}
+        names = []
+        for track in self.tracks:
+            name = track.metadata.get("name") or track.source
+            seen[name] = seen.get(name, 0) + 1
+            names.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+        return tuple(names)
+
+    @cached_property
+    def first_point(self) -> Indices:
+        """Index of each track's first point in `points_m`, and one past the last, shape (tracks + 1,)."""
+        return np.concatenate([[0], np.cumsum([len(t.latitude_deg) for t in self.tracks])]).astype(np.intp)
+
+    @cached_property
+    def points_m(self) -> Floats:
+        """Points of all tracks on the ellipsoid, shape (V, 3) ECEF [m]: distances are those in plan."""
+        latitude = np.concatenate([t.latitude_deg for t in self.tracks])
+        longitude = np.concatenate([t.longitude_deg for t in self.tracks])
+        return read_only(ecef_from_geodetic(latitude, longitude, np.zeros(len(latitude))))
+
+    @cached_property
+    def chainage_m(self) -> Floats:
+        """Length in plan on the ellipsoid from the first point of its track, of each point of `points_m`."""
+        steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
+        steps[self.first_point[1:-1] - 1] = 0.0
+        way = np.concatenate([[0.0], np.cumsum(steps)])
+        return read_only(way - np.repeat(way[self.first_point[:-1]], np.diff(self.first_point)))
+
+    @cached_property
+    def length_m(self) -> Floats:
+        """Length of each track, shape (tracks,)."""
+        return read_only(self.chainage_m[self.first_point[1:] - 1])
+
+    @cached_property
+    def graph(self) -> nx.DiGraph[int]:
+        """Directed graph of passages: node 4 t + 2 e is entering track t at end e, 4 t + 2 e + 1 leaving it there."""
+        graph: nx.DiGraph[int] = nx.DiGraph()
+        for t, length in enumerate(self.length_m.tolist()):
+            graph.add_edge(4 * t, 4 * t + 3, weight=length)
+            graph.add_edge(4 * t + 2, 4 * t + 1, weight=length)
+        for link in self.links:
+            if link.navigable:
+                a, b = 4 * link.first + 2 * link.first_end, 4 * link.second + 2 * link.second_end
+                graph.add_edge(a + 1, b, weight=0.0)
+                graph.add_edge(b + 1, a, weight=0.0)
+        return graph
+
+    @cached_property
+    def _index(self) -> tuple[cKDTree, Indices, Indices]:
+        """Tree of samples of all segments, and segment and track of each sample."""
+        steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
+        inner = np.ones(len(steps), dtype=np.bool_)
+        inner[self.first_point[1:-1] - 1] = False
+        segment = np.flatnonzero(inner & (steps > 0.0))
+        pieces = np.maximum(np.ceil(steps[segment] / _SAMPLE_M).astype(np.intp), 1)
+        of = np.repeat(segment, pieces)
+        share = (np.arange(len(of)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / np.repeat(pieces, pieces)
+        samples = self.points_m[of] + share[:, None] * (self.points_m[of + 1] - self.points_m[of])
+        track = np.searchsorted(self.first_point, of, side="right") - 1
+        return cKDTree(samples, balanced_tree=False), of, track
+
+    def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
+        """Tracks within a distance in plan of positions, shapes (n,), by a spatial index of all tracks."""
+        points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
+        tree, segment, of_track = self._index
+        count = min(_SAMPLES, len(segment))
+        usable = ~np.isnan(points[:, 0])
+        distance, sample = tree.query(
+            np.where(usable[:, None], points, 0.0), k=np.arange(1, count + 1), distance_upper_bound=within_m + _SAMPLE_M
+        )
+        present = np.isfinite(np.asarray(distance, dtype=np.float64))
+        sample = np.where(present, np.asarray(sample, dtype=np.intp), 0)
+        of, track = segment[sample], np.where(present, of_track[sample], -1)
+        start, step = self.points_m[of], self.points_m[of + 1] - self.points_m[of]
+        share, offset = project_on_segments(points[:, None], start, step)
+        offset = np.where(present & (offset <= within_m), offset, np.inf)
+        side = np.einsum("nki,nki->nk", np.cross(step, points[:, None] - start), points[:, None])
+        chainage = self.chainage_m[of] + share * np.linalg.norm(step, axis=-1)
+        # the nearest segment of each track: rows ordered by track, then by distance
+        order = np.lexsort((offset, track), axis=-1)
+        ordered = np.take_along_axis(track, order, axis=1)
+        first = np.ones_like(ordered, dtype=np.bool_)
+        first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
+        best = np.where(first, np.take_along_axis(offset, order, axis=1), np.inf)
+        picked = np.take_along_axis(order, np.argsort(best, axis=1, kind="stable")[:, :most], axis=1)
+        off = np.sort(best, axis=1)[:, :most]
+        found = np.isfinite(off)
+        sign = np.where(np.take_along_axis(side, picked, axis=1) > 0.0, -1.0, 1.0)
+        return Candidates(
+            track=np.where(found, np.take_along_axis(track, picked, axis=1), -1).astype(np.intp),
+            chainage_m=np.where(found, np.take_along_axis(chainage, picked, axis=1), np.nan),
+            offset_m=np.where(found, off * sign, np.inf),
+        )
+
+    def index_of(self, name: str) -> int:
+        """Number of the track of a name.
+
+        Raises
+        ------
+        SettingsError
+            There is no such track.
+        """
+        if name not in self.names:
+            close = [n for n in self.names if name.lower() in n.lower()][:3]
+            hint = f"; similar names: {', '.join(close)}" if close else f"; there are {len(self.names)} tracks"
+            raise SettingsError(f"there is no track {name!r} in the network{hint}")
+        return self.names.index(name)
+
+    def _ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
+        """Lengths and paths from a node, first near it and, where the track is not among them, in the whole network."""
+        for cutoff in (_NEAR_WAY_M, None):
+            length, path = cast(
+                "tuple[dict[int, float], dict[int, list[int]]]",
+                nx.single_source_dijkstra(self.graph, node, cutoff=cutoff),
+            )
+            if 4 * stop in length or 4 * stop + 2 in length:
+                break
+        return length, path
+
+    def shortest_route(self, stops: Sequence[int]) -> list[int]:
+        """Tracks of the shortest route that passes the given tracks in order, over navigable connections.
+
+        Raises
+        ------
+        MismatchError
+            No route leads from one to the next without turning back.
+        """
+        wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
+        best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
+        for stop in wanted[1:]:
+            reached: dict[int, tuple[float, list[int]]] = {}
+            for node, (cost, route) in best.items():
+                if node not in self.graph:
+                    continue
+                length, path = self._ways_from(node, stop)
+                for end in (0, 2):
+                    entry, leave = 4 * stop + end, 4 * stop + 3 - end
+                    if entry in length and cost + length[entry] < reached.get(leave, (np.inf, []))[0]:
+                        passed = [n // 4 for n in path[entry] if n % 2 == 0]
+                        reached[leave] = (cost + float(length[entry]), route + passed)
+            if not reached:
+                raise MismatchError(
+                    f"no route without turning back leads to track {self.names[stop]!r} over navigable connections"
+                )
+            best = reached
+        return min(best.values(), key=lambda item: item[0])[1]
+
+
+def read_network(
+    paths: Sequence[str | PathLike[str]],
+    *,
+    crs: str | None = None,
+    height_datum: str | None = None,
+    geoid: str | None = None,
+    tolerance_m: float = TOLERANCE_M,
+) -> Network:
+    """Read a network of tracks from map files.
+
+    Parameters
+    ----------
+    paths : sequence of paths
+        As `railfix.track.read.read_segments` reads them.
+    crs, height_datum, geoid : str, optional
+        As for `railfix.track.read_track`.
+    tolerance_m : float [m]
+        Where the files state no connections: ends nearer than this are one point, and a track on which the end of
+        another lies is divided there.
+
+    Raises
+    ------
+    InputFileError, SettingsError
+    """
+    tracks: list[Segment] = []
+    relations: list[Relation] = []
+    for path in paths:
+        tracks += read_segments(path, crs=crs, height_datum=height_datum, geoid=geoid, duplicates="keep")
+        relations += _relations(path)
+    if relations:
+        return _of_relations(tracks, relations, str(paths[0]))
+    divided, cuts = _divided(tracks, tolerance_m)
+    links = links_of_ends(divided, tolerance_m=tolerance_m)
+    note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
+    return Network(tracks=tuple(divided), links=links, notes=(note,))
+
+
+def _relations(path: str | PathLike[str]) -> list[Relation]:
+    """Connections that a file states, empty where it states none."""
+    if ending(path) in (".xml", ".railml"):
+        return read_railml_relations(path)
+    if ending(path) not in (".geojson", ".json", ".gpkg", ".fgb"):
+        return []
+    relations = []
+    for _, rows, _ in read_layers(path, geometry="Point"):
+        for row in rows:
+            if {"netelementA", "netelementB", "positionOnA", "positionOnB"} <= set(row):
+                relations.append(
+                    Relation(
+                        name=str(row.get("id", "")),
+                        first=str(row["netelementA"]),
+                        second=str(row["netelementB"]),
+                        first_end=int(row["positionOnA"]),
+                        second_end=int(row["positionOnB"]),
+                        navigable=str(row.get("navigability") or "both").lower() != "none",
+                    )
+                )
+    return relations
+
+
+def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -> Network:
+    number = {track.metadata.get("name"): k for k, track in enumerate(tracks)}
+    known = [r for r in relations if r.first in number and r.second in number]
+    if not known:
+        raise InputFileError(path, f"none of its {len(relations)} net relations names a track of the file")
+    links = tuple(
+        Link(
+            first=number[r.first],
+            first_end=r.first_end,
+            second=number[r.second],
+            second_end=r.second_end,
+            navigable=r.navigable,
+        )
+        for r in known
+    )
+    note = f"connections as {len(known)} net relations of the file state them"
+    if len(known) < len(relations):
+        note += f"; {len(relations) - len(known)} relations name a track that it does not have"
+    return Network(tracks=tuple(tracks), links=links, notes=(note,))
+
+
+def end_points(tracks: Iterable[Segment]) -> tuple[Floats, Floats]:
+    """Ends of tracks on the ellipsoid and unit vectors out of them, shapes (tracks, 2, 3)."""
+    ends, outward = [], []
+    for track in tracks:
+        points = ecef_from_geodetic(track.latitude_deg, track.longitude_deg, np.zeros(len(track.latitude_deg)))
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        inner = np.clip(np.searchsorted(way, _DIRECTION_M), 1, len(way) - 1)
+        outer = np.clip(np.searchsorted(way, way[-1] - _DIRECTION_M, side="right") - 1, 0, len(way) - 2)
+        arms = np.stack([points[0] - points[inner], points[-1] - points[outer]])
+        ends.append(points[[0, -1]])
+        outward.append(arms / np.linalg.norm(arms, axis=1, keepdims=True))
+    return np.array(ends), np.array(outward)
+
+
+def links_of_ends(tracks: Sequence[Segment], *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
+    """Connections of ends that lie within a tolerance; navigable where the direction changes by less than 60 deg."""
+    ends, outward = end_points(tracks)
+    tree = cKDTree(ends.reshape(-1, 3))
+    links = []
+    for a, b in sorted(tree.query_pairs(tolerance_m)):
+        turn = np.pi - np.arccos(np.clip(outward.reshape(-1, 3)[a] @ outward.reshape(-1, 3)[b], -1.0, 1.0))
+        links.append(
+            Link(
+                first=a // 2,
+                first_end=a % 2,
+                second=b // 2,
+                second_end=b % 2,
+                navigable=bool(turn < _LARGEST_TURN_RAD) and a // 2 != b // 2,
+            )
+        )
+    return tuple(links)
+
+
+def _divided(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], int]:
+    """Tracks divided at inner points on which the end of another track lies, and how many were divided."""
+    whole = Network(tracks=tuple(tracks), links=())
+    latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
+    longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
+    near = whole.near(latitude, longitude, within_m=tolerance_m)
+    cuts: dict[int, list[float]] = {}
+    for end, column in zip(*np.nonzero(near.track >= 0), strict=True):
+        other, place = int(near.track[end, column]), float(near.chainage_m[end, column])
+        if other != end // 2 and tolerance_m < place < whole.length_m[other] - tolerance_m:
+            cuts.setdefault(other, []).append(place)
+    parts: list[Segment] = []
+    for k, track in enumerate(tracks):
+        if k not in cuts:
+            parts.append(track)
+            continue
+        way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
+        places = sorted(cuts[k])
+        places = [p for i, p in enumerate(places) if i == 0 or p - places[i - 1] > tolerance_m]
+        bounds = [0.0, *places, float(way[-1])]
+        for number, (low, high) in enumerate(pairwise(bounds), start=1):
+            parts.append(_part(track, way, low, high, number))
+    return parts, len(cuts)
+
+
+def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> Segment:
+    inside = (way > low + 1e-6) & (way < high - 1e-6)
+    place = np.concatenate([[low], way[inside], [high]])
+    columns = {
+        name: np.interp(place, way, getattr(track, name))
+        for name in ("latitude_deg", "longitude_deg", "height_m", "kilometrage_m", "cant_m", "gradient_permille")
+    }
+    nearest = np.clip(np.searchsorted(way, place), 0, len(way) - 1)
+    name = f"{track.metadata.get('name', track.source)}/{number}"
+    return replace(
+        track,
+        **columns,
+        radius_m=track.radius_m[nearest],
+        source=f"{track.file} ({name})",
+        metadata=track.metadata | {"name": name},
+    )
+
+
+def has_heights(network: Network) -> bool:
+    """Whether every track has heights."""
+    return all(track.height_datum != NO_HEIGHTS for track in network.tracks)

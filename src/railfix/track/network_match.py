@@ -1,0 +1,244 @@
+"""Positions of a run on a network of tracks: the track of each, and how probable it is.
+
+A hidden Markov model over the log (Newson & Krumm 2009, doi:10.1145/1653771.1653818): a state is a track near the
+position or none of them; the likelihood is that of the distance in plan; a train changes to another track only over
+navigable connections whose way fits the distance run. Errors of neighbouring positions are common to them, so each
+position counts for the share of the correlation time that it covers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import Final
+
+import networkx as nx
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices
+from railfix.core.errors import InputFileError
+from railfix.core.files import ending
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.io.named_columns import read_named_columns
+from railfix.io.nmea import read_any_positions
+from railfix.io.position_log import positions_times, renamed
+from railfix.track.network import Candidates, Network
+
+#: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0.
+_UNMAPPED_COST: Final = 12.0
+#: Cost of passing from one track to another without a connection, and of leaving or entering the map.
+_JUMP_COST: Final = 18.0
+_LEAVE_COST: Final = 6.0
+#: Way by which the connection between two places may exceed the distance run [m].
+_SLACK_M: Final = 30.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanLog:
+    """Positions in plan, n rows.
+
+    Attributes
+    ----------
+    path : str
+    time : ndarray of datetime64[ns], shape (n,)
+        NaT where the log has none.
+    latitude_deg, longitude_deg : ndarray, shape (n,)
+        NaN where a row has no position.
+    """
+
+    path: str
+    time: Datetimes
+    latitude_deg: Floats
+    longitude_deg: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matched:
+    """Positions on a network, n rows.
+
+    Attributes
+    ----------
+    track : ndarray of int, shape (n,)
+        The most probable sequence; -1 where no track of the map fits.
+    chainage_m, offset_m : ndarray, shape (n,)
+        On that track, and distance in plan, positive to its right; NaN without a track.
+    probability : ndarray, shape (n,)
+        Of that track given the whole log.
+    candidates : Candidates
+    probabilities : ndarray, shape (n, m)
+        Of each candidate; the rest to 1 is that of no mapped track.
+    """
+
+    track: Indices
+    chainage_m: Floats
+    offset_m: Floats
+    probability: Floats
+    candidates: Candidates
+    probabilities: Floats
+
+
+def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PlanLog:
+    """Read positions in plan: any log of positions, or a CSV of latitude and longitude without heights.
+
+    Parameters
+    ----------
+    path : path
+    columns : mapping of str, optional
+        For CSV: name in railfix (``latitude_deg``, ``longitude_deg``, ``time_gpst``) to name in the file.
+
+    Raises
+    ------
+    InputFileError
+        The file is not a log of positions.
+    """
+    if ending(path) == ".csv":
+        table = renamed(read_named_columns(path), dict(columns or {}))
+        if "latitude_deg" in table and "longitude_deg" in table:
+            return PlanLog(
+                path=str(path),
+                time=positions_times(table),
+                latitude_deg=table.numbers("latitude_deg", blank=np.nan),
+                longitude_deg=table.numbers("longitude_deg", blank=np.nan),
+            )
+    elif columns:
+        raise InputFileError(path, "columns can be renamed in a .csv file only")
+    log = read_any_positions(path)
+    latitude, longitude, _ = geodetic_from_ecef(log.ecef_m)
+    return PlanLog(path=str(path), time=log.time, latitude_deg=latitude, longitude_deg=longitude)
+
+
+def match(
+    network: Network, log: PlanLog, *, sigma_m: float = 2.0, within_m: float = 30.0, correlation_s: float = 20.0
+) -> Matched:
+    """Match positions of a run to the tracks of a network.
+
+    Parameters
+    ----------
+    network : Network
+    log : PlanLog
+        In the order of travel, in the frame of the network.
+    sigma_m : float [m]
+        Standard deviation of the distance between position and track, map included.
+    within_m : float [m]
+        Farthest track considered.
+    correlation_s : float [s]
+        Time over which position errors persist.
+
+    Returns
+    -------
+    Matched
+    """
+    candidates = network.near(log.latitude_deg, log.longitude_deg, within_m=within_m)
+    n, m = candidates.track.shape
+    point = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(n))
+    step = np.nan_to_num(np.linalg.norm(np.diff(point, axis=0), axis=1))
+    seconds = np.diff(log.time) / np.timedelta64(1, "s")
+    weight = np.concatenate([[1.0], np.clip(np.where(np.isfinite(seconds), seconds, 0.4) / correlation_s, 1e-3, 1.0)])
+    known = candidates.track >= 0
+    cost = np.full((n, m + 1), np.inf)
+    cost[:, :m] = np.where(known, 0.5 * (np.where(known, candidates.offset_m, 0.0) / sigma_m) ** 2, np.inf)
+    cost[:, m] = np.where(np.isfinite(log.latitude_deg), _UNMAPPED_COST, 0.0)
+    cost *= weight[:, None]
+    moves = _Transitions(network, candidates, step)
+    path, gamma = _decode(cost, moves)
+    rows, mapped = np.arange(n), path < m
+    column = np.minimum(path, m - 1)
+    return Matched(
+        track=np.where(mapped, candidates.track[rows, column], -1),
+        chainage_m=np.where(mapped, candidates.chainage_m[rows, column], np.nan),
+        offset_m=np.where(mapped, candidates.offset_m[rows, column], np.nan),
+        probability=gamma[rows, path],
+        candidates=candidates,
+        probabilities=gamma[:, :m],
+    )
+
+
+class _Transitions:
+    """Cost of each passage from the candidates of an epoch to those of the next."""
+
+    def __init__(self, network: Network, candidates: Candidates, step_m: Floats) -> None:
+        self._network = network
+        self._track, self._place = candidates.track, candidates.chainage_m
+        self._step = step_m
+        self._ways: dict[tuple[int, int], dict[int, float]] = {}
+        same = (self._track[1:, None, :] == self._track[:-1, :, None]) & (self._track[:-1, :, None] >= 0)
+        #: Cost to stay, shape (n - 1, m, m); other passages are computed where both ends have one.
+        self._same = same
+
+    def __call__(self, k: int) -> Floats:
+        """Costs from epoch k to k + 1, shape (m + 1, m + 1)."""
+        before, after = self._track[k], self._track[k + 1]
+        m = len(before)
+        cost = np.full((m + 1, m + 1), _LEAVE_COST)
+        cost[m, m] = 0.0
+        cost[:m, :m] = np.where(self._same[k], 0.0, _JUMP_COST)
+        for i in np.flatnonzero(before >= 0):
+            for j in np.flatnonzero((after >= 0) & ~self._same[k, i]):
+                if self._connected(k, int(i), int(j)):
+                    cost[i, j] = 0.0
+        return cost
+
+    def _connected(self, k: int, i: int, j: int) -> bool:
+        """Whether a train can have run from one place to the other in the distance between two positions."""
+        a, b = int(self._track[k, i]), int(self._track[k + 1, j])
+        place, target = float(self._place[k, i]), float(self._place[k + 1, j])
+        length, reach = self._network.length_m, float(self._step[k]) + _SLACK_M
+        for end in (0, 1):
+            rest = place if end == 0 else float(length[a]) - place
+            if rest > reach:
+                continue
+            ways = self._from(a, end)
+            for entry in (0, 1):
+                into = target if entry == 0 else float(length[b]) - target
+                if rest + ways.get(4 * b + 2 * entry, np.inf) + into <= reach:
+                    return True
+        return False
+
+    def _from(self, track: int, end: int) -> dict[int, float]:
+        if (track, end) not in self._ways:
+            node = 4 * track + 2 * end + 1
+            reach = float(self._step.max(initial=0.0)) + _SLACK_M
+            inside = node in self._network.graph
+            self._ways[track, end] = (
+                dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach)) if inside else {}
+            )
+        return self._ways[track, end]
+
+
+def _decode(cost: Floats, moves: _Transitions) -> tuple[Indices, Floats]:
+    """Most probable sequence of states (Viterbi) and the probability of each state (forward, backward)."""
+    n, states = cost.shape
+    best, back = cost[0].copy(), np.zeros((n, states), dtype=np.intp)
+    forward = np.zeros((n, states))
+    forward[0] = _normal(np.exp(-(cost[0] - cost[0].min())))
+    passages = []
+    for k in range(1, n):
+        move = moves(k - 1)
+        passages.append(np.exp(-move))
+        total = best[:, None] + move
+        back[k] = np.argmin(total, axis=0)
+        best = total[back[k], np.arange(states)] + cost[k]
+        forward[k] = _normal((forward[k - 1] @ passages[-1]) * np.exp(-(cost[k] - cost[k].min())))
+    backward = np.ones((n, states))
+    for k in range(n - 2, -1, -1):
+        backward[k] = _normal(passages[k] @ (np.exp(-(cost[k + 1] - cost[k + 1].min())) * backward[k + 1]))
+    gamma = forward * backward
+    path = np.zeros(n, dtype=np.intp)
+    path[-1] = int(np.argmin(best))
+    for k in range(n - 1, 0, -1):
+        path[k - 1] = back[k, path[k]]
+    return path, gamma / gamma.sum(axis=1, keepdims=True)
+
+
+def _normal(weights: Floats) -> Floats:
+    return np.asarray(weights / weights.sum())
+
+
+def route_of(network: Network, matched: Matched) -> list[int]:
+    """Tracks that a run passed, in order; gaps are filled with the shortest way over navigable connections."""
+    seen = matched.track[matched.track >= 0]
+    if not len(seen):
+        return []
+    changes = np.concatenate([[True], np.diff(seen) != 0])
+    return network.shortest_route([int(t) for t in seen[changes]])
