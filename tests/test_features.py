@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
+from pathlib import Path
 
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+from railfix.cli import app
 from railfix.motion.features import FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from railfix.simulate.demonstration import demo_inputs
 from tracking_cases import bent_line
 
 NOISE = (2e-4, 1e-4)
@@ -122,3 +128,14 @@ def test_features_of_a_map_are_where_the_line_bends() -> None:
     found = [f for f in map_features(series, limits=FeatureLimits()) if f.quantity == "curvature"]
     assert min(abs(f.arc_m - 500.0) for f in found) < 20.0
     assert min(abs(f.arc_m - 1000.0) for f in found) < 20.0
+
+
+@pytest.mark.requirement("E3")
+def test_the_command_lists_the_features_of_the_demonstration(tmp_path: Path) -> None:
+    out = tmp_path / "features.csv"
+    result = CliRunner().invoke(app, ["map", "features", str(demo_inputs().track[0]), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    rows = pl.read_csv(out)
+    assert rows.columns == ["chainage_m", "quantity", "change"]
+    assert len(rows) > 3
+    assert (rows["chainage_m"].diff().drop_nulls() >= 0.0).all()

@@ -104,6 +104,63 @@ def check(
         )
 
 
+@app.command("features", cls=Command)
+@from_models
+def features(
+    tracks: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="File for the features; printed alone without it.")
+    ] = None,
+    reading: Annotated[TrackReading, Without("reference")],
+    overwrite: OverwriteOption = False,
+) -> None:
+    """List the features of a line: the places where its gradient or its curvature changes.
+
+    A train that measures the same change knows where it is (`railfix.motion.features`). Changes are taken over 15 m,
+    about the distance of two bogies.
+
+    Example:
+
+        railfix map features line.csv --out features.csv
+
+    Exit codes: 0 done; 2 the command line was misused; 3 a file is not a track map; 4 an option is wrong; 8 the file
+    cannot be written; 1 a defect of railfix.
+    """
+    import polars as pl
+
+    from railfix.motion.features import line_series, map_features
+    from railfix.track.trajectory import Trajectory
+
+    if out is not None:
+        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=tracks)
+    track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
+    trajectory = Trajectory.from_track(track)
+    found = map_features(line_series(trajectory))
+    arc = np.array([feature.arc_m for feature in found])
+    rows = pl.DataFrame(
+        {
+            "chainage_m": trajectory.chainage_at(arc).round(2),
+            "quantity": pl.Series([feature.quantity for feature in found], dtype=pl.String),
+            "change": np.array([feature.change for feature in found], dtype=np.float64),
+        }
+    )
+    if out is not None:
+        rows.write_csv(out)
+    table = Table("chainage m", "quantity", "change", title=f"{track.name}: {len(found)} features")
+    for chainage, quantity, change in rows.head(_SHOWN).iter_rows():
+        unit = f"{1e3 * change:+.1f} permille" if quantity == "gradient" else f"{1e3 * change:+.2f} / km"
+        table.add_row(f"{chainage:.1f}", quantity, unit)
+    console_of_tables().print(table)
+    if len(found) > _SHOWN:
+        typer.echo(f"and {len(found) - _SHOWN} more")
+
+
 @app.command("from-positions", cls=Command)
 def from_positions_command(
     positions: Annotated[
