@@ -187,3 +187,19 @@ def test_probabilities_sum_to_one_and_motion_decides() -> None:
     assert np.exp(state.log_probability).sum() == pytest.approx(1.0)
     assert np.nanmax(result.probability) <= 1.0 + 1e-12
     assert np.abs(result.arc_m - arc)[-20:].max() < 8.0
+
+
+@pytest.mark.requirement("E5")
+def test_a_jump_of_50_m_at_the_mouth_of_a_tunnel_moves_the_answer_by_less_than_a_fifth() -> None:
+    """All codes agree on a place 50 m ahead for five epochs after the gap: the wheel has carried the right one."""
+    case = ride(150, trajectory=bent_line(4000.0), noise=0.3)
+    gap = np.zeros(150, dtype=bool)
+    gap[90:120] = True
+    blank = without_epochs(case.epochs, gap)
+    ahead, _ = case.line.at(case.arc_m + 50.0)
+    here, _ = case.line.at(case.arc_m)
+    sats = case.epochs.sat_ecef_m
+    moved = np.linalg.norm(sats - ahead[:, None], axis=2) - np.linalg.norm(sats - here[:, None], axis=2)
+    code = blank.code_m + np.where((np.arange(150) >= 120) & (np.arange(150) < 125), 1.0, 0.0)[:, None] * moved
+    result, _ = track(replace(blank, code_m=code), case.line, sensors=wheel(case))
+    assert np.abs(result.arc_m - case.arc_m)[85:].max() < 10.0
