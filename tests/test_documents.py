@@ -14,7 +14,10 @@ from readme_example import real, shown, without_duration
 from reference_document import DOCUMENT, document
 from traceability import TABLE, marked_tests, table
 
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "data/README.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 
 
 def test_traceability_is_up_to_date() -> None:
@@ -43,8 +46,16 @@ def test_markers_are_found_on_functions_classes_and_files(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
 def test_links_between_documents_lead_somewhere(path: Path) -> None:
-    targets = re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text(encoding="utf-8"))
-    assert [t for t in targets if not (path.parent / t).exists()] == []
+    links = re.findall(r"\]\((?!https?:)([^)#\s]*)(?:#([^)]+))?\)", path.read_text(encoding="utf-8"))
+    assert [target for target, _ in links if not (path.parent / target).exists()] == []
+    places = [(path.parent / target if target else path, place) for target, place in links if place]
+    assert [(str(target), place) for target, place in places if place not in anchors(target)] == []
+
+
+def anchors(path: Path) -> set[str]:
+    """Anchors of the headings of a document."""
+    lines = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
 
 
 def test_ci_runs_the_command_of_the_readme() -> None:
