@@ -343,7 +343,7 @@ def test_sbas_messages_of_a_receiver(recordings: Path, tmp_path: Path) -> None:
     log.write_bytes(data)
     read = read_sbas(log)
     kept = np.delete(np.arange(200), [17, 90])
-    assert read.refused["parity"] == 2
+    assert read.rejected["parity"] == 2
     assert read.time.tolist() == known.time[kept].tolist()
     assert read.prn.tolist() == known.prn[kept].tolist()
     assert read.type.tolist() == known.type[kept].tolist()

@@ -14,7 +14,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, open_stream
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.receiver import rtcm, ubx
+from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
 from railfix.io.receiver.framing import Frames, find_frames
 from railfix.io.receiver.measurements import Measurements, Tracking, joined, observations_of
@@ -86,7 +86,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
         unfinished = rtcm.unfinished_epoch(frames)
         if unfinished is not None:  # the rest of its messages is still to come: kept for the next block
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
-    raw = ubx.rawx_measurements(frames)
+    raw = _raw_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
     msm = _without(frames) if np.isnat(time) else rtcm.msm_measurements(frames, time)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
@@ -103,6 +103,15 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     )
     rest = buffer[frames.consumed :].tobytes()
     return piece, StreamState(rest=rest, subframes=subframes, messages=messages, time=last)
+
+
+def _raw_measurements(frames: Frames) -> Measurements:
+    """Measurements of the receiver's own format: RXM-RAWX, or MeasEpoch where there is none of these."""
+    return (
+        ubx.rawx_measurements(frames)
+        if not len(frames.of("sbf", sbf.MEAS_EPOCH))
+        else sbf.meas_epoch_measurements(frames)
+    )
 
 
 def _without(frames: Frames) -> Measurements:
@@ -124,7 +133,8 @@ def _navigation(
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
     """Ephemerides and SBAS messages of a block."""
     subframes = ubx.sfrbx_subframes(frames)
-    epochs_at = frames.frame_start[frames.of("ubx", ubx.RXM_RAWX)]
+    blocks = frames.of("ubx", ubx.RXM_RAWX)
+    epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     received = _time_at(subframes.order, epochs_at, raw.time, state.time)
     first, unfinished = assembled(subframes, received, state.subframes)
@@ -195,7 +205,7 @@ def scan_receiver_log(
         why = (
             "its observations (RTCM 3) carry no date; give one with --date"
             if undated
-            else "holds no observations (UBX RXM-RAWX, RTCM 3 MSM4 to MSM7)"
+            else "holds no observations (UBX RXM-RAWX, SBF MeasEpoch, RTCM 3 MSM4 to MSM7)"
         )
         raise InputFileError(path, why)
 

@@ -249,7 +249,7 @@ def from_receiver(frames: SbasFrames, *, source: str = "receiver") -> SbasMessag
 
 def _gather_frames(frames: SbasFrames, number: int, gathered: _Gathered) -> None:
     dated = ~np.isnat(frames.time)
-    gathered.refused["line"] += int(np.count_nonzero(~dated))
+    gathered.rejected["line"] += int(np.count_nonzero(~dated))
     since = (frames.time - GPS_EPOCH).astype(np.int64)
     for row in np.flatnonzero(dated).tolist():
         digits = frames.octets[row].tobytes().hex().upper()[:63]

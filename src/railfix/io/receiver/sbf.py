@@ -1,0 +1,238 @@
+"""Septentrio SBF blocks as arrays: measurements (MeasEpoch) and the receiver's own positions (PVTGeodetic).
+
+Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.8
+(PVTGeodetic).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP, SPEED_OF_LIGHT
+from railfix.core.timescale import from_week
+from railfix.io.receiver.framing import Frames
+from railfix.io.receiver.measurements import Measurements
+from railfix.io.receiver.ubx import gathered
+
+MEAS_EPOCH: Final = 4027
+PVT_GEODETIC: Final = 4007
+#: Constellation and RINEX signal by signal number.
+SIGNALS: Final = {
+    0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
+    11: "R2C", 12: "R3Q", 13: "C1P", 14: "C5P", 15: "I5A", 17: "E1C", 19: "E6C", 20: "E5Q", 21: "E7Q", 22: "E8Q",
+    24: "S1C", 25: "S5I", 26: "J5Q", 28: "C2I", 29: "C7I", 30: "C6I", 32: "J1L", 33: "J1Z", 34: "C7D", 39: "J5P",
+}  # fmt: skip
+#: First and last SVID of each constellation, and what is added to it for the RINEX number.
+_NUMBERS: Final = (
+    (1, 37, "G", 0), (38, 61, "R", -37), (63, 68, "R", -38), (71, 106, "E", -70), (120, 140, "S", -100),
+    (141, 180, "C", -140), (181, 187, "J", -180), (191, 197, "I", -190), (198, 215, "S", -157), (223, 245, "C", -182),
+)  # fmt: skip
+_HEAD: Final = np.dtype(
+    [
+        ("tow_ms", "<u4"),
+        ("week", "<u2"),
+        ("count", "u1"),
+        ("size1", "u1"),
+        ("size2", "u1"),
+        ("flags", "u1"),
+        ("_", "V2"),
+    ]
+)
+_FIRST: Final = np.dtype(
+    [
+        ("channel", "u1"), ("type", "u1"), ("sv", "u1"), ("misc", "u1"), ("code", "<u4"), ("doppler", "<i4"),
+        ("carrier", "<u2"), ("carrier_msb", "i1"), ("cn0", "u1"), ("lock", "<u2"), ("info", "u1"), ("count", "u1"),
+    ]
+)  # fmt: skip
+_OTHER: Final = np.dtype(
+    [
+        ("type", "u1"), ("lock", "u1"), ("cn0", "u1"), ("offsets", "u1"), ("carrier_msb", "i1"), ("info", "u1"),
+        ("code", "<u2"), ("carrier", "<u2"), ("doppler", "<u2"),
+    ]
+)  # fmt: skip
+_PVT: Final = np.dtype(
+    [
+        ("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("latitude", "<f8"), ("longitude", "<f8"),
+        ("height", "<f8"), ("undulation", "<f4"),
+    ]
+)  # fmt: skip
+_NO_TIME: Final = 0xFFFFFFFF
+#: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
+_WITHOUT_OFFSET: Final = (1, 2)
+
+
+def _names() -> Strings:
+    """Names of satellites by SVID, blank where there is none."""
+    table = np.full(256, "", dtype="<U3")
+    for first, last, letter, shift in _NUMBERS:
+        for number in range(first, last + 1):
+            table[number] = f"{letter}{number + shift:02d}"
+    return table
+
+
+_NAMES: Final = _names()
+
+
+def _signal_names() -> Strings:
+    table = np.full(64, "", dtype="<U3")
+    for number, name in SIGNALS.items():
+        table[number] = name
+    return table
+
+
+_SIGNAL_NAMES: Final = _signal_names()
+
+
+def meas_epoch_measurements(frames: Frames) -> Measurements:
+    """Measurements of all MeasEpoch blocks.
+
+    Blocks whose length does not fit their counts, or without time, are skipped and counted.
+    """
+    chosen = frames.of("sbf", MEAS_EPOCH)
+    length = frames.end[chosen] - frames.start[chosen]
+    head = gathered(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)
+    chosen = chosen[length >= _HEAD.itemsize]
+    dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != 0xFFFF) & (head["size1"] >= 20) & (head["size2"] >= 12)
+    epochs, places, kinds, masters, broken = [], [], [], [], 0
+    for row in np.flatnonzero(dated).tolist():
+        found = _sub_blocks(frames, int(chosen[row]), head[row])
+        if found is None:
+            broken += 1
+            continue
+        place, kind, master = found
+        epochs.append(row)
+        places.append(place)
+        kinds.append(kind)
+        masters.append(master + sum(len(p) for p in places[:-1]))
+    skipped = {"broken MeasEpoch": broken, "MeasEpoch without time": int(np.count_nonzero(~dated))}
+    place = np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
+    kind = np.concatenate(kinds) if kinds else np.zeros(0, dtype=np.intp)
+    master = np.concatenate(masters) if masters else np.zeros(0, dtype=np.intp)
+    epoch = np.repeat(np.arange(len(epochs)), [len(p) for p in places]) if places else np.zeros(0, dtype=np.intp)
+    rows = head[np.array(epochs, dtype=np.intp)]
+    values = _decoded(frames, place, kind, master)
+    return Measurements(
+        time=from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),
+        epoch=epoch,
+        **values,
+        receiver="Septentrio",
+        skipped={what: number for what, number in skipped.items() if number},
+    )
+
+
+def _sub_blocks(frames: Frames, index: int, head: np.void) -> tuple[Indices, Indices, Indices] | None:
+    """Places of the sub-blocks of one block, which are of the second type, and each one's first-type sub-block."""
+    first, end = int(frames.start[index]) + _HEAD.itemsize, int(frames.end[index])
+    size1, size2 = int(head["size1"]), int(head["size2"])
+    places: list[int] = []
+    kinds: list[int] = []
+    masters: list[int] = []
+    cursor = first
+    for _ in range(int(head["count"])):
+        if cursor + size1 > end:
+            return None
+        master = len(places)
+        places.append(cursor)
+        kinds.append(0)
+        masters.append(master)
+        others = int(frames.data[cursor + 19])
+        cursor += size1
+        if cursor + others * size2 > end:
+            return None
+        for _ in range(others):
+            places.append(cursor)
+            kinds.append(1)
+            masters.append(master)
+            cursor += size2
+    return np.array(places, dtype=np.intp), np.array(kinds, dtype=np.intp), np.array(masters, dtype=np.intp)
+
+
+def _decoded(frames: Frames, place: Indices, kind: Indices, master: Indices) -> dict[str, Any]:
+    """Measurements of sub-blocks: those of the first type whole, those of the second as offsets from theirs."""
+    first = gathered(frames.data, place[master], _FIRST)
+    other = gathered(frames.data, np.where(kind == 1, place, 0), _OTHER) if len(frames.data) >= 12 else first
+    own = kind == 0
+    number = _signal_number(np.where(own, first["type"], other["type"]), np.where(own, first["info"], other["info"]))
+    name = _SIGNAL_NAMES[number]
+    satellite = _NAMES[first["sv"]]
+    known = (np.char.str_len(satellite) > 0) & (name.astype("<U1") == satellite.astype("<U1"))
+    channel = (_info_high(first["info"]) - 8).astype(np.int64)
+    main = _SIGNAL_NAMES[_signal_number(first["type"], first["info"])]
+    frequency, main_frequency = _frequency(name, channel), _frequency(main, channel)
+    code_main = ((first["misc"] & 15).astype(np.int64) << 32 | first["code"].astype(np.int64)) * 1e-3
+    code_main = np.where(code_main == 0, np.nan, code_main)
+    doppler_main = np.where(first["doppler"] == -(1 << 31), np.nan, first["doppler"] * 1e-4)
+    code_offset = _signed(other["offsets"] & 7, 3) * 65536 + other["code"].astype(np.int64)
+    no_code = ((other["offsets"] & 7) == 4) & (other["code"] == 0)
+    code = np.where(own, code_main, np.where(no_code, np.nan, code_main + code_offset * 1e-3))
+    doppler_offset = _signed(other["offsets"] >> 3, 5) * 65536 + other["doppler"].astype(np.int64)
+    no_doppler = ((other["offsets"] >> 3) == 16) & (other["doppler"] == 0)
+    scaled = doppler_main * frequency / main_frequency + doppler_offset * 1e-4
+    doppler = np.where(own, doppler_main, np.where(no_doppler, np.nan, scaled))
+    msb = np.where(own, first["carrier_msb"], other["carrier_msb"]).astype(np.int64)
+    lsb = np.where(own, first["carrier"], other["carrier"]).astype(np.int64)
+    no_phase = (msb == -128) & (lsb == 0)
+    phase = np.where(no_phase, np.nan, code * frequency / SPEED_OF_LIGHT + (msb * 65536 + lsb) * 1e-3)
+    level = np.where(own, first["cn0"], other["cn0"]).astype(np.float64)
+    cn0 = np.where(level == 255, np.nan, level * 0.25 + np.where(np.isin(number, _WITHOUT_OFFSET), 0.0, 10.0))
+    lock = np.where(own, first["lock"], other["lock"]).astype(np.float64)
+    unknown_lock = np.where(own, lock == 65535, lock == 255)
+    info = np.where(own, first["info"], other["info"])
+    glonass = np.char.startswith(satellite, "R")
+    return {
+        "satellite": np.where(known, satellite, ""),
+        "signal": np.where(known, np.array([text[1:] for text in name.tolist()], dtype="<U2"), ""),
+        "code_m": code,
+        "phase_cycles": phase,
+        "doppler_hz": doppler,
+        "cn0_dbhz": cn0,
+        "lock_s": np.where(unknown_lock, 0.0, lock),
+        "half_cycle": (info & 4 != 0) & ~no_phase,
+        "polarity": np.zeros(len(place), dtype=np.int64),
+        "glonass_channel": np.where(glonass, channel, 99),
+    }
+
+
+def _info_high(info: Integers) -> Integers:
+    """Bits 3 to 7 of ObsInfo: GLONASS channel plus 8, or the extended signal number."""
+    return np.asarray(info >> 3)
+
+
+def _signal_number(kind: Integers, info: Integers) -> Integers:
+    """Signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where these are 31."""
+    low = np.asarray(kind, dtype=np.int64) & 31
+    return np.where(low == 31, np.asarray(info, dtype=np.int64) // 8 + 32, low)
+
+
+def _signed(value: Integers, bits: int) -> Integers:
+    value = np.asarray(value, dtype=np.int64)
+    return np.where(value >= 1 << bits - 1, value - (1 << bits), value)
+
+
+def _frequency(name: Strings, channel: Integers) -> Floats:
+    """Carrier of each measurement [Hz]; NaN where the signal is unknown."""
+    frequency = np.full(len(name), np.nan)
+    for text in np.unique(name).tolist():
+        if text:
+            chosen = name == text
+            frequency[chosen] = CARRIER_FREQUENCY.get(text[0], {}).get(text[1], np.nan)
+            if text[0] == "R" and text[1] in GLONASS_STEP:
+                frequency[chosen] += channel[chosen] * GLONASS_STEP[text[1]]
+    return frequency
+
+
+def positions(frames: Frames) -> dict[str, np.ndarray]:
+    """The receiver's own positions, of PVTGeodetic blocks: time, latitude, longitude [deg], ellipsoidal height [m]."""
+    chosen = frames.of("sbf", PVT_GEODETIC)
+    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
+    rows = gathered(frames.data, frames.start[chosen], _PVT)
+    rows = rows[(rows["error"] == 0) & (rows["mode"] & 15 != 0) & (rows["tow_ms"] != _NO_TIME)]
+    return {
+        "time": from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),
+        "latitude_deg": np.degrees(rows["latitude"]),
+        "longitude_deg": np.degrees(rows["longitude"]),
+        "height_m": rows["height"],
+    }
