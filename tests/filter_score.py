@@ -202,7 +202,7 @@ def show_gaps(all_cases: list[Case]) -> None:
                 known = np.isfinite(errors)
                 if known.any():
                     print(
-                        f"{case.name:9s} {length:3.0f} s {label:10s} {len(errors)} windows, {known.sum()} with a place: "
+                        f"{case.name:9s} {length:3.0f} s {label:10s} {len(errors)} windows, {known.sum()} placed: "
                         f"p50 {np.nanmedian(errors):5.1f}  p95 {np.nanpercentile(errors, 95):5.1f} m  "
                         f"error/sigma p95 {np.nanpercentile(ratio[label], 95):4.1f}",
                         flush=True,

@@ -203,3 +203,38 @@ def test_a_jump_of_50_m_at_the_mouth_of_a_tunnel_moves_the_answer_by_less_than_a
     code = blank.code_m + np.where((np.arange(150) >= 120) & (np.arange(150) < 125), 1.0, 0.0)[:, None] * moved
     result, _ = track(replace(blank, code_m=code), case.line, sensors=wheel(case))
     assert np.abs(result.arc_m - case.arc_m)[85:].max() < 10.0
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("level", ["off", "on"])
+@pytest.mark.parametrize(
+    "garbage", ["no channel", "nothing measured", "wild codes", "one satellite", "same instant", "huge"]
+)
+def test_no_input_raises(garbage: str, level: str) -> None:
+    case = ride(40, noise=1.0)
+    epochs, random = case.epochs, np.random.default_rng(2)
+    if garbage == "no channel":
+        none = np.zeros(10, dtype=bool)
+        per_channel = (
+            "sat_ecef_m",
+            "sat_velocity_mps",
+            "code_m",
+            "code_sigma_m",
+            "phase_m",
+            "phase_joined",
+            "rate_mps",
+        )
+        values = {name: getattr(epochs, name)[:, none] for name in (*per_channel, "cn0_dbhz")}
+        epochs = replace(epochs, satellite=epochs.satellite[none], clock=epochs.clock[none], **values)
+    elif garbage == "nothing measured":
+        epochs = without_epochs(epochs, np.ones(40, dtype=bool))
+    elif garbage == "wild codes":
+        epochs = replace(epochs, code_m=epochs.code_m + 1e5 * random.normal(size=epochs.code_m.shape))
+    elif garbage == "one satellite":
+        epochs = replace(epochs, code_m=np.where(np.arange(10) > 0, np.nan, epochs.code_m))
+    elif garbage == "same instant":
+        epochs = replace(epochs, time=np.repeat(epochs.time[::2], 2))
+    else:
+        epochs = replace(epochs, rate_mps=1e9 * epochs.rate_mps, phase_m=-1e6 * epochs.phase_m)
+    result, _ = track(epochs, case.line, limits=TrackingLimits.model_validate({"level": level}))
+    assert len(result) == 40

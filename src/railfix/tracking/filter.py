@@ -31,6 +31,8 @@ _FREEDOM: Final = np.array([30.0**2, 10.0**2, 3.0**2])
 #: over 1 km, the line by 1 m over 20 m in its sharpest curves.
 _MOVED_M: Final = 2.0
 _RELINEARISED: Final = 4
+#: Shortest interval between epochs [s].
+_SHORTEST_S: Final = 1e-3
 #: Two epochs further apart than this have nothing to do with each other [s].
 _APART_S: Final = 3600.0
 
@@ -103,7 +105,8 @@ def _step(
     """One epoch; writes its row of the result."""
     now = epochs.time[epoch]
     first = bool(np.isnat(state.time))
-    dt = 1.0 if first else float(seconds(now - state.time))
+    # Two epochs at one instant are a millisecond apart: Dopplers and forces count by the interval.
+    dt = 1.0 if first else max(float(seconds(now - state.time)), _SHORTEST_S)
     if dt > _APART_S:
         state, first, dt = replace(TrackState.empty(), log_scale=state.log_scale), True, 1.0
     change = epochs.phase_m[epoch] - before[0]
