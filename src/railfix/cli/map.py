@@ -14,6 +14,7 @@ from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.map_network import columns_of, match_command, network, route
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
+from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import read_positions
 from railfix.run.options import TrackReading
 from railfix.run.output import check_output_file
@@ -165,7 +166,9 @@ def features(
 def from_positions_command(
     positions: Annotated[
         Path,
-        typer.Argument(metavar="POSITIONS", help="RTKLIB `.pos`, or CSV with named columns."),
+        typer.Argument(
+            metavar="POSITIONS", help="RTKLIB `.pos`, NMEA, GPX, NovAtel ASCII (`.asc`), or CSV with named columns."
+        ),
     ],
     *,
     out: Annotated[Path, typer.Option(metavar="TRACK.csv", help="Track map to write.")],
@@ -207,7 +210,7 @@ def from_positions_command(
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[positions])
-    log = read_positions(positions, columns=columns_of(column))
+    log = read_positions(positions, columns=columns_of(column)) if column else read_any_positions(positions)
     track, thinned = from_position_log(
         log,
         spacing_m=spacing,

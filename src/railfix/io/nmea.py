@@ -20,6 +20,7 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import utc_to_gpst
 from railfix.gnss.observations import capped_problems
 from railfix.io.position_log import PositionLog, read_positions
+from railfix.io.text_positions import read_gpx_positions, read_novatel_positions
 
 #: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); others are 0, no position.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
@@ -201,7 +202,10 @@ def read_any_positions(
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> PositionLog:
-    """Read a log of positions of any kind: NMEA by its ending (``.nmea``, ``.nma``, ``.gga``), else `read_positions`.
+    """Read a log of positions of any kind, by its ending.
+
+    NMEA (``.nmea``, ``.nma``, ``.gga``), GPX (``.gpx``), NovAtel ASCII (``.asc``, ``.ascii``, ``.gps``), else
+    `read_positions`.
 
     Parameters
     ----------
@@ -212,4 +216,8 @@ def read_any_positions(
     """
     if ending(path) in (".nmea", ".nma", ".gga"):
         return read_nmea(path, broken_lines=broken_lines, date=date)
+    if ending(path) == ".gpx":
+        return read_gpx_positions(path)
+    if ending(path) in (".asc", ".ascii", ".gps"):
+        return read_novatel_positions(path)
     return read_positions(path)
