@@ -109,3 +109,24 @@ def monitor(
     if not result.orders:
         console.print("no stop")
     show_files(console, files)
+
+
+@app.command("keys", cls=Command)
+def keys(
+    out: Annotated[Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; made where absent.")],
+    *,
+    train: Annotated[list[int], typer.Option(metavar="N", help="Number of a train; repeat it for several.")],
+    days: Annotated[int, typer.Option(metavar="DAYS", min=1, help="Validity of the certificates.")] = 365,
+) -> None:
+    """Make keys and certificates of a centre and its trains.
+
+    They are signed by an authority whose key is not kept: for another train make a new set. Keys can be read by their
+    owner alone; each train gets authority.pem and its own two files only.
+
+    Example: `railfix ground keys keys --train 1 --train 2`
+    """
+    from railfix.ground.keys import write_keys
+
+    if not all(0 < number < 1 << 32 for number in train):
+        raise SettingsError("--train: a number from 1 to 4294967295 was expected")
+    show_files(console_of_tables(), write_keys(out, sorted(set(train)), valid_days=days))

@@ -1,0 +1,230 @@
+"""Redundancy layer above two links: frames with sequence number and time stamp, and the defences of EN 50159.
+
+The links below encrypt and authenticate (QUIC, TLS 1.3); the CRC is a check against faults of the layers between,
+not cryptography. A receiver takes each frame once, whichever link brings it first, and no older one after a newer.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+from typing import Final
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+
+_HEAD: Final = struct.Struct("!BIQq")
+_ECHO: Final = struct.Struct("!Qqqq")
+_CHECK: Final = struct.Struct("!I")
+#: Longest payload [bytes]: with the head it fits a datagram of QUIC.
+LONGEST_PAYLOAD: Final = 1100
+#: Sequence numbers behind the newest that are remembered one by one.
+REMEMBERED: Final = 4096
+
+
+class FrameKind(IntEnum):
+    """Kind of a frame."""
+
+    #: Payload, used once.
+    DATA = 1
+    #: Answer to a frame.
+    ECHO = 2
+    #: Frame that only measures a link.
+    PROBE = 3
+
+
+class Threat(Enum):
+    """Threats of EN 50159, each with its counter."""
+
+    REPETITION = "repetition"
+    DELETION = "deletion"
+    INSERTION = "insertion"
+    RESEQUENCING = "resequencing"
+    CORRUPTION = "corruption"
+    DELAY = "delay"
+    MASQUERADE = "masquerade"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One frame.
+
+    Attributes
+    ----------
+    kind : FrameKind
+    sender : int
+    sequence : int
+    time_ns : int [ns]
+        Sender's monotonic clock when it was sent.
+    payload : bytes
+    """
+
+    kind: FrameKind
+    sender: int
+    sequence: int
+    time_ns: int
+    payload: bytes = b""
+
+    def encode(self) -> bytes:
+        """Return the bytes of the frame with their check."""
+        if len(self.payload) > LONGEST_PAYLOAD:
+            raise ValueError(f"a payload of {len(self.payload)} bytes; at most {LONGEST_PAYLOAD} fit a frame")
+        data = _HEAD.pack(self.kind, self.sender, self.sequence, self.time_ns) + self.payload
+        return data + _CHECK.pack(zlib.crc32(data))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Echo:
+    """Answer to a frame: its number, when it was sent (sender's clock), received and answered (answerer's clock)."""
+
+    sequence: int
+    sent_ns: int
+    received_ns: int
+    answered_ns: int
+
+    def encode(self) -> bytes:
+        """Return the payload of an echo frame."""
+        return _ECHO.pack(self.sequence, self.sent_ns, self.received_ns, self.answered_ns)
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Echo | None:
+        """Return the echo, None where the payload is none."""
+        if len(payload) != _ECHO.size:
+            return None
+        names = ("sequence", "sent_ns", "received_ns", "answered_ns")
+        return cls(**dict(zip(names, _ECHO.unpack(payload), strict=True)))
+
+    def round_trip_s(self, now_ns: int) -> float:
+        """Return the round-trip time at the sender: t4 - t1 - (t3 - t2) [s]."""
+        return (now_ns - self.sent_ns - (self.answered_ns - self.received_ns)) / 1e9
+
+
+class ReceiverLimits(Settings):
+    """Limits of a receiver.
+
+    Attributes
+    ----------
+    delay_s : float [s]
+        Largest delay above the shortest one seen.
+    drift : float
+        Largest drift of the clocks against each other; the shortest delay is forgotten at this rate.
+    jump : int
+        Largest step of the sequence number.
+    """
+
+    delay_s: float = Field(default=5.0, gt=0)
+    drift: float = Field(default=1e-4, ge=0)
+    jump: int = Field(default=10_000_000, ge=1)
+
+
+@dataclass(kw_only=True)
+class _Seen:
+    """Sequence numbers that have come: the newest, and the last ones as bits."""
+
+    newest: int = -1
+    bits: int = 0
+
+    def has(self, sequence: int) -> bool:
+        behind = self.newest - sequence
+        return behind >= REMEMBERED or (behind >= 0 and bool(self.bits >> behind & 1))
+
+    def add(self, sequence: int) -> None:
+        if sequence > self.newest:
+            step = sequence - self.newest
+            self.bits = ((self.bits << step) | 1) & ((1 << REMEMBERED) - 1) if step < REMEMBERED else 1
+            self.newest = sequence
+        else:
+            self.bits |= 1 << (self.newest - sequence)
+
+
+@dataclass(kw_only=True)
+class FrameReceiver:
+    """Receiver of the frames of one sender over any number of links.
+
+    Attributes
+    ----------
+    sender : int
+        The only one whose frames count; the certificate of the connection names it.
+    limits : ReceiverLimits
+    threats : Counter of Threat
+        Frames that were rejected, by threat; deletions are the numbers that a newer one has skipped.
+    second_copies : int
+        Frames that the other link had brought before.
+    """
+
+    sender: int
+    limits: ReceiverLimits = field(default_factory=ReceiverLimits)
+    threats: Counter[Threat] = field(default_factory=Counter)
+    second_copies: int = 0
+    _accepted: _Seen = field(default_factory=_Seen)
+    _links: dict[tuple[str, FrameKind], _Seen] = field(default_factory=dict)
+    _shortest_ns: float | None = None
+    _at_ns: int = 0
+
+    def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
+        """Return a frame to be answered and the same to be used; each None where it is not.
+
+        A second copy is answered, so that both links are measured, but not used.
+        """
+        frame = self._decoded(data)
+        if frame is None:
+            return None, None
+        on_link = self._links.setdefault((link, frame.kind), _Seen())
+        if on_link.has(frame.sequence):
+            return self._rejected(Threat.REPETITION)
+        if on_link.newest >= 0 and frame.sequence > on_link.newest + self.limits.jump:
+            return self._rejected(Threat.INSERTION)
+        if self._late(frame, now_ns):
+            return self._rejected(Threat.DELAY)
+        on_link.add(frame.sequence)
+        if frame.kind is not FrameKind.DATA:
+            return frame, None
+        if self._accepted.has(frame.sequence):
+            self.second_copies += 1
+            return frame, None
+        if frame.sequence < self._accepted.newest:
+            self.threats[Threat.RESEQUENCING] += 1
+            return frame, None
+        if self._accepted.newest >= 0:
+            self.threats[Threat.DELETION] += frame.sequence - self._accepted.newest - 1
+        self._accepted.add(frame.sequence)
+        return frame, frame
+
+    def clock_restarted(self) -> None:
+        """Forget the shortest delay: the sender was started again, its clock has another origin."""
+        self._shortest_ns = None
+
+    def _decoded(self, data: bytes) -> Frame | None:
+        if not _HEAD.size + _CHECK.size <= len(data) <= _HEAD.size + _CHECK.size + LONGEST_PAYLOAD:
+            self.threats[Threat.CORRUPTION] += 1
+            return None
+        body = data[: -_CHECK.size]
+        if zlib.crc32(body) != _CHECK.unpack(data[-_CHECK.size :])[0]:
+            self.threats[Threat.CORRUPTION] += 1
+            return None
+        kind, sender, sequence, time_ns = _HEAD.unpack(body[: _HEAD.size])
+        if sender != self.sender:
+            self.threats[Threat.MASQUERADE] += 1
+            return None
+        if kind not in tuple(FrameKind):
+            self.threats[Threat.INSERTION] += 1
+            return None
+        payload = body[_HEAD.size :]
+        return Frame(kind=FrameKind(kind), sender=sender, sequence=sequence, time_ns=time_ns, payload=payload)
+
+    def _late(self, frame: Frame, now_ns: int) -> bool:
+        """Return whether a frame took too long; clocks of both ends need not agree."""
+        took = now_ns - frame.time_ns
+        if self._shortest_ns is None:
+            self._shortest_ns = float(took)
+        self._shortest_ns = min(float(took), self._shortest_ns + self.limits.drift * (now_ns - self._at_ns))
+        self._at_ns = now_ns
+        return took - self._shortest_ns > self.limits.delay_s * 1e9
+
+    def _rejected(self, threat: Threat) -> tuple[None, None]:
+        self.threats[threat] += 1
+        return None, None

@@ -1,0 +1,219 @@
+"""Ends of the redundant links: a train with two bearers, and a centre."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Literal
+
+from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, Threat
+from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, LinkName
+from railfix.ground.quic import LinkProtocol, configuration, connected, listen
+
+#: Identity of the centre as a sender of frames.
+CENTRE = 0
+BEARERS: tuple[LinkName, LinkName] = ("A", "B")
+#: Time between attempts to connect [s].
+RETRY_S = 1.0
+
+
+def first_sequence() -> int:
+    """Return the number that a sender begins with: above those of its last start at up to 10 frames a second."""
+    return int(time.time() * 10)
+
+
+class TrainLinks:
+    """The train's end: two connections, each from its own local address.
+
+    Parameters
+    ----------
+    train : int
+    keys : Path
+        Folder of `railfix.ground.keys.write_keys`.
+    addresses : dict of {"A", "B"} to (str, int)
+        Centre's address on each bearer.
+    local : dict of {"A", "B"} to str
+        Local address of each bearer.
+    mode : {"spare", "both"}
+    received : callable
+        Called with the payload of each new frame of the centre.
+    """
+
+    def __init__(
+        self,
+        train: int,
+        keys: Path,
+        addresses: dict[LinkName, tuple[str, int]],
+        local: dict[LinkName, str],
+        *,
+        mode: Literal["spare", "both"] = "both",
+        received: Callable[[bytes], None] = lambda _: None,
+        limits: LinkLimits | None = None,
+    ) -> None:
+        self.train, self.mode = train, mode
+        self.meters = {name: LinkMeter(limits=limits or LinkLimits()) for name in BEARERS}
+        self.choice = LinkChoice()
+        self.receiver = FrameReceiver(sender=CENTRE)
+        self.protocols: dict[LinkName, LinkProtocol] = {}
+        self._keys, self._addresses, self._local = keys, addresses, local
+        self._received, self._sequence = received, first_sequence()
+        self._newest: bytes | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def start(self) -> None:
+        """Begin to connect; connections that end are made again."""
+        self._tasks = [asyncio.create_task(self._keep(name)) for name in BEARERS]
+
+    async def stop(self) -> None:
+        """End both connections."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _keep(self, name: LinkName) -> None:
+        settings = configuration(self._keys, f"train-{self.train}", is_client=True)
+        while True:
+            try:
+                async with connected(
+                    self._addresses[name],
+                    settings,
+                    local=self._local[name],
+                    received=lambda _, data: self._frame(name, data),
+                    timeout_s=3.0,
+                ) as protocol:
+                    if not self.protocols:
+                        self.receiver.clock_restarted()
+                    self.protocols[name] = protocol
+                    self._resend(name)
+                    while not protocol.ended:
+                        await asyncio.sleep(0.1)
+            except (ConnectionError, TimeoutError, OSError):
+                pass  # tried again after a time: the meter counts what is not answered
+            self.protocols.pop(name, None)
+            await asyncio.sleep(RETRY_S)
+
+    def send(self, payload: bytes, *, chainage_m: float = 0.0, direction: int = 0) -> None:
+        """Send a payload: with its echo on both links; in mode "spare" only the active one carries the payload."""
+        now_ns, now_s = time.monotonic_ns(), time.monotonic()
+        self._sequence += 1
+        self._newest = payload
+        for meter in self.meters.values():
+            meter.settle(now_s)
+        self.choice = self.choice.after(now_s, self.meters["A"], self.meters["B"])
+        for name in BEARERS:
+            carries = self.mode == "both" or name == self.choice.active
+            self.meters[name].sent(self._sequence, now_s, chainage_m=chainage_m, direction=direction)
+            self._put(name, FrameKind.DATA if carries else FrameKind.PROBE, payload if carries else b"", now_ns)
+
+    def _put(self, name: LinkName, kind: FrameKind, payload: bytes, now_ns: int) -> None:
+        if (protocol := self.protocols.get(name)) is None:
+            return
+        frame = Frame(kind=kind, sender=self.train, sequence=self._sequence, time_ns=now_ns, payload=payload)
+        protocol.send(frame.encode())
+
+    def _resend(self, name: LinkName) -> None:
+        """Send the newest payload at once where a link is back and no other one is there."""
+        if self._newest is not None and len(self.protocols) == 1:
+            self._sequence += 1
+            self._put(name, FrameKind.DATA, self._newest, time.monotonic_ns())
+
+    def _frame(self, name: LinkName, data: bytes) -> None:
+        now_ns = time.monotonic_ns()
+        answer, use = self.receiver.receive(name, data, now_ns)
+        if answer is None:
+            return
+        if answer.kind is FrameKind.ECHO and (echo := Echo.decode(answer.payload)) is not None:
+            self.meters[name].answered(echo.sequence, now_ns / 1e9, echo.round_trip_s(now_ns))
+        elif use is not None and use.kind is FrameKind.DATA:
+            self._received(use.payload)
+
+
+class CentreLinks:
+    """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
+
+    Parameters
+    ----------
+    keys : Path
+    hosts : dict of {"A", "B"} to str
+    received : callable
+        Called with the train's number and the payload.
+
+    Attributes
+    ----------
+    addresses : dict of {"A", "B"} to (str, int)
+    masquerades : int
+        Connections that were rejected for their certificate.
+    """
+
+    def __init__(self, keys: Path, hosts: dict[LinkName, str], *, received: Callable[[int, bytes], None]) -> None:
+        self.addresses: dict[LinkName, tuple[str, int]] = {}
+        self.receivers: dict[int, FrameReceiver] = {}
+        self.masquerades = 0
+        self._keys, self._hosts, self._received = keys, hosts, received
+        self._peers: dict[tuple[int, LinkName], LinkProtocol] = {}
+        self._sequence = self._echoes = first_sequence()
+        self._stack = AsyncExitStack()
+
+    async def start(self) -> None:
+        """Listen."""
+        settings = configuration(self._keys, "centre", is_client=False)
+        for name in BEARERS:
+            server, self.addresses[name] = await listen(
+                (self._hosts[name], 0),
+                settings,
+                received=lambda protocol, data, name=name: self._frame(name, protocol, data),  # type: ignore[misc]
+                rejected=self._masquerade,
+            )
+            self._stack.callback(server.close)
+
+    async def stop(self) -> None:
+        """End all connections."""
+        await self._stack.aclose()
+
+    def threats(self) -> Counter[Threat]:
+        """Return what was rejected from all trains."""
+        total: Counter[Threat] = Counter({Threat.MASQUERADE: self.masquerades})
+        for receiver in self.receivers.values():
+            total += receiver.threats
+        return total
+
+    def send(self, train: int, payload: bytes) -> None:
+        """Send a payload to a train on every link it has."""
+        self._sequence += 1
+        self._put(train, FrameKind.DATA, self._sequence, payload, BEARERS)
+
+    def _masquerade(self) -> None:
+        self.masquerades += 1
+
+    def _put(self, train: int, kind: FrameKind, sequence: int, payload: bytes, names: tuple[LinkName, ...]) -> None:
+        frame = Frame(kind=kind, sender=CENTRE, sequence=sequence, time_ns=time.monotonic_ns(), payload=payload)
+        for name in names:
+            if (protocol := self._peers.get((train, name))) is not None:
+                protocol.send(frame.encode())
+
+    def _frame(self, name: LinkName, protocol: LinkProtocol, data: bytes) -> None:
+        kind, _, name_of_train = (protocol.peer or "").partition("-")
+        if kind != "train" or not name_of_train.isdigit():
+            self._masquerade()
+            return
+        train, now_ns = int(name_of_train), time.monotonic_ns()
+        receiver = self.receivers.setdefault(train, FrameReceiver(sender=train))
+        if self._peers.get((train, name)) is not protocol and all(
+            known.ended for (number, _), known in self._peers.items() if number == train
+        ):
+            receiver.clock_restarted()
+        answer, use = receiver.receive(name, data, now_ns)
+        if answer is None:
+            return
+        self._peers[train, name] = protocol
+        echo = Echo(
+            sequence=answer.sequence, sent_ns=answer.time_ns, received_ns=now_ns, answered_ns=time.monotonic_ns()
+        )
+        self._echoes += 1
+        self._put(train, FrameKind.ECHO, self._echoes, echo.encode(), (name,))
+        if use is not None:
+            self._received(train, use.payload)

@@ -1,0 +1,152 @@
+"""Links over QUIC with datagrams: TLS 1.3 with certificates on both sides, one connection a bearer.
+
+aioquic asks a client for its certificate only by attributes that it names as its own (`_request_client_certificate`,
+`_peer_certificate`); they are used in this module alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from aioquic.asyncio.protocol import QuicConnectionProtocol
+from aioquic.asyncio.server import QuicServer, serve
+from aioquic.quic.configuration import QuicConfiguration
+from aioquic.quic.connection import QuicConnection
+from aioquic.quic.events import ConnectionTerminated, DatagramFrameReceived, HandshakeCompleted, QuicEvent
+from aioquic.tls import Alert, verify_certificate
+from cryptography import x509
+
+#: Name of the protocol in the handshake.
+PROTOCOL: Final = "railfix-link/1"
+#: A connection without any packet ends after this time [s].
+IDLE_S: Final = 10.0
+_REJECTED: Final = 0x101
+
+
+def configuration(folder: Path, name: str, *, is_client: bool) -> QuicConfiguration:
+    """Return the settings of an end from the files that `railfix.ground.keys.write_keys` wrote."""
+    settings = QuicConfiguration(
+        is_client=is_client,
+        alpn_protocols=[PROTOCOL],
+        max_datagram_frame_size=65_536,
+        idle_timeout=IDLE_S,
+        verify_mode=ssl.CERT_REQUIRED,
+        cadata=(folder / "authority.pem").read_bytes(),
+        server_name="centre" if is_client else None,
+    )
+    settings.load_cert_chain(folder / f"{name}.pem", folder / f"{name}.key")
+    return settings
+
+
+class LinkProtocol(QuicConnectionProtocol):
+    """One end of a connection that carries datagrams.
+
+    Attributes
+    ----------
+    peer : str or None
+        Common name of the other end's certificate, None before it was verified.
+    """
+
+    def __init__(
+        self,
+        quic: QuicConnection,
+        stream_handler: Any = None,
+        *,
+        received: Callable[[LinkProtocol, bytes], None],
+        rejected: Callable[[], None] = lambda: None,
+    ) -> None:
+        super().__init__(quic, stream_handler)
+        self.peer: str | None = None
+        self.ended = False
+        self._received = received
+        self._rejected = rejected
+        if not quic.configuration.is_client:
+            initialize = quic._initialize
+
+            def with_request(peer_cid: bytes) -> None:
+                initialize(peer_cid)
+                quic.tls._request_client_certificate = True
+
+            quic._initialize = with_request  # type: ignore[method-assign]
+
+    def quic_event_received(self, event: QuicEvent) -> None:
+        """Verify the peer at the end of the handshake; pass datagrams of a verified peer on."""
+        if isinstance(event, HandshakeCompleted):
+            self._verify()
+        elif isinstance(event, DatagramFrameReceived) and self.peer is not None:
+            self._received(self, event.data)
+        elif isinstance(event, ConnectionTerminated):
+            self.ended = True
+
+    def _verify(self) -> None:
+        certificate = self._quic.tls._peer_certificate
+        try:
+            if certificate is None:
+                raise ValueError("no certificate")
+            verify_certificate(certificate, cadata=self._quic.configuration.cadata)
+            names = certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+            self.peer = str(names[0].value)
+        except (Alert, ValueError, IndexError):
+            self._rejected()
+            self.close(error_code=_REJECTED, reason_phrase="certificate")
+
+    def send(self, data: bytes) -> None:
+        """Send a datagram; without a connection it is dropped."""
+        if self.ended or self.peer is None:
+            return
+        self._quic.send_datagram_frame(data)
+        self.transmit()
+
+
+async def listen(
+    address: tuple[str, int],
+    settings: QuicConfiguration,
+    *,
+    received: Callable[[LinkProtocol, bytes], None],
+    rejected: Callable[[], None],
+) -> tuple[QuicServer, tuple[str, int]]:
+    """Listen for connections at an address; port 0 takes a free one. Return the server and its address."""
+    server = await serve(
+        *address,
+        configuration=settings,
+        create_protocol=lambda quic, stream_handler=None: LinkProtocol(
+            quic, stream_handler, received=received, rejected=rejected
+        ),
+    )
+    transport: Any = server._transport
+    return server, transport.get_extra_info("sockname")[:2]
+
+
+@asynccontextmanager
+async def connected(
+    address: tuple[str, int],
+    settings: QuicConfiguration,
+    *,
+    local: str,
+    received: Callable[[LinkProtocol, bytes], None],
+    timeout_s: float = 5.0,
+) -> AsyncIterator[LinkProtocol]:
+    """Connect from a local address, that of the bearer's interface.
+
+    Raises
+    ------
+    ConnectionError, TimeoutError
+        The other end rejects the certificate, is another one, or does not answer.
+    """
+    loop = asyncio.get_running_loop()
+    transport, protocol = await loop.create_datagram_endpoint(
+        lambda: LinkProtocol(QuicConnection(configuration=settings), received=received), local_addr=(local, 0)
+    )
+    try:
+        protocol.connect(address)
+        await asyncio.wait_for(protocol.wait_connected(), timeout_s)
+        yield protocol
+    finally:
+        protocol.close()
+        await asyncio.sleep(0)
+        transport.close()

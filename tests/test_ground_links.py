@@ -1,0 +1,300 @@
+"""Redundant links: defences of EN 50159, response rate and round trip, switching, and QUIC with certificates."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from railfix.core.errors import OutputError
+from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
+from railfix.ground.keys import write_keys
+from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
+from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
+from railfix.ground.relay import Relay, RelaySettings
+
+pytestmark = pytest.mark.requirement("F3")
+
+SECOND = 1_000_000_000
+
+
+def frame(sequence: int, *, sender: int = 7, at_s: float = 0.0, kind: FrameKind = FrameKind.DATA) -> Frame:
+    return Frame(kind=kind, sender=sender, sequence=sequence, time_ns=round(at_s * SECOND), payload=b"place")
+
+
+def test_every_flipped_bit_is_rejected_and_counted() -> None:
+    data = frame(5).encode()
+    for bit in range(8 * len(data)):
+        receiver = FrameReceiver(sender=7)
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        assert receiver.receive("A", bytes(flipped), 0) == (None, None)
+        assert receiver.threats == {Threat.CORRUPTION: 1}
+    for length in range(len(data)):
+        assert FrameReceiver(sender=7).receive("A", data[:length], 0) == (None, None)
+
+
+def test_each_threat_has_its_counter() -> None:
+    receiver = FrameReceiver(sender=7, limits=ReceiverLimits(delay_s=2.0, jump=50))
+    used = lambda link, f, now_s=0.0: receiver.receive(link, f.encode(), round(now_s * SECOND))[1]  # noqa: E731
+    assert used("A", frame(1)) is not None
+    assert used("A", frame(1)) is None  # replayed
+    assert used("B", frame(1)) is None  # the other link's copy
+    assert used("A", frame(4, at_s=1.0), 1.0) is not None  # 2 and 3 skipped
+    assert used("A", frame(3, at_s=0.9), 1.1) is None  # overtaken
+    assert used("A", frame(5, at_s=2.0), 4.1) is None  # 2.1 s late
+    assert used("A", frame(6, sender=8, at_s=5.0), 5.0) is None
+    assert used("A", frame(100, at_s=6.0), 6.0) is None
+    assert receiver.threats == {
+        Threat.REPETITION: 1, Threat.DELETION: 2, Threat.RESEQUENCING: 1, Threat.DELAY: 1, Threat.MASQUERADE: 1,
+        Threat.INSERTION: 1,
+    }  # fmt: skip
+    assert receiver.second_copies == 1
+    assert used("B", frame(7, at_s=7.0), 7.0) is not None
+
+
+def test_the_origin_of_the_senders_clock_does_not_matter() -> None:
+    for origin in (-1e6, 0.0, 1e9):
+        receiver = FrameReceiver(sender=7, limits=ReceiverLimits(delay_s=2.0))
+        for k in range(1, 50):
+            late = 2.5 if k == 30 else 0.1
+            data = frame(k, at_s=origin + k).encode()
+            assert (receiver.receive("A", data, round((k + late) * SECOND))[1] is None) == (k == 30)
+
+
+@pytest.mark.parametrize("count", [30_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_no_message_is_used_twice_and_none_older_after_a_newer(count: int) -> None:
+    """Two links with loss, repetition and overtaking; a set of all used numbers is the second account."""
+    rng, receiver, used, newest = random.Random(3), FrameReceiver(sender=7), set(), -1
+    held: list[tuple[str, bytes]] = []
+    for sequence in range(count):
+        data = Frame(kind=FrameKind.DATA, sender=7, sequence=sequence, time_ns=sequence * 1000).encode()
+        arriving = [(link, data) for link in ("A", "B") if rng.random() > 0.2]
+        if held and rng.random() < 0.3:
+            arriving.append(held.pop(rng.randrange(len(held))))
+        if arriving and rng.random() < 0.1:
+            held.append(arriving[0] if rng.random() < 0.5 else arriving.pop(0))
+        for link, bytes_ in arriving:
+            _, use = receiver.receive(link, bytes_, sequence * 1000)
+            if use is not None:
+                assert use.sequence not in used
+                assert use.sequence > newest
+                newest = use.sequence
+                used.add(use.sequence)
+    assert len(used) > 0.94 * count
+    assert receiver.threats[Threat.REPETITION] > 0
+    assert receiver.threats[Threat.DELETION] == newest + 1 - len(used) - min(used)
+
+
+def test_both_links_lose_only_where_both_lose() -> None:
+    rng, receiver, lost = random.Random(1), FrameReceiver(sender=7), 0
+    for sequence in range(5000):
+        kept = [link for link in ("A", "B") if rng.random() > 0.3]
+        data = frame(sequence).encode()
+        uses = [receiver.receive(link, data, 0)[1] is not None for link in kept]
+        assert sum(uses) == bool(kept)
+        lost += not kept
+    assert receiver.threats[Threat.DELETION] == pytest.approx(lost, abs=1)
+
+
+def test_response_rate_and_round_trip_of_a_lossy_link() -> None:
+    """Loss p each way: (1 - p)^2 answered; delay d each way: 2 d, whatever the answer waits at the other end."""
+    rng, p, d, waits = random.Random(2), 0.2, 0.15, 0.4
+    meter = LinkMeter(limits=LinkLimits(window=4000))
+    for k in range(4000):
+        now = 1.0 * k
+        meter.sent(k, now, chainage_m=5.0 * k, direction=1)
+        if rng.random() > p and rng.random() > p:
+            echo = Echo(sequence=k, sent_ns=round(now * 1e9), received_ns=77 * SECOND,
+                        answered_ns=77 * SECOND + round(waits * 1e9))  # fmt: skip
+            back = now + 2 * d + waits
+            meter.answered(k, back, echo.round_trip_s(round(back * 1e9)))
+    meter.settle(1e9)
+    assert meter.response_rate == pytest.approx((1 - p) ** 2, abs=4 * (0.64 * 0.36 / 4000) ** 0.5)
+    assert meter.round_trip_s == pytest.approx(2 * d)
+    assert sum(sent for _, sent in meter.coverage.values()) == 4000
+    assert meter.coverage[3, 1][1] == 20  # 300 to 400 m, one frame each 5 m
+
+
+def test_switching_takes_at_most_three_misses_and_the_answer_time_and_returns() -> None:
+    """A is out from 100 s to 160 s; frames each second; the fake clock runs in steps of 50 ms."""
+    normal, spare, choice = LinkMeter(), LinkMeter(), LinkChoice()
+    history: list[tuple[float, str]] = []
+    echoes: list[tuple[float, LinkMeter, int]] = []
+    for step in range(20 * 260):
+        now = 0.05 * step
+        if step % 20 == 0:
+            for meter, up in ((normal, not 100.0 <= now < 160.0), (spare, True)):
+                meter.sent(step, now)
+                if up:
+                    echoes.append((now + 0.2, meter, step))
+        for at, meter, sequence in [item for item in echoes if item[0] <= now]:
+            meter.answered(sequence, now, 0.2)
+            echoes.remove((at, meter, sequence))
+        for meter in (normal, spare):
+            meter.settle(now)
+        after = choice.after(now, normal, spare)
+        if after != choice:
+            history.append((now, after.active))
+        choice = after
+    (left, to), (back, normally) = history
+    assert (to, normally) == ("B", "A")
+    assert left - 100.0 <= 3 * 1.0 + 1.0 + 0.1
+    assert back - 160.0 == pytest.approx(9.2, abs=0.2)  # ten answers in a row, the first at 160.2 s
+
+
+def test_the_normal_link_is_taken_at_once_where_only_the_spare_one_is_out() -> None:
+    lost, good = LinkMeter(misses=3), LinkMeter(good=1)
+    assert LinkChoice(active="B").after(0.0, good, lost).active == "A"
+    assert LinkChoice(active="B").after(0.0, LinkMeter(good=9), LinkMeter()).active == "B"
+    assert LinkChoice(active="A").after(0.0, lost, LinkMeter(misses=3)).active == "A"  # both gone: no use in switching
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("keys") / "own"
+    write_keys(folder, [7, 8])
+    write_keys(folder.parent / "other", [7])
+    return folder
+
+
+def test_keys_are_readable_by_their_owner_and_never_replaced(keys: Path) -> None:
+    assert {path.name for path in keys.iterdir()} == {
+        "authority.pem", "centre.pem", "centre.key", "train-7.pem", "train-7.key", "train-8.pem", "train-8.key",
+    }  # fmt: skip
+    assert (keys / "train-7.key").stat().st_mode & 0o077 == 0
+    with pytest.raises(OutputError, match="is there already"):
+        write_keys(keys, [9])
+
+
+HOSTS = {"A": "127.0.1.1", "B": "127.0.2.1"}
+LOCAL = {"A": "127.0.1.7", "B": "127.0.2.7"}
+
+
+def run(work: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(work, 20.0))
+
+
+async def _until(condition: Any, seconds: float) -> float:
+    start = time.monotonic()
+    while not condition() and time.monotonic() - start < seconds:
+        await asyncio.sleep(0.01)
+    return time.monotonic() - start
+
+
+def test_two_lossy_bearers_carry_each_message_once(keys: Path) -> None:
+    """Loss 20 %, delay 20 ms, jitter, bit errors 5 %; after an outage of A nothing that B carries is lost."""
+
+    async def work() -> None:
+        got: list[bytes] = []
+        orders: list[bytes] = []
+        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload))
+        await centre.start()
+        relays = {}
+        for k, name in enumerate(BEARERS):
+            settings = RelaySettings(
+                loss=0.2 if name == "A" else 0.0, delay_s=0.02, jitter_s=0.01, bit_errors=0.05, seed=k
+            )
+            relays[name] = Relay(centre.addresses[name], settings)
+            await relays[name].open(HOSTS[name])
+        train = TrainLinks(7, keys, {n: r.address for n, r in relays.items()}, LOCAL, received=orders.append)
+        await train.start()
+        await _until(lambda: len(train.protocols) == 2, 8.0)
+        assert {p.peer for p in train.protocols.values()} == {"centre"}
+        for k in range(100):
+            if k == 50:
+                relays["A"].up = False
+            train.send(b"%d" % k, chainage_m=10.0 * k)
+            centre.send(7, b"go %d" % k)
+            await asyncio.sleep(0.02)
+        await asyncio.sleep(0.2)
+        numbers = [int(payload) for payload in got]
+        assert numbers == sorted(set(numbers))
+        assert len(numbers) > 85
+        assert orders
+        assert len(orders) == len(set(orders))
+        assert train.meters["B"].response_rate > 0.7
+        assert 0.04 <= train.meters["B"].round_trip_s < 0.2
+        assert relays["B"].counts["bit errors"] > 0
+        assert centre.threats()[Threat.CORRUPTION] == 0  # QUIC has dropped them before
+        await train.stop()
+        await centre.stop()
+        for relay in relays.values():
+            relay.close()
+
+    run(work())
+
+
+@pytest.mark.parametrize("kind", ["other authority", "no certificate", "other train"])
+def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) -> None:
+    async def work() -> None:
+        got: list[bytes] = []
+        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload))
+        await centre.start()
+        folder = tmp_path / "keys"
+        folder.mkdir()
+        source = keys.parent / "other" if kind == "other authority" else keys
+        (folder / "authority.pem").write_bytes((keys / "authority.pem").read_bytes())
+        name = "train-8" if kind == "other train" else "train-7"
+        (folder / "train-7.pem").write_bytes((source / f"{name}.pem").read_bytes())
+        (folder / "train-7.key").write_bytes((source / f"{name}.key").read_bytes())
+        train = TrainLinks(7, folder, centre.addresses, LOCAL)
+        if kind == "no certificate":
+            import railfix.ground.links as links
+
+            plain = links.configuration
+
+            def without(path: Path, name: str, *, is_client: bool) -> Any:
+                settings = plain(path, name, is_client=is_client)
+                settings.certificate = settings.private_key = None
+                return settings
+
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(links, "configuration", without)
+                await train.start()
+                await asyncio.sleep(0.1)
+        else:
+            await train.start()
+        for _ in range(40):
+            train.send(b"from 7")
+            await asyncio.sleep(0.02)
+        assert got == []
+        assert centre.threats()[Threat.MASQUERADE] > 0
+        await train.stop()
+        await centre.stop()
+
+    run(work())
+
+
+def test_spare_mode_switches_and_sends_the_newest_when_both_were_gone(keys: Path) -> None:
+    async def work() -> None:
+        got: list[bytes] = []
+        centre = CentreLinks(keys, HOSTS, received=lambda _, payload: got.append(payload))
+        await centre.start()
+        relays = {name: Relay(centre.addresses[name], RelaySettings(delay_s=0.005)) for name in BEARERS}
+        for name in BEARERS:
+            await relays[name].open(HOSTS[name])
+        limits = LinkLimits(answer_s=0.1, misses=3, good=5, good_s=0.3)
+        train = TrainLinks(7, keys, {n: r.address for n, r in relays.items()}, LOCAL, mode="spare", limits=limits)
+        await train.start()
+        await _until(lambda: len(train.protocols) == 2, 5.0)
+        for k in range(100):
+            relays["A"].up = not 20 <= k < 50
+            train.send(b"%d" % k)
+            await asyncio.sleep(0.02)
+        lost = sorted(set(range(100)) - {int(payload) for payload in got})
+        assert train.choice.switches == 2
+        assert lost
+        assert lost[0] >= 20
+        assert lost[-1] <= 20 + 3 + 5 + 3  # three misses, five frames of answer time, and room for a slow machine
+        await train.stop()
+        await centre.stop()
+        for relay in relays.values():
+            relay.close()
+
+    run(work())
