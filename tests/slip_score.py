@@ -58,6 +58,7 @@ def main() -> int:
         )
     ]
     for rule in ("p2", "map"):
+        of_rule = SlipLimits.model_validate({"rule": rule})
         found = find_slips(
             t,
             speed.speed_mps,
@@ -84,8 +85,8 @@ def main() -> int:
         alarms = np.count_nonzero(np.diff((flagged & ~covered).astype(int)) == 1)
         print(
             f"rule {rule:3s}: {seen} of {len(spans)} slips found, after {np.median(late) if late else np.nan:.2f} s; "
-            f"instants flagged {100 * np.mean(share):.0f} %; false alarms {alarms} in {t[-1] / 3600:.2f} h; way through a "
-            f"slip p50 {np.nanmedian(ways):.2f}, largest {np.nanmax(ways):.2f} m"
+            f"instants flagged {100 * np.mean(share):.0f} %; false alarms {alarms} in {t[-1] / 3600:.2f} h; "
+            f"way through a slip p50 {np.nanmedian(ways):.2f}, largest {np.nanmax(ways):.2f} m"
         )
     return 0
 
