@@ -16,7 +16,8 @@ from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
-from railfix.pipeline.level_stage import protection_levels
+from railfix.pipeline.level_stage import protection_levels, risk_of
+from railfix.pipeline.open_places import places_beyond_the_level
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
@@ -128,9 +129,13 @@ def solve(
     if "raim" in config.screens and config.raim_protection == "on":
         raim = with_p4_level(raim, model, scale, config)
     corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
-    level = None
+    level, open_elsewhere = None, np.zeros(len(ranges), dtype=bool)
     if config.protection == "on" and config.carrier != "float":
         level = protection_levels(corrected, model, offset, raim, scale, config)
+        systems = [name[0] for name in corrected.satellite.tolist()]
+        open_elsewhere = places_beyond_the_level(
+            ranges, trajectory, place, model, level.level.level_m, scale, systems, risk_of(config), config
+        )
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
@@ -150,7 +155,7 @@ def solve(
         place=place,
         ties=ties,
         raim=raim,
-        status=_status(corrected, ranges, place, raim, judged, arc, off_map, offset, config),
+        status=_status(corrected, ranges, place, raim, judged, arc, off_map, offset, open_elsewhere, config),
         noise_scale=scale,
         own_sigma_m=own_sigma,
         arc_m=arc,
@@ -245,6 +250,7 @@ def _status(
     arc: Floats,
     off_map: Masks,
     offset: MapOffset,
+    open_elsewhere: Masks,
     config: Config,
 ) -> Codes:
     """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first."""
@@ -258,6 +264,9 @@ def _status(
         (beyond_threshold(offset, config.map_offset), Status.MAP_OFFSET),
         (np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE]), Status.INCONSISTENT),
         (sigma > config.largest_sigma_m, Status.UNCERTAIN),
-        ((section.excess <= config.section.threshold) | (redundancy < config.section.redundancy), Status.AMBIGUOUS),
+        (
+            (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,
+            Status.AMBIGUOUS,
+        ),
     ]
     return np.select([c for c, _ in conditions], [s.value for _, s in conditions], Status.OK).astype(np.int8)

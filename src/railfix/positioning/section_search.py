@@ -48,6 +48,9 @@ class SectionLimits(Settings):
     ambiguity_risk : float
         Probability that noise alone makes the true place fit this much worse than the best one
         (chi-square, one degree of freedom). P1 3.2: wrong sections on sharp curves.
+    reach_risk : float
+        Other places are looked for as far as noise makes them fit worse with this probability: further than they are
+        ambiguous, for a fault of one range can hide that much.
     separation_m : float
         Least distance along the line between two distinct places.
     redundancy : int
@@ -60,6 +63,7 @@ class SectionLimits(Settings):
     """
 
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
+    reach_risk: float = Field(default=1e-16, gt=0, lt=1)
     separation_m: float = Field(default=30.0, ge=0)
     redundancy: int = Field(default=2, ge=0)
     predicted_sigmas: float = Field(default=6.0, gt=0)
@@ -68,6 +72,11 @@ class SectionLimits(Settings):
     def threshold(self) -> float:
         """Excess of q that noise of unit variance explains."""
         return float(chi2.isf(self.ambiguity_risk, 1))
+
+    @cached_property
+    def reach(self) -> float:
+        """Excess of q up to which other places are found."""
+        return float(chi2.isf(min(self.reach_risk, self.ambiguity_risk), 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,7 +250,7 @@ def _ball(
     bend = weight_norm[at] * _bend(distance)
     q0 = np.maximum(point.wsse[at], 0.0)
     best = (np.sqrt(q0 + form) + bend) ** 2
-    reach = np.sqrt(best + limits.threshold * np.maximum(1.0, best / freedom[at]))
+    reach = np.sqrt(best + limits.reach * np.maximum(1.0, best / freedom[at]))
     # 1/trace(N^-1) is below the least eigenvalue of N: q grows at least that fast in every direction.
     growth = 1.0 / np.trace(point.covariance_m2[at], axis1=1, axis2=2)
     size = np.maximum(distance, np.sqrt(np.maximum(reach**2 - q0, 0.0) / growth))
@@ -307,7 +316,7 @@ def _coarse_to_fine(
         q = fit(ranges.take(epoch), points[stretches.middle[node]])
         np.minimum.at(upper, epoch, q)
         np.add.at(tried, epoch, 1)
-        reach = upper + limits.threshold * np.maximum(1.0, upper / freedom)
+        reach = upper + limits.reach * np.maximum(1.0, upper / freedom)
         nearest = np.maximum(
             np.sqrt(q) - weight_norm[epoch] * (1.0 + 2.0 * _ROTATION_GRADIENT) * stretches.radius_m[node], 0.0
         )
