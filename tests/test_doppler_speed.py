@@ -132,9 +132,9 @@ def test_epochs_do_not_touch_each_other_but_by_the_scale(quiet: Simulated) -> No
 
 
 def test_limits_are_checked() -> None:
-    with pytest.raises(ValueError, match="at least 3"):
+    with pytest.raises(ValueError, match="greater than or equal to 3"):
         DopplerSpeedLimits(min_satellites=2)
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="greater than 0"):
         DopplerSpeedLimits(zenith_mps=0.0)
 
 

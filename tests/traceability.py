@@ -26,7 +26,7 @@ ROWS: Final[dict[str, dict[str, str]]] = {
         "A5": "carrier phase beside code in the constrained model",
         "A6": "conventional position (3-D single point, nearest point of the trajectory) as the yardstick",
         "A7": "RINEX 2, 3, 4 observations and navigation of five systems, plain or packed, and SP3",
-        "A8": "live epoch processor at 10 Hz with the code of the batch; receiver streams in, messages out; two channels",
+        "A8": "live epoch processor at 10 Hz with the code of the batch; receiver streams in, messages out",
         "A9": "reference frames and epochs of maps: ETRS89, JGD2011, NAD83(2011), GDA2020, ITRF",
         "A10": "network of tracks with switches; routes over it; positions that name their track",
     },
