@@ -33,8 +33,24 @@ def _freeze(table: Any, length: int) -> None:
     freeze_arrays(table)
 
 
-@dataclass(frozen=True, kw_only=True)
-class KeplerRecords(NotebookTable):
+class _Records(NotebookTable):
+    """Length, text and freezing of broadcast records."""
+
+    satellite: Strings
+    toe: Datetimes
+
+    def __post_init__(self) -> None:
+        _freeze(self, len(self.satellite))
+
+    def __len__(self) -> int:
+        return len(self.satellite)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {_records_text(self.satellite, self.toe)}>"
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class KeplerRecords(_Records):
     """Keplerian records of GPS, QZSS, Galileo and BeiDou, n rows.
 
     Attributes
@@ -101,18 +117,9 @@ class KeplerRecords(NotebookTable):
     group_delay_2_s: Floats
     fit_interval_h: Floats
 
-    def __post_init__(self) -> None:
-        _freeze(self, len(self.satellite))
 
-    def __len__(self) -> int:
-        return len(self.satellite)
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__}: {_records_text(self.satellite, self.toe)}>"
-
-
-@dataclass(frozen=True, kw_only=True)
-class GlonassRecords(NotebookTable):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class GlonassRecords(_Records):
     """State-vector records of GLONASS, n rows.
 
     Attributes
@@ -145,15 +152,6 @@ class GlonassRecords(NotebookTable):
     health: Integers
     frequency_channel: Integers
     age_days: Floats
-
-    def __post_init__(self) -> None:
-        _freeze(self, len(self.satellite))
-
-    def __len__(self) -> int:
-        return len(self.satellite)
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__}: {_records_text(self.satellite, self.toe)}>"
 
 
 @dataclass(frozen=True, kw_only=True)

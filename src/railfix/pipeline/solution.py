@@ -32,7 +32,7 @@ from railfix.positioning.noise_scale import (
     robust_scale,
     stated_scale,
 )
-from railfix.positioning.normal_equations import ClockTies, Ranges, fit
+from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
 from railfix.positioning.robust_fit import map_information, robust_fit
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
@@ -106,8 +106,7 @@ def solve(
     tied = point
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
-        start = np.where(np.isnan(point.ecef_m), corrected.anchor_ecef_m, point.ecef_m)
-        tied = single_point(ranges, start, limits=config.single_point)
+        tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = place_on_line(ranges, index, tied, config, predicted=predicted)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
     robust, robust_sums = _robust_scale(corrected, ranges, trajectory, place, config, state)
@@ -170,6 +169,17 @@ def solve(
         noise = NoiseState(time=time[-1], age=float(age[-1]), robust=robust_sums, remaining=stated_sums)
     after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, carrier=carrier)
     return corrected, solution, after
+
+
+def _tied(ranges: Ranges, ties: ClockTies, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> SinglePoint:
+    """Return the 3-D positions with the clocks tied; those with free clocks where no bias is known yet."""
+    rows = np.flatnonzero(np.count_nonzero(ties.sigma_m < UNTIED_M, axis=1) > 1)
+    if not len(rows):
+        return point
+    start = np.where(np.isnan(point.ecef_m), anchor_ecef_m, point.ecef_m)
+    if len(rows) == len(ranges):
+        return single_point(ranges, start, limits=config.single_point)
+    return patched(point, rows, single_point(ranges.take(rows), start[rows], limits=config.single_point))
 
 
 def _agreeing(ranges: Ranges, point: SinglePoint, anchor_ecef_m: Floats, config: Config) -> tuple[Ranges, SinglePoint]:

@@ -6,7 +6,7 @@ NaN in xarray.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -246,6 +246,12 @@ def _protection_columns(result: AntennaResult) -> dict[str, pl.Series]:
     return columns
 
 
+def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Return the rows of all antennas in order of time, then of the antennas as given."""
+    table = pl.concat(parts)
+    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
+
+
 def positions_table(result: Result) -> pl.DataFrame:
     """One row an epoch and antenna, in order of time, then of the antennas as given.
 
@@ -259,8 +265,7 @@ def positions_table(result: Result) -> pl.DataFrame:
         Columns of `POSITION_COLUMNS`.
     """
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
-    table = pl.concat(parts)
-    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
+    return in_time_order(parts)
 
 
 def antenna_observations(name: str, result: AntennaResult, tracked: AlongTrack | None = None) -> pl.DataFrame:
@@ -342,8 +347,7 @@ def observations_table(result: Result) -> pl.DataFrame:
         Columns of `OBSERVATION_COLUMNS`.
     """
     parts = [antenna_observations(name, antenna, result.fusion.get(name)) for name, antenna in result.antennas.items()]
-    table = pl.concat(parts)
-    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
+    return in_time_order(parts)
 
 
 def rounded(table: pl.DataFrame) -> pl.DataFrame:

@@ -9,7 +9,7 @@ import polars as pl
 
 from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.results import Result
-from railfix.pipeline.tables import float_column
+from railfix.pipeline.tables import float_column, in_time_order
 from railfix.tracking import Kind, TrackStatus
 
 #: Words of the column ``status`` of the filter along the track, and of ``direction``.
@@ -67,10 +67,7 @@ def train_table(result: Result) -> pl.DataFrame:
         Columns of `TRAIN_COLUMNS`; without rows where the filter is off.
     """
     parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
-    if not parts:
-        return pl.DataFrame()
-    table = pl.concat(parts)
-    return table if len(parts) == 1 else table.sort("time_gpst", maintain_order=True)
+    return in_time_order(parts) if parts else pl.DataFrame()
 
 
 def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:

@@ -25,7 +25,37 @@ _BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
-class SatelliteStates:
+class _Arrays:
+    """Arrays of `SatelliteStates`, writable during the computation."""
+
+    position_ecef_m: Floats
+    velocity_ecef_mps: Floats
+    clock_m: Floats
+    group_delay_m: Floats
+    age_s: Floats
+    accuracy_m: Floats
+    record: Integers
+    no_record: Masks
+    too_old: Masks
+    unhealthy: Masks
+    future_record: Masks
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> _Arrays:
+        position, velocity = np.full((2, *shape, 3), np.nan)
+        clock, delay, age, accuracy = np.full((4, *shape), np.nan)
+        no_record, too_old, unhealthy, future = np.zeros((4, *shape), dtype=bool)
+        no_record[...] = True
+        record = np.full(shape, -1, dtype=np.int64)
+        return cls(
+            position_ecef_m=position, velocity_ecef_mps=velocity, clock_m=clock, group_delay_m=delay, age_s=age,
+            accuracy_m=accuracy, record=record, no_record=no_record, too_old=too_old, unhealthy=unhealthy,
+            future_record=future,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SatelliteStates(_Arrays):
     """Satellite states at the times of transmission, T epochs by M channels.
 
     NaN where a channel has no code, no record, or only records out of their validity.
@@ -58,18 +88,6 @@ class SatelliteStates:
     future_record : ndarray of bool, shape (T, M)
         The record used was transmitted after the epoch: usable in post-processing, not live.
     """
-
-    position_ecef_m: Floats
-    velocity_ecef_mps: Floats
-    clock_m: Floats
-    group_delay_m: Floats
-    age_s: Floats
-    accuracy_m: Floats
-    record: Integers
-    no_record: Masks
-    too_old: Masks
-    unhealthy: Masks
-    future_record: Masks
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -136,34 +154,6 @@ def satellite_states(
     if navigation.precise is not None:
         _fill_precise(navigation, satellite, time, code_m, observed, states)
     return SatelliteStates(**vars(states))
-
-
-@dataclass
-class _Arrays:
-    """Writable arrays of `SatelliteStates` during the computation."""
-
-    position_ecef_m: Floats
-    velocity_ecef_mps: Floats
-    clock_m: Floats
-    group_delay_m: Floats
-    age_s: Floats
-    accuracy_m: Floats
-    record: Integers
-    no_record: Masks
-    too_old: Masks
-    unhealthy: Masks
-    future_record: Masks
-
-    @classmethod
-    def empty(cls, shape: tuple[int, ...]) -> _Arrays:
-        position, velocity = np.full((2, *shape, 3), np.nan)
-        clock, delay, age, accuracy = np.full((4, *shape), np.nan)
-        no_record, too_old, unhealthy, future = np.zeros((4, *shape), dtype=bool)
-        no_record[...] = True
-        record = np.full(shape, -1, dtype=np.int64)
-        return cls(
-            position, velocity, clock, delay, age, accuracy, record, no_record, too_old, unhealthy, future
-        )  # fmt: skip
 
 
 def _limit(validity: NDArray[np.timedelta64], max_age_s: float | None) -> NDArray[np.timedelta64]:
