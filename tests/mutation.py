@@ -35,6 +35,10 @@ TESTS: Final = {
     "integrity": "raim_model protection_level stanford",
     "integrity/raim": "raim_model raim_detection raim_exclusion raim_reliability",
     "integrity/protection": "protection_level protection_risk protection_separation protection_sbas",
+    "pipeline/sensor_epochs": "sensor_epochs",
+    "pipeline/received": "received",
+    "pipeline/along_track": "train_output tracking",
+    "pipeline/train_table": "train_output",
     "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrier_stage screen_columns pipeline",
 }
 _PAIRS: Final = (

@@ -1,4 +1,4 @@
-"""A made case for every status and every reason of the pipeline."""
+"""A simulated case for every status and every reason of the pipeline."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from railfix.track.trajectory import Trajectory
 pytestmark = pytest.mark.requirement("B7")
 
 MASK_ONLY = {"screens": ["elevation"]}
-#: Epochs of the made cases: the train runs, all satellites are there.
+#: Epochs of the simulated cases: the train runs, all satellites are there.
 FRONT = clean_observations()["front"][400:440]
 WHOLE = front_alone(FRONT, MASK_ONLY)
 
@@ -50,6 +50,18 @@ def line(points_ecef_m: np.ndarray) -> dict[str, Trajectory]:
 @pytest.mark.requirement("A3")
 def test_everything_there_is_ok():
     all_are(WHOLE, Status.OK)
+
+
+@pytest.mark.requirement("A7")
+def test_nominal_errors_add_to_the_variance_along_the_line():
+    """Without an error model the variance grows with the square of the nominal sigma, from that of the noise alone."""
+    none = {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}
+    variance = [
+        front_alone(FRONT, MASK_ONLY | {"nominal": none | {"satellite_sigma_m": sigma}}).along_sigma_m ** 2
+        for sigma in (0.0, 1.0, 3.0)
+    ]
+    assert (variance[1] - variance[0] > 0.01).all()
+    np.testing.assert_allclose(variance[2] - variance[0], 9.0 * (variance[1] - variance[0]), rtol=1e-9)
 
 
 def test_no_observation():

@@ -125,6 +125,13 @@ def test_nothing_new_is_the_same_value() -> None:
     assert again.navigation.kepler is start.navigation.kepler
 
 
+def test_skipped_records_of_all_receptions_are_counted() -> None:
+    config, time = parse_config({}), np.datetime64("2024-03-05T03:10:00", "ns")
+    start = known_from_start(config, navigation=replace(clean_navigation(), skipped={"SBAS": 2, "IRNSS": 4}))
+    after = receive(start, config, time, navigation=replace(clean_navigation(), skipped={"SBAS": 1, "CNAV": 3}))
+    assert after.navigation.skipped == {"SBAS": 3, "IRNSS": 4, "CNAV": 3}
+
+
 def lock(value: Any) -> None:
     """Make every array in a value read-only, however deep; frozen dataclasses keep the array itself."""
     if isinstance(value, np.ndarray):

@@ -74,6 +74,24 @@ def test_a_wheel_without_direction_is_so_called_and_a_slow_one_says_nothing() ->
 
 
 @pytest.mark.requirement("E5")
+def test_no_way_before_the_first_pulse_nor_over_a_gap() -> None:
+    samples = _samples()
+    pulses = samples.tachometer
+    late = pulses.time > START + timedelta(np.array(5.5))
+    started = TachometerPulses(time=pulses.time[late], pulse=pulses.pulse[late], direction=pulses.direction[late])
+    found, _ = sensor_epochs(
+        replace(samples, tachometer=started), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS
+    )
+    assert found.wheel_m is not None
+    assert np.isfinite(found.wheel_m).tolist() == [False] * 6 + [True] * 13
+    far = EPOCHS[[0, 1, 18]]
+    gap, _ = sensor_epochs(samples, far, bent_line(), SensorState.empty(), limits=LIMITS)
+    for way in (gap.wheel_m, gap.radar_m, gap.force_mps2):
+        assert way is not None
+        assert np.isfinite(way).tolist() == [False, True, False]
+
+
+@pytest.mark.requirement("E5")
 @pytest.mark.parametrize("cuts", [[1], [3, 4, 11], list(range(1, 19))])
 def test_any_cutting_gives_the_same(cuts: list[int]) -> None:
     samples, line = _samples(), bent_line()
