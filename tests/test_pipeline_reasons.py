@@ -52,7 +52,6 @@ def test_everything_there_is_ok():
     all_are(WHOLE, Status.OK)
 
 
-@pytest.mark.requirement("A7")
 def test_nominal_errors_add_to_the_variance_along_the_line():
     """Without an error model the variance grows with the square of the nominal sigma, from that of the noise alone."""
     none = {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}
