@@ -314,6 +314,16 @@ def test_messages_of_the_demonstration(logs: dict[str, tuple[Observations, ...]]
     assert Metrics().text({"paired": 3}).count("# TYPE") == 4
 
 
+def test_bounds_of_the_filter_where_it_has_a_level(logs: dict[str, tuple[Observations, ...]]) -> None:
+    engine = LiveEngine(processor("front", filter="track", tracking={"level": "on"}), LiveSettings())
+    outputs = played(engine, [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:40]])
+    output = outputs[-2]
+    assert output.result is not None
+    amount = float(output.result.fusion["front"].tracked.amount_m[-1])
+    assert output.message.over_cm is not None
+    assert 0.0 <= output.message.over_cm / 100.0 - amount < 0.03
+
+
 def test_the_command_on_the_demonstration(tmp_path: Path) -> None:
     """RINEX files replayed live: messages in JSON and CBOR, tables as `railfix run` writes them."""
     files = demo_files()

@@ -38,8 +38,9 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     """The message of one processed epoch.
 
     The place is that of the filter along the track where it runs, else that of the single epoch; of two antennas
-    the one with the smaller protection level. The bounds are the protection level of the single epoch around its own
-    place, widened by the distance of the filter's place from it, so that they hold for both.
+    the one with the smaller protection level. The bounds are the filter's over- and under-reading amounts where it
+    has a level (`tracking.level`); else the protection level of the single epoch, widened by the distance of the
+    filter's place from it, so that they hold for both.
 
     Parameters
     ----------
@@ -64,6 +65,9 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         front = place + settings.facing * settings.front_offset_m
         values["chainage_cm"] = round(front * 100.0)
         bound = level + abs(place - single) + 0.01 if math.isfinite(single) else math.inf
+        amount = math.nan if track is None or not len(track) else float(track.tracked.amount_m[-1])
+        if math.isfinite(amount):  # the filter has a level of its own
+            bound, level = amount + 0.01, float(track.tracked.level_m[-1]) if track is not None else level
         if math.isfinite(bound):
             values["over_cm"] = values["under_cm"] = _up_cm(bound)
             values["protection_level_cm"] = _up_cm(level)
