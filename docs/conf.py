@@ -1,6 +1,7 @@
 """Settings of the documentation site: ``sphinx-build -W -b html docs build/site``."""
 
 import railfix
+from railfix.core import Settings
 
 project = "railfix"
 author = "The railfix developers"
@@ -20,15 +21,17 @@ suppress_warnings = ["misc.highlighting_failure"]  # examples with "..." for wha
 html_theme = "pydata_sphinx_theme"
 html_title = f"railfix {version}"
 html_show_sourcelink = False
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_sidebars = {"**": ["globaltoc.html"]}
 html_theme_options = {
     "navigation_with_keys": False,
     "show_toc_level": 2,
-    "navbar_align": "left",
+    "navbar_center": [],  # the sidebar has all pages under their headings
     "secondary_sidebar_items": ["page-toc"],
 }
 
 myst_heading_anchors = 4
-myst_enable_extensions = ["dollarmath"]
 nb_execution_mode = "force"
 nb_execution_in_temp = True
 nb_execution_timeout = 600
@@ -41,3 +44,15 @@ autodoc_typehints = "none"
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 numpydoc_attributes_as_param_list = True
+
+
+def short_signature(app, what, name, value, options, signature, annotation):  # noqa: ARG001
+    """Return the signature of a settings model without its defaults, which docs/reference.md lists."""
+    if isinstance(value, type) and issubclass(value, Settings):
+        return "(**settings)", annotation
+    return None
+
+
+def setup(app):
+    """Connect the functions of this file."""
+    app.connect("autodoc-process-signature", short_signature)
