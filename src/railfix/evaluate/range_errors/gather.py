@@ -134,6 +134,10 @@ def range_errors(
     if base is not None:
         residual = residual - base.at(result.time, satellite, largest_gap_s=limits.largest_base_gap_s)
     used = (reason == Reason.USED) & np.isfinite(residual)
+    # What a screen suspects has a sigma of its own: the errors of the others are what the model is of.
+    for name in ("doppler", "antenna_pair"):
+        if name in result.screens:
+            used &= ~result.screens[name].reject
     groups = clock_groups(satellite.astype("<U1"))
     clock = robust_clock(
         np.where(used, residual, np.nan), result.sigma_m[:, columns], groups, least_ranges=limits.least_ranges
