@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from ground_triangle import PLAN_M, simulated_fixes
 from railfix.cli.ground import app
 from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, release
 from railfix.ground.monitor_log import monitor_log
+from railfix.ground.simulated_triangle import PLAN_M, simulated_fixes
 from railfix.ground.station_fixes import station_fixes
 from railfix.ground.triangle import (
     SIDES,

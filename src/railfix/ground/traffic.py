@@ -190,7 +190,7 @@ class Traffic:
             self._lead(train, before)
             self._change_ends(train)
             message = train.message(self.now_s)
-            self._send(train.number, partial(self._report, message))
+            self._send_report(message)
         due = [item for item in self._mail if item[0] <= self.now_s]
         self._mail = [item for item in self._mail if item[0] > self.now_s]
         for _, _, deliver in sorted(due, key=lambda item: item[:2]):
@@ -244,8 +244,14 @@ class Traffic:
         self._stored = self.state
         self._grants += 1
         for number, train in self.state.trains.items():
-            grant = (self._grants, train.direction, train.end_m, self.state.stopped)
-            self._send(number, partial(self._authority, number, *grant))
+            self._send_authority(number, self._grants, train.direction, train.end_m)
+
+    def _send_report(self, message: TrainMessage) -> None:
+        self._send(message.train, partial(self._report, message))
+
+    def _send_authority(self, number: int, grant: int, direction: int, end_m: float) -> None:
+        stopped = self.state.stopped
+        self._send(number, partial(self._authority, number, grant, direction, end_m, stopped=stopped))
 
     def _wants_route(self, train: TrainInterval) -> bool:
         ahead = train.station + train.direction
@@ -255,7 +261,7 @@ class Traffic:
         way = train.direction * ((inner[1] if train.direction > 0 else inner[0]) - train.front_m)
         return way < 700.0
 
-    def _authority(self, number: int, grant: int, direction: int, end_m: float, stopped: bool) -> None:
+    def _authority(self, number: int, grant: int, direction: int, end_m: float, *, stopped: bool) -> None:
         train = self.trains[number]
         if grant <= train.authority or direction != train.direction:
             return

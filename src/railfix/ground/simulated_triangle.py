@@ -1,4 +1,4 @@
-"""Ranges of three receivers on a triangle, with faults put in."""
+"""Simulated fixes of three receivers on a triangle, with faults put in."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from railfix.ground.station_fixes import StationFixes, fixes_of_ranges
 from railfix.positioning.normal_equations import Ranges
 
 #: East and north of the receivers [m].
-PLAN_M = np.array([[0.0, 0.0], [800.0, 100.0], [300.0, 700.0]])
+PLAN_M: Floats = np.array([[0.0, 0.0], [800.0, 100.0], [300.0, 700.0]])
+#: Directions to the satellites [deg].
 ELEVATION_DEG = np.array([75.0, 50.0, 48.0, 35.0, 33.0, 25.0, 22.0, 18.0, 60.0])
 AZIMUTH_DEG = np.array([20.0, 80.0, 150.0, 215.0, 290.0, 340.0, 110.0, 250.0, 310.0])
 TIME = np.datetime64("2024-03-05T00:00:00", "ns")
@@ -29,7 +30,20 @@ def simulated_fixes(
     moved_m: Floats | None = None,
     noise_m: float = 0.4,
 ) -> StationFixes:
-    """Fixes from ranges with errors common to the receivers (T, M), and of receivers moved by (T, 3, 2) [m]."""
+    """Return fixes from simulated ranges of satellites that stand still.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    epochs : int
+        T, one a second.
+    common_m : ndarray, shape (T, 9), optional [m]
+        Errors of the satellites, common to the receivers.
+    moved_m : ndarray, shape (T, 3, 2), optional [m]
+        East and north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
+    noise_m : float [m]
+        Noise of a range.
+    """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
     enu = np.stack([np.cos(el) * np.sin(az), np.cos(el) * np.cos(az), np.sin(el)], axis=1)

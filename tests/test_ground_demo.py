@@ -1,0 +1,187 @@
+"""Demonstration of the ground side, and its page in a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import tempfile
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.applications import Starlette
+from starlette.responses import HTMLResponse, StreamingResponse
+from starlette.routing import Route
+
+from railfix.ground.demo import FAULT_S, run_demo
+from railfix.ground.web import PageServer, page_app
+from report_page import _OPTIONS, Page, browser, fetched
+
+pytestmark = [pytest.mark.requirement(row) for row in ("F1", "F2", "F3", "F4", "F5")]
+needs_browser = pytest.mark.skipif(browser() is None, reason="no chromium is installed")
+
+
+@pytest.fixture(scope="module")
+def demo() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Figures of the demonstration, and the last state of its page."""
+    states: list[dict[str, Any]] = []
+
+    async def keep(url: str) -> None:
+        text = await asyncio.to_thread(lambda: urllib.request.urlopen(url + "state").read())
+        states.append(json.loads(text))
+
+    figures = asyncio.run(asyncio.wait_for(run_demo(speed=25.0, password="secret", keep=keep), 60.0))
+    return figures, states[0]
+
+
+def test_the_story_of_the_demonstration(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    figures, state = demo
+    assert figures["invariants broken"] == {}
+    assert figures["routes set"] == 4
+    assert figures["cause"] == "satellites_or_jamming"
+    assert 0.0 < figures["suspended and stop ordered [s]"] - FAULT_S <= 6.0
+    assert figures["both trains at rest [s]"] > figures["suspended and stop ordered [s]"] + 10.0  # they were running
+    assert 0.7 * figures["reports sent"] < figures["reports used"] <= figures["reports sent"]
+    assert figures["times shown by simulated running"] >= 1
+    assert state["monitor"]["stopped"]
+    log = state["log"]
+    order = [k for k, line in enumerate(log) if line.endswith(("suspend satellite positioning", "triangle: stop"))]
+    assert [log[k].split(": ")[-1] for k in order] == ["stop", "suspend satellite positioning"]  # newest first
+    assert any("heard again" in line for line in log)
+
+
+@contextmanager
+def served(app: Starlette) -> Iterator[str]:
+    """Address of an application that is served in a thread."""
+    started, end, urls = threading.Event(), threading.Event(), []
+
+    async def work() -> None:
+        server = PageServer(app)
+        await server.start()
+        urls.append(server.url)
+        started.set()
+        while not end.is_set():
+            await asyncio.sleep(0.02)
+        await server.stop()
+
+    thread = threading.Thread(target=lambda: asyncio.run(work()))
+    thread.start()
+    assert started.wait(10.0)
+    try:
+        yield urls[0]
+    finally:
+        end.set()
+        thread.join(10.0)
+
+
+def browse(url: str, *options: str) -> str:
+    program = browser()
+    assert program is not None
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:
+        rules = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
+        command = [program, *_OPTIONS, rules, f"--user-data-dir={home}", *options, url]
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=60.0, check=False, env={**os.environ, "HOME": home}
+        )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
+@needs_browser
+def test_the_page_shows_trains_intervals_links_and_the_stop(
+    demo: tuple[dict[str, Any], dict[str, Any]], tmp_path: Path
+) -> None:
+    _, state = demo
+    hostile = {**state, "log": ["</script><b id='hostile'>x</b>", *state["log"]]}
+    shown = [hostile]
+    with served(page_app(lambda: shown[0], lambda: None, password="secret")) as url:
+        document = browse(url, "--window-size=1250,1200", "--dump-dom")
+        shown[0] = state
+        picture = Path(os.environ.get("RAILFIX_SCREENSHOTS", tmp_path)) / "ground.png"
+        browse(url, "--window-size=1100,1150", f"--screenshot={picture}")
+    page = Page(document)
+    assert page.text.get("railfix-errors", "") == ""
+    assert "STOP: satellites or jamming" in page.text["alarm"]
+    classes = [found.get("class") for _, found in page.elements]
+    assert classes.count("train") == 2
+    assert classes.count("occupied") >= 2
+    assert "hostile" not in [found.get("id") for _, found in page.elements]
+    assert document.count("<li>") == len(hostile["log"])
+    assert fetched(document) == []
+    assert picture.stat().st_size > 10_000
+
+
+PHONE = """<!DOCTYPE html><iframe id="phone" style="width:390px;height:3000px;border:0" src="/"></iframe><script>
+document.getElementById("phone").addEventListener("load", function () {
+  const inner = this.contentDocument, note = document.createElement("div");
+  note.id = "narrow";
+  note.dataset.page = inner.documentElement.scrollWidth;
+  const wide = e => !e.closest(".scroll") && e.getBoundingClientRect().right > 391;
+  note.dataset.over = [...inner.querySelectorAll("body *")].filter(wide).map(e => e.tagName + e.id).join(" ");
+  note.dataset.errors = inner.getElementById("railfix-errors").textContent;
+  document.body.append(note);
+});</script>"""
+
+
+@needs_browser
+def test_nothing_is_wider_than_a_telephone(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    app = page_app(lambda: demo[1], lambda: None, password="secret")
+    app.router.routes.append(Route("/phone", lambda _: HTMLResponse(PHONE)))
+    with served(app) as url:
+        note = Page(browse(url + "phone", "--window-size=1000,3000", "--dump-dom")).by_id("narrow")
+    assert (note["data-page"], note["data-over"], note["data-errors"]) == ("390", "", "")
+
+
+@needs_browser
+def test_the_page_connects_again_and_shows_newer_states(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    """Each connection ends after one event; the third says that the run is done."""
+    states = [{**demo[1], "done": False, "now": 1000.0 + k} for k in range(3)]
+    states[2]["done"] = True
+    connections: list[int] = []
+
+    def events(_: Any) -> StreamingResponse:
+        k = min(len(connections), 2)
+        connections.append(k)
+        return StreamingResponse(
+            iter([f"retry: 50\ndata: {json.dumps(states[k])}\n\n"]), media_type="text/event-stream"
+        )
+
+    app = page_app(lambda: states[0], lambda: None, password="secret")
+    app.router.routes[:] = [route for route in app.router.routes if getattr(route, "path", "") != "/events"]
+    app.router.routes.append(Route("/events", events))
+    with served(app) as url:
+        page = Page(browse(url, "--virtual-time-budget=20000", "--dump-dom"))
+    assert connections == [0, 1, 2]
+    assert "Time 1002 s." in page.text["clock"]
+    assert page.text.get("railfix-errors", "") == ""
+
+
+def test_orders_need_the_password(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    answers, asked = iter(["healthy for 3 s of the 300 s before a release", None]), []
+
+    def release() -> str | None:
+        asked.append(1)
+        return next(answers)
+
+    def post(url: str, password: str) -> tuple[int, str | None]:
+        request = urllib.request.Request(url + "release", data=password.encode(), method="POST")
+        try:
+            with urllib.request.urlopen(request) as answer:
+                return answer.status, json.load(answer)["refused"]
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, json.load(error)["refused"]
+
+    with served(page_app(lambda: demo[1], release, password="secret")) as url:
+        assert post(url, "wrong") == (403, "wrong password")
+        assert post(url, "") == (403, "wrong password")
+        assert asked == []
+        assert post(url, "secret") == (409, "healthy for 3 s of the 300 s before a release")
+        assert post(url, "secret") == (200, None)
