@@ -1,11 +1,11 @@
 """Offsets between the receiver clocks of the constellations, estimated slowly.
 
-Each constellation costs one satellite for its clock. But a receiver's clocks keep their distance
-(inter-system bias), to a metre over hours; once it is known, it gives that satellite back: one
-satellite of a constellation counts, and a reflected one is seen against all others.
+Each constellation needs one satellite to determine its clock. The offset between a receiver's clocks
+(inter-system bias) is stable to a metre over hours. Once it is known, a single
+satellite of a constellation contributes, and every satellite is checked against all others.
 
-The offset of an epoch is known from the epochs before it alone, so that a live epoch and one of
-a log get the same, however the log is cut.
+The offset used at an epoch is estimated from earlier epochs only, so live and post-processed results
+are equal, whatever the chunks.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class ClockOffsetLimits(Settings):
         Epochs nearer to each other than this are not independent: errors of a standing
         train are correlated over tens of seconds.
     window_s : float
-        Time constant of forgetting: receivers keep their offsets to a metre over hours, so half an hour loses
-        nothing, and a receiver that starts anew, or an error learnt unnoticed, is forgotten.
+        Time constant of forgetting: offsets are stable to a metre over hours, so half an hour loses
+        nothing, and the effect of a receiver restart or of an undetected error fades.
     """
 
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)

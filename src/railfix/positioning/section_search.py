@@ -9,7 +9,7 @@ point with the least such ``q``, in a time that does not grow with the line:
   whose radius follows from the ``q`` of any one point; a k-d tree returns its points;
 * where it does not (two or three satellites), coarse to fine: the square root of ``q`` cannot
   change faster than the square root of the summed weights times the distance moved, so a stretch
-  of line whose middle fits too badly is dropped whole.
+  of line whose middle fits too badly is dropped.
 
 Both are exact, not heuristic: tests compare them with ``q`` at every point of the line.
 """

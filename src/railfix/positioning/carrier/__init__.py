@@ -1,8 +1,8 @@
 """Carrier phase beside code (P4's observation model): slips, smoothed codes, float ambiguities.
 
-The phase is as good as a few millimetres but for a constant of each unbroken arc. `find_slips`
-tells where the arcs break, `smooth_codes` is the simple use of them (Hatch), `phase_positions` the
-full one: code and phase with the same geometry and clocks, an unknown constant an arc.
+The phase is precise to a few millimetres, but for an unknown constant per arc. `find_slips`
+detects where arcs end, `smooth_codes` is the Hatch filter, and `phase_positions` estimates positions
+from code and phase with the same geometry and clocks and one ambiguity per arc.
 """
 
 from __future__ import annotations

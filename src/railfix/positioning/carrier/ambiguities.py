@@ -1,8 +1,8 @@
 """Positions along the line from code and phase over a run of epochs: one least squares.
 
-P4's observation model with the map's constraint: unknown are the distance and the clocks of every
-epoch and one constant an arc of phase. The epochs' own unknowns are eliminated, so that the
-normal matrix is as large as there are arcs, whatever the number of epochs.
+P4's observation model with the map's constraint: the unknowns are the distance and the clocks of every
+epoch and one ambiguity per arc of phase. The unknowns of the epochs are eliminated: the
+normal matrix has one row per arc, whatever the number of epochs.
 
 `phase_positions` in `filtered` uses each epoch and those before it. The tests compare it with one least
 squares over all epochs of a run (`tests/phase_run.py`).
@@ -42,20 +42,20 @@ class PhaseLimits(Settings):
     drift_m : float
         Random walk of an ambiguity in one second [m/sqrt(s)]: what ionosphere, satellite orbit and
         clock, and multipath move a phase against the others. Without it, phases that drift by
-        centimetres while satellites move by hundredths of a radian outvote the codes by metres.
+        centimetres while satellites move by hundredths of a radian bias the position by metres.
         With codes of 1 m at 1 Hz, 0.01 averages over about 100 s. 0 holds ambiguities constant.
     hop_s : float
         The walk is taken in steps at multiples of this time since the GPS epoch.
     correlation_s : float
-        Code errors of a real receiver last for tens of seconds (multipath, delays): epochs nearer
-        to each other than this give the ambiguities no new information. The variance that the
-        ambiguities bring is multiplied by correlation / interval, up to that of codes alone. The
-        positions do not change. 0 for noise that is white, as a simulated one.
+        Code errors of a real receiver are correlated over tens of seconds (multipath, delays): epochs nearer
+        to each other than this give the ambiguities no new information. The variance of the
+        ambiguities is multiplied by correlation / interval, up to that of codes alone. The
+        positions do not change. 0 for white noise, such as simulated noise.
     passes : int
-        `phase_positions`: linearisations, each with its own memory, so that no result depends on
-        how a log is cut.
+        `phase_positions`: linearisations, each with its own state, so that results do not
+        depend on chunks.
     forget_s : float
-        `phase_positions`: an arc not seen for so long begins anew.
+        `phase_positions`: an arc not observed for this long starts again.
     largest_sigma_m : float
         Epochs whose noise along the line is larger have no position.
     """
@@ -85,7 +85,7 @@ def repeats_of(time: Datetimes, limits: PhaseLimits) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class ArcAmbiguities:
-    """Constants of arcs, A of them (of a whole run with a drift: of stretches of arcs inside a hop).
+    """Ambiguities of A arcs (with a drift over a complete run: of parts of arcs within a hop).
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class ArcAmbiguities:
         clocks of the phases' own, known up to a constant common to all: zero in the mean of the
         corrections to their first values, and the covariance is against that mean.
     covariance_m2 : ndarray, shape (A, A) [m^2]
-        From noise; a map that is off adds to it.
+        From noise alone, without the map error.
     """
 
     arc_id: Integers
@@ -110,8 +110,8 @@ class PhasePositions:
     Attributes
     ----------
     arc_m : ndarray, shape (T,) [m]
-        Along the trajectory, within its ends; NaN where there was no place to start from, or the
-        satellites do not tell.
+        Along the trajectory, within its ends; NaN without an initial position, or where the
+        satellites do not determine it.
     sigma_m, noise_sigma_m : ndarray, shape (T,) [m]
         Standard deviation with the map's error, and of noise alone.
     clock_m : ndarray, shape (T, G) [m]
@@ -142,7 +142,7 @@ class PhasePositions:
 
 
 def startable(ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats) -> tuple[Ranges, Phases, Floats]:
-    """The same with nothing used at epochs without a place, and any place on the line there.
+    """Ranges, phases and positions to start from: epochs without a position have no weight and distance 0.
 
     Raises
     ------
@@ -172,8 +172,8 @@ def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Inverse of normal matrices of ambiguities, shape (..., A, A).
 
     With a clock of the phases' own a constant common to all ambiguities is unobservable. It is fixed
-    by asking that the `held` ones (1, others 0; shape (..., A)) are zero in the mean: no difference
-    between them changes by that, and no digits are lost.
+    by the condition that the `held` ones (1, others 0; shape (..., A)) have zero mean, which changes no
+    difference between them and loses no digits.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)

@@ -1,7 +1,7 @@
-"""Names of unbroken stretches of phase.
+"""Numbers of phase arcs without a cycle slip.
 
-An arc's name is a whole number that no other arc of a run has: the channel's five letters and how
-many arcs that channel has had. So it can cross from chunk to chunk, whatever the channels' order.
+The number of an arc is unique in a run: the channel's five letters and the count of
+arcs of that channel so far. It does not depend on chunks or on the order of channels.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Integers, Masks, Strings
+from railfix.core.arrays import Indices, Integers, Masks, Strings
 
-#: Bits of the count in an arc's name; the channel's letters stand above.
+#: Bits of the count in an arc's number; the channel's letters are above them.
 COUNT_BITS: Final = 23
 #: No phase, no arc.
 NO_ARC: Final = -1
+
+#: Satellite and signal of each channel.
+ChannelKeys = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +35,20 @@ def channel_code(satellite: str, signal: str) -> int:
     return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
 
 
+def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
+    """Satellite and signal of each channel, by which states refer to channels."""
+    return tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
+
+
+def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
+    """Row of each channel among those of the epoch before, -1 for new ones, shape (M,).
+
+    Values of a state with one more for new channels at the end, ``np.append(values, np.nan)``, are indexed with it.
+    """
+    row = {key: i for i, key in enumerate(before)}
+    return np.array([row.get(key, -1) for key in now], dtype=np.intp)
+
+
 def number_arcs(
     slip: Masks,
     has_phase: Masks,
@@ -39,7 +56,7 @@ def number_arcs(
     signal: Strings,
     state: ArcState | None = None,
 ) -> tuple[Integers, ArcState]:
-    """The arc that each phase belongs to.
+    """Number of the arc of each phase.
 
     Parameters
     ----------

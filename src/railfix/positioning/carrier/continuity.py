@@ -1,9 +1,9 @@
 """Phase jumps detected on the line from the change of the phases between two epochs.
 
-Between two epochs the antenna moved by one unknown distance along a known line and the clock by
-one unknown; every further satellite is a check, good to a centimetre at any rate of the log and
-without Dopplers. Where they do not agree, the worst channel is taken out until the others do, and
-one that then fits comes back.
+Between two epochs the unknowns are the distance moved along a known line and the change of the clock;
+every further satellite is a check, precise to a centimetre at any rate of the log and
+without Dopplers. Where they disagree, the worst channels are rejected one by one until the others agree, and
+channels that then fit are accepted again.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
 from railfix.track.trajectory import Trajectory
 
 
@@ -31,10 +32,10 @@ class ContinuityLimits(Settings):
     aside_m : float
         Standard deviation across the line and in height of the change of place at once (map points).
     across_share, up_share : float
-        The same as shares of the way: a position that is 5 m off sees the line turned by 0.017 on a
-        curve of 300 m radius, and by 0.0025 on a vertical one of 2000 m.
+        The same as shares of the distance moved: a position error of 5 m turns the line by 0.017 on a
+        curve of 300 m radius, and by 0.0025 on a vertical curve of 2000 m.
     sigmas : float
-        A channel is out from so many standard deviations of its own residual on.
+        Threshold of rejection, in standard deviations of the channel's own residual.
     max_rejected : int
         Largest number of channels rejected; where more would be, no channel continues.
     max_gap_s : float
@@ -66,7 +67,7 @@ class ContinuityState:
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    channels: tuple[tuple[str, str], ...] = ()
+    channels: ChannelKeys = ()
     phase_m: Floats = field(default_factory=lambda: np.empty(0))
     sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))
     arc_m: float = float("nan")
@@ -79,7 +80,7 @@ class TrackJumps:
     Attributes
     ----------
     jump : ndarray of bool, shape (T, M)
-        True where the phase does not fit: its arc begins anew.
+        True where the phase does not fit: a new arc begins.
     metric_m : ndarray, shape (T, M) [m]
         Change of phase less that of the channels kept; NaN where not judged.
     judged : ndarray of bool, shape (T, M)
@@ -108,7 +109,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Phases that jump against the others and the line.
+    """Phases that disagree with the other phases and the line.
 
     Parameters
     ----------
@@ -132,12 +133,10 @@ def track_jumps(
     ContinuityState
     """
     limits, state = limits or ContinuityLimits(), state or ContinuityState()
-    channels = tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
-    place = {key: i for i, key in enumerate(state.channels)}
-    at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
-    last_phase, last_sat = np.full(len(channels), np.nan), np.full((len(channels), 3), np.nan)
-    last_phase[at >= 0], last_sat[at >= 0] = state.phase_m[at[at >= 0]], state.sat_ecef_m[at[at >= 0]]
-
+    channels = channel_keys(satellite, signal)
+    rows = rows_before(state.channels, channels)
+    last_phase = np.append(state.phase_m, np.nan)[rows]
+    last_sat = np.append(state.sat_ecef_m, np.full((1, 3), np.nan), axis=0)[rows]
     phase = np.concatenate([last_phase[None], phase_m])
     sats = np.concatenate([last_sat[None], sat_ecef_m])
     arc = np.r_[state.arc_m, arc_m]
@@ -187,7 +186,7 @@ def _around(sats: Floats, trajectory: Trajectory, arc: Floats) -> tuple[Floats, 
 def _consistent(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Channels that agree, the worst taken out one by one.
+    """Channels that agree after the worst are rejected one by one.
 
     Returns the mask of those kept, residuals of all, step along the line with its variance, and
     where the rest agrees. Where there is nothing to check with, all are kept.
@@ -204,7 +203,7 @@ def _consistent(
     if len(at):
         part = design[at], change[at], sigma[at], prior[at]
         kept[at], decided[at] = _worst_out(*part, judged[at], limits)
-        # One that was taken out for another's sake comes back.
+        # A channel rejected because of another one is accepted again.
         back = judged[at] & (_fitted(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
         kept[at], again = _worst_out(*part, back, limits)
         decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.max_rejected)
@@ -231,7 +230,7 @@ def _fitted(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: F
     residual = change - np.matmul(design, x[..., None])[..., 0]
     spread = np.einsum("tmi,tij,tmj->tm", design, inverse, design)
     own = sigma[:, None] ** 2
-    # Of a channel that nothing checks no variance is left: it cannot be judged.
+    # A channel that no other checks has no residual variance: it cannot be tested.
     checked = np.where(kept, own - spread, own + spread)
     size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
     return _Fit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
@@ -240,7 +239,7 @@ def _fitted(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: F
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Kept channels after taking out the worst one by one, and where the rest agrees."""
+    """Channels kept after rejecting the worst one by one, and the epochs where these agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

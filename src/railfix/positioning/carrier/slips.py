@@ -26,6 +26,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
+from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
 
 #: One millisecond as a distance [m]: the step of receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
@@ -101,7 +102,7 @@ class SlipState:
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    channels: tuple[tuple[str, str], ...] = ()
+    channels: ChannelKeys = ()
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     phase_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))
@@ -157,7 +158,7 @@ def median_or_zero(values: Floats) -> Floats:
     result = np.zeros(len(values))
     enough = np.flatnonzero(count >= _COMMON)
     if len(enough):
-        # NaN sorts last: the middle of the finite ones is found without leaving any out.
+        # NaN sorts last: the median is the middle of the finite values.
         ranked = np.sort(values[enough], axis=1)
         row, number = np.arange(len(enough)), count[enough]
         result[enough] = 0.5 * (ranked[row, (number - 1) // 2] + ranked[row, number // 2])
@@ -169,19 +170,6 @@ def _before(values: Floats, last: Floats) -> Floats:
     return np.concatenate([last[None], values[:-1]])
 
 
-def _last_row(state: SlipState, channels: tuple[tuple[str, str], ...]) -> dict[str, Floats]:
-    """The state's last epoch in the order of these channels, NaN for new ones."""
-    place = {key: i for i, key in enumerate(state.channels)}
-    at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
-    known = at >= 0
-    rows = {}
-    for name in ("code_m", "phase_m", "doppler_mps", "half_cycle"):
-        row = np.full(len(channels), np.nan)
-        row[known] = getattr(state, name)[at[known]]
-        rows[name] = row
-    return rows
-
-
 def find_slips(
     observations: Observations,
     state: SlipState | None = None,
@@ -191,8 +179,8 @@ def find_slips(
 ) -> tuple[Slips, SlipState]:
     """Cycle slips of every channel of a chunk.
 
-    A channel's phase begins anew after an epoch without it: what happened meanwhile nobody saw.
-    With fewer than three channels a clock step and a slip look alike, and count as a slip.
+    A channel's phase starts a new arc after an epoch without it.
+    With fewer than three channels a clock step cannot be told from a slip, and counts as a slip.
 
     Parameters
     ----------
@@ -209,11 +197,15 @@ def find_slips(
     -------
     Slips
     SlipState
-        Any cutting into chunks gives the same bits.
+        Division into chunks does not change the result.
     """
     limits, state = limits or SlipLimits(), state or SlipState()
-    channels = tuple(zip(observations.satellite.tolist(), observations.signal.tolist(), strict=True))
-    last = _last_row(state, channels)
+    channels = channel_keys(observations.satellite, observations.signal)
+    rows = rows_before(state.channels, channels)
+    last = {
+        name: np.append(getattr(state, name), np.nan)[rows]
+        for name in ("code_m", "phase_m", "doppler_mps", "half_cycle")
+    }
     if frequency_hz is None:
         frequency_hz = carrier_frequency_hz(
             observations.satellite, observations.signal, observations.header.glonass_channel

@@ -17,6 +17,7 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.positioning.carrier.arcs import ChannelKeys, channel_keys, rows_before
 from railfix.positioning.carrier.recursion import linear_recursion
 
 
@@ -29,8 +30,8 @@ class SmoothingLimits(Settings):
         Time constant: each code of an arc counts the same until the arc is this old, from then
         on older ones fade (DO-229D 2.1.4.1.5 takes 100 s, for the ionosphere's drift).
     clocks : {"own", "shared"}
-        "own": what all codes of an epoch changed against their phases in the mean is a clock, not
-        noise: taken off before and put back after averaging. For telephones, whose codes jump
+        "own": the mean change of all codes of an epoch against their phases is a clock, not
+        noise: subtracted before and added after averaging. For telephones, whose codes jump
         together by tens of metres (urban 95 % of the error along the line 10.8 to 7.0 m, against 50 m
         with "shared"); other receivers did not lose by it.
     """
@@ -63,7 +64,7 @@ class SmoothingState:
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    channels: tuple[tuple[str, str], ...] = ()
+    channels: ChannelKeys = ()
     base_m: Floats = field(default_factory=lambda: np.empty(0))
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
     variance: Floats = field(default_factory=lambda: np.empty(0))
@@ -79,8 +80,8 @@ class Smoothed:
     Attributes
     ----------
     code_m : ndarray, shape (T, M) [m]
-        The code as it came where there is no phase, and at the first epoch of an arc; NaN where
-        there is no code, unless its arc runs on in the phase: then the smoothed code does.
+        The raw code where there is no phase, and at the first epoch of an arc; NaN where
+        there is no code, unless the arc of its phase continues: then the smoothed code continues.
     sigma_factor : ndarray, shape (T, M)
         Expected standard deviation against that of one code, for noise that is white in time;
         multipath lasts for tens of seconds and is averaged less. NaN where `code_m` is.
@@ -88,22 +89,6 @@ class Smoothed:
 
     code_m: Floats
     sigma_factor: Floats
-
-
-def _rows(
-    state: SmoothingState, channels: tuple[tuple[str, str], ...]
-) -> tuple[Floats, Floats, Floats, Integers, Floats]:
-    """The state in the order of these channels; nothing runs in new ones."""
-    place = {key: i for i, key in enumerate(state.channels)}
-    at = np.array([place.get(key, -1) for key in channels], dtype=np.intp)
-    known = at >= 0
-    base, last = np.full((2, len(channels)), np.nan)
-    offset, variance = np.zeros((2, len(channels)))
-    count = np.zeros(len(channels), dtype=np.int64)
-    base[known], offset[known] = state.base_m[at[known]], state.offset_m[at[known]]
-    variance[known], count[known] = state.variance[at[known]], state.count[at[known]]
-    last[known] = state.last_m[at[known]]
-    return base, offset, variance, count, last
 
 
 def _held(values: Floats, at: Masks, first: Floats) -> Floats:
@@ -152,11 +137,14 @@ def smooth_codes(
     -------
     Smoothed
     SmoothingState
-        Any cutting into chunks gives the same within rounding (1e-9 m).
+        Division into chunks does not change the result beyond rounding (1e-9 m).
     """
     limits, state = limits or SmoothingLimits(), state or SmoothingState()
-    channels = tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
-    base0, offset0, variance0, count0, last0 = _rows(state, channels)
+    channels = channel_keys(satellite, signal)
+    rows = rows_before(state.channels, channels)
+    base0, last0 = (np.append(values, np.nan)[rows] for values in (state.base_m, state.last_m))
+    offset0, variance0 = (np.append(values, 0.0)[rows] for values in (state.offset_m, state.variance))
+    count0 = np.append(state.count, 0)[rows]
     if not len(time):
         return Smoothed(code_m=code_m, sigma_factor=np.ones(code_m.shape)), state
     has_phase = np.isfinite(phase_m)
