@@ -3,7 +3,7 @@
 Prints median, 99th percentile and largest time an epoch, wall and processor time, over the demonstration
 run that comes with railfix, or over another simulated one::
 
-    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask] [--gap 600] [--profile]
+    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask] [--gap 600]
 """
 
 from __future__ import annotations
