@@ -58,7 +58,6 @@ def main() -> int:
         )
     ]
     for rule in ("p2", "map"):
-        of_rule = SlipLimits.model_validate({"rule": rule})
         found = find_slips(
             t,
             speed.speed_mps,
