@@ -39,7 +39,10 @@ TESTS: Final = {
     "pipeline/received": "received",
     "pipeline/along_track": "train_output tracking",
     "pipeline/train_table": "train_output",
-    "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrier_stage screen_columns pipeline",
+    "pipeline/open_places": "open_places",
+    "pipeline/locate": "locate",
+    "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrier_stage screen_columns "
+    "pipeline_couplings pipeline",
 }
 _PAIRS: Final = (
     (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.BitAnd, ast.BitOr), (ast.And, ast.Or), (ast.Lt, ast.LtE),

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, with_code
+from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, only, with_code
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.signals import carrier_frequency_hz
@@ -151,3 +152,18 @@ def test_a_noisy_receiver_on_the_map_is_not_off_it() -> None:
     plain = found.constrained.wsse - found.single_point.wsse
     assert (plain > 27.6).mean() > 0.05
     assert (found.status == Status.OFF_MAP).mean() < 0.01
+
+
+def test_the_noise_of_a_3d_fit_is_that_of_its_redundant_ranges() -> None:
+    """Six satellites of one clock leave two redundant ranges, over which the misfit of the 3-D fit is divided."""
+    rng = np.random.default_rng(5)
+    log = clean_observations()["front"][300:500]
+    order = np.argsort(-FAULTY.elevation_deg[0])
+    gps = [s for s in FAULTY.satellite[order].tolist() if s[0] == "G"][:6]
+    noisy = with_code(only(log, gps), rng.normal(0.0, 40.0, (len(log), only(log, gps).code_m.shape[1])))
+    found = front_alone(noisy, {"screens": ["elevation"]})
+    shown = np.maximum(1.0, found.single_point.wsse / (found.n_used - 4))
+    lost = (found.constrained.wsse - found.single_point.wsse) / shown > chi2.isf(1e-6, 2)
+    inside = found.constrained.overshoot_m == 0
+    assert 0.01 < lost[inside].mean() < 0.5
+    np.testing.assert_array_equal((found.status == Status.OFF_MAP)[inside], lost[inside])

@@ -91,6 +91,23 @@ def test_no_way_before_the_first_pulse_nor_over_a_gap() -> None:
         assert np.isfinite(way).tolist() == [False, True, False]
 
 
+@pytest.mark.requirement("E2")
+def test_no_way_over_a_lost_or_a_doubled_pulse() -> None:
+    samples = _samples()
+    time = samples.tachometer.time
+    lost = int(np.searchsorted(time, START + timedelta(np.array(14.5))))
+    doubled = int(np.searchsorted(time, START + timedelta(np.array(9.5))))
+    halfway = time[doubled] + (time[doubled + 1] - time[doubled]) // 2
+    time = np.sort(np.append(np.delete(time, lost), halfway))
+    pulses = TachometerPulses(time=time, pulse=np.arange(1, len(time) + 1), direction=np.ones(len(time), dtype=int))
+    found, _ = sensor_epochs(
+        replace(samples, tachometer=pulses), EPOCHS, bent_line(), SensorState.empty(), limits=LIMITS
+    )
+    assert found.wheel_m is not None
+    # Epoch k is at k + 1 seconds; the first epoch has no way.
+    assert np.flatnonzero(np.isnan(found.wheel_m)).tolist() == [0, 9, 14]
+
+
 @pytest.mark.requirement("E5")
 @pytest.mark.parametrize("cuts", [[1], [3, 4, 11], list(range(1, 19))])
 def test_any_cutting_gives_the_same(cuts: list[int]) -> None:
