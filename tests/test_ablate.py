@@ -214,7 +214,7 @@ def test_only_fixed_positions_are_truth(truth: Path, tmp_path: Path) -> None:
     pl.concat([table.with_columns(quality)] * 2).reverse().write_csv(path)
     found = read_reference(path, ["front"])["front"]
     assert len(found.time) == 6
-    assert (np.diff(found.time) > np.timedelta64(0)).all()
+    assert (np.diff(found.time) > np.timedelta64(0, "ns")).all()
 
 
 @pytest.mark.slow

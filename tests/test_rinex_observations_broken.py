@@ -319,4 +319,4 @@ def test_whatever_is_broken_ends_in_one_sentence(
     except InputFileError:
         return
     assert len(counted) > 0
-    assert (np.diff(counted.time) > np.timedelta64(0)).all()
+    assert (np.diff(counted.time) > np.timedelta64(0, "ns")).all()

@@ -51,7 +51,7 @@ def test_recordings_are_read_without_a_fault(recordings: Path, name: str) -> Non
     path, shape = RECORDINGS[name]
     observations = read_observations(recordings / path)
     assert observations.code_m.shape == shape
-    assert (np.diff(observations.time) > np.timedelta64(0)).all()
+    assert (np.diff(observations.time) > np.timedelta64(0, "ns")).all()
     assert not observations.problems
     assert not observations.skipped
     code = observations.code_m[np.isfinite(observations.code_m)]

@@ -177,7 +177,7 @@ def test_damage_anywhere_is_an_error_or_an_ephemeris(tmp_path: Path, data: st.Da
     if error is not None:
         assert str(path) in str(error)
         return
-    assert (np.diff(found.time) > np.timedelta64(0)).all()
+    assert (np.diff(found.time) > np.timedelta64(0, "ns")).all()
     assert not np.isinf(found.position_ecef_m).any()
 
 

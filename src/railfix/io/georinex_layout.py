@@ -182,7 +182,7 @@ def _gps_time(data: xr.Dataset) -> Datetimes:
         time = bdt_to_gpst(time)
     elif system not in ("GPS", "GAL", "QZS"):
         raise ValueError(f"time_system is {system!r}; GPS, GAL, QZS, BDT, GLO or UTC was expected")
-    if (np.diff(time) <= np.timedelta64(0)).any():
+    if (np.diff(time) <= np.timedelta64(0, "ns")).any():
         raise ValueError("time must rise strictly; sort the dataset by time and drop repeated epochs")
     return time
 

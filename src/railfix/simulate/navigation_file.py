@@ -103,7 +103,7 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
     # Of records sent at one time the one for later.
-    rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0), True)]
+    rows = rows[np.append(np.diff(records.transmitted[rows]) > np.timedelta64(0, "ns"), True)]
     sent = records.transmitted[rows]
     begin, end = (int(np.searchsorted(sent, time, side="right")) for time in (first, last))
     if begin == 0 or not len(rows):

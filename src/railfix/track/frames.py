@@ -85,7 +85,7 @@ class FrameShift:
 def decimal_year(time: np.datetime64 | Datetimes) -> float:
     """Time as a decimal year, as frames' epochs are written."""
     year = np.asarray(time, dtype="datetime64[Y]")
-    start, end = year.astype("datetime64[s]"), (year + 1).astype("datetime64[s]")
+    start, end = year.astype("datetime64[s]"), (year + np.timedelta64(1, "Y")).astype("datetime64[s]")
     part = (np.asarray(time, dtype="datetime64[s]") - start) / (end - start)
     return float(year.astype(np.int64) + 1970 + part)
 

@@ -55,7 +55,7 @@ def draw_figure(chart: Chart) -> Figure:
     Returns
     -------
     Figure
-        ``figure.savefig("error.png")`` writes it; a notebook shows it.
+        ``figure.savefig("error.png")`` writes it; a notebook shows it after ``%matplotlib inline``.
     """
     from matplotlib.figure import Figure
 
