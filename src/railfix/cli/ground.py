@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from rich.markup import escape
 from rich.table import Table
 
 from railfix.cli.command import Command, Commands
@@ -22,13 +23,16 @@ app = typer.Typer(
     name="ground",
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="Monitor satellites by a reference triangle, demonstrate the ground side.",
 )
 
 
 @app.callback()
 def ground() -> None:
-    """Monitor satellites by a reference triangle, demonstrate the ground side."""
+    """Judge satellite positioning from the ground, and show the ground side at work.
+
+    A reference triangle of three receivers finds satellite faults, disturbances and failed receivers; a control centre
+    supervises trains over two encrypted links, gives each the distance it may run and sets points.
+    """
 
 
 @app.command("monitor", cls=Command)
@@ -124,6 +128,8 @@ def keys(
     owner alone; each train gets authority.pem and its own two files only.
 
     Example: `railfix ground keys keys --train 1 --train 2`
+
+    Exit codes as `railfix --help` says; 8 where a file is there already.
     """
     from railfix.ground.keys import write_keys
 
@@ -175,5 +181,5 @@ def demo(
     table = Table("what happened", "")
     for name, value in figures.items():
         text = ", ".join(f"{k} {v}" for k, v in value.items()) or "none" if isinstance(value, dict) else str(value)
-        table.add_row(name, text)
+        table.add_row(escape(name), text)
     console.print(table)

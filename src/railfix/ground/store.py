@@ -76,17 +76,17 @@ class Store:
         self._connection.close()
         self._engine.dispose()
 
-    def save(self, record: TrainRecord) -> None:
-        """Commit the newest report of a train; afterwards it may be acknowledged."""
-        values = {
-            "sequence": record.sequence,
-            "message": None if record.message is None else encode(record.message),
-        }
-        self._put(TRAINS, {"train": record.train}, values)
+    def save(self, *records: TrainRecord) -> None:
+        """Commit the newest reports of trains together; afterwards they may be acknowledged."""
+        with self._connection.begin():
+            for record in records:
+                message = None if record.message is None else encode(record.message)
+                self._put(TRAINS, {"train": record.train}, {"sequence": record.sequence, "message": message})
 
     def save_document(self, name: str, text: str) -> None:
         """Commit a named text, for example the state of the interlocking."""
-        self._put(DOCUMENTS, {"name": name}, {"text": text})
+        with self._connection.begin():
+            self._put(DOCUMENTS, {"name": name}, {"text": text})
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
         """Commit a line of the log."""
@@ -123,10 +123,9 @@ class Store:
 
     def _put(self, table: sql.Table, key: dict[str, Any], values: dict[str, Any]) -> None:
         where = [table.c[name] == value for name, value in key.items()]
-        with self._connection.begin():
-            done = self._connection.execute(table.update().where(*where).values(**values))
-            if done.rowcount == 0:
-                self._connection.execute(table.insert().values(**key, **values))
+        done = self._connection.execute(table.update().where(*where).values(**values))
+        if done.rowcount == 0:
+            self._connection.execute(table.insert().values(**key, **values))
 
 
 def _durable(connection: Any, _record: object) -> None:
