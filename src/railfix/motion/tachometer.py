@@ -36,9 +36,9 @@ class TachometerLimits(Settings):
         Time over which speeds are taken. P2 3.2 calls 0.1 s the usual smoothing of a tachometer; with uneven teeth
         take that of a whole turn.
     least_speed_mps : float
-        Below it nothing is said: P2 1, no output at low speed; 1 km/h.
+        Below it there is no output (P2 1; 1 km/h).
     silence_s : float
-        Time without a pulse after which nothing is said.
+        Time without a pulse after which there is no output.
     jitter_s, resolution_s : float
         Standard deviation of a pulse's instant, and the step of the clock that measures it.
     """

@@ -130,7 +130,7 @@ def sensor_epochs(
 
 
 def _slow(way: Floats, span: Floats, limits: SensorLimits) -> Masks:
-    """Whether a wheel has turned too slowly to say anything."""
+    """Whether the wheel turned too slowly for a distance."""
     return np.asarray(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
 
 

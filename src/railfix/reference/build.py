@@ -136,11 +136,11 @@ class _Builder:
         place = np.interp(_since(time, time), _since(fixes.time[good], time), fixes.arc_m[good])
         for _ in range(_ROUNDS if self.data.dopplers else 1):
             speeds = self._speeds(time, place)
-            settings, told = self._calibrated(speeds, wheel, fixes)
+            settings, calibrated = self._calibrated(speeds, wheel, fixes)
             evidence = self._evidence(time, at, fixes, good, speeds, wheel, place)
             smoothed = smooth(evidence, settings)
             place = np.clip(smoothed.arc_m, 0.0, self.trajectory.arc_m[-1])
-        facts = self._facts(speeds, wheel, smoothed, told)
+        facts = self._facts(speeds, wheel, smoothed, calibrated)
         excess = self._excess(speeds, wheel, smoothed, time, fixes, settings)
         return assembled(
             evidence,

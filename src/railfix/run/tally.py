@@ -169,7 +169,7 @@ class AntennaTally:
         names, which = np.unique(result.satellite, return_inverse=True)
         member = (which[:, None] == np.arange(len(names))).astype(np.int64)
         reason = result.reason[short]
-        # The signals that nobody looked at could not have stood in.
+        # Signals that were not checked cannot replace it.
         looked_at = (reason & Reason.OTHER_SIGNAL_TAKEN) == 0
 
         def enough(without: int) -> Masks:

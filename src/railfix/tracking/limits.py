@@ -56,7 +56,7 @@ class TrackingLimits(Settings):
         Distance of two branches at which half of their difference is the map's: three times an error of 1 m, that of
         a track surveyed by car or train.
     decided_travel_m : float
-        Hypotheses are dropped only after this much travel: before, motion has not told branches apart.
+        Hypotheses are dropped only after this much travel: before, motion does not separate branches.
     least_probability : float
         Hypotheses below it are dropped.
     most_hypotheses : int

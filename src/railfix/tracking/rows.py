@@ -231,7 +231,7 @@ def sensor_rows(
 ) -> Rows | None:
     """Rows of the sensors at one epoch, None without any.
 
-    `direction` is the sign of the last speed that told one, 0 before: an unsigned way takes it where the speed is
+    `direction` is the sign of the last speed with a direction, 0 before: an unsigned way takes it where the speed is
     near 0, for a train that stood goes on.
     """
     state = {unknown: mean[:, unknown] for unknown in Unknown}

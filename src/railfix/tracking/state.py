@@ -115,7 +115,7 @@ class TrackState:
     unaided_m : float [m]
         Way since codes were used.
     direction : float
-        Sign of the last speed that told one.
+        Sign of the last speed with a direction.
     """
 
     time: np.datetime64

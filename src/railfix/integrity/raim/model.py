@@ -246,7 +246,7 @@ def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *,
     misfit = ranges.code_m - distance
     if ranges.ties is not None:
         misfit = misfit - ranges.ties.offset_m[:, clock]
-    # A constant of all ranges is nobody's residual; without it the sums keep their digits.
+    # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
     total = totals.sum(axis=1, keepdims=True)
     misfit = misfit - (ranges.weight * misfit).sum(axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
     rows = root[..., None] * -(los @ axes.swapaxes(1, 2))

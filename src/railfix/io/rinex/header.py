@@ -139,7 +139,7 @@ def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = N
     header = apply_records(path, start, lines[1:], first_line=2, notes=notes)
     if not header.types:
         label = "# / TYPES OF OBSERV" if version < 3.0 else "SYS / # / OBS TYPES"
-        raise InputFileError(path, f"the header has no {label} record; the observations cannot be told apart")
+        raise InputFileError(path, f"the header has no {label} record; the observation types are unknown")
     return header
 
 

@@ -276,7 +276,7 @@ def _superseded(arc_id: Integers) -> Masks:
 
 
 def _without(memory: Memory, ends: Masks) -> Memory:
-    """The memory with some arcs eliminated: what they said of the others stays."""
+    """Normal equations with some arcs eliminated; their information on the others is kept."""
     runs = ~ends
     if runs.all():
         return memory

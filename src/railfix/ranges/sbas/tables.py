@@ -41,7 +41,7 @@ _NO_SERIES: Final = 2**19
 class Series:
     """Rows of many series (satellites, grid points ...) sorted by series and time of reception.
 
-    An empty table holds one row of a series that nobody asks for: `columns` can be indexed with the -1 that
+    An empty table holds one row of a series that is never used: `columns` can be indexed with the -1 that
     `newest` returns for "none", and the caller masks the value.
 
     Attributes
