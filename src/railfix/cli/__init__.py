@@ -26,6 +26,7 @@ class _Program(LazyCommands):
         "reference": "Build a reference trajectory from fixed positions, gaps bridged.",
         "live": "Position a train from its receivers' streams as they arrive.",
         "locate": "Compute 3-D positions from a log, without a track map.",
+        "which-track": "Decide on which track a train at rest stands.",
         "convert": "Write receiver logs as RINEX files.",
         "cn0-curve": "Fit the mean C/N0 over elevation of an antenna and receiver.",
         "error-model": "Model the pseudorange errors of a line from runs with references.",

@@ -1,0 +1,62 @@
+"""``railfix which-track``: the track on which a train at rest stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from railfix.cli.console import console_of_tables
+from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.cli.settings import Choices, settings_of
+from railfix.run.output import check_output_file
+from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files
+
+
+@from_models
+def which_track(
+    inputs: WhichTrackInputs,
+    options: WhichTrackOptions,
+    choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
+    *,
+    crs: Annotated[str | None, typer.Option(metavar="EPSG", help="CRS of a map whose file does not name one.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="PICTURE", help="Picture of the probabilities over time (.png or .svg).")
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Decide on which track a train at rest stands, or report that it is undecided.
+
+    Each track of the map within 60 m is a hypothesis, and so is a track that the map does not have (`none`). The
+    codes of each satellite have a constant error at rest, so waiting helps less than independent samples would. The
+    decision is taken when the probability of all other hypotheses together is below `--risk`; else all
+    probabilities are printed.
+
+    Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
+
+    Exit codes as `railfix --help` says; 5 where the train moves or no track is near.
+    """
+    if out is not None:
+        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
+    settings, _ = settings_of(choices)
+    decision = which_track_files(inputs, options, settings, crs=crs)
+    console = console_of_tables()
+    last = decision.posteriors[-1]
+    decided = "" if np.isnan(decision.decided_s) else f", decided after {decision.decided_s:.0f} s"
+    console.print(f"track: {decision.track}{decided} (risk {options.risk:g})", markup=False)
+    if not last.fits:
+        console.print("the codes do not fit the error model (--code-bias-m, --code-noise-m): no decision is taken")
+    table = Table("track", "probability", "facing its direction", show_edge=False)
+    facing = np.append(last.with_rising, np.nan)
+    for k in np.argsort(-last.probability):
+        share = facing[k] / last.probability[k] if last.probability[k] > 0.0 and np.isfinite(facing[k]) else np.nan
+        table.add_row(last.names[k], f"{last.probability[k]:.6f}", "" if np.isnan(share) else f"{share:.4f}")
+    console.print(table)
+    if out is not None:
+        from railfix.report.plots.which_track import plot_track_decision
+
+        plot_track_decision(decision, out, risk=options.risk)
+        console.print(f"picture: {out}", markup=False, soft_wrap=True)

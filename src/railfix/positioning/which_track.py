@@ -1,0 +1,326 @@
+"""Which of several tracks a train stands on, from codes at rest (P1 2.5).
+
+Hypotheses are a track and the way the train faces, and *none*: a track that the map does not have, parallel to the
+nearest at any distance that keeps clear of the others. At rest multipath does not average out: each satellite's code
+has a constant bias, so the covariance of the mean does not fall with the number of epochs, and satellite, orbit and
+atmosphere errors are common to both antennas. The posterior probability of a hypothesis is its prior times the likelihood integrated over the
+place along the track. A decision is taken when all others together have less than the risk allowed; whatever the
+time at which that happens, its probability of being wrong is that risk, as far as the error model holds (a posterior
+probability is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472, for the sequential test).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+from scipy.special import logsumexp
+from scipy.stats import chi2
+
+from railfix.core.arrays import Floats, Masks, Strings
+from railfix.core.settings import Settings, option
+
+#: Steps of the integrals along and across the track [m].
+_ALONG_M: Final = 0.25
+_ACROSS_M: Final = 0.3
+#: Tracks lie no nearer to each other than this [m]: a track that the map does not have keeps it from those it has.
+_CLEARANCE_M: Final = 3.0
+#: Part of a track about the train that is integrated over, either side [m].
+_REACH_M: Final = 40.0
+_LEAST_ELEVATION_DEG: Final = 10.0
+#: Probability of a larger misfit of the mean codes below which the error model is not believed.
+_MISFIT: Final = 1e-4
+NONE: Final = "none"
+
+
+class StandstillErrors(Settings):
+    """Errors of codes at rest, and prior of a track that the map does not have.
+
+    Attributes
+    ----------
+    code_bias_m : float [m]
+        Constant part of a satellite's code at the zenith (multipath); divided by the sine of the elevation.
+    code_noise_m : float [m]
+        Part that varies, correlated over `correlation_s`, likewise.
+    correlation_s : float [s]
+    map_sigma_m : float [m]
+        Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
+    unmapped_prior : float
+    unmapped_width_m : float [m]
+        Width over which a track that the map does not have can lie.
+    """
+
+    code_bias_m: float = option("Constant code error of a satellite at the zenith.", 0.6, metavar="M", gt=0)
+    code_noise_m: float = option("Varying code error of a satellite at the zenith.", 0.5, metavar="M", gt=0)
+    correlation_s: float = option("Time over which the varying part persists.", 60.0, metavar="S", gt=0)
+    map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
+    unmapped_prior: float = option("Prior probability of a track not in the map.", 0.05, metavar="P", gt=0, lt=1)
+    unmapped_width_m: float = Field(default=60.0, gt=0)
+
+    def bias_m(self, elevation_deg: Floats) -> Floats:
+        """Standard deviation of the constant code error [m]."""
+        return np.asarray(self.code_bias_m / _sine(elevation_deg))
+
+    def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
+        """Standard deviation of the mean of the varying code error over a time [m].
+
+        Of a first-order Gauss-Markov process: 2 tau/T (1 - tau/T (1 - exp(-T/tau))) of its variance.
+        """
+        ratio = self.correlation_s / max(seconds, 1e-9)
+        share = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
+        return np.asarray(self.code_noise_m / _sine(elevation_deg) * np.sqrt(min(share, 1.0)))
+
+
+def _sine(elevation_deg: Floats) -> Floats:
+    return np.asarray(np.sin(np.radians(np.maximum(elevation_deg, _LEAST_ELEVATION_DEG))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandstillFix:
+    """Mean place of one antenna at rest.
+
+    Attributes
+    ----------
+    east_north_m : ndarray, shape (2,)
+        From the origin of the yard's coordinates.
+    own_m2 : ndarray, shape (2, 2)
+        Covariance of what this antenna alone has: code bias and noise.
+    common_m2 : ndarray, shape (2, 2)
+        Of what both antennas have: satellites and atmosphere.
+    misfit : float
+        Weighted sum of squares of the residuals.
+    freedom : int
+    """
+
+    east_north_m: Floats
+    own_m2: Floats
+    common_m2: Floats
+    misfit: float
+    freedom: int
+
+    @property
+    def fits(self) -> bool:
+        """Whether the residuals agree with the error model."""
+        return self.freedom < 1 or bool(chi2.sf(self.misfit, self.freedom) > _MISFIT)
+
+
+def standstill_fix(
+    azimuth_deg: Floats,
+    elevation_deg: Floats,
+    system: Strings,
+    residual_m: Floats,
+    *,
+    seconds: float,
+    common_m: Floats,
+    errors: StandstillErrors,
+    receivers: int = 1,
+) -> StandstillFix | None:
+    """Place of an antenna at rest from mean code residuals at an origin.
+
+    Parameters
+    ----------
+    azimuth_deg, elevation_deg : ndarray, shape (K,)
+    system : ndarray of str, shape (K,)
+        Letter of each satellite's clock.
+    residual_m : ndarray, shape (K,)
+        Mean of observed minus computed code at the origin.
+    seconds : float
+        Time over which it is the mean.
+    common_m : ndarray, shape (K,)
+        Standard deviation of satellite and atmosphere errors, common to both antennas.
+    errors : StandstillErrors
+    receivers : int
+        2 where a base station's codes are subtracted, which have such errors too.
+
+    Returns
+    -------
+    StandstillFix or None
+        None where the satellites are too few.
+    """
+    letters = np.unique(system)
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    toward = np.stack(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=-1
+    )
+    design = np.hstack([-toward, (system[:, None] == letters).astype(np.float64)])
+    freedom = len(system) - design.shape[1]
+    if freedom < 0:
+        return None
+    own = receivers * (errors.bias_m(elevation_deg) ** 2 + errors.mean_noise_m(elevation_deg, seconds) ** 2)
+    weight = 1.0 / (own + common_m**2)
+    normal = design.T @ (weight[:, None] * design)
+    if np.linalg.cond(normal) > 1e10:
+        return None
+    gain = np.linalg.solve(normal, design.T * weight)
+    estimate = gain @ residual_m
+    left = residual_m - design @ estimate
+    plan = gain[:2]
+    return StandstillFix(
+        east_north_m=estimate[:2],
+        own_m2=(plan * own) @ plan.T,
+        common_m2=(plan * common_m**2) @ plan.T,
+        misfit=float(weight @ left**2),
+        freedom=freedom,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class YardTrack:
+    """A track near the train: name, and points east and north of the origin, shape (n, 2) [m], in its direction."""
+
+    name: str
+    points_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackPosterior:
+    """Probabilities of tracks.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the tracks, then `NONE`.
+    probability : ndarray, shape (tracks + 1,)
+    with_rising : ndarray, shape (tracks,)
+        Probability that the train stands on the track and faces its direction.
+    fits : bool
+        Whether the codes agree with the error model.
+    """
+
+    names: tuple[str, ...]
+    probability: Floats
+    with_rising: Floats
+    fits: bool
+
+    def decision(self, *, risk: float) -> str:
+        """Name of the track whose probability exceeds one minus the risk; empty while undecided."""
+        best = int(np.argmax(self.probability))
+        return self.names[best] if self.fits and 1.0 - self.probability[best] < risk else ""
+
+
+def track_posterior(
+    tracks: Sequence[YardTrack],
+    fixes: Sequence[StandstillFix],
+    *,
+    arms_m: Sequence[float],
+    errors: StandstillErrors,
+    prior: Mapping[str, float] | None = None,
+) -> TrackPosterior:
+    """Probability of each track, and of none, that a train at rest stands on it.
+
+    Parameters
+    ----------
+    tracks : sequence of YardTrack
+    fixes : sequence of StandstillFix
+        Of one antenna or both.
+    arms_m : sequence of float [m]
+        Place of each antenna along the train from a common point, positive to its front.
+    errors : StandstillErrors
+    prior : mapping of str to float, optional
+        Weights of the mapped tracks by name, from the last place or the interlocking; those not named have none.
+
+    Returns
+    -------
+    TrackPosterior
+    """
+    covariance = _covariance(fixes, errors, tracks)
+    places = np.concatenate([fix.east_north_m for fix in fixes])
+    weights = np.array([1.0 if prior is None else prior.get(track.name, 0.0) for track in tracks])
+    if not weights.sum() > 0.0:
+        raise ValueError("the prior names none of the tracks")
+    weights = weights / weights.sum() * (1.0 - errors.unmapped_prior)
+    evidence = np.full((len(tracks), 2), -np.inf)
+    for k, track in enumerate(tracks):
+        for j, facing in enumerate((1.0, -1.0)):
+            evidence[k, j] = _log_evidence(track.points_m, places, covariance, arms_m, facing, np.zeros(1))
+    nearest = int(np.argmin([_distance(track.points_m, fixes[0].east_north_m) for track in tracks]))
+    half = errors.unmapped_width_m / 2.0
+    shifts = np.arange(-half, half + _ACROSS_M / 2.0, _ACROSS_M)
+    width = len(shifts)
+    shifts = shifts[_clear(shifts, tracks, nearest, fixes[0].east_north_m)]
+    free = [
+        _log_evidence(tracks[nearest].points_m, places, covariance, arms_m, facing, shifts) - np.log(width)
+        for facing in (1.0, -1.0)
+    ]
+    with np.errstate(divide="ignore"):
+        logs = np.concatenate([(np.log(weights)[:, None] + evidence).ravel(), np.log(errors.unmapped_prior) + free])
+    total = logsumexp(logs)
+    if not np.isfinite(total):
+        shares = np.zeros((len(tracks) + 1, 2))
+        shares[-1] = 0.5
+    else:
+        shares = np.exp(logs - total).reshape(-1, 2)
+    return TrackPosterior(
+        names=(*(track.name for track in tracks), NONE),
+        probability=shares.sum(axis=1),
+        with_rising=shares[:-1, 0],
+        fits=all(fix.fits for fix in fixes),
+    )
+
+
+def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
+    """Covariance of all places, shape (2 A, 2 A): common errors and the map's are the same for every antenna."""
+    nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
+    step = np.diff(nearest.points_m, axis=0)
+    middle = nearest.points_m[:-1] + step / 2.0
+    heading = step[int(np.argmin(np.linalg.norm(middle - fixes[0].east_north_m, axis=1)))]
+    across = np.array([heading[1], -heading[0]]) / np.linalg.norm(heading)
+    shared = np.mean([fix.common_m2 for fix in fixes], axis=0) + errors.map_sigma_m**2 * np.outer(across, across)
+    covariance = np.kron(np.ones((len(fixes), len(fixes))), shared)
+    for k, fix in enumerate(fixes):
+        covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += fix.own_m2
+    return np.asarray(covariance + 1e-6 * np.eye(2 * len(fixes)))
+
+
+def _clear(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Masks:
+    """Shifts of the nearest track, about the place of the train, that keep clear of all tracks of the map."""
+    points = tracks[nearest].points_m
+    start, step = points[:-1], np.diff(points, axis=0)
+    share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)
+    foot = start + share[:, None] * step
+    k = int(np.argmin(np.linalg.norm(foot - place_m, axis=1)))
+    right = np.array([step[k, 1], -step[k, 0]]) / np.linalg.norm(step[k])
+    places = foot[k] + shifts_m[:, None] * right
+    nearest_m = np.min([_distances(track.points_m, places) for track in tracks], axis=0)
+    return np.asarray(nearest_m >= _CLEARANCE_M, dtype=np.bool_)
+
+
+def _distance(points_m: Floats, place_m: Floats) -> float:
+    return float(_distances(points_m, place_m[None])[0])
+
+
+def _distances(points_m: Floats, places_m: Floats) -> Floats:
+    """Distance of places, shape (n, 2), from a polyline, shape (n,)."""
+    start, step = points_m[:-1], np.diff(points_m, axis=0)
+    offset = places_m[:, None] - start
+    share = np.clip((offset * step).sum(axis=-1) / (step**2).sum(axis=-1), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - share[..., None] * step, axis=-1).min(axis=1))
+
+
+def _log_evidence(
+    points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
+) -> float:
+    """Logarithm of the likelihood integrated over the place along a track, and summed over shifts across it."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
+    dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
+    line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)
+    centre = dense[int(np.argmin(np.linalg.norm(line - places_m[:2], axis=1)))] - facing * arms_m[0]
+    at = np.arange(centre - _REACH_M, centre + _REACH_M, _ALONG_M)
+    at = at[(at > 0.0) & (at < way[-1])]
+    if not len(at) or not len(shifts_m):
+        return -np.inf
+    inverse = np.linalg.inv(covariance)
+    expected = []
+    for arm in arms_m:
+        place = np.clip(at + facing * arm, 0.0, way[-1])
+        segment = np.clip(np.searchsorted(way, place, side="right") - 1, 0, len(way) - 2)
+        heading = (points_m[segment + 1] - points_m[segment]) / (way[segment + 1] - way[segment])[:, None]
+        point = points_m[segment] + heading * (place - way[segment])[:, None]
+        right = np.stack([heading[:, 1], -heading[:, 0]], axis=-1)
+        expected.append(point[:, None] + right[:, None] * shifts_m[None, :, None])
+    left = places_m - np.concatenate(expected, axis=-1)
+    exponent = -0.5 * np.einsum("nui,ij,nuj->nu", left, inverse, left)
+    return float(logsumexp(exponent) - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1] + np.log(_ALONG_M))

@@ -1,0 +1,189 @@
+"""On which track a train at rest stands: closed form, calibration, the real roof, and a naive method beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+from typer.testing import CliRunner
+
+from railfix.cli import app
+from railfix.core.errors import MismatchError
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config
+from railfix.positioning.which_track import StandstillErrors, StandstillFix, track_posterior
+from railfix.run.which_track import BaseStation, StandstillCodes, decide_track, standstill_codes
+from yard_made import RISKS, SPACING_M, decided, made_tracks, to_geojson
+
+pytestmark = pytest.mark.requirement("E6")
+
+
+def _fix(place: tuple[float, float], sigma: float) -> StandstillFix:
+    own = sigma**2 * np.eye(2)
+    return StandstillFix(east_north_m=np.array(place), own_m2=own, common_m2=np.zeros((2, 2)), misfit=8.0, freedom=10)
+
+
+@pytest.mark.parametrize("y", [-1.5, -0.2, 0.0, 0.7, 2.0])
+def test_two_tracks_have_the_logistic_posterior(y: float) -> None:
+    """P = 1 / (1 + exp(-d y / sigma^2)) of the track on the side of y, for two tracks at distance d."""
+    sigma = 1.3
+    tracks = made_tracks(2, 0.0, np.array([-SPACING_M / 2.0, 0.0]), 0)
+    errors = StandstillErrors(map_sigma_m=0.0, unmapped_prior=1e-12)
+    posterior = track_posterior(tracks, [_fix((y, 3.0), sigma)], arms_m=(0.0,), errors=errors)
+    assert posterior.probability[1] == pytest.approx(1.0 / (1.0 + np.exp(-SPACING_M * y / sigma**2)), rel=1e-5)
+    assert posterior.probability.sum() == pytest.approx(1.0)
+
+
+def test_two_antennas_give_the_facing_and_one_does_not() -> None:
+    tracks = made_tracks(3, 30.0, np.zeros(2), 1)
+    heading = np.array([np.sin(np.radians(30.0)), np.cos(np.radians(30.0))])
+    fixes = [_fix(tuple(-10.0 * heading), 0.5), _fix(tuple(10.0 * heading), 0.5)]
+    both = track_posterior(tracks, fixes, arms_m=(10.0, -10.0), errors=StandstillErrors())
+    assert both.decision(risk=1e-2) == "T2"
+    assert both.with_rising[1] < 1e-6
+    one = track_posterior(tracks, fixes[:1], arms_m=(0.0,), errors=StandstillErrors())
+    assert one.with_rising[1] == pytest.approx(one.probability[1] / 2.0)
+
+
+def test_a_prior_of_the_interlocking_rules_tracks_out() -> None:
+    tracks = made_tracks(3, 0.0, np.zeros(2), 1)
+    fix = _fix((1.8, 0.0), 0.8)
+    open_ = track_posterior(tracks, [fix], arms_m=(0.0,), errors=StandstillErrors())
+    assert not open_.decision(risk=0.05)
+    known = track_posterior(
+        tracks, [fix], arms_m=(0.0,), errors=StandstillErrors(unmapped_prior=1e-3), prior={"T3": 0.9, "T1": 0.1}
+    )
+    assert known.decision(risk=0.05) == "T3"
+
+
+def test_codes_that_do_not_fit_give_no_decision() -> None:
+    tracks = made_tracks(2, 0.0, np.zeros(2), 0)
+    good = _fix((0.0, 0.0), 0.2)
+    bad = StandstillFix(
+        east_north_m=good.east_north_m, own_m2=good.own_m2, common_m2=good.common_m2, misfit=60.0, freedom=10
+    )
+    assert track_posterior(tracks, [good], arms_m=(0.0,), errors=StandstillErrors()).decision(risk=1e-2) == "T1"
+    assert track_posterior(tracks, [bad], arms_m=(0.0,), errors=StandstillErrors()).decision(risk=1e-2) == ""
+
+
+def test_mean_noise_is_that_of_a_gauss_markov_process() -> None:
+    errors = StandstillErrors(code_noise_m=1.0, correlation_s=30.0)
+    rng = np.random.default_rng(4)
+    keep = np.exp(-1.0 / 30.0)
+    from scipy.signal import lfilter
+
+    noise = rng.normal(0.0, 1.0, (6000, 90)) * np.sqrt(1.0 - keep**2)
+    noise[:, 0] /= np.sqrt(1.0 - keep**2)
+    means = lfilter([1.0], [1.0, -keep], noise, axis=1).mean(axis=1)
+    assert means.std() == pytest.approx(float(errors.mean_noise_m(np.array([90.0]), 90.0)[0]), rel=0.04)
+
+
+def _calibration(yards: int, common_m: float) -> dict[float, tuple[int, int]]:
+    rows = [decided(seed, errors=StandstillErrors(), common_sigma_m=common_m) for seed in range(yards)]
+    return {
+        risk: (sum(risk in a for a, _ in rows), sum(a[risk][0] != own for a, own in rows if risk in a))
+        for risk in RISKS
+    }
+
+
+@pytest.mark.parametrize("common_m", [0.05, 1.0])
+def test_wrong_decisions_of_simulated_yards_are_within_the_risk(common_m: float) -> None:
+    for risk, (given, wrong) in _calibration(100, common_m).items():
+        assert given > 30
+        assert wrong <= binom.ppf(0.999, given, risk)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("common_m", [0.05, 1.0])
+def test_wrong_decisions_of_2000_yards_are_within_the_risk(common_m: float) -> None:
+    for risk, (given, wrong) in _calibration(2000, common_m).items():
+        assert given > 400
+        assert wrong <= binom.ppf(0.999, given, risk)
+
+
+def test_samples_counted_as_independent_decide_wrongly() -> None:
+    """The naive method is over its risk by far on the same yards."""
+    rows = [decided(k, errors=StandstillErrors(), common_sigma_m=1.0, method="naive") for k in range(60)]
+    given = [(a[1e-3][0], own) for a, own in rows if 1e-3 in a]
+    wrong = sum(name != own for name, own in given)
+    assert wrong > binom.ppf(0.999, len(given), 1e-3)
+
+
+def test_a_train_on_a_track_that_the_map_lacks_is_on_none() -> None:
+    answers = [
+        decided(k, errors=StandstillErrors(), common_sigma_m=0.05, unmapped=True)[0].get(1e-2) for k in range(40)
+    ]
+    assert all(a is None or a[0] == "none" for a in answers)
+    assert sum(a is not None for a in answers) > 20
+
+
+# --- the real roof -----------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def roof(recordings: Path) -> dict[str, StandstillCodes]:
+    folder = recordings / "dual" / "mosaic_x2_99cm"
+    navigation = read_navigation(folder / "base.nav")
+    place = {
+        name: ecef_from_geodetic(*(float(v) for v in (folder / f"{name}_position.txt").read_text().split()))
+        for name in ("base", "rover")
+    }
+    base = BaseStation(observations=read_observations(folder / "base.obs"), ecef_m=place["base"])
+    rover = read_observations(folder / "rover.obs")
+    origin = place["rover"]
+    return {
+        "base": standstill_codes(rover, navigation, Config(), base=base, origin_ecef_m=origin),
+        "alone": standstill_codes(rover, navigation, Config(), origin_ecef_m=origin),
+    }
+
+
+def _from(codes: StandstillCodes, first: int, epochs: int) -> StandstillCodes:
+    rows = slice(first, first + epochs)
+    return StandstillCodes(**{**vars(codes), "time": codes.time[rows], "residual_m": codes.residual_m[rows]})
+
+
+@pytest.mark.parametrize(("kind", "decisions"), [("base", 0.9), ("alone", 0.0)])
+def test_roof_with_invented_yards_is_never_on_a_wrong_track(
+    roof: dict[str, StandstillCodes], kind: str, decisions: float
+) -> None:
+    """18 azimuths, starts every minute, yards of 5 tracks with the train on the middle or the edge."""
+    answers = []
+    for azimuth in range(0, 180, 10):
+        for start, own in ((0, 2), (60, 0), (120, 4), (180, 1), (240, 3)):
+            yard = made_tracks(5, azimuth, np.zeros(2), own)
+            result = decide_track(
+                yard, [_from(roof[kind], start, 61)], arms_m=(0.0,), errors=StandstillErrors(), risk=1e-3
+            )
+            answers.append((result.track, f"T{own + 1}"))
+    assert not [a for a in answers if a[0] not in ("undecided", a[1])]
+    assert np.mean([a == b for a, b in answers]) >= decisions
+
+
+def test_roof_between_tracks_of_a_map_that_lacks_its_own_is_on_none(roof: dict[str, StandstillCodes]) -> None:
+    for azimuth in range(0, 180, 30):
+        yard = [track for k, track in enumerate(made_tracks(5, azimuth, np.zeros(2), 2)) if k != 2]
+        result = decide_track(yard, [roof["base"]], arms_m=(0.0,), errors=StandstillErrors(), risk=1e-2, every_s=60.0)
+        assert result.track in ("none", "undecided")
+
+
+def test_command_prints_the_track_and_draws_it(recordings: Path, tmp_path: Path) -> None:
+    folder = recordings / "dual" / "mosaic_x2_99cm"
+    latitude, longitude, _ = (float(v) for v in (folder / "rover_position.txt").read_text().split())
+    yard = to_geojson(made_tracks(4, 30.0, np.zeros(2), 1), latitude, longitude)
+    (tmp_path / "yard.geojson").write_text(yard)
+    place = ",".join((folder / "base_position.txt").read_text().split())
+    words = ["which-track", "--front", str(folder / "rover.obs"), "--base", str(folder / "base.obs")]
+    words += ["--nav", str(folder / "base.nav"), "--map", str(tmp_path / "yard.geojson"), "--base-place", place]
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "p.png")])
+    assert result.exit_code == 0, result.output
+    assert result.output.startswith("track: T2, decided after 60 s")
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+def test_a_moving_train_is_an_error(recordings: Path) -> None:
+    folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
+    with pytest.raises(MismatchError, match="standstill"):
+        standstill_codes(read_observations(folder / "SEPT265G.21O"), read_navigation(folder / "SEPT2650.21P"), Config())
