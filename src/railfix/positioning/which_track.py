@@ -3,10 +3,11 @@
 Hypotheses are a track and the way the train faces, and *none*: a track that the map does not have, parallel to the
 nearest at any distance that keeps clear of the others. At rest multipath does not average out: each satellite's code
 has a constant bias, so the covariance of the mean does not fall with the number of epochs, and satellite, orbit and
-atmosphere errors are common to both antennas. The posterior probability of a hypothesis is its prior times the likelihood integrated over the
-place along the track. A decision is taken when all others together have less than the risk allowed; whatever the
-time at which that happens, its probability of being wrong is that risk, as far as the error model holds (a posterior
-probability is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472, for the sequential test).
+atmosphere errors are common to both antennas. The posterior probability of a hypothesis is its prior times the
+likelihood integrated over the place along the track. A decision is taken when all others together have less than the
+risk allowed; whatever the time at which that happens, its probability of being wrong is that risk, as far as the error
+model holds (a posterior probability is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472, for the sequential
+test).
 """
 
 from __future__ import annotations
