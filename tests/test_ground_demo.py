@@ -29,7 +29,7 @@ needs_browser = pytest.mark.skipif(browser() is None, reason="no chromium is ins
 
 
 @pytest.fixture(scope="module")
-def demo() -> tuple[dict[str, Any], dict[str, Any]]:
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], dict[str, Any]]:
     """Figures of the demonstration, and the last state of its page."""
     states: list[dict[str, Any]] = []
 
@@ -37,7 +37,10 @@ def demo() -> tuple[dict[str, Any], dict[str, Any]]:
         text = await asyncio.to_thread(lambda: urllib.request.urlopen(url + "state").read())
         states.append(json.loads(text))
 
-    figures = asyncio.run(asyncio.wait_for(run_demo(speed=25.0, password="secret", keep=keep), 60.0))
+    picture = tmp_path_factory.mktemp("demo") / "coverage.png"
+    work = run_demo(speed=25.0, password="secret", keep=keep, picture=picture)
+    figures = asyncio.run(asyncio.wait_for(work, 60.0))
+    assert picture.stat().st_size > 10_000
     return figures, states[0]
 
 

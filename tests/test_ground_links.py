@@ -14,6 +14,7 @@ import pytest
 from railfix.core.errors import OutputError
 from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.keys import write_keys
+from railfix.ground.link_figure import coverage
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
 from railfix.ground.relay import Relay, RelaySettings
@@ -119,6 +120,11 @@ def test_response_rate_and_round_trip_of_a_lossy_link() -> None:
     assert meter.round_trip_s == pytest.approx(2 * d)
     assert sum(sent for _, sent in meter.coverage.values()) == 4000
     assert meter.coverage[3, 1][1] == 20  # 300 to 400 m, one frame each 5 m
+
+
+def test_coverage_adds_the_meters_of_a_bearer_up() -> None:
+    first, second = (LinkMeter(coverage={(3, 1): (8, 10), (4, place): (1, 2)}) for place in (1, -1))
+    assert coverage([first, second]) == {1: {3: (16, 20), 4: (1, 2)}, -1: {4: (1, 2)}}
 
 
 def test_switching_takes_at_most_three_misses_and_the_answer_time_and_returns() -> None:

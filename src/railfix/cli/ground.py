@@ -147,6 +147,10 @@ def demo(
     hold: Annotated[
         float, typer.Option(metavar="S", min=0.0, max=3600.0, help="Keep the page after the end for this time.")
     ] = 0.0,
+    coverage: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Picture of the response rates along the line.")
+    ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Show two trains, two lossy links each, a centre with its page, and a satellite fault.
 
@@ -163,6 +167,8 @@ def demo(
 
     from railfix.ground.demo import run_demo
 
+    if coverage is not None:
+        check_output_file(coverage, overwrite="replace" if overwrite else "refuse", inputs=[])
     console, password = console_of_tables(), secrets.token_urlsafe(12)
 
     def announce(url: str) -> None:
@@ -174,7 +180,9 @@ def demo(
 
     try:
         figures = asyncio.run(
-            run_demo(seed=seed, speed=speed, port=port, password=password, announce=announce, keep=keep)
+            run_demo(
+                seed=seed, speed=speed, port=port, password=password, announce=announce, keep=keep, picture=coverage
+            )
         )
     except OSError as error:
         raise OutputError(f"the demonstration cannot use its loopback addresses ({error.strerror})") from None

@@ -18,6 +18,7 @@ from railfix.ground.centre import report_received as record_received
 from railfix.ground.interlocking import Interlocking, PointState, TrainInterval, interval_of
 from railfix.ground.interlocking_text import to_json
 from railfix.ground.keys import write_keys
+from railfix.ground.link_figure import draw_coverage
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
 from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, release
@@ -200,6 +201,7 @@ async def run_demo(
     password: str,
     announce: Callable[[str], None] = lambda _: None,
     keep: Callable[[str], Any] | None = None,
+    picture: Path | None = None,
 ) -> dict[str, Any]:
     """Run the demonstration and return its figures.
 
@@ -216,6 +218,8 @@ async def run_demo(
         Called with the address of the page.
     keep : callable, optional
         Awaited with the address at the end, before the page closes.
+    picture : Path, optional
+        Picture of the response rates along the line.
     """
     with tempfile.TemporaryDirectory() as name:
         folder, done = Path(name), False
@@ -264,6 +268,8 @@ async def run_demo(
             await _run(traffic, relays, speed)
             done = True
             figures = _figures(traffic, trains, centre)
+            if picture is not None:
+                draw_coverage(picture, {b: [links.meters[b] for links in trains.values()] for b in BEARERS})
             if keep is not None:
                 await keep(page.url)
         finally:
