@@ -224,14 +224,13 @@ def test_nothing_from_a_receiver_stops_after_the_late_time() -> None:
 
 @pytest.fixture(scope="module")
 def triangle_logs(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], Path]:
-    """Three logs of the simulator's reference station at three places, 60 s at 1 Hz."""
-    folder, logs = tmp_path_factory.mktemp("triangle"), []
-    base = load_recipe("commercial-run").scenario(changes={"duration_s": 60.0}).replaced(rate_hz=1.0, sensors=None)
-    for k, (chainage, lateral) in enumerate(((100.0, 50.0), (900.0, 50.0), (400.0, 600.0))):
-        station = ReferenceStation(chainage_m=chainage, lateral_m=lateral)
-        files = write_run(base.replaced(station=station), folder / str(k), packing="plain")
-        logs.append(files["station"])
-    return logs, files["nav"]
+    """Logs of three reference stations of the simulator, 60 s at 1 Hz."""
+    places = (("a", 100.0, 50.0), ("b", 900.0, 50.0), ("c", 400.0, 600.0))
+    stations = tuple(ReferenceStation(name=name, chainage_m=at, lateral_m=side) for name, at, side in places)
+    base = load_recipe("commercial-run").scenario(changes={"duration_s": 60.0})
+    scenario = base.replaced(rate_hz=1.0, sensors=None, stations=stations)
+    files = write_run(scenario, tmp_path_factory.mktemp("triangle"), packing="plain")
+    return [files[name] for name, _, _ in places], files["nav"]
 
 
 def test_logs_of_the_simulator(triangle_logs: tuple[list[Path], Path], tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ SAME_EPOCH = np.timedelta64(100, "ms")
 
 @dataclass(frozen=True, kw_only=True)
 class StationFixes:
-    """Single-point positions of N receivers at T epochs, each epoch from the satellites common to all.
+    """Single-point positions of N receivers at T epochs, each epoch from the same satellites with the same weights.
 
     Attributes
     ----------
@@ -109,9 +109,12 @@ def station_fixes(
     there = np.stack([np.isin(time, epoch) for epoch in epochs])
     # a receiver without an epoch takes no satellite away from the others: their own fixes still count
     shared = (usable | ~there[:, :, None]).all(axis=0)
+    # the same weights too, else an error common to the receivers moves each fix otherwise
+    square = np.where(usable, sigma**2, 0.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+    common_sigma = np.sqrt(np.where(square > 0.0, square, 1.0))
     groups = clock_groups([name[0] for name in satellite.tolist()])
     ranges = [
-        _ranges(position[k], corrected[k], sigma[k], usable[k] & shared, groups) for k in range(len(points_ecef_m))
+        _ranges(position[k], corrected[k], common_sigma, usable[k] & shared, groups) for k in range(len(points_ecef_m))
     ]
     return fixes_of_ranges(time, ranges, points_ecef_m, cn0_fallen=_fallen(cn0))
 
