@@ -85,9 +85,7 @@ class ReferenceInputs(InputFiles):
         if bool(self.logs) != bool(self.nav):
             raise SettingsError("Doppler speeds need both observations (--front, --rear) and navigation (--nav)")
         if self.vehicle is None and len(set(self.positions) | set(self.logs)) > 1:
-            raise SettingsError(
-                "two antennas need the vehicle that they are on; name its file with --vehicle"
-            )
+            raise SettingsError("two antennas need the vehicle that they are on; name its file with --vehicle")
         self.check_files()
         options = {"front": "--rtk", "rear": "--rtk-rear"}
         check_given_once((options[name], path) for name, path in self.positions.items())
