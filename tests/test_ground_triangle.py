@@ -177,6 +177,7 @@ def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
             continue
         kinds = [order for _, order, _, _ in log.orders]
         assert kinds == [Order.SUSPEND, Order.STOP]
+        assert {cause for _, _, cause, _ in log.orders} == {CAUSES[fault]}
         stopped = (log.orders[0][0] - fixes.time[0]) / np.timedelta64(1, "s")
         worst = np.nan_to_num(log.triangle.error_m).max(axis=1)
         begun = 20.0 if fault == "jamming" else float(np.argmax(worst > LIMITS.radius_m))

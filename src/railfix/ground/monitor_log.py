@@ -69,6 +69,8 @@ def monitor_log(
         verdict = Verdict(int(triangle.verdict[k]))
         state, given = advance(state, now, verdict, receiver=int(triangle.receiver[k]), limits=times)
         orders += [(fixes.time[k], order, state.cause or verdict, state.receiver) for order in given]
+    # one stop, latched: its cause may have become more exact after the orders
+    orders = [(time, order, state.cause or cause, state.receiver) for time, order, cause, _ in orders]
     return MonitoredLog(fixes=fixes, triangle=triangle, orders=tuple(orders))
 
 
