@@ -760,7 +760,7 @@ def test_levels_whose_kind_is_not_told(tmp_path: Path):
         (run / "run.json").write_text(json.dumps(record | {"protection": told}))
         found = evaluate_run(run, truth)
         assert list(found.integrity) == ["unknown"]
-        assert any("does not tell what the protection levels rest on" in note for note in found.runs[0].notes)
+        assert any("does not state the basis of the protection levels" in note for note in found.runs[0].notes)
     positions = pl.read_parquet(run / "positions.parquet").with_columns(protection_kind=pl.lit("separation"))
     positions.write_parquet(run / "positions.parquet")
     (run / "run.json").write_text(json.dumps(record | {"protection": {}}))
