@@ -70,6 +70,7 @@ def simulate(folder: Path) -> None:
 def railfix_command(folder: Path, out: Path, config: Path | None) -> list[str]:
     command = [sys.executable, "-m", "railfix", "run", "--front", f"{folder}/front.rnx", "--rear", f"{folder}/rear.rnx"]
     command += ["--nav", f"{folder}/nav.rnx", "--track", f"{folder}/track.csv", "--vehicle", f"{folder}/vehicle.toml"]
+    command += ["--filter", "off"]  # single epochs, as rnx2rtkp positions them
     return [*command, "--out", str(out), *(["--config", str(config)] if config else [])]
 
 
