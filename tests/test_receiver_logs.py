@@ -349,3 +349,15 @@ def test_sbas_messages_of_a_receiver(recordings: Path, tmp_path: Path) -> None:
     assert read.type.tolist() == known.type[kept].tolist()
     assert np.array_equal(read.bits[:, :28], known.bits[kept, :28])
     assert set(read.parity_bits.tolist()) == {24}
+
+
+def test_messages_whose_masks_do_not_fit_are_counted() -> None:
+    """An MSM7 of 30 bytes whose masks are empty, parity right: no measurement, one broken message."""
+    payload = bytes([1077 >> 4, (1077 & 15) << 4]) + bytes(28)
+    body = np.frombuffer(b"\xd3" + len(payload).to_bytes(2, "big") + payload, np.uint8)
+    parity = int(crc24q(body, np.array([0]), np.array([len(body)]))[0])
+    piece, _ = decode(
+        body.tobytes() + parity.to_bytes(3, "big"), StreamState(time=np.datetime64("2025-08-11", "ns")), at_end=True
+    )
+    assert piece.measurements.skipped == {"broken MSM": 1}
+    assert len(piece.measurements.code_m) == 0

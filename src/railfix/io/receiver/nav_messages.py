@@ -234,9 +234,8 @@ GLONASS: Final[dict[int, dict[str, Field]]] = {
         "slot": (70, 5, 1.0, "u"),
     },
 }
-#: User range accuracy of GPS, QZSS and BeiDou [m] by index (IS-GPS-200N, 20.3.3.3.1.3).
-URA_M: Final = np.array([2.4, 3.4, 4.85, 6.85, 9.65, 13.65, 24, 48, 96, 192, 384, 768, 1536, 3072, 6144, np.nan])
-#: The nominal values that RINEX writes for them.
+#: User range accuracy of GPS, QZSS and BeiDou [m] by index, the nominal values that RINEX writes
+#: (IS-GPS-200N, 20.3.3.3.1.3).
 URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192])
 
 

@@ -6,6 +6,7 @@ Source: RTCM 10403.3, sections 3.5.11 (1019, 1020, 1042, 1044 to 1046) and 3.5.1
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -69,9 +70,9 @@ def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
     Measurements
     """
     parts = [part for number in MSM_NUMBERS for part in _of_number(frames, number, near)]
-    counts = {"broken MSM": 0}
+    messages = len(frames.of("rtcm3", *MSM_NUMBERS))
     if not parts:
-        return _no_measurements()
+        return replace(_no_measurements(), skipped={"broken MSM": messages} if messages else {})
     order = np.concatenate([order for order, _ in parts])
     rows = joined([rows for _, rows in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
@@ -80,14 +81,13 @@ def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
-    broken = sum(int(rows_.skipped.get("broken MSM", 0)) for _, rows_ in parts)
-    counts["broken MSM"] = broken
+    broken = messages - len(order)  # masks or length that do not fit
     return Measurements(
         **{name: getattr(rows, name) for name in _ROW_NAMES},
         time=time[starts],
         epoch=epoch_of[rows.epoch],
         receiver="RTCM 3",
-        skipped={what: number for what, number in counts.items() if number},
+        skipped={"broken MSM": broken} if broken else {},
     )
 
 

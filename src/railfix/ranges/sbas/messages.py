@@ -10,45 +10,15 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, read_only
+from railfix.io.receiver.framing import crc24q
 from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
-#: CRC-24Q, x^24 included (DO-229D, A.4.3.3).
-POLYNOMIAL: Final = 0x1864CFB
 #: First eight bits of three successive messages (DO-229D, A.4.3.1).
 PREAMBLES: Final = (0x53, 0x9A, 0xC6)
 #: Preamble, type and data; parity; bytes a message takes in `SbasMessages.bits`.
 DATA_BITS: Final = 226
 PARITY_BITS: Final = 24
 ROW_BYTES: Final = 32
-
-
-def _table() -> Integers:
-    value = np.arange(256, dtype=np.int64) << 16
-    for _ in range(8):
-        value = value << 1
-        value = np.where(value & 0x1000000, value ^ POLYNOMIAL, value)
-    return value
-
-
-_TABLE: Final = _table()
-
-
-def crc24q(rows: Bytes) -> Integers:
-    """Parity of whole bytes, first bit first.
-
-    Parameters
-    ----------
-    rows : ndarray of uint8, shape (N, B)
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
-        24 bits.
-    """
-    crc = np.zeros(len(rows), dtype=np.int64)
-    for column in rows.T:
-        crc = ((crc << 8) & 0xFFFFFF) ^ _TABLE[(crc >> 16) ^ column]
-    return crc
 
 
 def message_parity(bits: Bytes) -> Integers:
@@ -62,7 +32,9 @@ def message_parity(bits: Bytes) -> Integers:
     # Six zero bits in front make whole bytes of 226 bits and do not change the parity.
     data = bits[:, :29].astype(np.int64)
     before = np.concatenate([np.zeros((len(bits), 1), dtype=np.int64), data[:, :-1]], axis=1)
-    return crc24q((((before << 2) & 0xFF) | (data >> 6)).astype(np.uint8))
+    rows = ((before << 2) & 0xFF | data >> 6).astype(np.uint8)
+    start = np.arange(len(rows)) * rows.shape[1]
+    return crc24q(rows.reshape(-1), start, start + rows.shape[1])
 
 
 def carried_parity(bits: Bytes) -> Integers:
