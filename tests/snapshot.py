@@ -52,6 +52,7 @@ PARKED_DEG: Final = (35.8729254, 138.3898229, 1004.46)
 VOLATILE: Final = {
     "version",
     "versions",
+    "kernels",
     "railfix",
     "seconds",
     "command",

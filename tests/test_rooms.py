@@ -13,6 +13,7 @@ SOURCE: Final = ROOT / "src" / "railfix"
 #: The rooms (the packages below `railfix`), floor by floor. docs/concepts.md draws the same.
 FLOORS: Final[tuple[tuple[str, ...], ...]] = (
     ("core",),
+    ("kernels",),
     ("gnss",),
     ("io",),
     ("track",),

@@ -24,6 +24,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.geodesy import range_with_rotation
+from railfix.kernels import compiled_by
 
 #: Sigma of an offset between clocks of which nothing is known [m].
 UNTIED_M: Final = 1e6
@@ -190,29 +191,17 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     -------
     NormalEquations
     """
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    weight, used = ranges.weight, (ranges.weight > 0)[:, None]
-    starts = ranges.starts
-    sizes = np.array([group.stop - group.start for group in ranges.groups], dtype=np.intp)
-    # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
-    rows = np.empty((len(weight), 4, weight.shape[1]))
-    np.negative(los.swapaxes(1, 2), out=rows[:, :3])
-    np.subtract(ranges.code_m, distance, out=rows[:, 3])
-    weighted = rows * weight[:, None]
-    totals = np.add.reduceat(weight, starts, axis=1)
-    seen = totals > 0
-    means = np.add.reduceat(weighted, starts, axis=2) / np.where(seen, totals, 1.0)[:, None]
-    rows -= np.repeat(means, sizes, axis=2)
-    rows *= used
-    np.multiply(rows, weight[:, None], out=weighted)
-    system = np.matmul(weighted, rows.swapaxes(1, 2))
-    if ranges.ties is not None:
-        apart, mass = _between_clocks(means, totals, ranges.ties)
-        system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
-        # A clock lies between the estimates from its own satellites and from the others.
-        shift = apart / (totals * ranges.ties.sigma_m**2 + 1.0)[:, None]
-        means -= shift
-        rows += np.repeat(shift, sizes, axis=2) * used
+    ties = ranges.ties
+    none = np.empty((0, len(ranges.groups)))
+    system, means, rows, seen = reduced_equations(
+        np.ascontiguousarray(ranges.sat_ecef_m),
+        np.ascontiguousarray(ranges.code_m),
+        np.ascontiguousarray(ranges.weight),
+        np.ascontiguousarray(place_ecef_m),
+        ranges.starts,
+        none if ties is None else np.ascontiguousarray(ties.offset_m),
+        none if ties is None else np.ascontiguousarray(ties.sigma_m),
+    )
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],
@@ -222,6 +211,64 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
         clock_slope=means[:, :3],
         design=rows[:, :3],
     )
+
+
+@compiled_by("ranges")
+def reduced_equations(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    place_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+) -> tuple[Floats, Floats, Floats, Masks]:
+    """Compute the normal equations of place and residual with the clocks eliminated; arrays in C order.
+
+    Parameters
+    ----------
+    sat_ecef_m : ndarray, shape (T, M, 3) [m]
+    code_m, weight : ndarray, shape (T, M)
+    place_ecef_m : ndarray, shape (T, 3) [m]
+    starts : ndarray of int, shape (G,)
+        First channel of each group.
+    offset_m, sigma_m : ndarray, shape (T, G) [m], or (0, G)
+        Of `ClockTies`; (0, G) without ties.
+
+    Returns
+    -------
+    system : ndarray, shape (T, 4, 4)
+        Normal matrix of the three axes and the residual.
+    means : ndarray, shape (T, 4, G)
+        Weighted means of the groups.
+    rows : ndarray, shape (T, 4, M)
+        Design, and residual, less the mean of the group; 0 where the weight is 0.
+    seen : ndarray of bool, shape (T, G)
+        Groups with weight.
+    """
+    distance, los = range_with_rotation(sat_ecef_m, place_ecef_m[:, None, :])
+    used = (weight > 0)[:, None]
+    sizes = np.diff(np.append(starts, weight.shape[1]))
+    # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
+    rows = np.empty((len(weight), 4, weight.shape[1]))
+    np.negative(los.swapaxes(1, 2), out=rows[:, :3])
+    np.subtract(code_m, distance, out=rows[:, 3])
+    weighted = rows * weight[:, None]
+    totals = np.add.reduceat(weight, starts, axis=1)
+    seen = totals > 0
+    means = np.add.reduceat(weighted, starts, axis=2) / np.where(seen, totals, 1.0)[:, None]
+    rows -= np.repeat(means, sizes, axis=2)
+    rows *= used
+    np.multiply(rows, weight[:, None], out=weighted)
+    system = np.matmul(weighted, rows.swapaxes(1, 2))
+    if len(offset_m) == len(weight):
+        apart, mass = _between_clocks(means, totals, ClockTies(offset_m=offset_m, sigma_m=sigma_m))
+        system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
+        # A clock lies between the estimates from its own satellites and from the others.
+        shift = apart / (totals * sigma_m**2 + 1.0)[:, None]
+        means -= shift
+        rows += np.repeat(shift, sizes, axis=2) * used
+    return system, means, rows, seen
 
 
 def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Floats, Floats]:

@@ -13,6 +13,7 @@ import polars as pl
 from railfix import __version__
 from railfix.core.reasons import Status
 from railfix.gnss.navigation import Navigation
+from railfix.kernels import kernels_in_use
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
 
@@ -126,6 +127,7 @@ def run_record(
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), **_versions()},
         "platform": platform.platform(),
+        "kernels": kernels_in_use(),
         "command": list(command),
         "inputs": list(files),
         "settings_asked": dict(asked),
