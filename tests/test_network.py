@@ -44,6 +44,15 @@ def test_near_agrees_with_every_segment_of_every_track() -> None:
         assert len(got) >= min(len(expected), 8)
 
 
+def test_near_finds_the_farther_tracks_of_a_densely_drawn_yard() -> None:
+    """Twelve tracks with a point each metre: hundreds of segments lie nearer than the outer track."""
+    x = np.arange(0.0, 400.0)
+    tracks = tuple(segment(f"T{k}", *to_degrees(x, np.full(400, 3.6 * k))) for k in range(12))
+    found = Network(tracks=tracks, links=()).near(*to_degrees(np.array([200.3]), np.array([0.5])), most=12)
+    assert found.track[0, :9].tolist() == list(range(9))
+    assert np.abs(found.offset_m[0, :9]) == pytest.approx([abs(3.6 * k - 0.5) for k in range(9)], abs=1e-3)
+
+
 def test_routes_pass_a_switch_by_stem_and_leg_only() -> None:
     net = made_network(10.0)
     assert net.shortest_route([0, 2, 3]) == [0, 2, 3]
@@ -57,9 +66,7 @@ def test_routes_pass_a_switch_by_stem_and_leg_only() -> None:
 
 def test_connections_from_ends_are_those_that_were_made() -> None:
     net = made_network(10.0)
-    found = {
-        frozenset([(a.first, a.first_end), (a.second, a.second_end)]): a.navigable for a in links_of_ends(net.tracks)
-    }
+    found = {frozenset([(a.first, a.first_end), (a.second, a.second_end)]): a.navigable for a in links_of_ends(net)}
     for link in net.links:
         assert found[frozenset([(link.first, link.first_end), (link.second, link.second_end)])] == link.navigable
 
@@ -157,8 +164,7 @@ def test_infrabel_network_has_every_switch(infrabel: Network) -> None:
     # each stem reaches two legs: as many as relations between legs that trains cannot take, less the crossings
     assert quality.switches == 43
     by_ends = {
-        frozenset([(a.first, a.first_end), (a.second, a.second_end)]): a.navigable
-        for a in links_of_ends(infrabel.tracks)
+        frozenset([(a.first, a.first_end), (a.second, a.second_end)]): a.navigable for a in links_of_ends(infrabel)
     }
     stated = {frozenset([(a.first, a.first_end), (a.second, a.second_end)]): a.navigable for a in infrabel.links}
     assert set(stated) <= set(by_ends)

@@ -20,7 +20,7 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import SettingsError
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.track import UNNAMED, Track
 
@@ -152,14 +152,21 @@ def frame_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats, str]:
     frame : str
         Code of the geographic CRS.
     """
-    system, kind = CRS.from_user_input(crs), kind_of_frame(crs)
-    frame = _modern_frame(crs)[0] if kind == "older datum" else _code(_geodetic(crs))
-    transformer = Transformer.from_crs(system.to_2d(), CRS.from_user_input(frame).to_2d(), always_xy=True)
-    longitude, latitude = transformer.transform(x, y)
+    kind = kind_of_frame(crs)
+    frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
+    longitude, latitude = _in_plan(crs, frame).transform(x, y)
     return np.asarray(latitude, np.float64), np.asarray(longitude, np.float64), frame
 
 
-def _code(geodetic: CRS) -> str:
+@lru_cache(maxsize=32)
+def _in_plan(crs: str, frame: str) -> Transformer:
+    source, target = (CRS.from_user_input(name).to_2d() for name in (crs, frame))
+    return Transformer.from_crs(source, target, always_xy=True)
+
+
+@lru_cache(maxsize=32)
+def _frame_of(crs: str) -> str:
+    geodetic = _geodetic(crs)
     authority = geodetic.to_authority()
     return geodetic.to_wkt() if authority is None else ":".join(authority)
 
@@ -181,6 +188,7 @@ def _modern_frame(crs: str) -> tuple[str, float, bool]:
     return best
 
 
+@lru_cache(maxsize=32)
 def older_datum_note(crs: str | None) -> tuple[str, ...]:
     """A note on the transformation of a map in an older datum; none for other maps."""
     if crs is None or kind_of_frame(crs) != "older datum":
@@ -201,12 +209,8 @@ def track_at(
     ----------
     track : Track
         Coordinates in the frame that `Provenance.frame` names.
-    time : datetime64
-        Of the log.
-    epoch : float, optional [year]
-        Epoch of the map's coordinates, where its frame is an ITRF.
-    plate : str, optional
-        Plate that moves coordinates of an ITRF from `epoch` to `time`: one of `PLATES`.
+    time, epoch, plate
+        As for `points_at`.
 
     Returns
     -------
@@ -219,7 +223,53 @@ def track_at(
     SettingsError
         The plate is unknown, or `epoch` or `plate` is given for a frame that does not need it.
     """
-    crs = track.provenance.frame
+    provenance = track.provenance
+    named = provenance.crs != UNNAMED
+    moved, shift = points_at(track.ecef_m, provenance.frame, time, epoch=epoch, plate=plate, named=named)
+    if moved is track.ecef_m:
+        return track, shift
+    latitude, longitude, height = geodetic_from_ecef(moved)
+    provenance = replace(provenance, frame=WORKING_FRAME)
+    return replace(track, latitude_deg=latitude, longitude_deg=longitude, height_m=height, provenance=provenance), shift
+
+
+def points_at(
+    ecef_m: Floats,
+    crs: str,
+    time: np.datetime64,
+    *,
+    epoch: float | None = None,
+    plate: str | None = None,
+    named: bool = True,
+) -> tuple[Floats, FrameShift]:
+    """Points of a map in the frame of the satellites at a time.
+
+    Parameters
+    ----------
+    ecef_m : ndarray, shape (n, 3) [m]
+    crs : str
+        Frame of the points.
+    time : datetime64
+        Of the log.
+    epoch : float, optional [year]
+        Epoch of the map's coordinates, where its frame is an ITRF.
+    plate : str, optional
+        Plate that moves coordinates of an ITRF from `epoch` to `time`: one of `PLATES`.
+    named : bool
+        Whether the map names its frame; else the size of the doubt is noted.
+
+    Returns
+    -------
+    ndarray, shape (n, 3) [m]
+        `ecef_m` itself where the frame is that of the satellites.
+    FrameShift
+        At the middle point.
+
+    Raises
+    ------
+    SettingsError
+        The plate is unknown, or `epoch` or `plate` is given for a frame that does not need it.
+    """
     kind, frame, year = kind_of_frame(crs), _geodetic(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
     if plate is not None and plate not in PLATES:
@@ -227,33 +277,58 @@ def track_at(
     held = _HELD.get(frame.name.split(" (")[0])
     if (epoch is not None or plate is not None) and not (kind == "dynamic" or held):
         raise SettingsError(f"the map's frame is {frame.name}, which takes no epoch and no plate of its own")
-    ecef = track.ecef_m
+    middle = ecef_m[len(ecef_m) // 2]
     if kind in ("wgs84", "older datum"):
-        notes = _doubt(track, time) if track.provenance.crs == UNNAMED else ()
-        return track, FrameShift(frame=frame.name, used=used, method="used as it is", notes=notes)
+        notes = () if named else _doubt(middle, time)
+        return ecef_m, FrameShift(frame=frame.name, used=used, method="used as it is", notes=notes)
     if held is not None:
         moved_by, since, rest = held
         plate, epoch = plate or moved_by, epoch or since
-        moved, method = _by_plate(ecef, plate, year - epoch), f"motion of the plate {plate} since {epoch:g}; {rest}"
+        moved, method = _by_plate(ecef_m, plate, year - epoch), f"motion of the plate {plate} since {epoch:g}; {rest}"
         notes = (f"map: {frame.name} moved to {used} by the {method}",)
     elif kind == "dynamic":
-        moved, method, notes = _from_dynamic(ecef, crs, year, epoch, plate)
+        moved, method, notes = _from_dynamic(ecef_m, crs, year, epoch, plate)
     else:
         operation = _operation(crs)
         assert operation is not None
-        latitude, longitude, height = track.latitude_deg, track.longitude_deg, track.height_m
+        latitude, longitude, height = geodetic_from_ecef(ecef_m)
         lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
         moved, method, notes = ecef_from_geodetic(lat, lon, up), f"PROJ: {operation.description}", ()
-    latitude, longitude, height = geodetic_from_ecef(moved)
-    middle = len(track) // 2
-    axes = enu_axes(track.latitude_deg[middle], track.longitude_deg[middle])
-    east, north, up_m = (float(v) for v in axes @ (moved[middle] - ecef[middle]))
-    provenance = replace(track.provenance, frame=WORKING_FRAME)
-    shifted = replace(track, latitude_deg=latitude, longitude_deg=longitude, height_m=height, provenance=provenance)
+    at = geodetic_from_ecef(middle)
+    east, north, up_m = (float(v) for v in enu_axes(float(at[0]), float(at[1])) @ (moved[len(ecef_m) // 2] - middle))
     shift = FrameShift(
         frame=frame.name, used=used, method=method, east_m=east, north_m=north, up_m=up_m, notes=tuple(notes)
     )
-    return shifted, shift
+    return moved, shift
+
+
+def in_map_frame(
+    ecef_m: Floats,
+    crs: str,
+    time: np.datetime64,
+    *,
+    epoch: float | None = None,
+    plate: str | None = None,
+    named: bool = True,
+) -> tuple[Floats, FrameShift]:
+    """Positions from satellites in the frame of a map: the shift of `points_at` taken off.
+
+    A shift of metres changes by micrometres over its own length, so it is taken at the positions.
+
+    Parameters
+    ----------
+    ecef_m : ndarray, shape (n, 3) [m]
+        NaN where there is no position.
+    crs, time, epoch, plate, named
+        As for `points_at`.
+    """
+    known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
+    if not len(known):
+        raise MismatchError("there is no position to move to the frame of the map")
+    moved, shift = points_at(ecef_m[known], crs, time, epoch=epoch, plate=plate, named=named)
+    back = ecef_m.copy()
+    back[known] = 2.0 * ecef_m[known] - moved
+    return back, shift
 
 
 def _from_dynamic(
@@ -284,16 +359,14 @@ def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
     return np.stack([x, y, z], axis=-1)
 
 
-def _doubt(track: Track, time: np.datetime64) -> tuple[str, ...]:
-    """A note on how far a map without a named frame may be off at its place."""
-    middle = len(track) // 2
-    latitude, longitude = float(track.latitude_deg[middle]), float(track.longitude_deg[middle])
+def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
+    """A note on how far a map without a named frame may be off at a point of it."""
+    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     for name, code in REGIONAL.items():
         area = CRS.from_user_input(code).area_of_use
         if area is None or not (area.south <= latitude <= area.north and _between(longitude, area.west, area.east)):
             continue
-        named = replace(track, provenance=replace(track.provenance, frame=code))
-        _, shift = track_at(named, time)
+        _, shift = points_at(ecef_m[None], code, time)
         size = float(np.hypot(np.hypot(shift.east_m, shift.north_m), shift.up_m))
         return (
             f"map: no reference frame is named, WGS 84 is assumed; if the map is in {name}, as is usual there, "

@@ -7,7 +7,7 @@ track to another only over a connection that is navigable: of a switch the stem 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -22,9 +22,11 @@ from railfix.core.arrays import Floats, Indices, read_only
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import ending
 from railfix.core.geodesy import ecef_from_geodetic
-from railfix.track.polyline import project_on_segments
+from railfix.track.polyline import NearestOnPolyline, project_on_segments
 from railfix.track.read import read_segments
-from railfix.track.segment import NO_HEIGHTS, Segment
+from railfix.track.route import first_gap, one_frame, orient
+from railfix.track.segment import Segment
+from railfix.track.track import UNNAMED
 from railfix.track.vector_file import read_layers
 from railfix.track.xml_files import Relation, read_railml_relations
 
@@ -38,8 +40,8 @@ _DIRECTION_M: Final = 10.0
 _NEAR_WAY_M: Final = 5_000.0
 #: Spacing of the samples of the spatial index [m].
 _SAMPLE_M: Final = 50.0
-#: Nearest samples examined for each position.
-_SAMPLES: Final = 48
+#: Nearest samples examined for each position at first; more where these do not reach as far as asked.
+_SAMPLES: Final = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,9 +140,25 @@ class Network:
                 graph.add_edge(b + 1, a, weight=0.0)
         return graph
 
+    @property
+    def frame(self) -> str:
+        """Geographic CRS of the coordinates.
+
+        Raises
+        ------
+        MismatchError
+            The tracks are in different ones.
+        """
+        return one_frame(self.tracks)
+
+    @property
+    def named(self) -> bool:
+        """Whether the files name the frame."""
+        return all(track.crs != UNNAMED for track in self.tracks)
+
     @cached_property
-    def _index(self) -> tuple[cKDTree, Indices, Indices]:
-        """Tree of samples of all segments, and segment and track of each sample."""
+    def _index(self) -> tuple[cKDTree, Indices, Indices, float]:
+        """Tree of samples of all segments, segment and track of each sample, and how far a piece reaches from it."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
         inner[self.first_point[1:-1] - 1] = False
@@ -150,19 +168,31 @@ class Network:
         share = (np.arange(len(of)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 0.5) / np.repeat(pieces, pieces)
         samples = self.points_m[of] + share[:, None] * (self.points_m[of + 1] - self.points_m[of])
         track = np.searchsorted(self.first_point, of, side="right") - 1
-        return cKDTree(samples, balanced_tree=False), of, track
+        reach = float((steps[segment] / pieces).max(initial=0.0)) / 2.0
+        return cKDTree(samples, balanced_tree=False), of, track, reach
+
+    def _samples_near(self, points_m: Floats, within_m: float) -> tuple[Floats, Indices]:
+        """Distance and number of every sample near each point, shape (n, k); infinite where there are fewer."""
+        tree, segment, _, reach = self._index
+        count = min(_SAMPLES, len(segment))
+        distance, sample = np.full((len(points_m), count), np.inf), np.zeros((len(points_m), count), dtype=np.intp)
+        short = np.arange(len(points_m))
+        while len(short):
+            more = ((0, 0), (0, count - distance.shape[1]))
+            distance, sample = np.pad(distance, more, constant_values=np.inf), np.pad(sample, more)
+            near = tree.query(points_m[short], k=np.arange(1, count + 1), distance_upper_bound=within_m + reach + 1e-3)
+            distance[short], sample[short] = near
+            full = np.isfinite(distance[short, -1]) & (count < len(segment))
+            short, count = short[full], min(4 * count, len(segment))
+        return distance, np.where(np.isfinite(distance), sample, 0).astype(np.intp)
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
         """Tracks within a distance in plan of positions, shapes (n,), by a spatial index of all tracks."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
-        tree, segment, of_track = self._index
-        count = min(_SAMPLES, len(segment))
+        _, segment, of_track, _ = self._index
         usable = ~np.isnan(points[:, 0])
-        distance, sample = tree.query(
-            np.where(usable[:, None], points, 0.0), k=np.arange(1, count + 1), distance_upper_bound=within_m + _SAMPLE_M
-        )
-        present = np.isfinite(np.asarray(distance, dtype=np.float64))
-        sample = np.where(present, np.asarray(sample, dtype=np.intp), 0)
+        distance, sample = self._samples_near(np.where(usable[:, None], points, 0.0), within_m)
+        present = np.isfinite(distance)
         of, track = segment[sample], np.where(present, of_track[sample], -1)
         start, step = self.points_m[of], self.points_m[of + 1] - self.points_m[of]
         share, offset = project_on_segments(points[:, None], start, step)
@@ -184,6 +214,24 @@ class Network:
             chainage_m=np.where(found, np.take_along_axis(chainage, picked, axis=1), np.nan),
             offset_m=np.where(found, off * sign, np.inf),
         )
+
+    def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
+        """Chainage on given tracks and distance from them in plan, shapes (n,); NaN without track or position.
+
+        Parameters
+        ----------
+        track : ndarray of int, shape (n,)
+            -1 where there is none.
+        latitude_deg, longitude_deg : ndarray, shape (n,)
+        """
+        points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
+        chainage, offset = np.full(len(track), np.nan), np.full(len(track), np.nan)
+        for number in np.unique(track[track >= 0]):
+            rows = np.flatnonzero((track == number) & np.isfinite(points[:, 0]))
+            own = slice(self.first_point[number], self.first_point[number + 1])
+            segment, along, offset[rows] = NearestOnPolyline(self.points_m[own])(points[rows])
+            chainage[rows] = self.chainage_m[own][segment] + along
+        return chainage, offset
 
     def index_of(self, name: str) -> int:
         """Number of the track of a name.
@@ -271,9 +319,9 @@ def read_network(
     if relations:
         return _of_relations(tracks, relations, str(paths[0]))
     divided, cuts = _divided(tracks, tolerance_m)
-    links = links_of_ends(divided, tolerance_m=tolerance_m)
+    network = Network(tracks=tuple(divided), links=())
     note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
-    return Network(tracks=tuple(divided), links=links, notes=(note,))
+    return replace(network, links=links_of_ends(network, tolerance_m=tolerance_m), notes=(note,))
 
 
 def _relations(path: str | PathLike[str]) -> list[Relation]:
@@ -320,37 +368,39 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
     return Network(tracks=tuple(tracks), links=links, notes=(note,))
 
 
-def end_points(tracks: Iterable[Segment]) -> tuple[Floats, Floats]:
+def end_points(network: Network) -> tuple[Floats, Floats]:
     """Ends of tracks on the ellipsoid and unit vectors out of them, shapes (tracks, 2, 3)."""
-    ends, outward = [], []
-    for track in tracks:
-        points = ecef_from_geodetic(track.latitude_deg, track.longitude_deg, np.zeros(len(track.latitude_deg)))
-        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        inner = np.clip(np.searchsorted(way, _DIRECTION_M), 1, len(way) - 1)
-        outer = np.clip(np.searchsorted(way, way[-1] - _DIRECTION_M, side="right") - 1, 0, len(way) - 2)
-        arms = np.stack([points[0] - points[inner], points[-1] - points[outer]])
-        ends.append(points[[0, -1]])
-        outward.append(arms / np.linalg.norm(arms, axis=1, keepdims=True))
-    return np.array(ends), np.array(outward)
+    first, last = network.first_point[:-1], network.first_point[1:] - 1
+    before = np.concatenate([[0.0], np.cumsum(network.length_m + 1.0)[:-1]])
+    place = network.chainage_m + np.repeat(before, last - first + 1)
+    inner = np.clip(np.searchsorted(place, before + _DIRECTION_M), first + 1, last)
+    outer = np.clip(np.searchsorted(place, before + network.length_m - _DIRECTION_M, side="right") - 1, first, last - 1)
+    points = network.points_m
+    ends = np.stack([points[first], points[last]], axis=1)
+    outward = ends - np.stack([points[inner], points[outer]], axis=1)
+    return ends, outward / np.linalg.norm(outward, axis=2, keepdims=True)
 
 
-def links_of_ends(tracks: Sequence[Segment], *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
+def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
     """Connections of ends that lie within a tolerance; navigable where the direction changes by less than 60 deg."""
-    ends, outward = end_points(tracks)
-    tree = cKDTree(ends.reshape(-1, 3))
-    links = []
-    for a, b in sorted(tree.query_pairs(tolerance_m)):
-        turn = np.pi - np.arccos(np.clip(outward.reshape(-1, 3)[a] @ outward.reshape(-1, 3)[b], -1.0, 1.0))
-        links.append(
-            Link(
-                first=a // 2,
-                first_end=a % 2,
-                second=b // 2,
-                second_end=b % 2,
-                navigable=bool(turn < _LARGEST_TURN_RAD) and a // 2 != b // 2,
-            )
-        )
-    return tuple(links)
+    ends, outward = end_points(network)
+    pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
+    pairs = pairs[np.lexsort(pairs.T[::-1])]
+    a, b = pairs.T
+    facing = np.einsum("ij,ij->i", outward.reshape(-1, 3)[a], outward.reshape(-1, 3)[b])
+    navigable = (facing < -np.cos(_LARGEST_TURN_RAD)) & (a // 2 != b // 2)
+    return tuple(
+        Link(first=i // 2, first_end=i % 2, second=j // 2, second_end=j % 2, navigable=n)
+        for i, j, n in zip(a.tolist(), b.tolist(), navigable.tolist(), strict=True)
+    )
+
+
+def is_route(segments: Sequence[Segment]) -> bool:
+    """Whether segments join to one route in their order: ends meet, and no train would have to turn back."""
+    if first_gap(segments) is not None:
+        return False
+    _, outward = end_points(Network(tracks=tuple(orient(segments)), links=()))
+    return bool((np.einsum("ij,ij->i", outward[:-1, 1], outward[1:, 0]) < -np.cos(_LARGEST_TURN_RAD)).all())
 
 
 def _divided(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], int]:
@@ -394,8 +444,3 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
         source=f"{track.file} ({name})",
         metadata=track.metadata | {"name": name},
     )
-
-
-def has_heights(network: Network) -> bool:
-    """Whether every track has heights."""
-    return all(track.height_datum != NO_HEIGHTS for track in network.tracks)

@@ -91,7 +91,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
     """Ends without a connection near another such end, or that turn into nothing."""
     if not loose:
         return
-    ends, outward = end_points(network.tracks)
+    ends, outward = end_points(network)
     points = np.array([ends[t, e] for t, e in loose])
     facing = np.array([outward[t, e] for t, e in loose])
     # two tracks that end beside each other point the same way
@@ -117,7 +117,7 @@ def _gaps(network: Network, loose: list[tuple[int, int]]) -> Iterator[NetworkFin
 
 def _joints(network: Network) -> Iterator[NetworkFinding]:
     """Connections whose ends do not meet, and navigable ones with a kink."""
-    ends, outward = end_points(network.tracks)
+    ends, outward = end_points(network)
     for link in network.links:
         first, second = (link.first, link.first_end), (link.second, link.second_end)
         names = (network.names[link.first], network.names[link.second])

@@ -20,9 +20,10 @@ MAX_GAP_M = 1.0
 
 
 def _ends(segment: Segment) -> Floats:
-    """Return first and last point, shape (2, 3) [m]."""
+    """Return first and last point, shape (2, 3) [m]; in plan where the segment has no heights."""
     i = [0, -1]
-    return ecef_from_geodetic(segment.latitude_deg[i], segment.longitude_deg[i], segment.height_m[i])
+    height = np.nan_to_num(segment.height_m[i])
+    return ecef_from_geodetic(segment.latitude_deg[i], segment.longitude_deg[i], height)
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
@@ -39,24 +40,40 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
     InputFileError
         Two neighbours are further apart than `max_gap_m` in any orientation.
     """
-    pieces = list(segments)
-    if len(pieces) > 1:
-        first, second = _ends(pieces[0]), _ends(pieces[1])
-        distance = np.linalg.norm(first[:, None] - second[None, :], axis=-1).min(axis=1)
-        if distance[0] < distance[1] and distance[1] > max_gap_m:
-            pieces[0] = pieces[0].reversed()
-    for k in range(1, len(pieces)):
-        here = _ends(pieces[k - 1])[1]
-        gaps = np.linalg.norm(_ends(pieces[k]) - here, axis=-1)
-        if gaps.min() > max_gap_m:
-            raise InputFileError(
-                pieces[k].source,
-                f"neither end meets the end of {pieces[k - 1].source}: the gap is {gaps.min():.2f} m, the limit "
-                f"{max_gap_m:g} m; give the segments in the order of the route",
-            )
-        if gaps[1] < gaps[0]:
-            pieces[k] = pieces[k].reversed()
-    return pieces
+    gap = first_gap(segments, max_gap_m=max_gap_m)
+    if gap is not None:
+        k, size = gap
+        raise InputFileError(
+            segments[k].source,
+            f"neither end meets the end of {segments[k - 1].source}: the gap is {size:.2f} m, the limit "
+            f"{max_gap_m:g} m; give the segments in the order of the route, or make a route of a network with "
+            "'railfix map route'",
+        )
+    return [s.reversed() if turned else s for s, turned in zip(segments, _turned(segments, max_gap_m), strict=True)]
+
+
+def _turned(segments: Sequence[Segment], max_gap_m: float) -> list[bool]:
+    """Whether each segment must be reversed to begin at the end of the one before."""
+    ends = [_ends(segment) for segment in segments]
+    turned = [False] * len(segments)
+    if len(ends) > 1:
+        distance = np.linalg.norm(ends[0][:, None] - ends[1][None, :], axis=-1).min(axis=1)
+        turned[0] = bool(distance[0] < distance[1] and distance[1] > max_gap_m)
+    for k in range(1, len(ends)):
+        gaps = np.linalg.norm(ends[k] - ends[k - 1][0 if turned[k - 1] else 1], axis=-1)
+        turned[k] = bool(gaps[1] < gaps[0])
+    return turned
+
+
+def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
+    """The first segment that does not meet the one before, and the gap [m]; None where all meet."""
+    turned = _turned(segments, max_gap_m)
+    for k in range(1, len(segments)):
+        here, there = _ends(segments[k - 1]), _ends(segments[k])
+        size = float(np.linalg.norm(there[1 if turned[k] else 0] - here[0 if turned[k - 1] else 1]))
+        if not size <= max_gap_m:
+            return k, size
+    return None
 
 
 def join(
@@ -97,7 +114,7 @@ def join(
         provenance=Provenance(
             files=_unique(piece.file for piece in pieces),
             crs=", ".join(_unique(piece.crs for piece in pieces)),
-            frame=_one_frame(pieces),
+            frame=one_frame(pieces),
             height_datum_asked=height_datum_asked or "",
             height_datum_used=", ".join(_unique(piece.height_datum for piece in pieces)),
             geoid=", ".join(_unique(piece.geoid for piece in pieces if piece.geoid)),
@@ -106,7 +123,7 @@ def join(
     )
 
 
-def _one_frame(pieces: Sequence[Segment]) -> str:
+def one_frame(pieces: Sequence[Segment]) -> str:
     """The frame of all pieces; pieces in two frames would be joined with a step of up to 2 m."""
     frames = {piece.frame: piece.source for piece in pieces}
     if len(frames) > 1:
