@@ -253,6 +253,7 @@ GROUPINGS = {
     "environment": lambda one: one["environment"],
     "speed": lambda one: speed_class(one["speed"]),
     "satellites": lambda one: satellite_class(one["n"]),
+    "signals": lambda one: "with satellites" if one["observed"] and one["n"] > 0 else "without satellites",
     "status": lambda one: one["status"],
 }
 KINDS = (
@@ -276,7 +277,7 @@ def all_figures(by_antenna):
                     groups.setdefault(group_of(one), []).append(one)
             for group, members in groups.items():
                 for position, both in KINDS:
-                    told = both == "own" and grouping not in ("satellites", "status")
+                    told = both == "own" and grouping not in ("satellites", "signals", "status")
                     found[grouping, group, antenna, position, both] = figures(members, position, both, with_limits=told)
     return found
 

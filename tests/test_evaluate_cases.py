@@ -32,7 +32,9 @@ from railfix.evaluate import (
     evaluate_runs,
 )
 from railfix.evaluate.blocks import block_limits
+from railfix.evaluate.branches import BRANCH_COLUMNS
 from railfix.evaluate.epochs import travelled, with_missing
+from railfix.evaluate.outages import OUTAGE_COLUMNS
 from railfix.evaluate.run_folder import tables_of
 from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, write_reference
@@ -160,6 +162,8 @@ def test_another_table_of_the_same_run_stands_beside_the_positions(tmp_path: Pat
         chainage_m=pl.Series(place + 1.0),
         along_sigma_m=pl.Series(np.full(10, 0.5)),
         protection_level_m=pl.Series(np.full(10, 6.0)),
+        branch_probability=pl.Series(np.where(time < 2, 0.95, 0.9995)),
+        sources=pl.Series(np.where(tunnel, "wheel+force", "code+doppler")),
         **{f"{axis}_m": pl.Series(places[:, i]) for i, axis in enumerate("xyz")},
     )
     train.write_csv(run / "train.csv")
@@ -179,6 +183,22 @@ def test_another_table_of_the_same_run_stands_beside_the_positions(tmp_path: Pat
     assert found.figure("positions", position="constrained_ok", **tracked) == 7
     assert found.figure("mean_m", position="conventional", **tracked) == pytest.approx(8.0, abs=1e-6)
     assert set(found.integrity) == {"train"}
+    usable = found.integrity["train"].stanford.filter(levels_of="usable", alarm_limit_m=10.0, grouping="all")
+    assert usable["nominal"].item() == 10  # tracking and coasting state a bound
+    assert found.figure("positions", grouping="signals", group="without satellites", **tracked) == 3
+    assert found.figure("positions", grouping="signals", group="without satellites", **single) == 0
+    assert found.outages is not None
+    (outage,) = found.outages.to_dicts()
+    assert (outage["run"], outage["epochs"], outage["positions"]) == ("run (train)", 3, 3)
+    assert (outage["duration_s"], outage["carried_by"]) == (3.0, "wheel+force")
+    assert outage["travelled_m"] == pytest.approx(30.0, abs=1e-6)
+    assert outage["outage_max_m"] == pytest.approx(1.0, abs=1e-6)
+    assert outage["largest_normalised"] == pytest.approx(2.0, abs=1e-6)
+    assert found.branches is not None
+    classes = {row["probability"]: row for row in found.branches.to_dicts()}
+    assert {name: row["judged"] for name, row in classes.items()} == {"0.9 to 0.99": 2, "0.999 to 1": 8, "all": 10}
+    assert classes["all"]["probability_mean"] == pytest.approx(0.9896)
+    assert classes["all"]["right_share"] == 1.0
     assert found.runs[0].configuration != found.runs[1].configuration
     result = CliRunner().invoke(app, ["evaluate", str(run), "--reference", "auto"])
     assert result.exit_code == 3  # no log to look for a reference beside; both tables were asked for
@@ -606,6 +626,7 @@ def test_the_reference_beside_the_log_must_be_the_only_one(tmp_path: Path):
 def test_the_document_names_every_column():
     text = (ROOT / "docs" / "evaluation.md").read_text()
     every = (EPOCH_COLUMNS, FIGURE_COLUMNS, INTERVAL_COLUMNS, LEVEL_COLUMNS, STANFORD_COLUMNS, BEYOND_COLUMNS)
+    every += (OUTAGE_COLUMNS, BRANCH_COLUMNS)
     for columns in every:
         for name, meaning in columns.items():
             assert f"| `{name}` | {meaning} |" in text

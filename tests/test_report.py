@@ -317,6 +317,7 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     largest = evaluation.figure("max_m", run="run (train)", antenna="front")
     assert "Filtered along the track, the train has a position at" in document
     assert f"and the worst is {largest:.1f} m off." in document
+    assert f"filtered {largest:.2f} m</dd>" in document
 
 
 def test_hostile_words_stay_words(folder: Path, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from railfix.cli.console import console_of_tables, progress_bar, show_summary
+from railfix.cli.evaluate_tables import outages
 from railfix.cli.options import OverwriteOption
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import POSITIONS_TABLE
@@ -79,6 +80,9 @@ def show_errors(evaluation: Evaluation) -> None:
             rate = "-" if row["rate"] is None else f"{100 * row['rate']:.2f} %"
             table.add_row(row["antenna"], name, rate, *cells)
     console.print(table)
+    if evaluation.outages is not None and len(evaluation.outages):
+        console.print("In the tunnel, without satellites, the filter along the track goes on:")
+        console.print(outages(evaluation.outages))
     show_levels(evaluation, console)
 
 

@@ -83,13 +83,15 @@ def evaluate(
     The error is the distance along the line from the reference to the position, + toward the end of
     the line whichever way the train runs. Shown for the positions on the map, those of status ok, and
     the conventional ones (3-D single point, moved to the nearest point of the line), over each one's own
-    epochs and over those that both have; by antenna, section, environment, speed, satellites used
-    and status; of several runs also by configuration and line.
+    epochs and over those that both have; by antenna, section, environment, speed, satellites used,
+    with and without satellites, and status; of several runs also by configuration and line.
 
     Into DIR come `evaluation.json` (all figures, options, hashes of the inputs), `errors.parquet` (one
     row an epoch and antenna), `tables.csv`, `intervals.csv` and, where a run has protection levels,
     `levels.csv`, `stanford_KIND.csv` (levels against errors, counted at each alarm limit) and
-    `beyond_KIND.csv` (every epoch whose error is over its level), with KIND `sbas` or `separation`.
+    `beyond_KIND.csv` (every epoch whose error is over its level), with KIND `sbas`, `separation` or `train`;
+    for the filter along the track `outages.csv` (stretches without satellites) and `branches.csv` (stated
+    probability of the place against its correctness).
 
     Example:
 

@@ -13,7 +13,9 @@ from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_files, show_notes
 from railfix.cli.evaluate_levels import show_integrity
+from railfix.evaluate.figures import WITH_SATELLITES
 from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
+from railfix.evaluate.scores import WRONG_PLACE_M
 
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
@@ -28,6 +30,7 @@ _GROUPINGS: Final = {
     "line": "By line, the runs of a configuration together",
     "environment": "By environment",
     "speed": "By speed",
+    "signals": "With and without satellites (tunnels and other outages)",
     "satellites": "By satellites used",
     "status": "By status",
     "section": "By section of the line",
@@ -69,11 +72,18 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
         console.print("Protection levels")
         console.print(_levels(evaluation.levels))
         show_integrity(evaluation, console)
+    if evaluation.outages is not None and len(evaluation.outages):
+        console.print("Stretches without satellites, as the filter along the track passes them")
+        console.print(outages(evaluation.outages))
+    if evaluation.branches is not None and len(evaluation.branches):
+        console.print(f"Stated probability of the place against the share of places within {WRONG_PLACE_M:g} m")
+        console.print(_branches(evaluation.branches))
     for grouping, head in _GROUPINGS.items():
         rows = evaluation.figures.filter(pl.col("grouping") == grouping, pl.col("epochs_of") == "own")
         if several and grouping in ("environment", "speed"):
             rows = rows.filter(pl.col("run") == "all")
-        if rows.is_empty() or (grouping == "environment" and rows["group"].unique().to_list() == ["unknown"]):
+        trivial = {"environment": "unknown", "signals": WITH_SATELLITES}.get(grouping)
+        if rows.is_empty() or rows["group"].unique().to_list() == [trivial]:
             continue
         console.print(head)
         console.print(_grouped(rows))
@@ -152,9 +162,11 @@ def _grouped(rows: pl.DataFrame) -> Table:
     if rows["grouping"][0] == "section":
         both = both.head(_MOST_SECTIONS)
     for row in both.iter_rows(named=True):
-        cells = [f"{row['observed']:,}"]
+        # without satellites nothing is observed: every epoch counts
+        counted, rate = ("epochs", "rate_of_run") if row["grouping"] == "signals" else ("observed", "rate")
+        cells = [f"{row[counted]:,}"]
         for suffix in ("", "_conventional"):
-            cells.append(_percent(row[f"rate{suffix}"]))
+            cells.append(_percent(row[f"{rate}{suffix}"]))
             cells.append(_metres(row[f"mean_m{suffix}"], sign="+"))
             cells += [_metres(row[f"{name}{suffix}"]) for name in ("std_m", "p50_m", "p95_m", "max_m")]
         table.add_row(_of(row), row["group"], row["antenna"], *cells)
@@ -194,6 +206,38 @@ def _levels(rows: pl.DataFrame) -> Table:
             f"{row['errors']:,}",
             f"{row['over_level']:,}",
         )
+    return table
+
+
+def outages(rows: pl.DataFrame) -> Table:
+    """Table of stretches without satellites."""
+    heads = ("lasting s", "way m", "rate %", "p50", "p95", "max", "at its end", "sigma there", "max /sigma")
+    table = _table("run", "antenna", "begin", "environment", "carried by", *heads, text=5)
+    for row in rows.iter_rows(named=True):
+        table.add_row(
+            row["run"],
+            row["antenna"],
+            f"{row['begin_gpst']:%H:%M:%S}",
+            row["environment"],
+            row["carried_by"] or "prediction",
+            f"{row['duration_s']:.1f}",
+            "-" if row["travelled_m"] is None else f"{row['travelled_m']:.0f}",
+            _percent(row["positions"] / row["epochs"]),
+            *(_metres(row[f"outage_{name}_m"]) for name in ("p50", "p95", "max")),
+            _metres(row["end_error_m"], sign="+"),
+            _metres(row["end_sigma_m"]),
+            _metres(row["largest_normalised"]),
+        )
+    return table
+
+
+def _branches(rows: pl.DataFrame) -> Table:
+    heads = ("positions", "stated %", "right %", "wrong", "blocks", "with a wrong one")
+    table = _table("run", "antenna", "probability", *heads, text=3)
+    for row in rows.iter_rows(named=True):
+        shares = (_percent(row[name]) for name in ("probability_mean", "right_share"))
+        counts = (f"{row[name]:,}" for name in ("wrong_places", "blocks", "wrong_blocks"))
+        table.add_row(row["run"], row["antenna"], row["probability"], f"{row['judged']:,}", *shares, *counts)
     return table
 
 

@@ -48,12 +48,17 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "conventional_error_m": "3-D single point at its nearest point of the trajectory, + toward the end",
     "distance_m": "straight distance between the position on the map and the reference",
     "along_sigma_m": "standard deviation that the run states",
+    "branch_probability": "probability of the place given, of the filter along the track",
+    "sources": "measurements that the filter along the track used; empty for single epochs",
     "interval_m": "distance travelled since the previous position",
     "gap_s": "time since the previous position",
     "conventional_interval_m": "the same for the conventional positions",
     "conventional_gap_s": "the same for the conventional positions",
     "block": "block of time within the run, for confidence limits",
 }
+
+#: Rows of tables of the filter along the track: it states a probability for every place.
+OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,6 +246,8 @@ def antenna_epochs(
         "conventional_error_m": errors.conventional_error_m,
         "distance_m": errors.distance_m,
         "along_sigma_m": column("along_sigma_m"),
+        "branch_probability": column("branch_probability"),
+        "sources": _texts(mine, "sources", rows) if "sources" in mine.columns else np.full(len(time), ""),
     }
     for prefix, answered in (("", answers.chainage_m), ("conventional_", answers.conventional_chainage_m)):
         # moved_m is interpolated by time over gaps of the reference, so that positions there count

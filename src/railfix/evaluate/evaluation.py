@@ -12,12 +12,14 @@ import polars as pl
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
+from railfix.evaluate.branches import branch_table
 from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, protection_columns
 from railfix.evaluate.figures import ALL, KEYS, WORDS, classed, figures_by
 from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
 from railfix.evaluate.intervals import interval_table
 from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.outages import outage_table
 from railfix.evaluate.place import TrackFiles
 from railfix.evaluate.run_folder import POSITIONS_TABLE, UNKNOWN_KIND, RunFolder, read_run
 from railfix.evaluate.sections import read_sections
@@ -121,6 +123,9 @@ class Evaluation:
         `railfix.evaluate.LEVEL_COLUMNS`; None where no run has a protection level.
     integrity : mapping of str to Integrity
         Levels against errors, by what the levels rest on; empty where no run has a level.
+    outages, branches : polars.DataFrame or None
+        `railfix.evaluate.outages.OUTAGE_COLUMNS`, `railfix.evaluate.branches.BRANCH_COLUMNS`; None where no table of
+        the filter along the track is among the runs.
     options : EvaluationOptions
     inputs : tuple of mapping
         Files of all runs, with size and hash.
@@ -132,6 +137,8 @@ class Evaluation:
     intervals: pl.DataFrame
     levels: pl.DataFrame | None
     integrity: Mapping[str, Integrity]
+    outages: pl.DataFrame | None
+    branches: pl.DataFrame | None
     options: EvaluationOptions
     inputs: tuple[Mapping[str, Any], ...] = ()
 
@@ -242,6 +249,8 @@ def evaluate_runs(
         intervals=_intervals(epochs),
         levels=level_table(epochs, list(KEYS)),
         integrity=integrity_of(epochs, [run for run in map(_levelled, parts, names) if run is not None], options),
+        outages=outage_table(epochs),
+        branches=branch_table(epochs),
         options=options,
         inputs=tuple({entry["path"]: entry for run in evaluated for entry in run.inputs}.values()),
     )
@@ -392,7 +401,7 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
     Runs of different configurations are never put together: they may be of the same log.
     """
     both = _with_all(classed(epochs, options))
-    tables = [figures_by(both, ("all", "section", "environment", "speed", "satellites", "status"), options)]
+    tables = [figures_by(both, ("all", "section", "environment", "speed", "satellites", "signals", "status"), options)]
     if epochs["run"].n_unique() > 1:
         named = both.with_columns(
             pl.col("configuration").alias("configuration_group"),

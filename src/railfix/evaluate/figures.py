@@ -25,11 +25,15 @@ WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration",
 WORDS: Final = pl.Categorical()
 #: In place of a name: everything together.
 ALL: Final = "all"
+#: Groups of `signals`: epochs at which the single-epoch solution used a satellite, and tunnels and other outages.
+WITH_SATELLITES: Final = "with satellites"
+WITHOUT_SATELLITES: Final = "without satellites"
+AIDED: Final = pl.col("observed") & (pl.col("n_used").fill_null(0) > 0)
 
 #: Columns of the table of figures, with their unit and meaning.
 FIGURE_COLUMNS: Final[dict[str, str]] = {
-    "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `status`; of several runs also "
-    "`configuration` and `line`: the runs of one configuration together",
+    "grouping": "`all`, `section`, `environment`, `speed`, `satellites`, `signals` (with or without a satellite "
+    "used), `status`; of several runs also `configuration` and `line`: the runs of one configuration together",
     "group": "name of the group",
     "run": "name of the run; `all` for several together",
     "configuration": "settings of the run",
@@ -87,7 +91,7 @@ _LIMITS: Final = tuple(
     for end in ("low", "high")
 )
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
-PASSED: Final = (Status.OK.text, "tracking")
+PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
 _USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
@@ -108,6 +112,7 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
         "environment": pl.lit(0),
         "speed": pl.when(pl.col("speed_mps").is_null()).then(len(edges) + 2).otherwise(speed_rank),
         "satellites": pl.when(pl.col("n_used").is_null()).then(-1).otherwise(_rank(pl.col("n_used"), sats)),
+        "signals": pl.when(AIDED).then(0).otherwise(1),
         "status": pl.col("status").replace_strict({s.text: int(s) for s in Status}, default=len(Status)),
     }
     begins = section * options.section_m
@@ -117,6 +122,7 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
         "environment": pl.col("environment"),
         "speed": pl.col("speed_rank").replace_strict(dict(enumerate(_speed_names(options)))),
         "satellites": pl.col("satellites_rank").replace_strict(dict(enumerate(_satellite_names(options), start=-1))),
+        "signals": pl.when(AIDED).then(pl.lit(WITH_SATELLITES)).otherwise(pl.lit(WITHOUT_SATELLITES)),
         "status": pl.col("status"),
     }
     inside = epochs.filter("in_reference").select(*KEYS, *_USED)

@@ -14,8 +14,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats, Masks, Strings
-from railfix.core.reasons import Status
-from railfix.evaluate.figures import ALL, KEYS
+from railfix.evaluate.figures import ALL, KEYS, PASSED
 from railfix.evaluate.options import WINDOWS_S, EvaluationOptions
 from railfix.evaluate.run_folder import floats
 from railfix.integrity.stanford import Region, Stanford, stanford
@@ -28,6 +27,8 @@ LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
 PARTS: Final = ("fault_free_m", "one_fault_m", "two_faults_m")
 STATED: Final = ("cause", "status")
 _ALARM: Final = "alarm"
+#: Statuses whose level is a bound: a coasting filter states one and raises no alarm.
+_BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
     Region.MISLEADING: "misleading",
@@ -42,7 +43,8 @@ _REGIONS: Final = {
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
-    "levels_of": "`usable`: levels of positions with status ok and no alarm, all others infinite; `all`: every level",
+    "levels_of": "`usable`: levels of positions with status ok (of the filter: tracking, coasting) and no alarm, all "
+    "others infinite; `all`: every level",
     "alarm_limit_m": "alarm limit AL",
     "own_limit": "it is the alarm limit of the run (of rows together: of all their runs)",
     "epochs": "of the run, with a reference; epochs missing in the log included",
@@ -85,7 +87,7 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
     "KIND_status": "status of the level",
     "status": "status of the epoch",
     "n_used": "satellites used",
-    "usable": "status ok and no alarm: misleading information",
+    "usable": "usable status and no alarm: misleading information",
 }
 
 
@@ -145,7 +147,8 @@ def counted_levels(
     has : ndarray of bool, shape (T,)
         Epochs with a position.
     status, verdict : ndarray of str, shape (T,)
-        Of the position (`railfix.core.reasons.Status`), of the level (`railfix.integrity.protection.Status`);
+        Of the position (`railfix.core.reasons.Status`, `railfix.tracking.TrackStatus`), of the level
+        (`railfix.integrity.protection.Status`);
         blank where there is none.
     levels_of : {"usable", "all"}
 
@@ -160,7 +163,7 @@ def counted_levels(
 
 
 def _usable(status: Strings, verdict: Strings) -> Masks:
-    return np.asarray((status == Status.OK.text) & (verdict != _ALARM))
+    return np.asarray(np.isin(status, _BOUNDED) & (verdict != _ALARM))
 
 
 def _words(table: pl.DataFrame, name: str) -> Strings:

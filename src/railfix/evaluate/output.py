@@ -12,12 +12,14 @@ from typing import Any, Final, Protocol
 import polars as pl
 
 from railfix import __version__
+from railfix.evaluate.branches import BRANCH_COLUMNS
 from railfix.evaluate.epochs import EPOCH_COLUMNS
 from railfix.evaluate.evaluation import Evaluation
 from railfix.evaluate.figures import FIGURE_COLUMNS
 from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS
 from railfix.evaluate.intervals import INTERVAL_COLUMNS
 from railfix.evaluate.levels import LEVEL_COLUMNS
+from railfix.evaluate.outages import OUTAGE_COLUMNS
 
 #: What P1 found (3.3, table 4; 5, figures 10 to 12), for comparison where it is asked for.
 P1_TABLE_4: Final = (
@@ -29,6 +31,7 @@ P1_COMMERCIAL: Final = (
     {"position": "conventional", "rate": 0.867, "max_m": 65.8},
     {"position": "constrained, all screens", "rate": 0.846, "max_m": 10.2},
 )
+_FILTER_COLUMNS: Final = {"outages": OUTAGE_COLUMNS, "branches": BRANCH_COLUMNS}
 #: Epochs beyond their level in ``evaluation.json``, the worst; the CSV file has all.
 MOST_BEYOND: Final = 200
 
@@ -60,6 +63,8 @@ def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
     levels.csv           protection levels, where a run has any
     stanford_KIND.csv    levels against errors, counted; KIND is what the levels rest on (sbas, separation)
     beyond_KIND.csv      epochs whose error is over the level
+    outages.csv          stretches without satellites, where a table of the filter is evaluated
+    branches.csv         stated probabilities of the place against its correctness, the same
     ==================== ================================================================
 
     Returns
@@ -77,6 +82,8 @@ def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
     folder.append_csv("intervals.csv", evaluation.intervals)
     if evaluation.levels is not None:
         folder.append_csv("levels.csv", evaluation.levels)
+    for name, table in _of_filter(evaluation).items():
+        folder.append_csv(f"{name}.csv", table)
     for kind, found in evaluation.integrity.items():
         folder.append_csv(f"stanford_{kind}.csv", found.stanford)
         folder.append_csv(f"beyond_{kind}.csv", found.beyond)
@@ -84,10 +91,17 @@ def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
     return folder.commit({"railfix": __version__, "runs": "; ".join(str(run.path) for run in evaluation.runs)})
 
 
+def _of_filter(evaluation: Evaluation) -> dict[str, pl.DataFrame]:
+    """Tables of the filter along the track by name; empty without one."""
+    tables = {"outages": evaluation.outages, "branches": evaluation.branches}
+    return {name: table for name, table in tables.items() if table is not None}
+
+
 def as_record(evaluation: Evaluation) -> dict[str, Any]:
     """Everything that ``evaluation.json`` says, as plain values; NaN as None."""
-    tables = {"figures": evaluation.figures, "intervals": evaluation.intervals}
+    tables = {"figures": evaluation.figures, "intervals": evaluation.intervals, **_of_filter(evaluation)}
     columns = {"figures": FIGURE_COLUMNS, "intervals": INTERVAL_COLUMNS, "epochs": EPOCH_COLUMNS}
+    columns |= {name: _FILTER_COLUMNS[name] for name in _of_filter(evaluation)}
     if evaluation.levels is not None:
         tables["levels"] = evaluation.levels
         columns["levels"] = LEVEL_COLUMNS

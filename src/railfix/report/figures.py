@@ -81,6 +81,7 @@ def _plan(run: ReportedRun, antenna: str, background: Sequence[Floats]) -> Chart
         positions,
         error_m=None if errors is None else _aligned(positions, errors),
         level_m=level if np.isfinite(level).any() else None,
+        filtered=run.train_of(antenna),
         track=run.track,
         tunnels_m=_tunnels(errors),
         background=background,

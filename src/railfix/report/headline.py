@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,11 @@ from railfix.report.tables import figures_of
 
 @dataclass(frozen=True, kw_only=True)
 class KeyFigure:
-    """A figure with its name and the conventional one, or a remark."""
+    """A figure with its name, that of the filter along the track, and the conventional one or a remark."""
 
     name: str
     value: str
+    filtered: str = ""
     beside: str = ""
 
 
@@ -100,27 +101,39 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
         f"and the worst is {number(worst, 1)} m off (conventional: {number(float(other_wide), 1)} m and "
         f"{number(other_worst, 1)} m)."
     )
+    filtered = _filtered(run, antenna)
     lengths = (
-        ("median error", middle, other_middle),
-        ("95 % of errors within", wide, other_wide),
-        ("largest error", worst, other_worst),
+        ("median error", "p50", middle, other_middle),
+        ("95 % of errors within", "p95", wide, other_wide),
+        ("largest error", "max", worst, other_worst),
     )
     figures = [
-        KeyFigure(name=name, value=number(float(value), 2, " m"), beside=number(float(beside), 2, " m"))
-        for name, value, beside in lengths
+        KeyFigure(
+            name=name,
+            value=number(float(value), 2, " m"),
+            filtered=number(filtered[key], 2, " m") if filtered else "",
+            beside=number(float(beside), 2, " m"),
+        )
+        for name, key, value, beside in lengths
     ]
     rates = share(compared.rate, 1), share(compared.conventional_rate, 1)
-    figures.append(KeyFigure(name="epochs with a position", value=rates[0], beside=rates[1]))
+    of_filter = f"{share(filtered['rate'], 1)} of all" if filtered else ""
+    figures.append(KeyFigure(name="epochs with a position", value=rates[0], filtered=of_filter, beside=rates[1]))
     own = figures_of(evaluation, run, antenna, "constrained_ok")
     return Headline(
         verdict=verdict,
         figures=(*(_beside(figure) for figure in figures), _integrity_figure(run, antenna, evaluation, own)),
-        remarks=(*_filtered(run, antenna), _alike(run, compared), *_larger_error(compared), *_marked(compared)),
+        remarks=(
+            *_filter_remark(run, antenna, evaluation, filtered),
+            _alike(run, compared),
+            *_larger_error(compared),
+            *_marked(compared),
+        ),
     )
 
 
 def _beside(figure: KeyFigure) -> KeyFigure:
-    return KeyFigure(name=figure.name, value=figure.value, beside=f"conventional {figure.beside}")
+    return replace(figure, beside=f"conventional {figure.beside}")
 
 
 def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, own: Mapping[str, Any]) -> KeyFigure:
@@ -144,19 +157,38 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     )
 
 
-def _filtered(run: ReportedRun, antenna: str) -> list[str]:
-    """A sentence on the filter along the track."""
+def _filtered(run: ReportedRun, antenna: str) -> dict[str, float]:
+    """Error sizes and rate of the filter along the track over all its epochs; empty without it."""
     table = run.filtered_of(antenna)
     known = pl.DataFrame() if table is None else table.filter("positioned", "reference_good")
     if table is None or not len(known):
-        return []
-    size = np.abs(floats(known, "error_m"))
+        return {}
+    p50, p95, largest = np.percentile(np.abs(floats(known, "error_m")), [50.0, 95.0, 100.0]).tolist()
     rate = len(table.filter("in_reference", "positioned")) / max(len(table.filter("in_reference")), 1)
-    return [
-        f"Filtered along the track, the train has a position at {share(rate, 1)} of all epochs, those without "
-        f"satellites included; 95 % of these are within {number(float(np.percentile(size, 95.0)), 1)} m, and the worst "
-        f"is {number(float(size.max()), 1)} m off."
-    ]
+    return {"p50": p50, "p95": p95, "max": largest, "rate": rate}
+
+
+def _filter_remark(
+    run: ReportedRun, antenna: str, evaluation: Evaluation, filtered: Mapping[str, float]
+) -> Iterator[str]:
+    """Sentences on the filter along the track, and on its stretches without satellites."""
+    if not filtered:
+        return
+    yield (
+        f"Filtered along the track, the train has a position at {share(filtered['rate'], 1)} of all epochs, those "
+        f"without satellites included; 95 % of these are within {number(filtered['p95'], 1)} m, and the worst "
+        f"is {number(filtered['max'], 1)} m off."
+    )
+    if evaluation.outages is not None:
+        passed = evaluation.outages.filter(run=run.name_in(evaluation, "train"), antenna=antenna)
+        for row in passed.sort("travelled_m", descending=True, nulls_last=True).head(1).iter_rows(named=True):
+            yield (
+                f"The longest of {len(passed)} stretches without satellites ({row['environment']}, "
+                f"{number(row['duration_s'], 1)} s and {number(row['travelled_m'], 0)} m, carried by "
+                f"{row['carried_by'].replace('+', ' and ') or 'prediction alone'}) is passed with at most "
+                f"{number(row['outage_max_m'], 2)} m of error, {number(row['end_error_m'], 2)} m at its end with a "
+                f"stated sigma of {number(row['end_sigma_m'], 1)} m."
+            )
 
 
 def _alike(run: ReportedRun, compared: _Compared) -> str:
@@ -205,15 +237,26 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
     level = floats(observed, "protection_level_m")
     level = level[np.isfinite(level)]
     rate = float(has.mean()) if len(has) else np.nan
+    train = run.train_of(antenna)
+    tracked = np.empty(0) if train is None else floats(train, "along_sigma_m")
+    placed = tracked[np.isfinite(tracked)]
     return Headline(
         verdict=(
             f"At {share(rate, 1)} of the epochs with satellite signals the train has a position on its line; railfix "
             f"states a standard deviation of at most {number(float(wide), 1)} m for 95 % of these."
         ),
         figures=(
-            KeyFigure(name="epochs with a position", value=share(rate, 1)),
+            KeyFigure(
+                name="epochs with a position",
+                value=share(rate, 1),
+                filtered=f"{share(len(placed) / len(tracked), 1)} of all" if len(tracked) else "",
+            ),
             KeyFigure(name="passed every check", value=share(float(passed.mean()) if len(passed) else np.nan, 1)),
-            KeyFigure(name="stated sigma, median", value=number(float(middle), 2, " m")),
+            KeyFigure(
+                name="stated sigma, median",
+                value=number(float(middle), 2, " m"),
+                filtered=number(float(np.median(placed)), 2, " m") if len(placed) else "",
+            ),
             KeyFigure(
                 name="protection level, median",
                 value=number(float(np.median(level)) if len(level) else np.nan, 1, " m"),

@@ -227,7 +227,10 @@ def _run(
     background: Sequence[Floats],
 ) -> _RunPart:
     anchor, first = f"run{number}", run.folder.antennas[0]
-    merits = [] if evaluation is None else [Folded("Figures of merit", tables.merits(run, evaluation))]
+    merits = []
+    if evaluation is not None:
+        merits.append(Folded("Figures of merit", tables.merits(run, evaluation)))
+        merits.append(Folded("Filter along the track", tables.filter_tables(run, evaluation)))
 
     def place(i: int) -> str:
         return f"sky{number}-{i}" if run.observations is not None else ""

@@ -39,6 +39,8 @@ class ReportedRun:
     errors, filtered : polars.DataFrame or None
         `railfix.evaluate.EPOCH_COLUMNS` of the single-epoch positions, and of the filter along the track; None
         without a reference or without a filter.
+    train : polars.DataFrame or None
+        Positions by the filter along the track (`railfix.pipeline.train_table.TRAIN_COLUMNS`), None without.
     reference : str
         Path of the reference; empty without one.
     conventional : Path or None
@@ -55,19 +57,17 @@ class ReportedRun:
     observations: pl.LazyFrame | None
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
+    train: pl.DataFrame | None
     reference: str
     conventional: Path | None
     track: Track | None
     curve: Cn0Curve | None
     notes: tuple[str, ...]
 
-    def name_in(self, evaluation: Evaluation) -> str:
-        """Name of its single-epoch positions in the tables of an evaluation."""
-        return next(
-            run.name
-            for run in evaluation.runs
-            if run.table == POSITIONS_TABLE and run.path.resolve() == self.folder.path.resolve()
-        )
+    def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
+        """Name of one of its tables of positions in the tables of an evaluation; empty where it is not there."""
+        mine = (run for run in evaluation.runs if run.path.resolve() == self.folder.path.resolve())
+        return next((run.name for run in mine if run.table == table), "")
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -85,6 +85,10 @@ class ReportedRun:
     def filtered_of(self, antenna: str) -> pl.DataFrame | None:
         """Rows of the filter along the track, None without."""
         return None if self.filtered is None else self.filtered.filter(antenna=antenna)
+
+    def train_of(self, antenna: str) -> pl.DataFrame | None:
+        """Positions by the filter along the track, None without."""
+        return None if self.train is None else self.train.filter(antenna=antenna)
 
 
 def read_runs(
@@ -173,6 +177,7 @@ def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None, conve
         observations=_observations(folder.path / _OBSERVATIONS),
         errors=tables.get(POSITIONS_TABLE),
         filtered=tables.get("train"),
+        train=read_run(folder.path, table="train").positions if "train" in tables_of(folder.path) else None,
         reference=reference,
         conventional=conventional,
         track=track,

@@ -195,6 +195,77 @@ def merits(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
     return [*blocks, _intervals(evaluation, run.name_in(evaluation))]
 
 
+def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
+    """Figures of the filter along the track: all epochs, with and without satellites, outages, probabilities."""
+    name = run.name_in(evaluation, "train")
+    if not name:
+        return [Absent("The run has no filter along the track (railfix run --filter off).")]
+    figures = evaluation.figures.filter(pl.col("grouping").is_in(["all", "signals"]), run=name, epochs_of="own")
+    rows = figures.filter(pl.col("position") == "constrained").sort("antenna", "grouping", maintain_order=True)
+    blocks: list[Block] = [
+        Table(
+            name="filter",
+            head=["antenna", "epochs", "epochs", "rate", "mean", "std", "p50", "p95", "p99", "largest", "p95 / sigma"],
+            rows=[
+                [
+                    str(row["antenna"]),
+                    str(row["group"]),
+                    number(row["epochs"], 0),
+                    share(row["rate_of_run"]),
+                    *(number(row[key]) for key in ("mean_m", "std_m", "p50_m", "p95_m", "p99_m", "max_m")),
+                    number(row["normalised_p95"]),
+                ]
+                for row in rows.iter_rows(named=True)
+            ],
+            caption="Errors along the line of the filter along the track, in metres; rate: share of all epochs",
+            numeric=range(2, 11),
+        )
+    ]
+    if evaluation.outages is not None and len(outages := evaluation.outages.filter(run=name)):
+        blocks.append(
+            Table(
+                name="outages",
+                head=["antenna", "begin", "environment", "carried by", "lasting, s", "way", "p95", "largest",
+                      "at its end", "sigma there"],
+                rows=[
+                    [
+                        str(row["antenna"]),
+                        f"{row['begin_gpst']:%H:%M:%S}",
+                        str(row["environment"]),
+                        row["carried_by"] or "prediction",
+                        number(row["duration_s"], 1),
+                        number(row["travelled_m"], 0),
+                        *(number(row[key]) for key in ("outage_p95_m", "outage_max_m", "end_error_m", "end_sigma_m")),
+                    ]
+                    for row in outages.iter_rows(named=True)
+                ],
+                caption="Stretches without satellites, in metres",
+                numeric=range(4, 10),
+            )
+        )  # fmt: skip
+    if evaluation.branches is not None and len(branches := evaluation.branches.filter(run=name)):
+        blocks.append(
+            Table(
+                name="branches",
+                head=["antenna", "stated probability", "positions", "mean of it", "right", "wrong", "blocks",
+                      "with a wrong one"],
+                rows=[
+                    [
+                        str(row["antenna"]),
+                        str(row["probability"]),
+                        number(row["judged"], 0),
+                        *(share(row[key]) for key in ("probability_mean", "right_share")),
+                        *(number(row[key], 0) for key in ("wrong_places", "blocks", "wrong_blocks")),
+                    ]
+                    for row in branches.iter_rows(named=True)
+                ],
+                caption="Stated probability of the place against the share of places within 50 m of the reference",
+                numeric=range(2, 8),
+            )
+        )  # fmt: skip
+    return blocks
+
+
 def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
     where = f"{antenna} {_POSITION_NAMES[row['position']]}".strip()
     return [

@@ -17,6 +17,7 @@ from railfix.report.plots.chart import (
     CONSTRAINED,
     CONVENTIONAL,
     CYCLE,
+    FILTERED,
     GREY,
     ORDERED,
     Bars,
@@ -45,6 +46,7 @@ def plan(
     *,
     error_m: Floats | None = None,
     level_m: Floats | None = None,
+    filtered: pl.DataFrame | None = None,
     track: Track | None = None,
     tunnels_m: Sequence[tuple[float, float]] = (),
     background: Sequence[Floats] = (),
@@ -59,6 +61,8 @@ def plan(
     error_m, level_m : ndarray, shape (rows,), optional [m]
         Errors along the line, or protection levels: the positions are coloured by the size of the first that is
         given, and by their status without either.
+    filtered : polars.DataFrame, optional
+        Positions by the filter along the track; those of epochs without a position of their own are drawn.
     track : Track, optional
         Line to draw, also where there are no positions; without it the line is drawn through the positions.
     tunnels_m : sequence of (float, float) [m]
@@ -99,6 +103,8 @@ def plan(
             layers.append(
                 Points(label=f"{label} ({len(rows):,})", colour=colour, x=x, y=y, size=4.0, epoch_s=epoch[kept])
             )
+    if filtered is not None:
+        layers += _filtered(positions.filter(pl.Series(has)), filtered, frame, cell, start_of(positions))
     layers.append(_kilometrage(positions.filter(pl.Series(has)), here[has]))
     thinned = "" if shown == total else f" Of positions too close to tell apart one is drawn ({shown:,} in all)."
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
@@ -113,6 +119,19 @@ def plan(
         layers=tuple(layers),
         equal=True,
     )
+
+
+def _filtered(
+    placed: pl.DataFrame, filtered: pl.DataFrame, frame: _LocalFrame, cell: float, start: np.datetime64
+) -> Iterator[Points]:
+    """Filtered positions of the epochs that have none of their own."""
+    alone = filtered.join(placed, on="time_gpst", how="anti").filter(pl.col("x_m").is_not_null())
+    if len(alone):
+        place = frame.plane(points(alone, *_ECEF))
+        kept = one_per_cell(place[:, 0], place[:, 1], cell=cell)
+        label = f"filtered, no position of its own ({len(alone):,})"
+        epoch = since(alone, start)[kept]
+        yield Points(label=label, colour=FILTERED, x=place[kept, 0], y=place[kept, 1], size=4.0, epoch_s=epoch)
 
 
 @dataclass(frozen=True, kw_only=True)
