@@ -26,6 +26,14 @@ def test_every_name_of_the_package_can_be_imported(package: object) -> None:
     assert all(getattr(package, name) is not None for name in names)
 
 
+@pytest.mark.requirement("A7")
+def test_a_run_starts_without_the_large_parts_of_scipy() -> None:
+    heavy = ["scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal", "matplotlib", "networkx", "numba"]
+    program = f"import sys, railfix.cli.run; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_the_import_is_quick_and_loads_no_array_library() -> None:
     program = (
         "import time, sys; began = time.process_time(); import railfix; "

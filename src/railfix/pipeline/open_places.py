@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from railfix.core.arrays import Floats, Masks
 from railfix.integrity.protection import RiskBudget
@@ -71,9 +71,9 @@ def places_beyond_the_level(
     worse = (elsewhere.wsse - here.wsse) / variance
     without = worse[:, None] - (_drops(at_other) - _drops(at_best)) / variance[:, None]
     prior = risk.prior(systems)[at_best.channel]
-    allowed = chi2.isf(np.minimum(risk.risk_per_sample / np.maximum(prior, risk.risk_per_sample), 1.0), 1)
+    allowed = chdtri(1, np.minimum(risk.risk_per_sample / np.maximum(prior, risk.risk_per_sample), 1.0))
     with np.errstate(invalid="ignore"):
-        opened = worse <= chi2.isf(risk.risk_per_sample, 1)
+        opened = worse <= chdtri(1, risk.risk_per_sample)
         opened |= (at_best.used & (without <= allowed)).any(axis=1)
         apart = np.linalg.norm(trajectory.at_arc(there.arc_m) - trajectory.at_arc(arc[rows]), axis=1)
         beyond[rows] = opened & (apart > level_m[rows])

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.constants import CLOCK_GROUP
@@ -229,7 +229,7 @@ def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config:
 @lru_cache
 def _chi_square_limit(risk: float, freedom: int) -> float:
     """Return the chi-square value that noise exceeds with a probability of `risk`."""
-    return float(chi2.isf(risk, freedom))
+    return float(chdtri(freedom, risk))
 
 
 def _off_map(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, config: Config) -> Masks:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
@@ -48,12 +48,12 @@ class MapOffsetLimits(Settings):
     @property
     def note_threshold(self) -> float:
         """Statistic from which on a run has a note."""
-        return float(chi2.isf(self.note_risk, 2))
+        return float(chdtri(2, self.note_risk))
 
     @property
     def threshold(self) -> float:
         """Statistic from which on epochs have the status."""
-        return float(chi2.isf(self.risk, 2))
+        return float(chdtri(2, self.risk))
 
 
 @dataclass(frozen=True, kw_only=True)

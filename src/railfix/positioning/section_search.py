@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
@@ -71,12 +71,12 @@ class SectionLimits(Settings):
     @cached_property
     def threshold(self) -> float:
         """Excess of q that noise of unit variance explains."""
-        return float(chi2.isf(self.ambiguity_risk, 1))
+        return float(chdtri(1, self.ambiguity_risk))
 
     @cached_property
     def reach(self) -> float:
         """Excess of q up to which other places are found."""
-        return float(chi2.isf(min(self.reach_risk, self.ambiguity_risk), 1))
+        return float(chdtri(1, min(self.reach_risk, self.ambiguity_risk)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,7 @@ from typing import Final
 
 import numpy as np
 from pydantic import Field
-from scipy.special import logsumexp
-from scipy.stats import chi2
+from scipy.special import chdtrc, logsumexp
 
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.settings import Settings, option
@@ -105,7 +104,7 @@ class StandstillFix:
     @property
     def fits(self) -> bool:
         """Whether the residuals agree with the error model."""
-        return self.freedom < 1 or bool(chi2.sf(self.misfit, self.freedom) > _MISFIT)
+        return self.freedom < 1 or bool(chdtrc(self.freedom, self.misfit) > _MISFIT)
 
 
 def standstill_fix(

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 from scipy.special import ndtri
-from scipy.stats import norm
 
 from railfix.core.arrays import Floats
 from railfix.core.settings import Settings
@@ -51,7 +50,7 @@ def k_factor(risk: float) -> float:
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
-    return float(norm.isf(risk / 2.0))
+    return float(-ndtri(risk / 2.0))
 
 
 def one_sided_k(probability: Floats) -> Floats:

@@ -14,7 +14,7 @@ from typing import Final, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.settings import Settings
@@ -79,12 +79,12 @@ class RaimLimits(Settings):
     @cached_property
     def separation(self) -> float:
         """WSSE by which another exclusion must fit worse, in noise variances."""
-        return float(chi2.isf(self.separation_risk, 1))
+        return float(chdtri(1, self.separation_risk))
 
     @cached_property
     def own_error(self) -> float:
         """Square of an excluded satellite's own error over its sigma that noise does not reach."""
-        return float(chi2.isf(self.false_alarm, 1))
+        return float(chdtri(1, self.false_alarm))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +188,6 @@ def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats
 def _chi_square_table(false_alarm: float, size: int) -> Floats:
     """Chi-square thresholds of 0 (NaN) to size - 1 degrees of freedom."""
     table = np.full(size, np.nan)
-    table[1:] = chi2.isf(false_alarm, np.arange(1, size))
+    table[1:] = chdtri(np.arange(1, size), false_alarm)
     table.flags.writeable = False
     return table

@@ -19,8 +19,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2, norm
+from scipy.special import chdtri, chndtr, ndtri
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.raim.detection import RaimLimits
@@ -156,10 +155,12 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
 @lru_cache(maxsize=1024)
 def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
     """The lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
-    limit = float(chi2.isf(false_alarm, freedom))
+    from scipy.optimize import brentq
+
+    limit = float(chdtri(freedom, false_alarm))
 
     def excess(value: float) -> float:
-        return math.log(max(float(ncx2.cdf(limit, freedom, value)), 1e-300)) - math.log(missed_detection)
+        return math.log(max(float(chndtr(limit, freedom, value)), 1e-300)) - math.log(missed_detection)
 
     upper = limit + 10.0
     while excess(upper) > 0:
@@ -169,7 +170,7 @@ def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) ->
 
 def _noise_factor(risk: float, components: int) -> float:
     """K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane."""
-    return float(norm.isf(risk / 2.0)) if components == 1 else math.sqrt(-2.0 * math.log(risk))
+    return float(-ndtri(risk / 2.0)) if components == 1 else math.sqrt(-2.0 * math.log(risk))
 
 
 def _longest_axis(covariance: Floats) -> Floats:

@@ -16,16 +16,18 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
-from scipy.interpolate import PchipInterpolator
 
 from railfix.core.arrays import Floats, Integers, Masks, Strings, read_only
 from railfix.core.settings import Settings
 from railfix.gnss.observations import ObservationHeader
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PchipInterpolator
 
 #: Standard deviation of a normal variable against its median absolute deviation.
 _NORMAL_MAD: Final = 1.482_602_218_505_602
@@ -114,6 +116,8 @@ class Cn0Mean:
 
     @cached_property
     def _interpolated(self) -> PchipInterpolator:
+        from scipy.interpolate import PchipInterpolator
+
         return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
 
     def at(self, elevation_deg: ArrayLike) -> Floats:

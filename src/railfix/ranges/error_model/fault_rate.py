@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from railfix.core.arrays import Integers
 from railfix.ranges.error_model.fit import ErrorSamples
@@ -31,7 +31,7 @@ def fault_rate(samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: 
     ranges, count = int(used.sum()), int(faulty.sum())
     # Within a faulty block only a part of the ranges is faulty; without one, one range of a block would be.
     part = (count / ranges) / (len(bad) / len(every)) if len(bad) else 1.0
-    upper = float(beta.ppf(confidence, len(bad) + 1, len(every) - len(bad))) if len(every) > len(bad) else 1.0
+    upper = float(betaincinv(len(bad) + 1, len(every) - len(bad), confidence)) if len(every) > len(bad) else 1.0
     return FaultRate(
         beyond_sigma=beyond_sigma,
         ranges=ranges,

@@ -1,0 +1,148 @@
+"""Where the time of `railfix run --filter off` goes, stage by stage, in one process.
+
+The two logs of an hour at 10 Hz of `bench_run.py` are simulated first, or taken from ``--run``. Each stage's own time
+without the stages inside it, the least of the rounds; ``RAILFIX_KERNELS`` chooses the kernels::
+
+    python tests/benchmarks/bench_stages.py [--run FOLDER] [--rounds 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import bench_run
+
+from railfix.kernels import kernels_in_use
+
+#: Stages: name, module in which the function is looked up when it is called, function.
+STAGES: Final = (
+    ("corrections, weights", "railfix.pipeline.processor", "correct_ranges"),
+    ("satellite orbits and clocks", "railfix.pipeline.corrected_ranges", "satellite_states"),
+    ("anchor", "railfix.pipeline.corrected_ranges", "_anchor"),
+    ("angles", "railfix.pipeline.corrected_ranges", "SeenFrom.of"),
+    ("atmosphere", "railfix.pipeline.corrected_ranges", "modelled_delays"),
+    ("screens of one antenna", "railfix.pipeline.processor", "EpochProcessor._screened"),
+    ("screens of the antenna pair", "railfix.pipeline.processor", "EpochProcessor._pair_screened"),
+    ("screens of the antenna pair", "railfix.pipeline.processor", "EpochProcessor._positions_screened"),
+    ("screens of the antenna pair", "railfix.pipeline.processor", "EpochProcessor._pair"),
+    ("rest of positioning", "railfix.pipeline.processor", "solve"),
+    ("conventional position", "railfix.pipeline.solution", "single_point"),
+    ("robust fits", "railfix.pipeline.solution", "_agreeing"),
+    ("robust fits", "railfix.pipeline.solution", "_robust_scale"),
+    ("section search", "railfix.pipeline.solve", "search"),
+    ("constrained position", "railfix.pipeline.solve", "constrained_position"),
+    ("fault detection", "railfix.pipeline.solution", "fault_free"),
+    ("test of the map", "railfix.pipeline.solution", "map_offset"),
+    ("linear model", "railfix.pipeline.solution", "constrained_model"),
+    ("protection level", "railfix.pipeline.solution", "protection_levels"),
+    ("open places", "railfix.pipeline.solution", "places_beyond_the_level"),
+    ("results", "railfix.pipeline.processor", "antenna_result"),
+    ("results", "railfix.run.tally", "Tally.add"),
+    ("tables", "railfix.run.driver", "positions_table"),
+    ("tables", "railfix.run.output", "OutputFolder.append_csv"),
+    ("tables", "railfix.run.output", "OutputFolder.append_parquet"),
+    ("tables", "railfix.run.output", "OutputFolder.commit"),
+)
+
+
+class Stages:
+    """Own time of each stage; times of stages inside it are taken off."""
+
+    def __init__(self) -> None:
+        self.spent: defaultdict[str, float] = defaultdict(float)
+        self._inside: list[float] = []
+
+    def timed(self, name: str, action: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the same function, its time noted."""
+
+        def measured(*arguments: Any, **named: Any) -> Any:
+            self._inside.append(0.0)
+            begin = time.process_time()
+            try:
+                return action(*arguments, **named)
+            finally:
+                whole = time.process_time() - begin
+                self.spent[name] += whole - self._inside.pop()
+                if self._inside:
+                    self._inside[-1] += whole
+
+        return measured
+
+    def iterated(self, name: str, source: Callable[..., Iterator[Any]]) -> Callable[..., Iterator[Any]]:
+        """Return the same generator function, the time of its steps noted."""
+
+        def measured(*arguments: Any, **named: Any) -> Iterator[Any]:
+            step = self.timed(name, source(*arguments, **named).__next__)
+            while True:
+                try:
+                    item = step()
+                except StopIteration:
+                    return
+                yield item
+
+        return measured
+
+
+def watched() -> Stages:
+    """Put a stopwatch into every stage."""
+    stages = Stages()
+    for name, module, path in STAGES:
+        holder: Any = importlib.import_module(module)
+        *classes, function = path.split(".")
+        for part in classes:
+            holder = getattr(holder, part)
+        setattr(holder, function, stages.timed(name, getattr(holder, function)))
+    from railfix.run import driver
+
+    driver.aligned = stages.iterated("reading", driver.aligned)  # type: ignore[assignment]
+    return stages
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--run", type=Path, help="folder of a simulated run, made with --plain")
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args()
+    from railfix.pipeline.config import Config
+    from railfix.run import RunInputs, RunOptions, run_files
+
+    with tempfile.TemporaryDirectory(prefix="railfix-bench-") as scratch:
+        folder = options.run or Path(scratch) / "hour"
+        if options.run is None:
+            bench_run.simulate(folder)
+        inputs = RunInputs(
+            front=(folder / "front.rnx",),
+            rear=(folder / "rear.rnx",),
+            nav=(folder / "nav.rnx",),
+            track=(folder / "track.csv",),
+            vehicle=folder / "vehicle.toml",
+        )
+        stages = watched()
+        least: dict[str, float] = {}
+        epochs = 0
+        for number in range(options.rounds + 1):
+            stages.spent.clear()
+            begin = time.process_time()
+            summary = run_files(inputs, Config(filter="off"), out=Path(scratch) / f"out{number}", options=RunOptions())
+            whole = time.process_time() - begin
+            epochs = summary.tally.epochs
+            spent = {**stages.spent, "all": whole, "everything else": whole - sum(stages.spent.values())}
+            if number:  # the first round warms up
+                least = {name: min(value, least.get(name, value)) for name, value in spent.items()}
+        print(f"{epochs} antenna-epochs, kernels: {kernels_in_use()}; least of {options.rounds} rounds")
+        for name, value in least.items():
+            print(f"{name:32s} {value:6.3f} s  {1e6 * value / epochs:6.1f} us")
+
+
+if __name__ == "__main__":
+    main()
