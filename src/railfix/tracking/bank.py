@@ -13,6 +13,7 @@ it is no test: robust filters can settle in different modes without a fault.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -23,7 +24,7 @@ from railfix.tracking.hypotheses import begin
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
-from railfix.tracking.robust import first_weights, robust_update
+from railfix.tracking.robust import applied, first_weights, prior_of, robust_update
 from railfix.tracking.rows import Kind, Rows
 from railfix.tracking.state import CLOCKS, SATELLITES, Bank, Unknown
 
@@ -111,33 +112,31 @@ def levelled(
         covariances[:, unknown, :] = covariances[:, :, unknown] = 0.0
         covariances[:, unknown, unknown] = covariance[unknown, unknown]
     means[:, Unknown.CODE_CLOCK] = mean[Unknown.CODE_CLOCK]
-    design = np.broadcast_to(rows.design[best], (len(without), *rows.design[best].shape))
-    value = rows.value[best] - (design @ (means - mean)[..., None])[..., 0]
-    own = Rows(design=design, value=value, variance=rows.variance, kind=rows.kind, column=rows.column)
+    combine, design = rows.combine[best : best + 1], rows.design[best : best + 1]
+    value = rows.value[best] - (design @ (combine @ (means - mean)[..., None]))[..., 0]
+    own = replace(rows, combine=combine, design=design, value=value)
     use = np.stack([~_of(name, rows, satellite) for name in without])
     degrees = limits.degrees_of_freedom
-    weight = first_weights(own, covariances, degrees)
-    update = robust_update(own, covariances, weight, degrees=degrees, passes=limits.level_passes, use=use)
+    prior = prior_of(own, covariances)
+    weight = first_weights(own, prior, degrees)
+    update = robust_update(own, prior, weight, degrees=degrees, passes=limits.level_passes, use=use)
     weak = np.where(_contradicted(rows, update.weight, use, limits), weak + dt, 0.0)
-    return Bank(without=without, mean=means + update.change, covariance=update.covariance, weak_s=weak)
+    means, covariances = applied(means, covariances, prior, update)
+    return Bank(without=without, mean=means, covariance=covariances, weak_s=weak)
 
 
 def _contradicted(rows: Rows, weight: Floats, use: Masks, limits: TrackingLimits) -> Masks:
     """Whether the mean weight of codes, or of Dopplers and phases, is that of a lost track, shape (B,)."""
     found = np.zeros(len(weight), dtype=np.bool_)
-    for kinds, least in (
-        ((Kind.CODE,), limits.lost_code_weight),
-        ((Kind.PHASE, Kind.DOPPLER), limits.lost_motion_weight),
-    ):
-        mask = use & rows.of(kinds)
-        count = mask.sum(axis=1)
-        found |= (count > 0) & (np.where(mask, weight, 0.0).sum(axis=1) < least * count)
+    for part, least in ((rows.codes, limits.lost_code_weight), (rows.motion, limits.lost_motion_weight)):
+        count = use[:, part].sum(axis=1)
+        found |= (count > 0) & (np.where(use[:, part], weight[:, part], 0.0).sum(axis=1) < least * count)
     return found
 
 
 def _sources(rows: Rows, satellite: Strings) -> list[str]:
     """Satellites with a code, constellations where there are several, and sensors of an epoch."""
-    codes = satellite[rows.kind == Kind.CODE]
+    codes = satellite[rows.codes]
     names = [str(name) for name in dict.fromkeys(codes.tolist())]
     letters = [letter for letter in CLOCKS if any(_clock(name) == letter for name in names)]
     sensors = [name for kind, name in SENSORS.items() if (rows.kind == kind).any()]

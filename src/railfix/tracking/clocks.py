@@ -2,82 +2,87 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.tracking.limits import TrackingLimits
-from railfix.tracking.robust import Update, mean_weight
-from railfix.tracking.rows import Channels, Kind, Rows
+from railfix.tracking.robust import Update, mean_weight, median
+from railfix.tracking.rows import Rows
 from railfix.tracking.state import OFFSETS, TrackState, Unknown
 
 #: A clock whose median innovation is beyond this many standard deviations has stepped.
-_STEPPED: Final = 5.0
+STEPPED: Final = 5.0
 #: Time over which the scales of Dopplers and phases are learnt [s].
-_SCALE_S: Final = 60.0
+SCALE_S: Final = 60.0
 #: The scales' variances stay within these logarithms.
-_SCALE_RANGE: Final = (-1.5, 3.0)
+SCALE_RANGE: Final = (-1.5, 3.0)
 #: Standard deviation of the clock of phases and its drift after a step [m, m/s].
-_UNKNOWN_CLOCK: Final = 100.0
+UNKNOWN_CLOCK: Final = 100.0
 
 
 def clocks_of_epoch(
-    rows: Rows, channels: Channels, mean: Floats, covariance: Floats, known: Masks
+    rows: Rows, offset: Indices, mean: Floats, covariance: Floats, known: Masks
 ) -> tuple[Floats, Floats, Masks]:
-    """Means with clocks near this epoch's: those of the codes always, those of phases and Dopplers after a step."""
-    mean, covariance, known = mean.copy(), covariance.copy(), known.copy()
+    """Means with clocks near this epoch's: those of the codes always, those of phases and Dopplers after a step.
+
+    Parameters
+    ----------
+    rows : Rows
+    offset : ndarray of int, shape (K,)
+        Code clock of each channel.
+    mean, covariance : ndarray, shapes (H, N), (H, N, N)
+    known : ndarray of bool, shape (len(CLOCKS),)
+        Clocks that have had a code.
+    """
+    mean = mean.copy()
     codes, phases, dopplers = rows.common
-    if codes.any():
-        offset = np.zeros(int(rows.column.max()) + 1, dtype=np.intp)
-        offset[channels.column] = channels.offset
+    if codes.stop:
         group = offset[rows.column[codes]]
         value = rows.value[:, codes]
-        if not known.any():
-            known[group[0]] = True
-            covariance[:, OFFSETS + group[0], OFFSETS + group[0]] = 1e-4
         old = known[group]
-        if not old.any():
-            known[group[0]] = True
-            old = known[group]
-        clock = np.median(value[:, old], axis=1)
+        if not old.all():
+            known = known.copy()
+            if not known.any():
+                covariance = covariance.copy()
+                covariance[:, OFFSETS + group[0], OFFSETS + group[0]] = 1e-4
+            if not old.any():
+                known[group[0]] = True
+                old = known[group]
+        clock = median(value[:, old])
         mean[:, Unknown.CODE_CLOCK] += clock
-        for new in np.unique(group[~old]).tolist():
-            mean[:, OFFSETS + new] += np.median(value[:, group == new], axis=1) - clock
+        for new in np.unique(group[~old]).tolist() if not old.all() else ():
+            mean[:, OFFSETS + new] += median(value[:, group == new]) - clock
             known[new] = True
-    for mask, unknown, sigma in ((phases, Unknown.PHASE_CLOCK, 100.0), (dopplers, Unknown.DRIFT, 100.0)):
-        if not mask.any():
+    for part, unknown in ((phases, Unknown.PHASE_CLOCK), (dopplers, Unknown.DRIFT)):
+        if part.stop == part.start:
             continue
-        median = np.median(rows.value[:, mask], axis=1)
+        middle = median(rows.value[:, part])
         spread = covariance[:, unknown, unknown]
-        stepped = np.abs(median) > _STEPPED * np.sqrt(spread + 0.25)
-        stepped |= spread > sigma**2
+        stepped = np.abs(middle) > STEPPED * np.sqrt(spread + 0.25)
+        stepped |= spread > UNKNOWN_CLOCK**2
         if stepped.any():
             at = np.flatnonzero(stepped)
-            mean[at, unknown] += median[at]
+            mean[at, unknown] += middle[at]
+            covariance = covariance.copy()
             covariance[at, unknown, :] = 0.0
             covariance[at, :, unknown] = 0.0
-            covariance[at, unknown, unknown] = sigma**2
+            covariance[at, unknown, unknown] = UNKNOWN_CLOCK**2
     return mean, covariance, known
 
 
-def weighed(state: TrackState, rows: Rows, update: Update, best: int, dt: float, limits: TrackingLimits) -> TrackState:
-    """The state with how long weights have been low, and the scales of Dopplers and phases."""
-    weight = update.weight[best]
-    motion = mean_weight(rows, weight, (Kind.PHASE, Kind.DOPPLER))
-    code = mean_weight(rows, weight, (Kind.CODE,))
-    gain = 1.0 - np.exp(-min(dt, 1.0) / _SCALE_S)
+def learn(state: TrackState, rows: Rows, update: Update, best: int, dt: float, limits: TrackingLimits) -> None:
+    """Count how long mean weights of the best hypothesis have been low; learn the scales of Dopplers and phases."""
+    gain = 1.0 - np.exp(-min(dt, 1.0) / SCALE_S)
     scales = []
-    for kind, old in zip((Kind.DOPPLER, Kind.PHASE), state.log_scale, strict=True):
-        mask = rows.kind == kind
-        if mask.sum() > 3:
-            square = (update.residual[best, mask] ** 2 + update.spread[best, mask]) / rows.variance[mask]
-            old = old + gain * float(np.log(np.mean(weight[mask] * square)))
-        scales.append(float(np.clip(old, *_SCALE_RANGE)))
-    return replace(
-        state,
-        weak_motion_s=state.weak_motion_s + dt if motion < limits.lost_motion_weight else 0.0,
-        weak_code_s=state.weak_code_s + dt if code < limits.lost_code_weight else 0.0,
-        log_scale=(scales[0], scales[1]),
-    )
+    for part, old in zip((rows.common[2], rows.common[1]), state.log_scale, strict=True):
+        if part.stop - part.start > 3:
+            square = (update.residual[best, part] ** 2 + update.spread[best, part]) / rows.variance[part]
+            old = old + gain * float(np.log(np.mean(update.weight[best, part] * square)))
+        scales.append(min(max(old, SCALE_RANGE[0]), SCALE_RANGE[1]))
+    motion = mean_weight(update.weight, rows.motion)[best]
+    code = mean_weight(update.weight, rows.codes)[best]
+    state.weak_motion_s = state.weak_motion_s + dt if motion < limits.lost_motion_weight else 0.0
+    state.weak_code_s = state.weak_code_s + dt if code < limits.lost_code_weight else 0.0
+    state.log_scale = (scales[0], scales[1])

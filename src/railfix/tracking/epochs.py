@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
 
 
@@ -80,17 +78,15 @@ class SensorEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """The last epoch that had observations: what a change of the carrier phase is taken from.
+    """The last epoch: what a change of the carrier phase is taken from.
 
     Attributes
     ----------
-    time : datetime64[ns]
     satellite : ndarray of str, shape (K,)
     sat_ecef_m : ndarray, shape (K, 3) [m]
     phase_m : ndarray, shape (K,) [m]
     """
 
-    time: np.datetime64
     satellite: Strings
     sat_ecef_m: Floats
     phase_m: Floats

@@ -8,10 +8,10 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.geodesy import range_with_rotation
+from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import CODE_CLOCK_SIGMA_M
-from railfix.tracking.rows import Channels
 from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Unknown
 
 #: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between [m].
@@ -35,7 +35,7 @@ _BESIDE_SHARE: Final = 0.01
 _KEPT: Final = np.array([Unknown.WHEEL, Unknown.FORCE_OFFSET, Unknown.RADAR])
 
 
-def places(channels: Channels, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
+def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tuple[Floats, Floats]:
     """Places along the line that the codes of an epoch are consistent with.
 
     Returns
@@ -45,8 +45,8 @@ def places(channels: Channels, line: Line, limits: TrackingLimits) -> tuple[Floa
     sigma_m : ndarray, shape (C,) [m]
         Half of the stretch that is about as likely, at least `start_sigma_m`.
     """
-    has = np.isfinite(channels.code_m) & np.isfinite(channels.code_sigma_m)
-    groups = [has & (channels.offset == g) for g in range(len(CLOCKS))]
+    has = chunk.has[0, epoch]
+    groups = [has & (chunk.offset == g) for g in range(len(CLOCKS))]
     groups = [group for group in groups if group.sum() > 1]
     if sum(int(group.sum()) - 1 for group in groups) < 1:
         return np.empty(0), np.empty(0)
@@ -55,9 +55,9 @@ def places(channels: Channels, line: Line, limits: TrackingLimits) -> tuple[Floa
     likelihood = np.zeros(len(arc))
     degrees = limits.degrees_of_freedom
     for group in groups:
-        distance, _ = range_with_rotation(channels.sat_ecef_m[group], points[:, None, :])
-        residual = channels.code_m[group] - distance
-        variance = (1.0 + limits.code_white_share**2) * channels.code_sigma_m[group] ** 2
+        distance, _ = range_with_rotation(chunk.sat_ecef_m[epoch, group], points[:, None, :])
+        residual = chunk.measured[0, epoch, group] - distance
+        variance = (1.0 + limits.code_white_share**2) * chunk.code_sigma_m[epoch, group] ** 2
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(limits.passes):
             weight = (degrees + 1.0) / (degrees + (residual - clock) ** 2 / variance) / variance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -46,76 +47,79 @@ def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Flo
     return step, density * noise
 
 
+_singer = lru_cache(maxsize=64)(singer_step)
+
+
 def predicted(mean: Floats, covariance: Floats, line: Line, dt: float, limits: TrackingLimits) -> tuple[Floats, Floats]:
     """Mean and covariance after an interval, shapes (H, N) and (H, N, N).
 
-    The clone `Unknown.BEFORE` takes the place, what begins anew at an epoch gets its prior.
+    The clones `Unknown.BEFORE` and `Unknown.SPEED_BEFORE` take place and speed, what begins anew at an epoch gets its
+    prior.
     """
-    count, width = mean.shape
-    step, noise = singer_step(dt, limits.acceleration_mps2, limits.acceleration_s)
-    travel = np.abs(mean[:, Unknown.SPEED]) * dt
-    move = np.broadcast_to(np.eye(width), (count, width, width)).copy()
-    move[:, :3, :3] = step
-    move[:, Unknown.BEFORE, :] = 0.0
-    move[:, Unknown.BEFORE, Unknown.PLACE] = 1.0
-    move[:, Unknown.SPEED_BEFORE, :] = 0.0
-    move[:, Unknown.SPEED_BEFORE, Unknown.SPEED] = 1.0
-    move[:, Unknown.PHASE_CLOCK, :] = 0.0
-    move[:, Unknown.PHASE_CLOCK, Unknown.DRIFT] = dt
-    for fresh in FRESH:
-        move[:, fresh, fresh] = 0.0
+    step, noise = _singer(dt, limits.acceleration_mps2, limits.acceleration_s)
+    speed = np.abs(mean[:, Unknown.SPEED])
+    travel = speed * dt
     map_kept = np.exp(-travel / limits.map_absolute_m)
     code_kept = np.exp(-dt / limits.code_correlation_s - travel / limits.code_correlation_m)
-    for unknown in (Unknown.MAP_RIGHT, Unknown.MAP_UP):
-        move[:, unknown, unknown] = map_kept
     doppler_kept = np.exp(-dt / limits.doppler_correlation_s)
-    move[:, Unknown.DOPPLER_SPEED, Unknown.DOPPLER_SPEED] = doppler_kept
     slow_kept = np.exp(-dt / limits.slow_code_s)
-    move[:, Unknown.CODE_PLACE, Unknown.CODE_PLACE] = slow_kept
-    diagonal = np.arange(SATELLITES, width)
-    move[:, diagonal, diagonal] = code_kept[:, None]
+    kept = np.ones(mean.shape)
+    kept[:, FRESH] = 0.0
+    kept[:, Unknown.MAP_RIGHT] = kept[:, Unknown.MAP_UP] = map_kept
+    kept[:, Unknown.DOPPLER_SPEED] = doppler_kept
+    kept[:, Unknown.CODE_PLACE] = slow_kept
+    kept[:, SATELLITES:] = code_kept[:, None]
 
-    after = (move @ mean[..., None])[..., 0]
-    spread = move @ covariance @ np.swapaxes(move, 1, 2)
-    spread[:, :3, :3] += noise
-    spread[:, Unknown.PLACE, Unknown.PLACE] += _LEAST_STEP_M2
-    spread[:, Unknown.SPEED, Unknown.SPEED] += _LEAST_STEP_M2
+    after = _moved(mean[..., None], kept, step, dt)[..., 0]
+    spread = _moved(covariance, kept, step, dt)
+    spread = _moved(np.swapaxes(spread, 1, 2), kept, step, dt)
+    lasting = limits.doppler_error_mps + limits.doppler_error_share * speed
     walk = limits.clock_walk_mps**2
-    spread[:, Unknown.DRIFT, Unknown.DRIFT] += walk * dt
-    spread[:, Unknown.PHASE_CLOCK, Unknown.PHASE_CLOCK] += walk * dt**3 / 3.0 + 1e-6
+    added = np.zeros(mean.shape)
+    added[:, Unknown.PLACE] = added[:, Unknown.SPEED] = _LEAST_STEP_M2
+    added[:, Unknown.DRIFT] = walk * dt
+    added[:, Unknown.PHASE_CLOCK] = walk * dt**3 / 3.0 + 1e-6
+    added[:, Unknown.MAP_RIGHT] = line.sigma_plan_m**2 * (1.0 - map_kept**2)
+    added[:, Unknown.MAP_UP] = line.sigma_height_m**2 * (1.0 - map_kept**2)
+    added[:, Unknown.CODE_PLACE] = limits.slow_code_m**2 * (1.0 - slow_kept**2)
+    added[:, Unknown.DOPPLER_SPEED] = lasting**2 * (1.0 - doppler_kept**2)
+    added[:, Unknown.WHEEL] = WHEEL_WALK**2 * dt
+    added[:, Unknown.FORCE_OFFSET] = FORCE_WALK_MPS2**2 * dt
+    added[:, Unknown.RADAR] = RADAR_WALK**2 * dt
+    added[:, OFFSETS:SATELLITES] = limits.offset_walk_m**2 * dt
+    added[:, SATELLITES:] = (1.0 - code_kept**2)[:, None]
+    added[:, FRESH] = _fresh_variances(after, spread[:, 0, 0] + noise[0, 0] + _LEAST_STEP_M2, line, travel, limits)
+    diagonal = np.arange(mean.shape[1])
+    spread[:, diagonal, diagonal] += added
+    spread[:, :3, :3] += noise
     spread[:, Unknown.PHASE_CLOCK, Unknown.DRIFT] += walk * dt**2 / 2.0
     spread[:, Unknown.DRIFT, Unknown.PHASE_CLOCK] += walk * dt**2 / 2.0
-    spread[:, Unknown.MAP_RIGHT, Unknown.MAP_RIGHT] += line.sigma_plan_m**2 * (1.0 - map_kept**2)
-    spread[:, Unknown.MAP_UP, Unknown.MAP_UP] += line.sigma_height_m**2 * (1.0 - map_kept**2)
-    spread[:, Unknown.CODE_PLACE, Unknown.CODE_PLACE] += limits.slow_code_m**2 * (1.0 - slow_kept**2)
-    lasting = limits.doppler_error_mps + limits.doppler_error_share * np.abs(mean[:, Unknown.SPEED])
-    spread[:, Unknown.DOPPLER_SPEED, Unknown.DOPPLER_SPEED] += lasting**2 * (1.0 - doppler_kept**2)
-    spread[:, Unknown.WHEEL, Unknown.WHEEL] += WHEEL_WALK**2 * dt
-    spread[:, Unknown.FORCE_OFFSET, Unknown.FORCE_OFFSET] += FORCE_WALK_MPS2**2 * dt
-    spread[:, Unknown.RADAR, Unknown.RADAR] += RADAR_WALK**2 * dt
-    offsets = np.arange(OFFSETS, SATELLITES)
-    spread[:, offsets, offsets] += limits.offset_walk_m**2 * dt
-    spread[:, diagonal, diagonal] += (1.0 - code_kept**2)[:, None]
-    for fresh, variance in zip(FRESH, _fresh_variances(after, spread, line, travel, limits), strict=True):
-        spread[:, fresh, fresh] = variance
     return after, spread
 
 
-def _fresh_variances(
-    mean: Floats, covariance: Floats, line: Line, travel: Floats, limits: TrackingLimits
-) -> tuple[Floats, ...]:
-    """Variances of the clock of the codes and of the map's displacement to the right, up and along, (H,) each.
+def _moved(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:
+    """The transition times a matrix, shape (H, N, ...)."""
+    moved = rows * kept[:, :, None]
+    moved[:, :3] = step @ rows[:, :3]
+    moved[:, Unknown.BEFORE] = rows[:, Unknown.PLACE]
+    moved[:, Unknown.SPEED_BEFORE] = rows[:, Unknown.SPEED]
+    moved[:, Unknown.PHASE_CLOCK] = dt * rows[:, Unknown.DRIFT]
+    return moved
 
-    The displacement's direction is also uncertain by how the line bends where the place is uncertain.
+
+def _fresh_variances(mean: Floats, variance: Floats, line: Line, travel: Floats, limits: TrackingLimits) -> Floats:
+    """Variances of the clock of the codes and of the map's displacement to the right, up and along, shape (H, 4).
+
+    The displacement's direction is also uncertain by how the line bends where the place is uncertain, with its
+    `variance`.
     """
-    _, now = line.at(mean[:, Unknown.PLACE])
-    _, before = line.at(mean[:, Unknown.BEFORE])
-    bend = ((now[:, 0] - before[:, 0])[:, None, :] * now).sum(axis=-1)
-    place = np.minimum(covariance[:, Unknown.PLACE, Unknown.PLACE], limits.start_sigma_m**2)
+    count = len(mean)
+    _, axes = line.at(np.concatenate([mean[:, Unknown.PLACE], mean[:, Unknown.BEFORE]]))
+    bend = ((axes[:count, 0] - axes[count:, 0])[:, None, :] * axes[:count]).sum(axis=-1)
+    place = np.minimum(variance, limits.start_sigma_m**2)
     rough = 2.0 * limits.map_roughness_m**2 * (1.0 - np.exp(-travel / limits.map_correlation_m)) + 1e-8
-    return (
-        np.full(len(mean), CODE_CLOCK_SIGMA_M**2),
-        rough + place * bend[:, 1] ** 2,
-        rough + place * bend[:, 2] ** 2,
-        limits.map_scale_m**2 * travel + 1e-8,
-    )
+    fresh = np.empty((count, 4))
+    fresh[:, 0] = CODE_CLOCK_SIGMA_M**2
+    fresh[:, 1:3] = rough[:, None] + place[:, None] * bend[:, 1:] ** 2
+    fresh[:, 3] = limits.map_scale_m**2 * travel + 1e-8
+    return fresh

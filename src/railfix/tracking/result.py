@@ -118,14 +118,12 @@ class Tracked:
 
 def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weight: Floats) -> None:
     """Innovations and weights of the best hypothesis."""
-    for kind in Kind:
-        mask = rows.kind == kind
-        result.used[epoch, kind] = np.count_nonzero(weight[mask] > 0.5)
-        if kind <= Kind.DOPPLER:
-            result.innovation[epoch, kind, rows.column[mask]] = innovation[mask]
-            result.weight[epoch, kind, rows.column[mask]] = weight[mask]
-    result.code_weight[epoch] = mean_weight(rows, weight, (Kind.CODE,))
-    result.motion_weight[epoch] = mean_weight(rows, weight, (Kind.PHASE, Kind.DOPPLER))
+    end = rows.bounds[2]
+    result.innovation[epoch, rows.kind[:end], rows.column[:end]] = innovation[:end]
+    result.weight[epoch, rows.kind[:end], rows.column[:end]] = weight[:end]
+    result.used[epoch] = np.bincount(rows.kind[weight > 0.5], minlength=len(Kind))
+    result.code_weight[epoch] = mean_weight(weight[None], rows.codes)[0]
+    result.motion_weight[epoch] = mean_weight(weight[None], rows.motion)[0]
 
 
 def write_place(

@@ -3,31 +3,54 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Masks
-from railfix.tracking.rows import Kind, Rows
+from railfix.tracking.rows import MOTION, Rows
 from railfix.tracking.state import Unknown
+
+#: Share of a sensor's variance that no weight takes away: two sensors of the same combination keep it regular.
+SENSOR_FLOOR: Final = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prior:
+    """Gaussians of the combinations of one epoch before its measurements.
+
+    Attributes
+    ----------
+    root : ndarray, shape (H, D)
+        Standard deviations of the combinations; everything else counts in them.
+    gain : ndarray, shape (H, N, D)
+        Covariance of unknowns with combinations times `information`.
+    covariance, information : ndarray, shape (H, D, D)
+    design : ndarray, shape (H, M, D)
+    """
+
+    root: Floats
+    gain: Floats
+    covariance: Floats
+    information: Floats
+    design: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
 class Update:
-    """Gaussians after an epoch.
+    """Gaussians of the combinations after an epoch.
 
     Attributes
     ----------
-    change : ndarray, shape (H, N)
+    change : ndarray, shape (H, D)
         Of the mean.
-    covariance : ndarray, shape (H, N, N)
+    covariance : ndarray, shape (H, D, D)
     weight : ndarray, shape (H, M)
         1 / (variance inflation) of each row, at most (nu + 1) / nu.
     residual : ndarray, shape (H, M)
         After the update.
     spread : ndarray, shape (H, M)
         Variance of the fitted value.
-    log_evidence : ndarray, shape (H,)
-        Laplace approximation, up to a constant common to the hypotheses.
     """
 
     change: Floats
@@ -35,27 +58,79 @@ class Update:
     weight: Floats
     residual: Floats
     spread: Floats
-    log_evidence: Floats
 
 
-def first_weights(rows: Rows, covariance: Floats, degrees: float) -> Floats:
+def prior_of(rows: Rows, covariance: Floats) -> Prior:
+    """The combinations before the epoch, of unknowns with a covariance of shape (H, N, N)."""
+    cross = covariance @ np.swapaxes(rows.combine, 1, 2)
+    own = rows.combine @ cross
+    diagonal = np.arange(own.shape[1])
+    variance = own[:, diagonal, diagonal]
+    variance[:, rows.bounds[0] + 1 + MOTION :] += SENSOR_FLOOR * rows.variance[rows.bounds[2] :]
+    root = np.sqrt(variance)
+    scale = 1.0 / root
+    own = own * scale[:, :, None] * scale[:, None, :]
+    own[:, diagonal, diagonal] = 1.0
+    information = _inverse(own)
+    information = 0.5 * (information + np.swapaxes(information, 1, 2))
+    gain = (cross * scale[:, None, :]) @ information
+    return Prior(root=root, gain=gain, covariance=own, information=information, design=rows.design * root[:, None, :])
+
+
+def first_weights(rows: Rows, prior: Prior, degrees: float, freedom: Floats | None = None) -> Floats:
     """Weights from innovations, what a clock common to a kind takes up left out as their median, shape (H, M).
 
     The clocks begin at every epoch nearly unknown: with their prior in it, the variance of an innovation would
     hide every outlier.
+
+    Parameters
+    ----------
+    rows : Rows
+    prior : Prior
+    degrees : float
+    freedom : ndarray, shape (2,), optional
+        Variances added to place and speed.
     """
-    blind = rows.design.copy()
-    blind[:, :, [Unknown.CODE_CLOCK, Unknown.PHASE_CLOCK, Unknown.DRIFT]] = 0.0
-    spread = ((blind @ covariance) * blind).sum(axis=-1) + rows.variance
+    codes = rows.bounds[0]
+    blind = prior.design.copy()
+    blind[:, :, [codes, codes + 2, codes + MOTION]] = 0.0
+    spread = ((blind @ prior.covariance) * blind).sum(axis=-1) + rows.variance
+    if freedom is not None:
+        spread += _freed(rows, Unknown.PLACE) ** 2 * freedom[0] + _freed(rows, Unknown.SPEED) ** 2 * freedom[1]
     value = rows.value.copy()
-    for mask in rows.common:
-        if mask.any():
-            value[:, mask] -= np.median(value[:, mask], axis=1, keepdims=True)
+    for part in rows.common:
+        if part.stop > part.start:
+            value[:, part] -= median(value[:, part])[:, None]
     return np.asarray((degrees + 1.0) / (degrees + value**2 / spread))
 
 
+def _inverse(matrices: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+
+
+def _freed(rows: Rows, unknown: Unknown) -> Floats:
+    """Coefficients of an unknown in each row, shape (H, M)."""
+    return np.asarray((rows.design @ rows.combine[:, :, unknown, None])[..., 0])
+
+
+def median(values: Floats) -> Floats:
+    """Median over the last axis, which has at least one element."""
+    ordered = np.sort(values, axis=-1)
+    middle = values.shape[-1] // 2
+    if values.shape[-1] % 2:
+        return np.asarray(ordered[..., middle])
+    return np.asarray(0.5 * (ordered[..., middle - 1] + ordered[..., middle]))
+
+
 def robust_update(
-    rows: Rows, covariance: Floats, weight: Floats, *, degrees: float, passes: int, use: Masks | None = None
+    rows: Rows,
+    prior: Prior,
+    weight: Floats,
+    *,
+    degrees: float,
+    passes: int,
+    use: Masks | None = None,
+    information: Floats | None = None,
 ) -> Update:
     """Reweighted least squares of one epoch against its prior.
 
@@ -65,70 +140,73 @@ def robust_update(
     Parameters
     ----------
     rows : Rows
-    covariance : ndarray, shape (H, N, N)
-        Before the epoch.
+    prior : Prior
     weight : ndarray, shape (H, M)
         Of the first pass.
     degrees : float
     passes : int
     use : ndarray of bool, shape (H, M), optional
         Rows that each Gaussian takes.
+    information : ndarray, shape (H, D, D), optional
+        Instead of that of the prior.
     """
-    count, _, width = rows.design.shape
-    inverse = np.linalg.inv(covariance)
-    prior = np.asarray(0.5 * (inverse + np.swapaxes(inverse, 1, 2)), dtype=np.float64)
-    transposed = np.swapaxes(rows.design, 1, 2)
-    change = np.zeros((count, width))
-    after, residual, spread = covariance, rows.value, np.zeros_like(rows.value)
+    design, information = prior.design, prior.information if information is None else information
+    transposed = np.swapaxes(design, 1, 2)
+    change = np.zeros(design.shape[::2])
+    after, residual, spread = prior.covariance, rows.value, np.zeros_like(rows.value)
     for turn in range(passes):
         weight = weight if use is None else np.where(use, weight, 0.0)
         scaled = transposed * (weight / rows.variance)[:, None, :]
-        after = np.asarray(np.linalg.inv(prior + scaled @ rows.design), dtype=np.float64)
+        after = _inverse(information + scaled @ design)
         change = (after @ (scaled @ rows.value[..., None]))[..., 0]
-        residual = rows.value - (rows.design @ change[..., None])[..., 0]
-        spread = ((rows.design @ after) * rows.design).sum(axis=-1)
+        residual = rows.value - (design @ change[..., None])[..., 0]
+        spread = ((design @ after) * design).sum(axis=-1)
         if turn < passes - 1:
             weight = (degrees + 1.0) / (degrees + (residual**2 + spread) / rows.variance)
+    return Update(change=change, covariance=after, weight=weight, residual=residual, spread=spread)
+
+
+def log_evidence(rows: Rows, prior: Prior, update: Update, degrees: float) -> Floats:
+    """Logarithm of the evidence by Laplace's approximation, up to a constant common to the hypotheses, shape (H,)."""
+    fit = -0.5 * (degrees + 1.0) * np.log1p(update.residual**2 / (degrees * rows.variance)).sum(axis=1)
+    change = update.change
+    away = -0.5 * (change[:, None, :] @ prior.information @ change[:, :, None])[:, 0, 0]
+    volume = 0.5 * (np.linalg.slogdet(update.covariance)[1] + np.linalg.slogdet(prior.information)[1])
+    return np.asarray(fit + away + volume)
+
+
+def applied(mean: Floats, covariance: Floats, prior: Prior, update: Update) -> tuple[Floats, Floats]:
+    """Mean and covariance of all unknowns after the update of the combinations, shapes (H, N) and (H, N, N)."""
+    less = prior.covariance - update.covariance
+    after = covariance - prior.gain @ less @ np.swapaxes(prior.gain, 1, 2)
     after = 0.5 * (after + np.swapaxes(after, 1, 2))
-    fit = -0.5 * (degrees + 1.0) * np.log1p(residual**2 / (degrees * rows.variance)).sum(axis=1)
-    away = -0.5 * (change[:, None, :] @ prior @ change[:, :, None])[:, 0, 0]
-    volume = 0.5 * (np.linalg.slogdet(after)[1] - np.linalg.slogdet(covariance)[1])
-    return Update(
-        change=change,
-        covariance=after,
-        weight=weight,
-        residual=residual,
-        spread=spread,
-        log_evidence=fit + away + volume,
-    )
+    return mean + (prior.gain @ update.change[..., None])[..., 0], after
 
 
-def better_mode(
-    rows: Rows, covariance: Floats, update: Update, freedom: Floats, *, degrees: float, passes: int
-) -> Update:
+def better_mode(rows: Rows, prior: Prior, update: Update, freedom: Floats, *, degrees: float, passes: int) -> Update:
     """The update from another start where its evidence is larger, hypothesis by hypothesis.
 
-    Student's t has several maxima. The second start frees place, speed and acceleration first: what most
+    Student's t has several maxima. The second start frees place and speed first: what most
     measurements agree on is found although the prediction contradicts it, and its evidence, with the prediction
     in it, decides.
 
     Parameters
     ----------
     rows : Rows
-    covariance : ndarray, shape (H, N, N)
+    prior : Prior
     update : Update
         From the first start.
-    freedom : ndarray, shape (3,)
-        Variances added to place, speed and acceleration for the second start.
+    freedom : ndarray, shape (2,)
+        Variances added to place and speed for the second start.
     degrees : float
     passes : int
     """
-    free = covariance.copy()
-    diagonal = np.arange(len(freedom))
-    free[:, diagonal, diagonal] += freedom
-    start = robust_update(rows, free, first_weights(rows, free, degrees), degrees=degrees, passes=passes)
-    other = robust_update(rows, covariance, start.weight, degrees=degrees, passes=passes)
-    better = other.log_evidence > update.log_evidence
+    freed = np.stack([rows.combine[:, :, unknown] / prior.root for unknown in (Unknown.PLACE, Unknown.SPEED)], axis=2)
+    free = prior.covariance + (freed * freedom) @ np.swapaxes(freed, 1, 2)
+    weight = first_weights(rows, prior, degrees, freedom)
+    start = robust_update(rows, prior, weight, degrees=degrees, passes=passes, information=_inverse(free))
+    other = robust_update(rows, prior, start.weight, degrees=degrees, passes=passes)
+    better = log_evidence(rows, prior, other, degrees) > log_evidence(rows, prior, update, degrees)
     if not better.any():
         return update
 
@@ -139,7 +217,8 @@ def better_mode(
     return Update(**{name: chosen(name) for name in update.__dataclass_fields__})
 
 
-def mean_weight(rows: Rows, weight: Floats, kinds: tuple[Kind, ...]) -> float:
-    """Mean weight of the rows of some kinds, NaN without any; `weight` is that of one hypothesis, shape (M,)."""
-    mask = rows.of(kinds)
-    return float(weight[mask].mean()) if mask.any() else float("nan")
+def mean_weight(weight: Floats, part: slice) -> Floats:
+    """Mean weight of some rows, NaN without any, shape (H,); `weight` has shape (H, M)."""
+    if part.stop == part.start:
+        return np.full(len(weight), np.nan)
+    return np.asarray(weight[:, part].mean(axis=1))

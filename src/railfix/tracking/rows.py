@@ -12,6 +12,9 @@ of its constellation's code clock, w the time-correlated error of Dopplers, z th
 the codes' place over minutes, m the map's error, q the error of the map's displacement over the epoch. The
 gradient g of the phase's change is one for both ends: the direction of the chord. With a gradient for each end the
 phases would measure absolute place from the bend of the line, more sharply than the line is known.
+
+The rows depend on few combinations y of the unknowns: one for each code, the clock of the codes, six for all phases and
+Dopplers (`MOTION`), one for each sensor. Rounds of reweighting need the covariance of y alone (`robust`).
 """
 
 from __future__ import annotations
@@ -22,11 +25,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import range_with_rotation
+from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import SensorEpochs
-from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import OFFSETS, SATELLITES, Unknown
 
@@ -51,34 +54,10 @@ class Kind(IntEnum):
     PLACE = 6
 
 
-@dataclass(frozen=True, kw_only=True)
-class Channels:
-    """GNSS measurements of one epoch: K channels that have any.
-
-    Attributes
-    ----------
-    slot : ndarray of int, shape (K,)
-        Place of the satellite's error among the satellites of the state.
-    offset : ndarray of int, shape (K,)
-        Place of its code clock in `state.CLOCKS`.
-    sat_ecef_m, sat_velocity_mps, before_ecef_m : ndarray, shape (K, 3)
-    code_m, code_sigma_m, rate_mps, cn0_dbhz, phase_change_m : ndarray, shape (K,)
-        NaN where there is none.
-    column : ndarray of int, shape (K,)
-        Channel of the epochs given.
-    """
-
-    slot: Indices
-    offset: Indices
-    sat_ecef_m: Floats
-    sat_velocity_mps: Floats
-    before_ecef_m: Floats
-    code_m: Floats
-    code_sigma_m: Floats
-    rate_mps: Floats
-    cn0_dbhz: Floats
-    phase_change_m: Floats
-    column: Indices
+_KINDS: Final = np.array([Kind.CODE, Kind.PHASE, Kind.DOPPLER], dtype=np.int64)
+#: Combinations that phases and Dopplers depend on: way since the epoch before, clock of the phases, error of the map's
+#: displacement to the right and up, speed by Dopplers, drift.
+MOTION: Final = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,148 +66,178 @@ class Rows:
 
     Attributes
     ----------
-    design : ndarray, shape (H, M, N)
+    combine : ndarray, shape (H, D, N)
+        Combinations y of the unknowns, ``y = combine x``.
+    design : ndarray, shape (H, M, D)
+        Of the rows over the combinations.
     value : ndarray, shape (H, M)
         Measured less computed at the mean, for changes from the mean.
     variance : ndarray, shape (M,)
     kind : ndarray of int, shape (M,)
+        In rising order.
     column : ndarray of int, shape (M,)
         Channel of GNSS measurements, -1 for sensors.
+    bounds : tuple of int
+        Rows of codes, phases and Dopplers end before these.
+    """
+
+    combine: Floats
+    design: Floats
+    value: Floats
+    variance: Floats
+    kind: Integers
+    column: Indices
+    bounds: tuple[int, int, int]
+
+    @property
+    def codes(self) -> slice:
+        """Rows of codes."""
+        return slice(0, self.bounds[0])
+
+    @property
+    def motion(self) -> slice:
+        """Rows of phases and Dopplers."""
+        return slice(self.bounds[0], self.bounds[2])
+
+    @property
+    def common(self) -> tuple[slice, slice, slice]:
+        """Rows of codes, phases and Dopplers: those of a kind share a clock."""
+        first, second, third = self.bounds
+        return slice(0, first), slice(first, second), slice(second, third)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorRows:
+    """Rows of the sensors: S rows for each of H hypotheses, over the unknowns themselves.
+
+    Attributes
+    ----------
+    design : ndarray, shape (H, S, N)
+    value : ndarray, shape (H, S)
+    variance : ndarray, shape (S,)
+    kind : ndarray of int, shape (S,)
     """
 
     design: Floats
     value: Floats
     variance: Floats
     kind: Integers
-    column: Indices
-
-    def of(self, kinds: tuple[Kind, ...]) -> Masks:
-        """Rows of some kinds, shape (M,)."""
-        return np.asarray(np.logical_or.reduce([self.kind == kind for kind in kinds]), dtype=np.bool_)
-
-    @property
-    def common(self) -> tuple[Masks, Masks, Masks]:
-        """Rows of codes, phases and Dopplers."""
-        return self.kind == Kind.CODE, self.kind == Kind.PHASE, self.kind == Kind.DOPPLER
 
 
-def noise_of(channels: Channels, dt: float, limits: TrackingLimits, scale: tuple[float, float]) -> tuple[Floats, ...]:
-    """Variances of white errors of codes, phases' changes and Dopplers, each shape (K,)."""
-    cn0 = np.where(np.isnan(channels.cn0_dbhz), 45.0, np.minimum(channels.cn0_dbhz, 50.0))
-    weak = 10.0 ** ((45.0 - cn0) / 10.0)
-    code = (limits.code_white_share * channels.code_sigma_m) ** 2 / min(dt, 1.0)
-    phase = (limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak) * np.exp(scale[1])
-    doppler = (limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak) * np.exp(scale[0])
-    return code, phase, doppler
-
-
-def gnss_rows(
-    channels: Channels, line: Line, mean: Floats, point: Floats, dt: float, noise: tuple[Floats, ...]
+def rows_of(
+    chunk: Chunk,
+    epoch: int,
+    line: Line,
+    mean: Floats,
+    point: Floats,
+    scale: tuple[float, float],
+    sensors: SensorRows | None,
 ) -> Rows:
-    """Rows of codes, phases and Dopplers.
+    """Rows of one epoch.
 
     Parameters
     ----------
-    channels : Channels
+    chunk : Chunk
+    epoch : int
     line : Line
     mean : ndarray, shape (H, N)
         About which changes are counted.
     point : ndarray, shape (H, 2) [m]
         Arc lengths, now and at the epoch before, at which the equations are linearised.
-    dt : float [s]
-        Since the epoch before; 1 for the first.
-    noise : tuple of ndarray, shape (K,)
-        `noise_of`.
+    scale : tuple of float
+        Logarithms of what the variances of Dopplers and phases are multiplied by.
+    sensors : SensorRows or None
     """
     count, width = mean.shape
-    ecef, axes = line.at(point[:, 0])
-    before, _ = line.at(point[:, 1])
-    distance, sight = range_with_rotation(channels.sat_ecef_m, ecef[:, None, :])
+    dt = chunk.interval_s[epoch]
+    has = chunk.has[:, epoch]
+    code, phase, doppler = (np.flatnonzero(mask) for mask in has)
+    bounds = (len(code), len(code) + len(phase), len(code) + len(phase) + len(doppler))
+    extra = 0 if sensors is None else len(sensors.variance)
+    clock, way = len(code), len(code) + 1
+    combine = np.zeros((count, way + MOTION + extra, width))
+    design = np.zeros((count, bounds[2] + extra, way + MOTION + extra))
+    value = np.empty((count, bounds[2] + extra))
+
+    ends, axes = line.at(point.T.reshape(-1))
+    ecef, before, axes = ends[:count], ends[count:], axes[:count]
+    sat = chunk.sat_ecef_m[epoch]
+    distance, sight = range_with_rotation(sat, ecef[:, None, :])
     on_axes = sight @ np.swapaxes(axes, 1, 2)  # (H, K, 3): u.e, u.c, u.h
     moved = mean[:, [Unknown.PLACE, Unknown.BEFORE]] - point
-    designs, values, variances, kinds, columns = [], [], [], [], []
 
-    has = np.flatnonzero(np.isfinite(channels.code_m) & np.isfinite(channels.code_sigma_m))
-    if len(has):
-        design = np.zeros((count, len(has), width))
-        rows = np.arange(len(has))
-        design[:, :, Unknown.PLACE] = design[:, :, Unknown.CODE_PLACE] = -on_axes[:, has, 0]
-        design[:, :, Unknown.MAP_RIGHT] = -on_axes[:, has, 1]
-        design[:, :, Unknown.MAP_UP] = -on_axes[:, has, 2]
-        design[:, :, Unknown.CODE_CLOCK] = 1.0
-        design[:, rows, OFFSETS + channels.offset[has]] = 1.0
-        design[:, rows, SATELLITES + channels.slot[has]] = channels.code_sigma_m[has]
-        computed = distance[:, has] - on_axes[:, has, 0] * moved[:, :1]
-        rest = (design[:, :, Unknown.MAP_RIGHT :] @ mean[:, Unknown.MAP_RIGHT :, None])[..., 0]
-        designs.append(design)
-        values.append(channels.code_m[has] - computed - rest)
-        variances.append(noise[0][has])
-        kinds.append(np.full(len(has), int(Kind.CODE)))
-        columns.append(channels.column[has])
+    at = np.arange(len(code))
+    combine[:, at, Unknown.PLACE] = combine[:, at, Unknown.CODE_PLACE] = -on_axes[:, code, 0]
+    combine[:, at, Unknown.MAP_RIGHT] = -on_axes[:, code, 1]
+    combine[:, at, Unknown.MAP_UP] = -on_axes[:, code, 2]
+    combine[:, at, OFFSETS + chunk.offset[code]] = 1.0
+    combine[:, at, SATELLITES + chunk.slot[code]] = chunk.code_sigma_m[epoch, code]
+    combine[:, clock, Unknown.CODE_CLOCK] = 1.0
+    design[:, at, at] = 1.0
+    design[:, at, clock] = 1.0
+    linear = mean.copy()
+    linear[:, Unknown.PLACE] = moved[:, 0]
+    linear = (combine[:, : len(code)] @ linear[..., None])[..., 0] + mean[:, Unknown.CODE_CLOCK, None]
+    value[:, : len(code)] = chunk.measured[0, epoch, code] - distance[:, code] - linear
 
-    has = np.flatnonzero(np.isfinite(channels.phase_change_m))
-    if len(has):
-        old, _ = range_with_rotation(channels.before_ecef_m[has], before[:, None, :])
+    combine[:, way, Unknown.PLACE] = combine[:, way, Unknown.STEP_ALONG] = 1.0
+    combine[:, way, Unknown.BEFORE] = -1.0
+    for k, unknown in enumerate((Unknown.PHASE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.SPEED), start=1):
+        combine[:, way + k, unknown] = 1.0
+    combine[:, way + 4, Unknown.DOPPLER_SPEED] = 1.0
+    combine[:, way + 5, Unknown.DRIFT] = 1.0
+    if len(phase):
+        part = slice(bounds[0], bounds[1])
+        old, _ = range_with_rotation(chunk.before_ecef_m[epoch, phase], before[:, None, :])
         chord = ecef - before
         length = np.sqrt((chord * chord).sum(axis=1))
         sign = np.where(point[:, 0] >= point[:, 1], 1.0, -1.0)
         straight = np.where(length > _CHORD_M, sign / np.maximum(length, _CHORD_M), 0.0)[:, None] * chord
         along = np.where((length > _CHORD_M)[:, None], straight, axes[:, 0])
-        gradient = -(sight[:, has] @ along[:, :, None])[..., 0]
-        design = np.zeros((count, len(has), width))
-        design[:, :, Unknown.PLACE], design[:, :, Unknown.BEFORE] = gradient, -gradient
-        design[:, :, Unknown.PHASE_CLOCK] = 1.0
-        design[:, :, Unknown.STEP_RIGHT] = -on_axes[:, has, 1]
-        design[:, :, Unknown.STEP_UP] = -on_axes[:, has, 2]
-        design[:, :, Unknown.STEP_ALONG] = gradient
-        computed = distance[:, has] - old + gradient * (moved[:, :1] - moved[:, 1:])
-        designs.append(design)
-        values.append(channels.phase_change_m[has] - computed - mean[:, Unknown.PHASE_CLOCK, None])
-        variances.append(noise[1][has])
-        kinds.append(np.full(len(has), int(Kind.PHASE)))
-        columns.append(channels.column[has])
-
-    has = np.flatnonzero(np.isfinite(channels.rate_mps))
-    if len(has):
-        sat, velocity = channels.sat_ecef_m[has], channels.sat_velocity_mps[has]
-        moving = (sight[:, has] * velocity).sum(axis=-1)
+        gradient = -(sight[:, phase] @ along[:, :, None])[..., 0]
+        design[:, part, way] = gradient
+        design[:, part, way + 1] = 1.0
+        design[:, part, way + 2 : way + 4] = -on_axes[:, phase, 1:]
+        computed = distance[:, phase] - old + gradient * (moved[:, :1] - moved[:, 1:])
+        value[:, part] = chunk.measured[1, epoch, phase] - computed - mean[:, Unknown.PHASE_CLOCK, None]
+    if len(doppler):
+        part = slice(bounds[1], bounds[2])
+        sat, velocity = sat[doppler], chunk.sat_velocity_mps[epoch, doppler]
+        moving = (sight[:, doppler] * velocity).sum(axis=-1)
         moving += _TURN * (velocity[:, 0] * ecef[:, 1:2] - velocity[:, 1] * ecef[:, :1])
         tangent = axes[:, 0]
         stretch = 1.0 + moving / SPEED_OF_LIGHT
-        slope = (-on_axes[:, has, 0] + _TURN * (sat[:, 0] * tangent[:, 1:2] - sat[:, 1] * tangent[:, :1])) / stretch
-        design = np.zeros((count, len(has), width))
-        design[:, :, Unknown.SPEED], design[:, :, Unknown.DRIFT] = slope, 1.0
-        design[:, :, Unknown.DOPPLER_SPEED] = slope
-        design[:, :, Unknown.STEP_RIGHT] = -on_axes[:, has, 1] / dt
-        design[:, :, Unknown.STEP_UP] = -on_axes[:, has, 2] / dt
+        slope = (-on_axes[:, doppler, 0] + _TURN * (sat[:, 0] * tangent[:, 1:2] - sat[:, 1] * tangent[:, :1])) / stretch
+        design[:, part, way + 2 : way + 4] = -on_axes[:, doppler, 1:] / dt
+        design[:, part, way + 4] = slope
+        design[:, part, way + 5] = 1.0
         speed = mean[:, Unknown.SPEED, None] + mean[:, Unknown.DOPPLER_SPEED, None]
         computed = moving / stretch + slope * speed + mean[:, Unknown.DRIFT, None]
-        designs.append(design)
-        values.append(channels.rate_mps[has] - computed)
-        variances.append(noise[2][has])
-        kinds.append(np.full(len(has), int(Kind.DOPPLER)))
-        columns.append(channels.column[has])
-
-    if not designs:
-        return Rows(
-            design=np.empty((count, 0, width)),
-            value=np.empty((count, 0)),
-            variance=np.empty(0),
-            kind=np.empty(0, dtype=np.int64),
-            column=np.empty(0, dtype=np.intp),
-        )
+        value[:, part] = chunk.measured[2, epoch, doppler] - computed
+    variance = chunk.variance[:, epoch]
+    variances = [variance[0, code], variance[1, phase] * np.exp(scale[1]), variance[2, doppler] * np.exp(scale[0])]
+    kinds = [_KINDS.repeat([len(code), len(phase), len(doppler)])]
+    if sensors is not None:
+        at = np.arange(extra)
+        combine[:, way + MOTION :] = sensors.design
+        design[:, bounds[2] + at, way + MOTION + at] = 1.0
+        value[:, bounds[2] :] = sensors.value
+        variances.append(sensors.variance)
+        kinds.append(sensors.kind)
     return Rows(
-        design=np.concatenate(designs, axis=1),
-        value=np.concatenate(values, axis=1),
+        combine=combine,
+        design=design,
+        value=value,
         variance=np.concatenate(variances),
         kind=np.concatenate(kinds),
-        column=np.concatenate(columns),
+        column=np.concatenate([code, phase, doppler, np.full(extra, -1, dtype=np.intp)]),
+        bounds=bounds,
     )
 
 
 def sensor_rows(
     sensors: SensorEpochs, epoch: int, line: Line, mean: Floats, dt: float, direction: float
-) -> Rows | None:
+) -> SensorRows | None:
     """Rows of the sensors at one epoch, None without any.
 
     `direction` is the sign of the last speed with a direction, 0 before: an unsigned way takes it where the speed is
@@ -271,23 +280,9 @@ def sensor_rows(
     for row, (coefficients, _, _, _) in enumerate(listed):
         for column, coefficient in coefficients.items():
             design[:, row, column] = coefficient
-    return Rows(
+    return SensorRows(
         design=design,
         value=np.stack([value for _, value, _, _ in listed], axis=1),
         variance=np.array([sigma**2 for _, _, sigma, _ in listed]),
         kind=np.array([int(kind) for _, _, _, kind in listed]),
-        column=np.full(len(listed), -1, dtype=np.intp),
-    )
-
-
-def joined(first: Rows, second: Rows | None) -> Rows:
-    """Rows of both."""
-    if second is None:
-        return first
-    return Rows(
-        design=np.concatenate([first.design, second.design], axis=1),
-        value=np.concatenate([first.value, second.value], axis=1),
-        variance=np.concatenate([first.variance, second.variance]),
-        kind=np.concatenate([first.kind, second.kind]),
-        column=np.concatenate([first.column, second.column]),
     )

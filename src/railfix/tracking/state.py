@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks, Strings
+from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.epochs import Previous
 
 #: Letters of the receiver clocks of codes, in the order of their offsets in the state.
@@ -55,8 +55,8 @@ class Unknown(IntEnum):
 OFFSETS: Final = len(Unknown)
 #: First error of a satellite.
 SATELLITES: Final = OFFSETS + len(CLOCKS)
-#: Unknowns that begin anew at every epoch.
-FRESH: Final = (Unknown.CODE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.STEP_ALONG)
+#: Unknowns that begin anew at every epoch: clock of the codes, displacements of the map.
+FRESH: Final = slice(Unknown.CODE_CLOCK, Unknown.STEP_ALONG + 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,9 +84,9 @@ class Bank:
         return cls(without=(), mean=np.empty((0, width)), covariance=np.empty((0, width, width)), weak_s=np.empty(0))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class TrackState:
-    """What one epoch leaves to the next: H hypotheses of N unknowns.
+    """What one epoch leaves to the next: H hypotheses of N unknowns. Its arrays are never written to.
 
     Attributes
     ----------
@@ -155,3 +155,50 @@ class TrackState:
             previous=None,
             measured=np.datetime64("NaT", "ns"),
         )
+
+    def forget(self) -> None:
+        """Begin anew: no hypothesis, no sub-filter, no clock known."""
+        width = SATELLITES + len(self.satellite)
+        self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
+        self.log_probability = self.origin_m = np.empty(0)
+        self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
+        self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
+        self.bank = None
+
+    def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:
+        """Keep the errors of some satellites, and begin those of new ones.
+
+        Parameters
+        ----------
+        kept : ndarray of int
+            Among `satellite`.
+        new : tuple of str
+        """
+        index = np.concatenate([np.arange(SATELLITES), SATELLITES + kept]).astype(np.intp)
+        self.mean, self.covariance = _rearranged(self.mean, self.covariance, index, len(new))
+        if self.bank is not None:
+            mean, covariance = _rearranged(self.bank.mean, self.bank.covariance, index, len(new))
+            self.bank = replace(self.bank, mean=mean, covariance=covariance)
+        self.satellite = np.array([*self.satellite[kept].tolist(), *new], dtype=np.str_)
+        unseen = np.full(len(new), np.datetime64("NaT"), dtype="datetime64[ns]")
+        self.seen = np.concatenate([self.seen[kept], unseen])
+
+
+def _rearranged(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
+    """Gaussians over some of their unknowns and so many new errors of satellites."""
+    count, old, width = len(mean), len(index), len(index) + new
+    means, covariances = np.zeros((count, width)), np.zeros((count, width, width))
+    means[:, :old] = mean[:, index]
+    covariances[:, :old, :old] = covariance[:, index[:, None], index]
+    diagonal = np.arange(old, width)
+    covariances[:, diagonal, diagonal] = 1.0
+    return means, covariances
+
+
+def begun_anew(mean: Floats, covariance: Floats, unknowns: Indices) -> tuple[Floats, Floats]:
+    """Gaussians in which some unknowns are standard normal and independent of all else."""
+    mean, covariance = mean.copy(), covariance.copy()
+    mean[:, unknowns] = 0.0
+    covariance[:, unknowns, :] = covariance[:, :, unknowns] = 0.0
+    covariance[:, unknowns, unknowns] = 1.0
+    return mean, covariance

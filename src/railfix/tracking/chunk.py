@@ -1,0 +1,159 @@
+"""Epochs prepared for the recursion: what needs no place is computed for all epochs of a chunk at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.timescale import seconds
+from railfix.tracking.epochs import GnssEpochs, Previous
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.state import CLOCKS, TrackState
+
+#: Shortest interval between epochs [s].
+_SHORTEST_S: Final = 1e-3
+#: Two epochs further apart than this have nothing to do with each other [s].
+_APART_S: Final = 3600.0
+#: Satellites unseen for this many correlation times are dropped from the state.
+_FORGOTTEN: Final = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """T epochs of K channels and S errors of satellites.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    interval_s : ndarray, shape (T,) [s]
+        Since the epoch before; 1 for the first.
+    apart : ndarray of bool, shape (T,)
+        Epochs so long after the one before that they begin anew.
+    satellite : ndarray of str, shape (K,)
+    slot : ndarray of int, shape (K,)
+        Place of the channel's error among those of the state; -1 for one that is never measured.
+    offset : ndarray of int, shape (K,)
+        Place of its code clock in `CLOCKS`.
+    sat_ecef_m, sat_velocity_mps, before_ecef_m : ndarray, shape (T, K, 3)
+        Satellites at transmission, and those of the epoch before.
+    measured : ndarray, shape (3, T, K)
+        Code [m], change of the phase since the epoch before [m] and range rate [m/s]; NaN where there is none.
+    has : ndarray of bool, shape (3, T, K)
+        Where it is finite.
+    variance : ndarray, shape (3, T, K)
+        Of their white errors, before the scales learnt from residuals.
+    code_sigma_m : ndarray, shape (T, K) [m]
+        Of the satellite's correlated error.
+    fresh : ndarray of bool, shape (T, S)
+        Satellites whose error begins at an epoch.
+    """
+
+    time: Datetimes
+    interval_s: Floats
+    apart: Masks
+    satellite: Strings
+    slot: Indices
+    offset: Indices
+    sat_ecef_m: Floats
+    sat_velocity_mps: Floats
+    before_ecef_m: Floats
+    measured: Floats
+    has: Masks
+    variance: Floats
+    code_sigma_m: Floats
+    fresh: Masks
+
+
+def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
+    """The chunk; the state gets an error for each satellite measured in it."""
+    phase, before = _previous(epochs, state.previous)
+    phase = np.concatenate([phase[None], epochs.phase_m])
+    placed = np.isfinite(epochs.sat_ecef_m).all(axis=2)
+    before = np.concatenate([before[None], epochs.sat_ecef_m])[:-1]
+    measured = np.stack([epochs.code_m, phase[1:] - phase[:-1], epochs.rate_mps])
+    has = np.isfinite(measured) & placed
+    has[0] &= np.isfinite(epochs.code_sigma_m)
+    has[1] &= epochs.phase_joined & np.isfinite(before).all(axis=2)
+    has[2] &= np.isfinite(epochs.sat_velocity_mps).all(axis=2)
+
+    since = np.diff(epochs.time, prepend=epochs.time[:1] if np.isnat(state.time) else state.time)
+    gap = seconds(since)
+    apart = gap > _APART_S
+    # Two epochs at one instant are a millisecond apart: Dopplers and forces count by the interval.
+    interval = np.maximum(gap, _SHORTEST_S)
+    interval[apart] = 1.0
+    if np.isnat(state.time):
+        interval[:1] = 1.0
+
+    any_kind = np.asarray(has.any(axis=0), dtype=np.bool_)
+    slot = _with_satellites(state, epochs, np.asarray(any_kind.any(axis=0)))
+    seen = np.full((len(epochs) + 1, len(state.satellite)), np.datetime64("NaT"), dtype="datetime64[ns]")
+    seen[0] = state.seen
+    used = np.flatnonzero(slot >= 0)
+    seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT"))
+    seen = np.fmax.accumulate(seen, axis=0)
+    earlier = np.concatenate([np.array([state.time]), epochs.time[:-1]])
+    kept = seconds(earlier[:, None] - seen[:-1]) <= _FORGOTTEN * limits.code_correlation_s
+    fresh = np.zeros(kept.shape, dtype=np.bool_)
+    fresh[:, slot[used]] = any_kind[:, used]
+    state.seen = seen[-1]
+
+    cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
+    weak = 10.0 ** ((45.0 - cn0) / 10.0)
+    code = (limits.code_white_share * epochs.code_sigma_m) ** 2 / np.minimum(interval, 1.0)[:, None]
+    return Chunk(
+        time=epochs.time,
+        interval_s=interval,
+        apart=apart,
+        satellite=epochs.satellite,
+        slot=slot,
+        offset=np.array([CLOCKS.index(str(letter)) for letter in epochs.clock], dtype=np.intp),
+        sat_ecef_m=epochs.sat_ecef_m,
+        sat_velocity_mps=epochs.sat_velocity_mps,
+        before_ecef_m=before,
+        measured=measured,
+        has=has,
+        variance=np.stack(
+            [
+                code,
+                limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
+                limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
+            ]
+        ),
+        code_sigma_m=epochs.code_sigma_m,
+        fresh=fresh & ~kept,
+    )
+
+
+def leave(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:
+    """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
+    phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
+    state.previous = Previous(satellite=epochs.satellite, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
+    kept = seconds(chunk.time[-1] - state.seen) <= _FORGOTTEN * limits.code_correlation_s
+    if not kept.all():
+        state.rearrange(np.flatnonzero(kept), ())
+
+
+def _previous(epochs: GnssEpochs, previous: Previous | None) -> tuple[Floats, Floats]:
+    """Phase and satellites of the epoch before the first, in the order of the channels."""
+    size = len(epochs.satellite)
+    phase, sat = np.full(size, np.nan), np.full((size, 3), np.nan)
+    if previous is not None:
+        _, here, there = np.intersect1d(epochs.satellite, previous.satellite, return_indices=True)
+        phase[here], sat[here] = previous.phase_m[there], previous.sat_ecef_m[there]
+    return phase, sat
+
+
+def _with_satellites(state: TrackState, epochs: GnssEpochs, measured: Masks) -> Indices:
+    """Give the state a place for the error of each satellite measured; return the place of each channel's."""
+    place = {str(name): k for k, name in enumerate(state.satellite)}
+    names = [str(name) for name in epochs.satellite]
+    new = [name for name in dict.fromkeys(np.array(names)[measured].tolist()) if name not in place]
+    if new:
+        state.rearrange(np.arange(len(state.satellite)), tuple(new))
+        place |= {name: len(place) + k for k, name in enumerate(new)}
+    slot = [place[name] if there else -1 for name, there in zip(names, measured.tolist(), strict=True)]
+    return np.array(slot, dtype=np.intp)
