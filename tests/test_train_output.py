@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 
@@ -43,6 +45,21 @@ def test_one_row_an_epoch_and_antenna_with_all_columns(tracked: RunSummary) -> N
 
 
 @pytest.mark.requirement("E5")
+def test_summary_and_record_count_what_the_table_holds(tracked: RunSummary) -> None:
+    train = pl.read_parquet(tracked.files["train.parquet"])
+    record = json.loads(tracked.files["run.json"].read_text())
+    for antenna in ("front", "rear"):
+        mine = train.filter(pl.col("antenna") == antenna)
+        found = tracked.tracks[antenna]
+        counted = dict(mine.group_by(pl.col("status").cast(pl.String)).len().iter_rows())
+        assert {word: count for word, count in found.status.items() if count} == counted
+        assert found.along_sigma_m is not None
+        assert found.along_sigma_m.max_m == mine["along_sigma_m"].max()
+        assert found.along_sigma_m.p50_m == mine["along_sigma_m"].quantile(0.5)
+        assert record["antennas"][antenna]["filter"] == asdict(found)
+
+
+@pytest.mark.requirement("E5")
 def test_chunks_change_nothing(tracked: RunSummary, tmp_path: Path) -> None:
     other = _run(tmp_path / "run", Config(filter="track"), 13)
     assert_frame_equal(*(pl.read_parquet(s.files["train.parquet"]) for s in (tracked, other)), abs_tol=1e-9)
@@ -74,3 +91,4 @@ def test_the_command_tracks_unless_told_not_to(tmp_path: Path, given: tuple[str,
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code == 0, result.output
     assert (out / "train.csv").exists() is written
+    assert ("Filter along the track (train.csv)" in result.output) is written

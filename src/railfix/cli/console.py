@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -17,6 +17,7 @@ from railfix.core.reasons import Status
 if TYPE_CHECKING:
     from railfix.run import RunSummary
     from railfix.run.driver import Progress as ProgressCall
+    from railfix.run.record import Filtered
     from railfix.run.tally import AntennaTally
 
 
@@ -75,7 +76,12 @@ def show_summary(summary: RunSummary) -> None:
     """Epochs, positions, statuses, the budget of reasons, and where the results are."""
     console = console_of_tables()
     names = list(summary.tally.antennas)
+    if summary.tracks:
+        console.print("Each epoch by itself (positions.csv)")
     console.print(_positions(summary, names))
+    if summary.tracks:
+        console.print("Filter along the track (train.csv)")
+        console.print(_filtered(summary.tracks))
     console.print("Rejected pseudoranges by their first reason, and by that reason alone")
     console.print(_reasons(summary, names))
     show_notes(console, summary.notes)
@@ -117,6 +123,21 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
         for word in ("available", "alarm"):
             shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
             table.add_row(f"  {word}", *shown)
+    return table
+
+
+def _filtered(tracks: Mapping[str, Filtered]) -> Table:
+    table = Table()
+    table.add_column("")
+    for name in tracks:
+        table.add_column(name, justify="right")
+    for status in dict.fromkeys(word for found in tracks.values() for word in found.status):
+        if any(found.status[status] for found in tracks.values()):
+            table.add_row(status, *(f"{found.status[status]:,}" for found in tracks.values()))
+    for label, field in (("p50", "p50_m"), ("p95", "p95_m"), ("largest", "max_m")):
+        sigmas = [found.along_sigma_m for found in tracks.values()]
+        cells = ["-" if sigma is None else f"{getattr(sigma, field):.2f} m" for sigma in sigmas]
+        table.add_row(f"sigma along the line, {label}", *cells)
     return table
 
 

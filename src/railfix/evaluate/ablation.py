@@ -219,6 +219,7 @@ def ablate_files(
             sigma={},
             protection={},
             found_levels={},
+            found_tracks={},
             notes=notes,
             wall_s=wall,
         )

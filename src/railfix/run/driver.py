@@ -34,7 +34,7 @@ from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import AlongSigma, Levels, along_sigma, levels, run_record
+from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
 from railfix.run.sensors import read_sensors, until
 from railfix.run.sources import Line, Log, open_line
 from railfix.run.tally import Tally
@@ -60,6 +60,8 @@ class RunSummary:
         Percentiles of the along-track standard deviation by antenna.
     levels : mapping of str to Levels
         Protection levels by antenna; empty where they are off.
+    tracks : mapping of str to Filtered
+        Statuses and sigmas of the filter along the track by antenna; empty where it is off.
     level_basis : str
         "indicative protection" where the priors of the levels are assumed, "protection" where they are measured.
     notes : tuple of str
@@ -71,6 +73,7 @@ class RunSummary:
     tally: Tally
     sigma: Mapping[str, AlongSigma]
     levels: Mapping[str, Levels]
+    tracks: Mapping[str, Filtered]
     level_basis: str
     notes: tuple[str, ...]
     files: Mapping[str, Path]
@@ -128,6 +131,7 @@ def run_files(
         check_sbas_time(processor.received.sbas, tally)
         check_positions(tally)
         sigma, found_levels = along_sigma(folder), levels(folder)
+        tracks = filtered(folder) if config.filter == "track" else {}
         notes = (
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally, found_levels),
@@ -146,14 +150,16 @@ def run_files(
             sigma=sigma,
             protection=level_facts(config),
             found_levels=found_levels,
+            found_tracks=tracks,
             notes=notes,
             wall_s=wall,
         )
         folder.write_json("run.json", record)
         files = folder.commit(_footer(record))
     return RunSummary(
-        tally=tally, sigma=sigma, levels=found_levels, level_basis=level_basis, notes=notes, files=files, wall_s=wall
-    )
+        tally=tally, sigma=sigma, levels=found_levels, tracks=tracks, level_basis=level_basis, notes=notes, files=files,
+        wall_s=wall,
+    )  # fmt: skip
 
 
 def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Line, dict[Antenna, Log]]:

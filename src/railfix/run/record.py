@@ -16,6 +16,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.kernels import kernels_in_use
 from railfix.run.output import OutputFolder
 from railfix.run.tally import Tally
+from railfix.tracking import TrackStatus
 
 #: Packages whose version may matter to a result.
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
@@ -28,6 +29,14 @@ class AlongSigma:
     p50_m: float
     p95_m: float
     max_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filtered:
+    """Positions of the filter along the track of one antenna: epochs by status, and percentiles of sigma [m]."""
+
+    status: dict[str, int]
+    along_sigma_m: AlongSigma | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +91,28 @@ def along_sigma(folder: OutputFolder) -> dict[str, AlongSigma]:
     }
 
 
+def filtered(folder: OutputFolder) -> dict[str, Filtered]:
+    """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written so far."""
+    sigma, status = pl.col("along_sigma_m"), pl.col("status").cast(pl.String)
+    table = (
+        folder.scan("train.parquet")
+        .group_by("antenna")
+        .agg(
+            p50=sigma.quantile(0.5),
+            p95=sigma.quantile(0.95),
+            max=sigma.max(),
+            **{word.text: (status == word.text).sum() for word in TrackStatus},
+        )
+        .sort("antenna")
+        .collect()
+    )
+    found = {}
+    for row in table.iter_rows(named=True):
+        along = AlongSigma(p50_m=row["p50"], p95_m=row["p95"], max_m=row["max"]) if row["max"] is not None else None
+        found[row["antenna"]] = Filtered(status={s.text: row[s.text] for s in TrackStatus}, along_sigma_m=along)
+    return found
+
+
 def run_record(
     *,
     files: Sequence[Mapping[str, Any]],
@@ -95,6 +126,7 @@ def run_record(
     sigma: Mapping[str, AlongSigma],
     protection: Mapping[str, Any],
     found_levels: Mapping[str, Levels],
+    found_tracks: Mapping[str, Filtered],
     notes: Sequence[str],
     wall_s: float,
 ) -> dict[str, Any]:
@@ -117,6 +149,8 @@ def run_record(
     protection : mapping
         Assumptions of the protection levels (`railfix.pipeline.level_stage.level_facts`).
     found_levels : mapping of str to Levels
+    found_tracks : mapping of str to Filtered
+        Empty without the filter along the track.
     notes : sequence of str
     wall_s : float
 
@@ -149,6 +183,7 @@ def run_record(
                 **antenna.as_dict(),
                 "along_sigma_m": asdict(sigma[name]) if name in sigma else None,
                 "protection_level": asdict(found_levels[name]) if name in found_levels else None,
+                "filter": asdict(found_tracks[name]) if name in found_tracks else None,
             }
             for name, antenna in tally.antennas.items()
         },
