@@ -21,7 +21,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.reference_log import read_reference
 from railfix.io.rinex import scan_observations
 from railfix.pipeline.config import parse_config
-from railfix.run import RunInputs, run_files
+from railfix.run import RunInputs, RunOptions, run_files
 from railfix.run import sources as run_sources
 from railfix.simulate.demonstration import demo_inputs
 
@@ -165,6 +165,43 @@ def test_the_table_keeps_its_lines_where_the_terminal_is_narrow(truth: Path, tmp
     assert result.exit_code == 0, result.output
     (line,) = [line for line in result.output.splitlines() if line.startswith("without raim")]
     assert len(line.split()) == 2 + 4 + 8
+
+
+def test_the_filter_has_a_row_and_one_without_each_of_its_sources(truth: Path, tmp_path: Path) -> None:
+    """The tunnel of the demonstration begins 60 s after the start; a made wheel carries through it."""
+    true = pl.read_csv(truth, schema_overrides={"time_gpst": pl.Datetime("ns")}).filter(antenna="front")
+    t = (true["time_gpst"] - true["time_gpst"][0]).dt.total_nanoseconds().to_numpy() / 1e9
+    way = true["chainage_m"].to_numpy() - true["chainage_m"][0]
+    pulses = np.arange(1.0, np.floor(way[t < 75.0].max() / 0.045))
+    when = np.datetime64("2024-03-05T03:10:00", "ns") + (
+        np.interp(0.045 * pulses, way[t < 75.0], t[t < 75.0]) * 1e9
+    ).astype("timedelta64[ns]")
+    wheel = tmp_path / "pulses.csv"
+    pl.DataFrame({"time_gpst": when, "pulse": pulses.astype(np.int64), "direction": 1}).write_csv(wheel)
+    config = parse_config(
+        {
+            "filter": "track",
+            "screens": ["elevation"],
+            "sensors": {"tachometer": {"wheel_diameter_m": 0.045 * 60 / np.pi, "pulses_per_turn": 60}},
+        }
+    )
+    inputs = inputs_with(truth).replaced(rear=(), tachometer=wheel)
+    options = RunOptions.model_validate({"start": "2024-03-05T03:10:50", "end": "2024-03-05T03:11:12"})
+    made = ablate_files(inputs, config, out=tmp_path / "out", options=options)
+    effects = {effect.choice: effect for effect in made.effects}
+    assert list(effects) == ["all", "none", "filter", *(f"filter without {n}" for n in ("phase", "doppler", "wheel"))]
+    assert effects["filter"].sources == ("code", "phase", "doppler", "wheel")
+    assert effects["filter without wheel"].sources == ("code", "phase", "doppler")
+    outage = {name: effect.outage for name, effect in effects.items()}
+    assert (outage["all"].positions, outage["filter"].positions) == (0, 73)  # type: ignore[union-attr]
+    assert outage["filter"].max_m < 2.0  # type: ignore[union-attr]
+    rows = pl.read_csv(made.files["ablation.csv"])
+    assert rows.filter(choice="filter")["outage_max_m"].item() == pytest.approx(outage["filter"].max_m)  # type: ignore[union-attr]
+    run = run_files(inputs.replaced(truth=None), config, out=tmp_path / "run", options=options)
+    train = pl.read_parquet(run.files["train.parquet"]).join(true, on="time_gpst", suffix="_true")
+    train = train.filter(pl.col("sources").str.contains("code"))
+    error = (train["chainage_m"] - train["chainage_m_true"]).abs().to_numpy()
+    assert np.median(error) == pytest.approx(effects["filter"].coordinates.p50_m, abs=0.02)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

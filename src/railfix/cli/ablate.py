@@ -1,4 +1,4 @@
-"""``railfix ablate``: compare choices of screens on one log."""
+"""``railfix ablate``: compare choices of screens, and of the filter's sources, on one log."""
 
 from __future__ import annotations
 
@@ -30,14 +30,20 @@ def ablate(
     (no second antenna, no C/N0 curve) are left out and named. Validity and health of the satellites are
     checked in every case; `none` is these checks alone, without an elevation mask.
 
+    With `--filter track` the filter along the track has rows too: with every source that is there
+    (codes, phases, Dopplers, and the sensors given) and without each but codes, all screens on.
+
     For each choice: the rate of epochs with coordinates and of status ok, satellites used, the median
     standard deviation along the line; with `--truth` also the errors along the line (over 50 m counts as
-    a wrong position), of all epochs with coordinates and of those that are ok. Into DIR come
+    a wrong position), of all epochs with coordinates and of those that are ok, of epochs without satellites, and the
+    95th percentile of the error over its stated sigma. Into DIR come
     `ablation.csv` with all figures, those of the conventional position included, and `ablation.json`.
 
     Example:
 
         railfix ablate --front front.obs --nav brdc.nav --track line.csv --truth rtk.pos --out screens
+
+        railfix ablate ... --tachometer pulses.csv --inertial imu.csv --filter track --out sources
 
     Exit codes: 0 done; 2 the command line was misused; 3 an input file is not what it should be;
     4 a setting is wrong; 5 the inputs do not match each other; 7 not one position; 8 DIR cannot be
@@ -68,6 +74,9 @@ def _show(console: Console, effects: list[Effect]) -> None:
     heads = ["rate\n%", "ok\n%", "sats\nused", "sigma\np50 m"]
     if scored:
         heads += [f"{head}\n{of}" for of in ("all", "ok") for head in ("p50", "p95", "max", "wrong")]
+    filtered = any(effect.sources for effect in effects)
+    if scored and filtered:
+        heads += [f"{head}\nno sats" for head in ("p50", "p95", "max")] + ["p95\n/sigma"]
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
     for effect in effects:
@@ -75,6 +84,9 @@ def _show(console: Console, effects: list[Effect]) -> None:
         cells.append(f"{effect.sigma_p50_m:.2f}")
         for figures in (effect.coordinates, effect.ok):
             cells += _errors(figures) if figures is not None else []
+        if scored and filtered:
+            cells += _errors(effect.outage)[:3] if effect.outage is not None else ["-"] * 3
+            cells.append(f"{effect.normalised_p95:.2f}")
         table.add_row(effect.choice, *cells)
     if scored:
         console.print("errors along the line in metres, wrong positions in per cent; all: every epoch with coordinates")

@@ -1,4 +1,4 @@
-"""Effect of each screen: the logs are read once and processed with every choice of screens."""
+"""Effect of each screen and of each source of the filter: the logs are read once, processed with every choice."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from railfix.core.reasons import Status
 from railfix.evaluate.along_track import along_track_error, interpolate_reference
 from railfix.evaluate.scores import Score, score
 from railfix.io.reference_log import AntennaReference, read_reference
-from railfix.pipeline.config import Config
+from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
@@ -30,28 +31,34 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import run_record
+from railfix.run.sensors import read_sensors, until
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
+from railfix.tracking import TrackStatus
 
-#: Names of the choices with all screens and with none.
-ALL, NONE = "all", "none"
+#: Names of the choices with all screens and with none, and of the filter along the track.
+ALL, NONE, FILTER = "all", "none", "filter"
+#: Sensors by the input that has them.
+_SENSORS: Final[Mapping[str, FilterSource]] = {"tachometer": "wheel", "radar": "radar", "inertial": "force"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Rates and errors of one choice of screens on one antenna.
+    """Rates and errors of one choice of screens, or of sources of the filter along the track, on one antenna.
 
     Attributes
     ----------
     choice : str
-        "all", "none", "only raim", "without raim".
+        "all", "none", "only raim", "without raim"; "filter", "filter without phase".
     screens : tuple of str
+    sources : tuple of str
+        Of the filter along the track; empty for single epochs.
     antenna : str
     epochs : int
         Epochs with observations, and with a reference where one is given.
     rate, ok_rate : float
-        Share of the epochs with coordinates, and of those of status ok.
+        Share of the epochs with coordinates, and of those of status ok; of the filter: tracking.
     n_used : float
         Satellites used, mean over the epochs.
     sigma_p50_m : float [m]
@@ -59,10 +66,15 @@ class Effect:
     coordinates, ok, conventional : Score or None
         Errors of all positions, of those with status ok, and of the conventional position from the same ranges;
         None without a reference.
+    outage : Score or None
+        Errors at the epochs without observations, such as those in tunnels; None where there are none.
+    normalised_p95 : float
+        95th percentile of the error size over the standard deviation; NaN without a reference.
     """
 
     choice: str
     screens: tuple[str, ...]
+    sources: tuple[str, ...]
     antenna: str
     epochs: int
     rate: float
@@ -72,19 +84,23 @@ class Effect:
     coordinates: Score | None = None
     ok: Score | None = None
     conventional: Score | None = None
+    outage: Score | None = None
+    normalised_p95: float = float("nan")
 
     def as_row(self) -> dict[str, Any]:
         """Plain values for one row of a table, NaN as None."""
         row: dict[str, Any] = {name: getattr(self, name) for name in _OF_EFFECT}
-        row["screens"] = " ".join(self.screens)
-        for name in ("coordinates", "ok", "conventional"):
+        row["screens"], row["sources"] = " ".join(self.screens), " ".join(self.sources)
+        for name in ("coordinates", "ok", "conventional", "outage"):
             figures: Score | None = getattr(self, name)
             for figure in _OF_SCORE:
                 row[f"{name}_{figure}"] = None if figures is None else getattr(figures, figure)
         return {k: None if isinstance(v, float) and np.isnan(v) else v for k, v in row.items()}
 
 
-_OF_EFFECT: Final = ("choice", "screens", "antenna", "epochs", "rate", "ok_rate", "n_used", "sigma_p50_m")
+_OF_EFFECT: Final = (
+    "choice", "screens", "sources", "antenna", "epochs", "rate", "ok_rate", "n_used", "sigma_p50_m", "normalised_p95",
+)  # fmt: skip
 _OF_SCORE: Final = ("positions", "mean_m", "std_m", "p50_m", "p95_m", "max_m", "wrong_place")
 
 
@@ -116,6 +132,15 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {name: chosen for name, chosen in named.items() if first[chosen] == name}
 
 
+def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
+    """Choices of the filter's sources by name: all that are there, all but each; codes are always used."""
+    absent = [source for name, source in _SENSORS.items() if getattr(inputs, name) is None]
+    there = tuple(source for source in sources if source not in absent)
+    return {FILTER: there} | {
+        f"{FILTER} without {name}": tuple(other for other in there if other != name) for name in there if name != "code"
+    }
+
+
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Active screens that can work in this run, and one sentence on each that cannot."""
     setup = ScreenSetup(
@@ -140,8 +165,9 @@ def ablate_files(
 ) -> Ablation:
     """Process the logs with every choice of screens, and write the rates and errors of each.
 
-    The logs are read once. ``ablation.csv`` has a row per choice and antenna, ``ablation.json`` also the content of
-    ``run.json``.
+    With ``config.filter = "track"`` the filter along the track has rows too: with everything that is there, and
+    without each of its sources, all screens on. The logs are read once. ``ablation.csv`` has a row per choice and
+    antenna, ``ablation.json`` also the content of ``run.json``.
 
     Parameters
     ----------
@@ -171,25 +197,31 @@ def ablate_files(
         truth = None if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs))
         navigation, line, logs = open_inputs(inputs, options)
         screens, left_out = judging_screens(config, line.trajectories)
-        processors = {
-            name: processor_of(
-                # protection levels are not part of the result
-                config.model_copy(update={"screens": chosen, "protection": "off"}),
-                navigation,
-                line.trajectories,
-            )
-            for name, chosen in choices(screens).items()
-        }
+        # protection levels are not part of the result
+        plain = config.model_copy(update={"protection": "off", "filter": "off"})
+        settings = {name: plain.model_copy(update={"screens": chosen}) for name, chosen in choices(screens).items()}
+        if config.filter == "track":
+            filtered = plain.model_copy(update={"filter": "track", "screens": screens})
+            settings |= {
+                name: filtered.model_copy(update={"filter_sources": chosen})
+                for name, chosen in filter_choices(inputs, config.filter_sources).items()
+            }
+        processors = {name: processor_of(chosen, navigation, line.trajectories) for name, chosen in settings.items()}
+        sensors = read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
+        received = np.datetime64("NaT", "ns")
         states = dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}
         parts: dict[tuple[str, str], list[dict[str, Floats]]] = {}
         for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+            end = max(part.time[-1] for part in chunk.values() if len(part))
+            since = until(sensors, received, end)
+            received = end
             for name, processor in processors.items():
-                result, states[name] = processor.process(chunk, states[name])
+                result, states[name] = processor.process(chunk, states[name], sensors=since)
                 tallies[name].add(result)
                 for antenna, positions in result.antennas.items():
                     reference = None if truth is None else truth[antenna]
-                    columns = _columns(positions, reference, line.trajectories[antenna])
+                    columns = _columns(positions, result.fusion.get(antenna), reference, line.trajectories[antenna])
                     parts.setdefault((name, antenna), []).append(columns)
             check_same_day(navigation, tallies[NONE])
             check_same_place(tallies[NONE], antennas="all")
@@ -200,7 +232,7 @@ def ablate_files(
         check_same_place(tallies[NONE])
         check_positions(tallies[NONE])
         effects = tuple(
-            _effect(name, processor.config.screens, antenna, parts[name, antenna])
+            _effect(name, processor.config, antenna, parts[name, antenna])
             for antenna in inputs.logs
             for name, processor in processors.items()
         )
@@ -230,24 +262,32 @@ def ablate_files(
     return Ablation(effects=effects, notes=notes, files=files, wall_s=wall)
 
 
-def _columns(result: AntennaResult, reference: AntennaReference | None, trajectory: Trajectory) -> dict[str, Floats]:
-    """Columns of one chunk of one antenna from which the effect is computed."""
+def _columns(
+    result: AntennaResult, track: AlongTrack | None, reference: AntennaReference | None, trajectory: Trajectory
+) -> dict[str, Floats]:
+    """Columns of one chunk of one antenna from which the effect is computed: of the filter where it runs."""
     counted = result.status != Status.NO_OBSERVATION
+    without = ~counted
+    if track is None:
+        arc, sigma, ok = result.arc_m, result.along_sigma_m, result.status == Status.OK
+    else:
+        arc = np.where(np.isfinite(track.chainage_m), track.tracked.arc_m, np.nan)
+        sigma, ok = track.tracked.sigma_m, track.tracked.status == TrackStatus.TRACKING
     columns = {
-        "has": np.isfinite(result.arc_m).astype(np.float64),
-        "ok": (result.status == Status.OK).astype(np.float64),
+        "has": np.isfinite(arc).astype(np.float64),
+        "ok": ok.astype(np.float64),
         "n_used": result.n_used.astype(np.float64),
-        "sigma_m": result.along_sigma_m,
+        "sigma_m": sigma,
     }
     if reference is not None:
         place = interpolate_reference(result.time, reference.time, reference.ecef_m)
-        counted = counted & np.isfinite(place[:, 0])
-        columns["error_m"] = along_track_error(result.arc_m, place, trajectory)
+        counted, without = counted & np.isfinite(place[:, 0]), without & np.isfinite(place[:, 0])
+        columns["error_m"] = along_track_error(arc, place, trajectory)
         columns["conventional_m"] = along_track_error(result.conventional_arc_m, place, trajectory)
-    return columns | {"counted": counted.astype(np.float64)}
+    return columns | {"counted": counted.astype(np.float64), "without": without.astype(np.float64)}
 
 
-def _effect(choice: str, screens: tuple[str, ...], antenna: str, parts: Sequence[Mapping[str, Floats]]) -> Effect:
+def _effect(choice: str, config: Config, antenna: str, parts: Sequence[Mapping[str, Floats]]) -> Effect:
     """Effect of one choice on one antenna, from the columns of all chunks.
 
     Raises
@@ -261,21 +301,28 @@ def _effect(choice: str, screens: tuple[str, ...], antenna: str, parts: Sequence
         raise MismatchError(f"the truth and the {antenna} log have no time in common; give that of the same run")
     has, ok = counts & (columns["has"] > 0), counts & (columns["ok"] > 0)
     figures: dict[str, Score] = {}
+    normalised = float("nan")
     if "error_m" in columns:
-        error = columns["error_m"]
+        error, without = columns["error_m"], columns["without"] > 0
         figures = {
             "coordinates": score(error, counts),
             "ok": score(np.where(ok, error, np.nan), counts),
             "conventional": score(columns["conventional_m"], counts),
         }
+        if without.any():
+            figures["outage"] = score(error, without)
+        ratio = np.abs(error / columns["sigma_m"])[(counts | without) & np.isfinite(error)]
+        normalised = float(np.percentile(ratio, 95.0)) if len(ratio) else normalised
     return Effect(
         choice=choice,
-        screens=screens,
+        screens=config.screens,
+        sources=config.filter_sources if config.filter == "track" else (),
         antenna=antenna,
         epochs=int(counts.sum()),
         rate=float(has.sum() / counts.sum()),
         ok_rate=float(ok.sum() / counts.sum()),
         n_used=float(columns["n_used"][counts].mean()),
         sigma_p50_m=float(np.median(columns["sigma_m"][has])) if has.any() else float("nan"),
+        normalised_p95=normalised,
         **figures,
     )

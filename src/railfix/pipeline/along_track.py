@@ -109,7 +109,9 @@ def along_track(
         Of the sensors on board since the chunk before.
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
-    sensors, kept = sensor_epochs(samples, epochs.time, trajectory, state.sensors, limits=config.sensors)
+    sensors, kept = sensor_epochs(
+        samples, epochs.time, trajectory, state.sensors, limits=config.sensors, sources=config.filter_sources
+    )
     tracked, after = track(epochs, Line.of(trajectory), state.track, limits=config.tracking, sensors=sensors)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
@@ -156,6 +158,7 @@ def gnss_epochs(
         frequency = carrier_frequency_hz(obs.satellite, obs.signal, channels)
         slips, after = find_slips(obs, state, frequency_hz=frequency, limits=config.slips)
     healthy = (ranges.reason & ~int(_WEIGHED_BY_FILTER)) == 0
+    phases, dopplers = ("phase" in config.filter_sources, "doppler" in config.filter_sources)
     no_delay = np.zeros(ranges.code_m.shape)
     phase = corrected_phase_m(
         slips.phase_m[:, columns], ranges.satellites.clock_m, no_delay, np.nan_to_num(ranges.troposphere_m)
@@ -168,9 +171,9 @@ def gnss_epochs(
         sat_velocity_mps=ranges.satellites.velocity_ecef_mps,
         code_m=np.where(healthy, ranges.corrected_code_m, np.nan),
         code_sigma_m=ranges.sigma_m * noise_scale[:, None],
-        phase_m=np.where(healthy, phase, np.nan),
+        phase_m=np.where(healthy & phases, phase, np.nan),
         phase_joined=~slips.slip[:, columns],
-        rate_mps=np.where(healthy, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
+        rate_mps=np.where(healthy & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
         cn0_dbhz=ranges.cn0_dbhz,
     )
     return epochs, after

@@ -55,6 +55,10 @@ DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
 }
 
 
+#: Measurements that the filter along the track can use, as its column `sources` names them.
+FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force"]
+FILTER_SOURCES: Final[tuple[FilterSource, ...]] = ("code", "phase", "doppler", "wheel", "radar", "force")
+
 #: Names of the screens, in the order in which they judge.
 SCREEN_NAMES: Final = tuple(screen.name for screen in SCREENS)
 
@@ -176,6 +180,9 @@ class Config(ScreenSettings):
     filter : {"track", "off"}
         Whether epochs also go through one filter along the track (codes, Dopplers, changes of the carrier phase and
         sensors, from this and earlier epochs), into a table of its own. `railfix run` and `railfix demo` ask for it.
+    filter_sources : tuple of str
+        Measurements that the filter uses, where they are there: `code`, `phase` and `doppler` of the satellites, and
+        `wheel`, `radar`, `force` of the sensors on board.
     tracking : TrackingLimits
         Noise of motion and measurements of that filter.
     sensors : SensorLimits
@@ -219,6 +226,7 @@ class Config(ScreenSettings):
     continuity: ContinuityLimits = ContinuityLimits()
     phase: PhaseLimits = PhaseLimits()
     filter: Literal["track", "off"] = "off"
+    filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()
     sensors: SensorLimits = SensorLimits()
     clock_offsets: ClockOffsetLimits = ClockOffsetLimits()
@@ -250,6 +258,13 @@ class Config(ScreenSettings):
         if len(set(value)) != len(value):
             raise ValueError("name each screen once")
         return tuple(name for name in SCREEN_NAMES if name in value)
+
+    @field_validator("filter_sources")
+    @classmethod
+    def _codes_and_each_once(cls, value: tuple[FilterSource, ...]) -> tuple[FilterSource, ...]:
+        if "code" not in value or len(set(value)) != len(value):
+            raise ValueError("name each measurement once, code among them: places are sought by codes")
+        return tuple(name for name in FILTER_SOURCES if name in value)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, TypeVar
 
@@ -73,6 +74,7 @@ def sensor_epochs(
     state: SensorState,
     *,
     limits: SensorLimits,
+    sources: Container[str] = ("wheel", "radar", "force"),
 ) -> tuple[SensorEpochs, SensorState]:
     """Return ways and forces between the epochs, and the samples to keep.
 
@@ -86,6 +88,8 @@ def sensor_epochs(
         Tells which way the front points.
     state : SensorState
     limits : SensorLimits
+    sources : container of str
+        Which of `wheel`, `radar` and `force` are wanted.
     """
     samples = samples or SensorSamples()
     pulses = _together(state.samples.tachometer, samples.tachometer)
@@ -100,7 +104,7 @@ def sensor_epochs(
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     values: dict[str, Any] = {}
-    if len(pulses):
+    if len(pulses) and "wheel" in sources:
         way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
         known = usable & (edges[:-1] >= pulses.time[0]) & ~_slow(way, span, limits) & ~_faulty(pulses, edges)
         quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
@@ -109,12 +113,12 @@ def sensor_epochs(
             "wheel_sigma_m": np.full(len(time), np.hypot(limits.wheel_sigma_m, quantum)),
             "wheel_sign": "unknown" if (pulses.direction == 0).all() else "measured",
         }
-    if len(radar):
+    if len(radar) and "radar" in sources:
         mean, share = _mean_between(radar.time, radar.speed_mps, edges)
         known = usable & (share >= _COMPLETE)
         sigma = limits.radar_sigma_mps * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
         values |= {"radar_m": np.where(known, facing * mean * span, np.nan), "radar_sigma_m": sigma}
-    if len(inertial):
+    if len(inertial) and "force" in sources:
         mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
         known = usable & (share >= _COMPLETE)
         values |= {
