@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli import app
-from railfix.io import rinex
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.io import read_any_positions, rinex
 
 pytestmark = pytest.mark.requirement("A8")
 RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
@@ -55,14 +56,9 @@ def test_a_run_on_a_receiver_log(recordings: Path, tmp_path: Path) -> None:
     place = railfix.read_observations(log)
     assert len(place) == 562
     line = tmp_path / "line.csv"
-    from railfix.io.receiver import ubx
-    from railfix.io.receiver.framing import find_frames
-    from railfix.io.receiver.log import open_stream
-
-    with open_stream(log, content="bytes") as stream:
-        frames = find_frames(np.frombuffer(stream.read(), np.uint8))
-    fixes = ubx.positions(frames, place.time)
-    latitude, longitude, height = (np.median(fixes[name]) for name in ("latitude_deg", "longitude_deg", "height_m"))
+    fixes = read_any_positions(log)
+    assert (len(fixes), fixes.quality.tolist()) == (552, [5] * 552)  # from the first fix on
+    latitude, longitude, height = (np.median(v) for v in geodetic_from_ecef(fixes.ecef_m))
     rows = [f"{latitude + 2e-5 * k:.9f},{longitude + 3e-5 * k:.9f},{height:.3f}" for k in range(-100, 101)]
     line.write_text("latitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
     converted, nav = tmp_path / "log.rnx", tmp_path / "log.nav"

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 import railfix
 from railfix.cli import app
 from railfix.core.errors import ChannelsDisagreeError
+from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
-from railfix.io.receiver import ubx
-from railfix.io.receiver.framing import find_frames
+from railfix.io import read_any_positions
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
 from railfix.live.channels import TwoChannels, compare, digests
 from railfix.live.engine import LiveEngine, LiveOutput
@@ -174,9 +174,7 @@ def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> N
 
 def ubx_line(log: Path, folder: Path) -> Path:
     """A line of 1 km through the place that the receiver itself gives."""
-    data = np.frombuffer(gzip.decompress(log.read_bytes()), np.uint8)
-    fixes = ubx.positions(find_frames(data), railfix.read_observations(log).time)
-    latitude, longitude, height = (float(np.median(fixes[k])) for k in ("latitude_deg", "longitude_deg", "height_m"))
+    latitude, longitude, height = (float(np.median(v)) for v in geodetic_from_ecef(read_any_positions(log).ecef_m))
     rows = [f"{latitude + 2e-5 * k:.9f},{longitude + 3e-5 * k:.9f},{height:.3f}" for k in range(-100, 101)]
     path = folder / "line.csv"
     path.write_text("# crs: EPSG:4979\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")

@@ -1,8 +1,9 @@
-"""SBF MeasEpoch blocks, written here from a UBX log's values and read back; RTKLIB reads the same from them."""
+"""SBF blocks, written here from a UBX log's values and read back; RTKLIB reads the same from them."""
 
 from __future__ import annotations
 
 import binascii
+import gzip
 import shutil
 import struct
 import subprocess
@@ -13,8 +14,16 @@ import pytest
 
 import railfix
 from railfix.core.timescale import to_week
+from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io import rinex
+from railfix.io import read_any_positions, rinex
+from railfix.io.receiver import sbf, ubx
+from railfix.io.receiver.framing import find_frames
+from railfix.io.receiver.log import StreamState, decode
+from railfix.io.receiver.subframes import Subframes, sbas_frames
+from railfix.live.stream import ReceiverState, receive_bytes
+from railfix.ranges.sbas import from_receiver
+from railfix.ranges.sbas.messages import with_parity
 
 pytestmark = pytest.mark.requirement("A8")
 
@@ -124,3 +133,224 @@ def test_damaged_blocks_are_skipped(logged: Observations, tmp_path: Path) -> Non
     read = railfix.read_observations(path)
     assert len(read) == EPOCHS - 1
     assert read.skipped["bytes outside messages"] > 50
+
+
+# --- navigation pages ---------------------------------------------------------
+
+#: Block and source of a page by constellation and UBX signal; Galileo is E1-B and E5b.
+PAGE = {
+    ("G", 0): (4017, 0),
+    ("J", 0): (4066, 6),
+    ("E", 1): (4023, 17),
+    ("E", 5): (4023, 21),
+    ("C", 0): (4047, 28),
+    ("R", 0): (4026, 8),
+    ("S", 0): (4020, 24),
+}
+SVID = {"G": 0, "E": 70, "C": 140, "J": 180, "R": 37, "S": 100}
+
+
+def page(subframes: Subframes, row: int, time: np.datetime64, *, passed: int = 1) -> bytes:
+    """A navigation page with the bits of a subframe that UBX has."""
+    name, words = str(subframes.satellite[row]), subframes.words[row]
+    kind, source = PAGE[name[0], int(subframes.signal[row])]
+    bits = np.unpackbits(words.astype(">u4").view(np.uint8)).reshape(10, 32)
+    if name[0] == "E":  # the even page's six tail bits and the padding left out
+        pages = bits.reshape(-1)
+        bits = np.concatenate([pages[:114], pages[128:248], np.zeros(22, np.uint8)])
+    elif name[0] == "C":
+        bits = np.concatenate([bits[:, 2:].reshape(-1), np.zeros(20, np.uint8)])
+    length = 3 if name[0] == "R" else 8 if name[0] in "ES" else 10
+    content = np.packbits(bits.reshape(-1)[: 32 * length]).view(">u4").astype("<u4").tobytes()
+    week, second = to_week(time)
+    channel = int(subframes.glonass_channel[row]) + 8 if name[0] == "R" else 0
+    head = (round(float(second) * 1000), int(week), SVID[name[0]] + int(name[1:]), passed, 0, source, channel, 0)
+    return block(kind, struct.pack("<IHBBBBBB", *head) + content)
+
+
+def cold_start(recordings: Path) -> np.ndarray:
+    path = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
+    return np.frombuffer(gzip.decompress(path.read_bytes()), np.uint8)
+
+
+def sbf_of_ubx(data: np.ndarray, observations: Observations) -> bytes:
+    """The log as SBF: a MeasEpoch for each RXM-RAWX, a page for each RXM-SFRBX, in the same order."""
+    frames = find_frames(data)
+    subframes = ubx.sfrbx_subframes(frames)
+    epochs_at = frames.frame_start[frames.of("ubx", ubx.RXM_RAWX)]
+    parts = [(int(at), meas_epoch(observations, k)) for k, at in enumerate(epochs_at[: len(observations)].tolist())]
+    for row in range(len(subframes)):
+        if (subframes.satellite[row][:1], int(subframes.signal[row])) in PAGE:
+            before = int(np.searchsorted(epochs_at, subframes.order[row])) - 1
+            time = observations.time[min(max(before, 0), len(observations) - 1)]
+            parts.append((int(subframes.order[row]), page(subframes, row, time)))
+    return b"".join(part for _, part in sorted(parts, key=lambda item: item[0]))
+
+
+@pytest.fixture(scope="module")
+def cold(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Navigation]:
+    """The cold start as SBF, and the ephemerides of the UBX log."""
+    data = cold_start(recordings)
+    source, path = tmp_path_factory.mktemp("cold") / "log.ubx", tmp_path_factory.mktemp("sbf") / "log.sbf"
+    source.write_bytes(data.tobytes())
+    path.write_bytes(sbf_of_ubx(data, railfix.read_observations(source)))
+    return path, railfix.read_navigation(source)
+
+
+def by_satellite(navigation: Navigation) -> dict[tuple[str, np.datetime64, float], dict[str, object]]:
+    records = navigation.kepler
+    names = records.__dataclass_fields__
+    return {
+        (str(records.satellite[k]), records.toe[k], float(records.iode[k])): {
+            name: getattr(records, name)[k] for name in names
+        }
+        for k in range(len(records))
+    }
+
+
+def test_ephemerides_of_pages_are_those_of_ubx(cold: tuple[Path, Navigation]) -> None:
+    """GPS and Galileo, field by field: the same subframes in both formats."""
+    path, expected = cold
+    ours, theirs = by_satellite(railfix.read_navigation(path)), by_satellite(expected)
+    assert set(ours) == set(theirs)
+    assert {key[0][0] for key in ours} == {"G", "E"}
+    assert len(ours) >= 28
+    for key, record in theirs.items():
+        for name, value in record.items():
+            assert ours[key][name] == value or (value != value and ours[key][name] != ours[key][name]), (key, name)
+
+
+def test_rtklib_reads_the_same_ephemerides(cold: tuple[Path, Navigation], tmp_path: Path) -> None:
+    """Galileo records as `convbin` writes them of the same SBF file.
+
+    RTKLIB 2.4.3 makes none from pages of GPS, and its decoder of these pages (not that of UBX) cuts off bits of af1,
+    af2, sqrt(A), i-dot and Crs: those are compared bit by bit in test_receiver_nav_messages.py.
+    """
+    program = shutil.which("convbin")
+    if program is None:
+        pytest.skip("convbin (Debian package rtklib) is not installed")
+    path, _ = cold
+    target = tmp_path / "log.nav"
+    words = [program, "-r", "sbf", "-v", "3.04", "-n", str(target), "-od", "-o", str(tmp_path / "log.obs"), str(path)]
+    subprocess.run(words, capture_output=True, check=True, timeout=60)
+    ours, theirs = by_satellite(railfix.read_navigation(path)), by_satellite(railfix.read_navigation(target))
+    assert len(theirs) >= 19
+    assert set(theirs) == {key for key in ours if key[0][0] == "E"}
+    names = ("af0_s", "eccentricity", "m0", "delta_n", "omega0", "i0", "omega", "omega_dot", "cuc", "cic", "iode")
+    for key, record in theirs.items():
+        for name in names:
+            assert ours[key][name] == pytest.approx(record[name], rel=1e-11, abs=0.0), (key, name)
+
+
+@pytest.mark.parametrize("letter", ["G", "J", "E", "C", "R", "S"])
+def test_words_of_a_page_are_those_of_ubx(letter: str) -> None:
+    """Random bits of every constellation there and back; a page whose CRC failed is left out and counted."""
+    rng = np.random.default_rng(ord(letter))
+    count = 20
+    used = {"G": 10 * [30], "J": 10 * [30], "E": 3 * [32] + [24] + 3 * [32] + [24], "C": 10 * [30], "R": [32, 32, 21]}
+    lengths = used.get(letter, 7 * [32] + [26])
+    words = np.zeros((count, 10), dtype=np.uint32)
+    left = letter in "ERS"  # bits stand at the left of a word there
+    for k, length in enumerate(lengths):
+        words[:, k] = rng.integers(0, 1 << length, count, dtype=np.uint64) << (32 - length if left else 0)
+    if letter == "E":
+        words[:, 3] &= np.uint32(0xFFFFC000)  # the tail of the even page, which SBF leaves out
+    signal = np.array([key[1] for key in PAGE if key[0] == letter], dtype=np.int64)
+    numbers = np.arange(count) % (5 if letter == "J" else 20) + (20 if letter == "S" else 1)
+    sent = Subframes(
+        satellite=np.array([f"{letter}{k:02d}" for k in numbers.tolist()]),
+        signal=signal[np.arange(count) % len(signal)],
+        glonass_channel=np.arange(count) % 14 - 7,
+        words=words,
+        order=np.arange(count),
+    )
+    time = np.datetime64("2025-05-23T13:59:00", "ns")
+    data = b"".join(page(sent, k, time, passed=int(k != 7)) for k in range(count))
+    read = sbf.navigation_subframes(find_frames(np.frombuffer(data, np.uint8)))
+    kept = np.arange(count) != 7
+    assert read.satellite.tolist() == sent.satellite[kept].tolist()
+    assert read.signal.tolist() == sent.signal[kept].tolist()
+    assert np.array_equal(read.words, words[kept])
+    assert letter != "R" or read.glonass_channel.tolist() == sent.glonass_channel[kept].tolist()
+    assert read.skipped == {"SBF navigation pages without valid CRC": 1}
+
+
+def test_sbas_messages_of_pages() -> None:
+    """GEORawL1 gives the messages that were put in, with their parity checked."""
+    rng = np.random.default_rng(3)
+    bits = rng.integers(0, 256, (6, 32), dtype=np.uint8)
+    bits[:, 0] = np.array([0x53, 0x9A, 0xC6] * 2)
+    bits[:, 1] = bits[:, 1] & 3 | 4 << 2  # type 4
+    bits = with_parity(bits)
+    words = np.zeros((6, 10), dtype=np.uint32)
+    words[:, :8] = bits.view(">u4").reshape(6, 8)
+    words[5, 3] ^= np.uint32(1)  # damaged: its parity tells
+    names = np.full(6, "S36")
+    zero = np.zeros(6, dtype=np.int64)
+    sent = Subframes(satellite=names, signal=zero, glonass_channel=zero, words=words, order=np.arange(6))
+    start = np.datetime64("2025-05-23T13:59:00", "ns")
+    data = b"".join(page(sent, k, start + np.timedelta64(k, "s")) for k in range(6))
+    read = sbf.navigation_subframes(find_frames(np.frombuffer(data, np.uint8)))
+    messages = from_receiver(sbas_frames(read, start + np.arange(6).astype("timedelta64[s]")))
+    assert (messages.prn.tolist(), messages.type.tolist()) == ([136] * 5, [4] * 5)
+    assert np.array_equal(messages.bits, bits[:5])
+    assert messages.rejected["parity"] == 1
+
+
+def test_a_stream_of_sbf_cut_anywhere_is_the_log(cold: tuple[Path, Navigation]) -> None:
+    """Epochs and records in the order of the stream, in fragments as a receiver sends them."""
+    data = cold[0].read_bytes()[:150_000]
+    whole, _ = decode(data, StreamState(), at_end=True)
+    rng = np.random.default_rng(4)
+    state, epochs, records, place = ReceiverState(), [], [], 0
+    known_at_epoch: list[int] = []
+    while place < len(data):
+        step = int(rng.integers(1, 3000))
+        items, state = receive_bytes(data[place : place + step], state)
+        place += step
+        for item in items:
+            if item.navigation is not None:
+                records += item.navigation.kepler.satellite.tolist()
+            for epoch in item.epochs:
+                epochs.append(epoch.time[0])
+                known_at_epoch.append(len(records))
+    assert np.array_equal(np.array(epochs), whole.measurements.time)
+    assert records == [record.satellite for record in whole.ephemerides.records]
+    assert known_at_epoch[0] == 0
+    assert len(set(known_at_epoch)) >= 5  # as they became complete, not all at once
+
+
+@pytest.mark.parametrize(("kind", "name"), [(4007, "PVTGeodetic"), (4006, "PVTCartesian")])
+def test_positions_of_the_receiver(tmp_path: Path, kind: int, name: str) -> None:
+    """PVT blocks serve as reference positions: RTK with fixed ambiguities has quality 1."""
+    latitude, longitude, height = 0.9, -0.04, 100.0
+    from railfix.core.geodesy import ecef_from_geodetic
+
+    ecef = ecef_from_geodetic(np.degrees(latitude), np.degrees(longitude), height)
+    place = (latitude, longitude, height) if kind == 4007 else tuple(ecef.tolist())
+    data = b""
+    for k, (mode, error) in enumerate([(4, 0), (5, 0), (1, 0), (6, 0), (10, 0), (0, 1), (4, 3)]):
+        head = struct.pack("<IHBB3df", 1000 * k, 2367, mode, error, *place, 47.0)
+        data += block(kind, head + bytes(40))
+    path = tmp_path / "log.sbf"
+    path.write_bytes(data)
+    log = read_any_positions(path)
+    assert log.quality.tolist() == [1, 2, 5, 3, 6], name
+    assert np.abs(log.ecef_m - ecef).max() < 1e-6
+    assert np.diff(log.time).tolist() == [1_000_000_000] * 4
+
+
+def test_further_antennas_and_scrambled_blocks_are_left_out(logged: Observations, tmp_path: Path) -> None:
+    """A receiver with two antennas: the main antenna's measurements alone; encrypted ones are counted."""
+    one = bytearray(meas_epoch(logged, 0))
+    first = 8 + 12  # header and head of the block
+    one[first + 1] |= 1 << 5  # the first satellite is that of the second antenna
+    scrambled = bytearray(meas_epoch(logged, 1))
+    scrambled[8 + 9] |= 0x80
+    data = b"".join(block(4027, bytes(part[8:])) for part in (one, scrambled))
+    path = tmp_path / "log.sbf"
+    path.write_bytes(data + meas_epoch(logged, 2))
+    read = railfix.read_observations(path)
+    assert len(read) == 2
+    assert read.skipped["scrambled MeasEpoch"] == 1
+    assert read.skipped["measurements of further antennas of a MeasEpoch"] == 1

@@ -20,6 +20,8 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import utc_to_gpst
 from railfix.gnss.observations import capped_problems
 from railfix.io.position_log import PositionLog, read_positions
+from railfix.io.receiver.log import head_of, is_receiver_log
+from railfix.io.receiver.positions import read_receiver_positions
 from railfix.io.text_positions import read_gpx_positions, read_novatel_positions
 
 #: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); others are 0, no position.
@@ -204,15 +206,15 @@ def read_any_positions(
 ) -> PositionLog:
     """Read a log of positions of any kind, by its ending.
 
-    NMEA (``.nmea``, ``.nma``, ``.gga``), GPX (``.gpx``), NovAtel ASCII (``.asc``, ``.ascii``, ``.gps``), else
-    `read_positions`.
+    NMEA (``.nmea``, ``.nma``, ``.gga``), GPX (``.gpx``), NovAtel ASCII (``.asc``, ``.ascii``, ``.gps``), receiver logs
+    by their content (`railfix.io.receiver.positions`), else `read_positions`.
 
     Parameters
     ----------
     path : path
     broken_lines : {"stop", "count"}
     date : datetime64, optional
-        For NMEA; see `read_nmea`.
+        For NMEA (see `read_nmea`), and UBX logs whose positions have no date.
     """
     if ending(path) in (".nmea", ".nma", ".gga"):
         return read_nmea(path, broken_lines=broken_lines, date=date)
@@ -220,4 +222,6 @@ def read_any_positions(
         return read_gpx_positions(path)
     if ending(path) in (".asc", ".ascii", ".gps"):
         return read_novatel_positions(path)
+    if ending(path) != ".csv" and is_receiver_log(head_of(path)):
+        return read_receiver_positions(path, date=date)
     return read_positions(path)

@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Bytes, Indices
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.io.receiver import rtcm, ubx
+from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import navigation_of
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, decode
@@ -60,11 +60,13 @@ def receive_bytes(data: bytes, state: ReceiverState) -> tuple[list[Received], Re
 
 
 def epoch_ends(buffer: Bytes) -> Indices:
-    """Places after the messages that complete an epoch: RXM-RAWX, and the last MSM of an epoch."""
+    """Places after the messages that complete an epoch: RXM-RAWX, MeasEpoch, and the last MSM of an epoch."""
     frames = find_frames(buffer, at_end=False)
     raw, msm = frames.of("ubx", ubx.RXM_RAWX), frames.of("rtcm3", *rtcm.MSM_NUMBERS)
     last = msm[rtcm.completes_epoch(frames, msm)]
-    return np.sort(np.concatenate([frames.end[raw] + 2, frames.end[last] + 3]))
+    return np.sort(
+        np.concatenate([frames.end[raw] + 2, frames.end[frames.of("sbf", sbf.MEAS_EPOCH)], frames.end[last] + 3])
+    )
 
 
 def _receive(data: bytes, state: ReceiverState) -> tuple[Received, ReceiverState]:

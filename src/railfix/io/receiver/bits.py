@@ -16,20 +16,6 @@ Field = tuple[int | tuple[tuple[int, int], ...], int, float, str]
 _LONGEST: Final = 62
 
 
-def unpacked(messages: Bytes) -> Bytes:
-    """Bits of messages, most significant first.
-
-    Parameters
-    ----------
-    messages : ndarray of uint8, shape (N, B)
-
-    Returns
-    -------
-    ndarray of uint8, shape (N, 8 B)
-    """
-    return np.unpackbits(messages, axis=1)
-
-
 def unsigned(bits: Bytes, first: int, length: int) -> Integers:
     """Unsigned integers from a bit field, shape (N,)."""
     if length > _LONGEST:

@@ -159,7 +159,7 @@ def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigat
 
 def _pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], dict[str, int]]:
     """Decoded pages in the order of the stream: row, satellite, number, fields."""
-    counts: dict[str, int] = {}
+    counts: dict[str, int] = dict(subframes.skipped)
     pages: list[tuple[int, str, int, Values]] = []
     letters = subframes.satellite.astype("<U1")
     for letter, decode in (("G", _lnav), ("J", _lnav), ("E", _inav), ("C", _beidou), ("R", _glonass)):

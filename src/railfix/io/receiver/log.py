@@ -18,7 +18,7 @@ from railfix.io.receiver import rtcm, sbf, ubx
 from railfix.io.receiver.ephemerides import Assembled, Unfinished, assembled, assembled_rtcm, merged, navigation_of
 from railfix.io.receiver.framing import Frames, find_frames
 from railfix.io.receiver.measurements import Measurements, Tracking, joined, observations_of
-from railfix.io.receiver.subframes import SbasFrames, sbas_frames
+from railfix.io.receiver.subframes import SbasFrames, joined_subframes, sbas_frames
 
 _BLOCK_BYTES: Final = 1 << 22
 #: Bytes in which a log must show a frame with a valid checksum to be taken for one.
@@ -132,7 +132,7 @@ def _navigation(
     frames: Frames, raw: Measurements, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
     """Ephemerides and SBAS messages of a block."""
-    subframes = ubx.sfrbx_subframes(frames)
+    subframes = joined_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     blocks = frames.of("ubx", ubx.RXM_RAWX)
     epochs_at = frames.frame_start[blocks if len(blocks) else frames.of("sbf", sbf.MEAS_EPOCH)]
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
@@ -229,6 +229,7 @@ def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 |
     whole = merged(parts)
     if not whole.records:
         raise InputFileError(
-            ", ".join(names), "holds no whole ephemeris (UBX RXM-SFRBX, RTCM 3 1019, 1020, 1042, 1044, 1046)"
+            ", ".join(names),
+            "holds no whole ephemeris (UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044, 1046)",
         )
     return navigation_of(whole, sources=names)

@@ -1,7 +1,7 @@
-"""Septentrio SBF blocks as arrays: measurements (MeasEpoch) and the receiver's own positions (PVTGeodetic).
+"""Septentrio SBF blocks as arrays: measurements, navigation pages, the receiver's own positions.
 
-Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.8
-(PVTGeodetic).
+Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
+(GPSRawCA, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, GEORawL1), 4.2.8 (PVTGeodetic, PVTCartesian).
 """
 
 from __future__ import annotations
@@ -10,15 +10,37 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Integers, Strings
+from railfix.core.arrays import Bytes, Floats, Indices, Integers, Strings
 from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP, SPEED_OF_LIGHT
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
 from railfix.io.receiver.framing import Frames
 from railfix.io.receiver.measurements import Measurements
+from railfix.io.receiver.subframes import Subframes
 from railfix.io.receiver.ubx import gathered
 
+Words = np.ndarray[tuple[int, int], np.dtype[np.uint32]]
+
 MEAS_EPOCH: Final = 4027
+PVT_CARTESIAN: Final = 4006
 PVT_GEODETIC: Final = 4007
+GPS_RAW_CA: Final = 4017
+GEO_RAW_L1: Final = 4020
+GAL_RAW_INAV: Final = 4023
+GLO_RAW_CA: Final = 4026
+BDS_RAW: Final = 4047
+QZS_RAW_L1CA: Final = 4066
+#: Navigation pages: constellation, and UBX signal number by SBF signal number (None: of all signals).
+_PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
+    GPS_RAW_CA: ("G", None),
+    QZS_RAW_L1CA: ("J", None),
+    GAL_RAW_INAV: ("E", {17: 1, 21: 5, 22: 5}),
+    BDS_RAW: ("C", {28: 0, 29: 2, 30: 4}),
+    GLO_RAW_CA: ("R", None),
+    GEO_RAW_L1: ("S", None),
+}
+#: Bits of an even page of Galileo I/NAV without its tail, and of a page of BeiDou.
+_EVEN_BITS, _BDS_BITS = 114, 300
 #: Constellation and RINEX signal by signal number.
 SIGNALS: Final = {
     0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
@@ -53,13 +75,21 @@ _OTHER: Final = np.dtype(
         ("code", "<u2"), ("carrier", "<u2"), ("doppler", "<u2"),
     ]
 )  # fmt: skip
-_PVT: Final = np.dtype(
+_PAGE: Final = np.dtype(
     [
-        ("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("latitude", "<f8"), ("longitude", "<f8"),
-        ("height", "<f8"), ("undulation", "<f4"),
+        ("tow_ms", "<u4"), ("week", "<u2"), ("sv", "u1"), ("passed", "u1"), ("viterbi", "u1"), ("source", "u1"),
+        ("channel", "u1"), ("_", "V1"), ("words", "<u4", 10),
     ]
 )  # fmt: skip
+_PVT: Final = np.dtype(
+    [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
+)
+#: RTKLIB's quality by mode of a PVT block: stand-alone, differential, fixed place, RTK fixed and float, SBAS,
+#: moving base fixed and float, PPP fixed and float.
+_QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
+#: Flag of MeasEpoch: measurements are encrypted.
+_SCRAMBLED: Final = 0x80
 #: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
 _WITHOUT_OFFSET: Final = (1, 2)
 
@@ -96,7 +126,9 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
     head = gathered(frames.data, frames.start[chosen][length >= _HEAD.itemsize], _HEAD)
     chosen = chosen[length >= _HEAD.itemsize]
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != 0xFFFF) & (head["size1"] >= 20) & (head["size2"] >= 12)
-    epochs, places, kinds, masters, broken = [], [], [], [], 0
+    scrambled = dated & (head["flags"] & _SCRAMBLED != 0)
+    dated &= ~scrambled
+    epochs, places, kinds, masters, broken, before = [], [], [], [], 0, 0
     for row in np.flatnonzero(dated).tolist():
         found = _sub_blocks(frames, int(chosen[row]), head[row])
         if found is None:
@@ -106,17 +138,24 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
         epochs.append(row)
         places.append(place)
         kinds.append(kind)
-        masters.append(master + sum(len(p) for p in places[:-1]))
-    skipped = {"broken MeasEpoch": broken, "MeasEpoch without time": int(np.count_nonzero(~dated))}
+        masters.append(master + before)
+        before += len(place)
+    skipped = {
+        "broken MeasEpoch": broken,
+        "MeasEpoch without time": int(np.count_nonzero(~dated & ~scrambled)),
+        "scrambled MeasEpoch": int(np.count_nonzero(scrambled)),
+    }
     place = np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
     kind = np.concatenate(kinds) if kinds else np.zeros(0, dtype=np.intp)
     master = np.concatenate(masters) if masters else np.zeros(0, dtype=np.intp)
     epoch = np.repeat(np.arange(len(epochs)), [len(p) for p in places]) if places else np.zeros(0, dtype=np.intp)
     rows = head[np.array(epochs, dtype=np.intp)]
-    values = _decoded(frames, place, kind, master)
+    main = frames.data[place + np.where(kind == 0, 1, 0)] >> 5 == 0 if len(place) else np.zeros(0, dtype=bool)
+    skipped["measurements of further antennas of a MeasEpoch"] = int(np.count_nonzero(~main))
+    values = {name: array[main] for name, array in _decoded(frames, place, kind, master).items()}
     return Measurements(
         time=from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),
-        epoch=epoch,
+        epoch=epoch[main],
         **values,
         receiver="Septentrio",
         skipped={what: number for what, number in skipped.items() if number},
@@ -224,15 +263,85 @@ def _frequency(name: Strings, channel: Integers) -> Floats:
     return frequency
 
 
+def navigation_subframes(frames: Frames) -> Subframes:
+    """Navigation pages, their words laid out as in UBX RXM-SFRBX.
+
+    Pages whose parity or CRC the receiver found wrong are left out and counted.
+    """
+    chosen = frames.of("sbf", *_PAGES)
+    # The shortest block (GLONASS, three words) has 24 bytes; words that a block lacks are zero.
+    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= 24]
+    data = np.concatenate([frames.data, np.zeros(_PAGE.itemsize, np.uint8)])
+    rows, kind = gathered(data, frames.start[chosen], _PAGE), frames.kind[chosen]
+    has = (frames.end - frames.start)[chosen][:, None] >= 16 + 4 * np.arange(10)
+    words = np.where(has, rows["words"], 0).astype(np.uint32)
+    satellite = _NAMES[rows["sv"]]
+    signal = np.zeros(len(chosen), dtype=np.int64)
+    known = np.zeros(len(chosen), dtype=bool)
+    for number, (letter, signals) in _PAGES.items():
+        of_kind = (kind == number) & np.char.startswith(satellite, letter)
+        if signals is None:
+            known |= of_kind
+        for theirs, ours in (signals or {}).items():
+            this = of_kind & (rows["source"] & 31 == theirs)
+            signal[this], known = ours, known | this
+    galileo, beidou = kind == GAL_RAW_INAV, kind == BDS_RAW
+    words[galileo] = _inav_words(words[galileo])
+    words[beidou] = _words_of_30(words[beidou])
+    passed = rows["passed"] != 0
+    counts = {
+        "SBF navigation pages without valid CRC": int(np.count_nonzero(known & ~passed)),
+        "SBF navigation pages of unknown satellites or signals": int(np.count_nonzero(~known)),
+    }
+    return Subframes(
+        satellite=satellite,
+        signal=signal,
+        glonass_channel=rows["channel"].astype(np.int64) - 8,
+        words=words,
+        order=frames.frame_start[chosen],
+        skipped={what: number for what, number in counts.items() if number},
+    ).take(known & passed)
+
+
+def _bits(words: Words) -> Bytes:
+    return np.unpackbits(words.astype(">u4").view(np.uint8).reshape(len(words), 40), axis=1)
+
+
+def _inav_words(words: Words) -> Words:
+    """Even and odd page in four words each, from both joined without the even page's tail."""
+    bits = _bits(words)
+    pages = np.zeros((len(words), 320), dtype=np.uint8)
+    pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]
+    pages[:, 128:248] = bits[:, _EVEN_BITS : _EVEN_BITS + 120]
+    return np.packbits(pages, axis=1).reshape(-1).view(">u4").reshape(len(words), 10).astype(np.uint32)
+
+
+def _words_of_30(words: Words) -> Words:
+    """Ten words of 30 bits, right-aligned, from 300 bits put after each other."""
+    bits = _bits(words)[:, :_BDS_BITS].reshape(-1, 10, 30).astype(np.uint32)
+    return np.asarray((bits << np.arange(29, -1, -1, dtype=np.uint32)).sum(axis=2, dtype=np.uint32))
+
+
 def positions(frames: Frames) -> dict[str, np.ndarray]:
-    """The receiver's own positions, of PVTGeodetic blocks: time, latitude, longitude [deg], ellipsoidal height [m]."""
-    chosen = frames.of("sbf", PVT_GEODETIC)
+    """The receiver's own positions: of PVTGeodetic blocks where it sends them, else of PVTCartesian.
+
+    Returns
+    -------
+    dict
+        ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts), ``sigma_m`` (shape (N, 3), NaN).
+    """
+    geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
+    chosen = frames.of("sbf", PVT_GEODETIC if geodetic else PVT_CARTESIAN)
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
     rows = gathered(frames.data, frames.start[chosen], _PVT)
-    rows = rows[(rows["error"] == 0) & (rows["mode"] & 15 != 0) & (rows["tow_ms"] != _NO_TIME)]
+    mode = rows["mode"] & 15
+    rows = rows[(rows["error"] == 0) & np.isin(mode, list(_QUALITY)) & (rows["tow_ms"] != _NO_TIME)]
+    place = rows["place"]
+    if geodetic:
+        place = ecef_from_geodetic(np.degrees(place[:, 0]), np.degrees(place[:, 1]), place[:, 2])
     return {
         "time": from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),
-        "latitude_deg": np.degrees(rows["latitude"]),
-        "longitude_deg": np.degrees(rows["longitude"]),
-        "height_m": rows["height"],
+        "ecef_m": place,
+        "quality": np.array([_QUALITY[int(m)] for m in rows["mode"] & 15], dtype=np.int64),
+        "sigma_m": np.full((len(rows), 3), np.nan),
     }

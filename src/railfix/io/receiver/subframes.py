@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,18 +12,20 @@ from railfix.core.arrays import Bytes, Datetimes, Integers, Strings
 
 @dataclass(frozen=True, kw_only=True)
 class Subframes:
-    """Raw navigation words, N rows in the order of the stream.
+    """Raw navigation words as UBX has them, N rows in the order of the stream.
 
     Attributes
     ----------
     satellite : ndarray of str, shape (N,)
     signal : ndarray of int, shape (N,)
-        Signal number of the receiver (UBX sigId).
+        Signal number (UBX sigId; other formats are translated to it).
     glonass_channel : ndarray of int, shape (N,)
     words : ndarray of uint32, shape (N, 10)
         Words of 30 or 32 bits, right-aligned; unused ones 0.
     order : ndarray of int, shape (N,)
         Place in the stream, to tell which epoch came before.
+    skipped : mapping of str to int
+        Pages left out, by reason.
     """
 
     satellite: Strings
@@ -30,14 +33,10 @@ class Subframes:
     glonass_channel: Integers
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
     order: Integers
+    skipped: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.satellite)
-
-    def of(self, letters: str) -> Subframes:
-        """The rows of some constellations."""
-        chosen = np.isin(self.satellite.astype("<U1"), list(letters)) & (self.satellite != "")
-        return self.take(chosen)
 
     def take(self, rows: Integers | np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Subframes:
         """Some of the rows."""
@@ -47,7 +46,20 @@ class Subframes:
             glonass_channel=self.glonass_channel[rows],
             words=self.words[rows],
             order=self.order[rows],
+            skipped=self.skipped,
         )
+
+
+def joined_subframes(first: Subframes, second: Subframes) -> Subframes:
+    """Subframes of two formats of one stream, in its order."""
+    if not len(second) and not second.skipped:
+        return first
+    arrays = ("satellite", "signal", "glonass_channel", "words", "order")
+    both = Subframes(
+        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in arrays},
+        skipped={**first.skipped, **second.skipped},
+    )
+    return both.take(np.argsort(both.order, kind="stable"))
 
 
 @dataclass(frozen=True, kw_only=True)

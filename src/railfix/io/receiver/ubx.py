@@ -9,8 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Strings
-from railfix.core.timescale import from_week
+from railfix.core.arrays import Bytes, Strings
+from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.timescale import from_week, nearest_week
 from railfix.io.receiver.framing import Frames
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.subframes import Subframes
@@ -84,7 +85,12 @@ _RAWX_HEADER: Final = np.dtype(
 _PVT: Final = np.dtype(
     [
         ("tow_ms", "<u4"),
-        ("calendar", "V20"),
+        ("year", "<u2"),
+        ("month", "u1"),
+        ("day", "u1"),
+        ("clock", "V3"),
+        ("valid", "u1"),
+        ("_", "V8"),
         ("fix", "u1"),
         ("flags", "u1"),
         ("flags2", "u1"),
@@ -213,50 +219,67 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
     )
 
 
-def positions(frames: Frames, epochs: Datetimes) -> dict[str, np.ndarray]:
+def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
     """The receiver's own positions: of NAV-HPPOSLLH where it is sent, else of NAV-PVT.
 
     Parameters
     ----------
     frames : Frames
-    epochs : ndarray of datetime64[ns]
-        Times of the log; the messages carry the time of week only.
+    near : datetime64[ns]
+        A time within half a week where no NAV-PVT with a date comes before (`date_of`); NaT: without it there is no
+        position.
 
     Returns
     -------
     dict
-        ``time``, ``latitude_deg``, ``longitude_deg``, ``height_m`` (ellipsoidal), ``sigma_m`` (horizontal), ``fixed``.
+        ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts, of the NAV-PVT of the same instant; 5
+        without one), ``sigma_m`` (shape (N, 3), north, east, up).
     """
+    coarse = frames.of("ubx", NAV_PVT)
+    coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]
+    pvt = gathered(frames.data, frames.start[coarse], _PVT)
+    fixed = (pvt["flags"] & 1 == 1) & np.isin(pvt["fix"], [2, 3, 4])
+    carrier = pvt["flags"] >> 6
+    quality = np.where(carrier > 0, 3 - carrier.astype(np.int64), np.where(pvt["flags"] & 2 != 0, 4, 5))
     fine = frames.of("ubx", NAV_HPPOSLLH)
     fine = fine[frames.end[fine] - frames.start[fine] == _HPPOSLLH.itemsize]
     if len(fine):
         rows = gathered(frames.data, frames.start[fine], _HPPOSLLH)
-        valid = rows["flags"] & 1 == 0
+        kept = rows["flags"] & 1 == 0
         latitude = rows["latitude"] * 1e-7 + rows["latitude_fine"] * 1e-9
         longitude = rows["longitude"] * 1e-7 + rows["longitude_fine"] * 1e-9
         height = rows["height_mm"] * 1e-3 + rows["height_fine"] * 1e-4
-        sigma = rows["horizontal"] * 1e-4
+        horizontal, vertical = rows["horizontal"] * 1e-4, rows["vertical"] * 1e-4
+        by_tow = dict(zip(pvt["tow_ms"].tolist(), np.where(fixed, quality, -1).tolist(), strict=True))
+        quality = np.array([by_tow.get(tow, 5) for tow in rows["tow_ms"].tolist()], dtype=np.int64)
+        kept &= quality > 0  # before its first fix a receiver sends places that NAV-PVT calls invalid
     else:
-        coarse = frames.of("ubx", NAV_PVT)
-        coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]
-        rows = gathered(frames.data, frames.start[coarse], _PVT)
-        valid = (rows["flags"] & 1 == 1) & np.isin(rows["fix"], [2, 3, 4])
+        rows, kept = pvt, fixed
         latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7
-        height, sigma = rows["height_mm"] * 1e-3, rows["horizontal_mm"] * 1e-3
-    rows, place = rows[valid], np.flatnonzero(valid)
+        height = rows["height_mm"] * 1e-3
+        horizontal, vertical = rows["horizontal_mm"] * 1e-3, rows["vertical_mm"] * 1e-3
+    if np.isnat(near):
+        kept = np.zeros(len(rows), dtype=bool)
+    # u-blox gives the error of the place in both horizontal directions together.
+    sigma = np.stack([horizontal / np.sqrt(2.0), horizontal / np.sqrt(2.0), vertical], axis=-1)
+    time = np.full(len(rows), np.datetime64("NaT", "ns"))
+    if kept.any():
+        time[kept] = nearest_week(rows["tow_ms"][kept] * 1e-3, np.full(int(kept.sum()), near))
     return {
-        "time": weeks_near(rows["tow_ms"].astype(np.float64) * 1e-3, epochs),
-        "latitude_deg": latitude[place],
-        "longitude_deg": longitude[place],
-        "height_m": height[place],
-        "sigma_m": sigma[place],
+        "time": time[kept],
+        "ecef_m": ecef_from_geodetic(latitude, longitude, height)[kept],
+        "quality": quality[kept],
+        "sigma_m": sigma[kept],
     }
 
 
-def weeks_near(seconds_of_week: np.ndarray, epochs: Datetimes) -> Datetimes:
-    """Times of week as instants of the week nearest to a log's epochs."""
-    from railfix.core.timescale import nearest_week
-
-    if not len(epochs):
-        return np.full(len(seconds_of_week), np.datetime64("NaT", "ns"))
-    return nearest_week(seconds_of_week, np.full(len(seconds_of_week), epochs[len(epochs) // 2]))
+def date_of(frames: Frames) -> np.datetime64:
+    """Day of the last NAV-PVT with a valid date (UTC, which is near enough to resolve weeks); NaT without one."""
+    chosen = frames.of("ubx", NAV_PVT)
+    chosen = chosen[frames.end[chosen] - frames.start[chosen] >= _PVT.itemsize]
+    rows = gathered(frames.data, frames.start[chosen], _PVT)
+    rows = rows[rows["valid"] & 3 == 3]
+    if not len(rows):
+        return np.datetime64("NaT", "ns")
+    last = rows[-1]
+    return np.datetime64(f"{int(last['year']):04d}-{int(last['month']):02d}-{int(last['day']):02d}", "ns")

@@ -199,7 +199,7 @@ def read_sbas(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines
     ----------
     paths : path or sequence of paths
         RTKLIB (.sbs), EGNOS message server (.ems), RINEX broadcast data (type B) or a receiver's log (UBX with
-        RXM-SFRBX of SBAS), recognised by their content; plain, gzip or compress.
+        RXM-SFRBX of SBAS, SBF with GEORawL1), recognised by their content; plain, gzip or compress.
     broken_lines : {"stop", "count"}
         A line that is no message stops the reading, or is counted under "line" in `rejected` and
         named in `notes`. A message whose parity or preamble is wrong was damaged on its way: it is
