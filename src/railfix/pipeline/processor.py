@@ -8,7 +8,7 @@ any cutting gives the same results.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from railfix.pipeline.along_track import AlongTrack, FilterState, along_track
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.compared import ChunkSteps, PlacedRanges, PositionVerdict, Published
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.received import Received, known_from_start, receive
@@ -29,7 +30,15 @@ from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
 from railfix.ranges.sbas import SbasMessages
-from railfix.screens import SCREENS, ObservationScreen, PairedEpochs, PairScreen, PositionScreen, ScreenSetup
+from railfix.screens import (
+    SCREENS,
+    ObservationScreen,
+    PairedEpochs,
+    PairScreen,
+    PositionScreen,
+    ScreenSetup,
+    Verdict,
+)
 from railfix.screens.pairs import on_pairs, pair_antennas
 from railfix.track.trajectory import Trajectory
 
@@ -160,40 +169,46 @@ class EpochProcessor:
             navigation=navigation,
             messages=messages,
         )
-        after = dict(state.antennas)
-        ranges: dict[str, CorrectedRanges] = {}
-        for name, part in observations.items():
-            ranges[name], after[name] = self._screened(name, part, received, after.get(name, AntennaState()))
-        pair = self._pair(ranges)
-        if pair is not None:
-            ranges = self._pair_screened(pair, ranges)
-        predicted: Mapping[str, PredictedPlace] = {}  # by antenna; from the filter along the track, once there is one
-        solutions: dict[str, Solution] = {}
-        for name, corrected in ranges.items():
-            ranges[name], solutions[name], after[name] = solve(
-                corrected, self._index[name], self.config, after[name], predicted=predicted.get(name)
+        chunks = {
+            name: AntennaChunk(
+                self,
+                name,
+                part,
+                received,
+                state.antennas.get(name, AntennaState()),
+                state.fusion.get(name, FilterState()),
+                sensors,
             )
-        if pair is not None:
-            ranges, solutions = self._positions_screened(pair, ranges, solutions)
-        results = {
-            name: antenna_result(corrected, self.trajectories[name], solutions[name], self.config)
-            for name, corrected in ranges.items()
+            for name, part in observations.items()
         }
-        tracks: dict[str, AlongTrack] = {}
-        filters = dict(state.fusion)
-        for name, corrected in ranges.items() if self.config.filter == "track" else ():
-            tracks[name], filters[name] = along_track(
-                corrected,
-                solutions[name].noise_scale,
-                self.trajectories[name],
-                received.navigation,
-                self.config,
-                filters.get(name, FilterState()),
-                samples=sensors,
-            )
-        notes = (*received.notes, *self._lacking)
-        result = Result(antennas=results, notes=notes, fusion=tracks)
-        return result, State(antennas=after, received=received, fusion=filters)
+        self.compare(chunks)
+        results = {name: chunk.finished() for name, chunk in chunks.items()}
+        tracks = {name: chunk.tracked for name, chunk in chunks.items() if chunk.tracked is not None}
+        result = Result(antennas=results, notes=(*received.notes, *self._lacking), fusion=tracks)
+        after = State(
+            antennas={**state.antennas, **{name: chunk.state for name, chunk in chunks.items()}},
+            received=received,
+            fusion={**state.fusion, **{name: chunks[name].filter_state for name in tracks}},
+        )
+        return result, after
+
+    def compare(self, chunks: Mapping[str, ChunkSteps]) -> None:
+        """Take the same chunk of all antennas through the screens that compare them, up to their last step.
+
+        Parameters
+        ----------
+        chunks : mapping of str to ChunkSteps
+            By antenna. Those of other processes come last: they work while this one does.
+        """
+        ranges = {name: chunk.screened() for name, chunk in chunks.items()}
+        pair = self._pair(ranges)
+        verdicts = self._pair_verdicts(pair, ranges)
+        for name, chunk in chunks.items():
+            chunk.judge(verdicts.get(name, ()))
+        published = {name: chunk.solved() for name, chunk in chunks.items()}
+        checks = self._position_verdicts(pair, published)
+        for name, chunk in chunks.items():
+            chunk.check(checks.get(name, ()))
 
     def _screened(
         self, name: str, obs: Observations, received: Received, state: AntennaState
@@ -217,7 +232,7 @@ class EpochProcessor:
             state = replace(state, carrier=carrier)
         return ranges, state
 
-    def _pair(self, ranges: Mapping[str, CorrectedRanges]) -> PairedEpochs | None:
+    def _pair(self, ranges: Mapping[str, PlacedRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
         if len(ranges) < 2 or not self._setup.spacing_known:
             return None
@@ -231,34 +246,106 @@ class EpochProcessor:
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )
 
-    def _pair_screened(self, pair: PairedEpochs, ranges: Mapping[str, CorrectedRanges]) -> dict[str, CorrectedRanges]:
-        """Return the ranges of both antennas after the screens of their common observations."""
-        judged = dict(ranges)
+    def _pair_verdicts(
+        self, pair: PairedEpochs | None, ranges: Mapping[str, PlacedRanges]
+    ) -> dict[str, tuple[Verdict, ...]]:
+        """Return the verdicts of the screens of common observations, by antenna."""
+        verdicts: dict[str, tuple[Verdict, ...]] = {}
         for screen, limits in self._screens:
-            if isinstance(screen, PairScreen):
-                verdicts = screen.judge(judged["front"], judged["rear"], pair, limits)
-                judged = {name: corrected.judged(verdicts[name]) for name, corrected in judged.items()}
-        return judged
+            if pair is not None and isinstance(screen, PairScreen):
+                for name, more in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
+                    verdicts[name] = (*verdicts.get(name, ()), *more)
+        return verdicts
 
-    def _positions_screened(
-        self, pair: PairedEpochs, ranges: Mapping[str, CorrectedRanges], solutions: Mapping[str, Solution]
-    ) -> tuple[dict[str, CorrectedRanges], dict[str, Solution]]:
-        """Return ranges and solutions after the screens of the published positions; both antennas get the status."""
-        judged, checked = dict(ranges), dict(solutions)
-        chainage = {name: self.trajectories[name].chainage_at(solution.arc_m) for name, solution in solutions.items()}
+    def _position_verdicts(
+        self, pair: PairedEpochs | None, published: Mapping[str, Published]
+    ) -> dict[str, tuple[PositionVerdict, ...]]:
+        """Return the verdicts of the screens of the published positions, by antenna; both antennas get the status."""
+        checks: dict[str, tuple[PositionVerdict, ...]] = {}
         for screen, limits in self._screens:
-            if not isinstance(screen, PositionScreen):
+            if pair is None or not isinstance(screen, PositionScreen):
                 continue
-            front, rear = chainage["front"][pair.front_epoch], chainage["rear"][pair.rear_epoch]
-            verdict = screen.judge(front, rear, pair, limits)
+            front, rear = published["front"].chainage_m, published["rear"].chainage_m
+            verdict = screen.judge(front[pair.front_epoch], rear[pair.rear_epoch], pair, limits)
             for name, epochs in (("front", pair.front_epoch), ("rear", pair.rear_epoch)):
-                status = checked[name].status
-                screened = on_pairs(verdict, status.shape, epochs, epochs)
-                doubtful = screened.reject & self._has_coordinates[status]
-                status = np.where(doubtful, int(screen.status), status).astype(np.int8)
-                judged[name] = replace(judged[name], screens={**judged[name].screens, screen.name: screened})
-                checked[name] = replace(checked[name], status=status)
-        return judged, checked
+                screened = on_pairs(verdict, published[name].chainage_m.shape, epochs, epochs)
+                checks[name] = (*checks.get(name, ()), PositionVerdict(screen.name, screened, int(screen.status)))
+        return checks
+
+
+class AntennaChunk:
+    """A chunk of one antenna: the steps between which antennas are compared (`ChunkSteps`).
+
+    Attributes
+    ----------
+    state : AntennaState
+        Before the chunk; after it once `finished` was called.
+    filter_state : FilterState
+        Likewise.
+    tracked : AlongTrack or None
+        By the filter along the track, where it is on.
+    """
+
+    def __init__(
+        self,
+        processor: EpochProcessor,
+        name: str,
+        observations: Observations,
+        received: Received,
+        state: AntennaState,
+        filter_state: FilterState,
+        sensors: SensorSamples | None,
+    ) -> None:
+        self.state, self.filter_state = state, filter_state
+        self.tracked: AlongTrack | None = None
+        self._processor, self._name, self._received, self._sensors = processor, name, received, sensors
+        self._ranges, self.state = processor._screened(name, observations, received, state)
+        self._solution: Solution | None = None
+
+    def screened(self) -> CorrectedRanges:
+        """Return the corrected ranges after the screens of this antenna alone."""
+        return self._ranges
+
+    def judge(self, verdicts: Iterable[Verdict]) -> None:
+        """Take the verdicts of the screens of common observations."""
+        self._ranges = self._ranges.judged(verdicts)
+
+    def solved(self) -> Published:
+        """Solve and return what is published of the positions."""
+        processor = self._processor
+        predicted: PredictedPlace | None = None  # from the filter along the track, once there is one
+        self._ranges, self._solution, self.state = solve(
+            self._ranges, processor._index[self._name], processor.config, self.state, predicted=predicted
+        )
+        return Published(chainage_m=processor.trajectories[self._name].chainage_at(self._solution.arc_m))
+
+    def check(self, verdicts: Iterable[PositionVerdict]) -> None:
+        """Take the verdicts of the screens of the published positions."""
+        assert self._solution is not None, "solved() comes first"
+        for verdict in verdicts:
+            status = self._solution.status
+            doubtful = verdict.screened.reject & self._processor._has_coordinates[status]
+            status = np.where(doubtful, verdict.status, status).astype(np.int8)
+            screens = {**self._ranges.screens, verdict.name: verdict.screened}
+            self._ranges = replace(self._ranges, screens=screens)
+            self._solution = replace(self._solution, status=status)
+
+    def finished(self) -> AntennaResult:
+        """Return the result of the chunk."""
+        assert self._solution is not None, "solved() comes first"
+        processor, trajectory = self._processor, self._processor.trajectories[self._name]
+        result = antenna_result(self._ranges, trajectory, self._solution, processor.config)
+        if processor.config.filter == "track":
+            self.tracked, self.filter_state = along_track(
+                self._ranges,
+                self._solution.noise_scale,
+                trajectory,
+                self._received.navigation,
+                processor.config,
+                self.filter_state,
+                samples=self._sensors,
+            )
+        return result
 
 
 def conditions_of(config: Config) -> Conditions:

@@ -1,0 +1,80 @@
+"""Steps of a chunk of one antenna, and what two antennas show each other between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Protocol
+
+from railfix.core.arrays import Bits, Datetimes, Floats, Masks, Strings
+from railfix.screens import AntennaRanges, Screened, Verdict
+
+
+class PlacedRanges(AntennaRanges, Protocol):
+    """Corrected ranges with the approximate places of the antenna."""
+
+    @property
+    def anchor_ecef_m(self) -> Floats:
+        """Approximate place, shape (T, 3) [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SentRanges:
+    """`PlacedRanges` without anything else, to be sent to another process."""
+
+    time: Datetimes
+    break_before: Masks
+    satellite: Strings
+    signal: Strings
+    frequency_hz: Floats
+    code_m: Floats
+    doppler_hz: Floats
+    cn0_dbhz: Floats
+    elevation_deg: Floats
+    azimuth_deg: Floats
+    corrected_code_m: Floats
+    sigma_m: Floats
+    reason: Bits
+    anchor_ecef_m: Floats
+
+    @classmethod
+    def of(cls, ranges: PlacedRanges) -> SentRanges:
+        """Return what `ranges` shows."""
+        return cls(**{item.name: getattr(ranges, item.name) for item in fields(cls)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Published:
+    """Positions of T epochs that are compared with those of the other antenna.
+
+    Attributes
+    ----------
+    chainage_m : ndarray, shape (T,) [m]
+        NaN where there is none.
+    """
+
+    chainage_m: Floats
+
+
+class PositionVerdict(NamedTuple):
+    """Verdict of a screen on the positions of one antenna: doubtful ones get the status."""
+
+    name: str
+    screened: Screened
+    status: int
+
+
+class ChunkSteps(Protocol):
+    """A chunk of one antenna, in this process or another one; the steps are called in this order."""
+
+    def screened(self) -> PlacedRanges:
+        """Return the corrected ranges after the screens of this antenna alone."""
+
+    def judge(self, verdicts: Iterable[Verdict]) -> None:
+        """Take the verdicts of the screens of common observations."""
+
+    def solved(self) -> Published:
+        """Solve and return what is published of the positions."""
+
+    def check(self, verdicts: Iterable[PositionVerdict]) -> None:
+        """Take the verdicts of the screens of the published positions."""
