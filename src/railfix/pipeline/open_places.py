@@ -1,87 +1,298 @@
-"""Other places of the line that the ranges leave open at the risk of the protection level.
+"""Other places of the line that the hypotheses of a level leave open.
 
-A level is a distance around one place. Where another branch, the next track or another pass of the line explains the
-ranges as well, without a fault or with a fault in any one satellite, the error can be the distance between the two: the
-level must reach that far, or the status must name it.
+A level is linear: it bounds the error along the tangent at the position. Where the line turns away, passes itself or
+branches, a satellite left out can move the position to a place that no tangent leads to. Under each hypothesis
+of the level (no fault, one faulty satellite, two) the weighted sum of squared residuals is a quadratic form in the
+place, which is evaluated along the line around the position.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Final
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import ndtr
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.protection import RiskBudget
-from railfix.integrity.raim import LinearModel, constrained_model
+from railfix.integrity.protection.risk import one_sided_k
+from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact, compact
-from railfix.pipeline.config import Config
-from railfix.pipeline.solve import Place
-from railfix.positioning.constrained import constrained_position
-from railfix.positioning.normal_equations import Ranges
-from railfix.track.trajectory import Trajectory
+from railfix.positioning.normal_equations import inverse_3x3
+from railfix.positioning.section_search import SearchIndex
+
+#: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
+_ALONG: Final = 0.9945
+#: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
+_FURTHEST_M: Final = 5000.0
+#: Share of the risk of a sample below which places are not looked for.
+_NEGLIGIBLE: Final = 0.01
+#: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
+_BLOCK_SIZE: Final = 300_000
+
+
+@dataclass(frozen=True)
+class _Forms:
+    """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
+
+    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position.
+    """
+
+    prior: Floats  # (T, K)
+    constant: Floats  # (T, K)
+    slope: Floats  # (T, K, 3) [1/m]
+    matrix: Floats  # (T, K, 3, 3) [1/m^2]
+
+    def take(self, epochs: Indices) -> _Forms:
+        """Return the forms of some epochs, by index."""
+        return _Forms(self.prior[epochs], self.constant[epochs], self.slope[epochs], self.matrix[epochs])
+
+    def coefficients(self) -> Floats:
+        """Return the coefficients of the monomials of `_Sections.monomials`, shape (T, 10, K)."""
+        of_squares = [self.matrix[..., i, i] for i in range(3)]
+        of_products = [2.0 * self.matrix[..., i, j] for i, j in ((0, 1), (0, 2), (1, 2))]
+        return np.stack([self.constant, *np.moveaxis(-2.0 * self.slope, 2, 0), *of_squares, *of_products], axis=1)
+
+    def radius_m(self, risk: float) -> Floats:
+        """Return the distance from the position within which all open places lie, shape (T,); `_FURTHEST_M` at most.
+
+        Places further away have a hundredth of the risk at most.
+        """
+        covariance = inverse_3x3(self.matrix)
+        centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
+        form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
+        # The trace of a covariance is above its largest eigenvalue.
+        widest = np.trace(covariance, axis1=2, axis2=3)
+        total = self.prior.sum(axis=1, keepdims=True)
+        sigmas = np.maximum(one_sided_k(_NEGLIGIBLE * risk / np.where(total > 0, total, 1.0)), 0.0)
+        radius = np.linalg.norm(centre, axis=2) + np.sqrt((form + sigmas**2) * widest)
+        radius = np.where(self.prior > 0, np.nan_to_num(radius, nan=_FURTHEST_M), 0.0)
+        return np.asarray(np.minimum(radius.max(axis=1), _FURTHEST_M))
+
+
+@dataclass(frozen=True)
+class _Sections:
+    """Sections of the line around the positions: P pairs of an epoch and a section, sorted by epoch."""
+
+    epoch: Indices  # (P,)
+    start_m: Floats  # (P, 3) first point, along, across and up from the position
+    tangent: Floats  # (P, 3)
+    length_m: Floats  # (P,)
+    beyond: Masks  # (P,) with a part beyond the level that the tangent does not lead to
+
+    def take(self, pairs: Masks | Indices) -> _Sections:
+        """Return some of the sections."""
+        return _Sections(
+            self.epoch[pairs], self.start_m[pairs], self.tangent[pairs], self.length_m[pairs], self.beyond[pairs]
+        )
+
+    def monomials(self) -> Floats:
+        """Return the monomials of q at the start, of its slope and of its curvature along each section, (P, 3, 10)."""
+        (x, y, z), (a, b, c) = self.start_m.T, self.tangent.T
+        none, one = np.zeros(len(x)), np.ones(len(x))
+        start = [one, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
+        slope = [none, a, b, c, 2 * x * a, 2 * y * b, 2 * z * c, x * b + y * a, x * c + z * a, y * c + z * b]
+        curvature = [none, none, none, none, a * a, b * b, c * c, a * b, a * c, b * c]
+        return np.moveaxis(np.array([start, slope, curvature]), 2, 0)
 
 
 def places_beyond_the_level(
-    ranges: Ranges,
-    trajectory: Trajectory,
-    place: Place,
+    index: SearchIndex,
+    arc_m: Floats,
     model: LinearModel,
     level_m: Floats,
     scale: Floats,
     systems: Sequence[str],
     risk: RiskBudget,
-    config: Config,
+    rows: Indices,
 ) -> Masks:
-    """Return the epochs whose best other place is open at the level's risk and beyond the level, shape (T,).
+    """Return the epochs with places of the line that are open beyond the level, shape (T,).
 
-    Leaving out satellite i lowers the sum of squares at a place by ``nu_i^2 / S_ii``. The other place is open where it
-    fits worse than the best one by no more than noise explains with the risk of a sample over the prior of the
-    hypothesis: none, or a fault of one satellite.
+    Under a hypothesis J, a place that fits worse than the best place of the line by x variances is the true one with a
+    probability of ``Q(sqrt(x))`` at most. An epoch is returned where these probabilities, of the best place beyond
+    the level, times the prior of J, add up to more than the risk of a sample. Where the line is straight, the level
+    keeps this sum within the risk.
 
     Parameters
     ----------
-    ranges : Ranges
-    trajectory : Trajectory
-    place : Place
-        Its `section.other_vertex` is the other place.
+    index : SearchIndex
+        Of the trajectory.
+    arc_m : ndarray, shape (T,) [m]
+        Positions.
     model : LinearModel
         Of the positions.
     level_m : ndarray, shape (T,) [m]
     scale : ndarray, shape (T,)
-        Noise scale.
+        Noise scale, taken as 1 at least.
     systems : sequence of str
         Constellation letter of each channel.
     risk : RiskBudget
-    config : Config
+    rows : ndarray of int
+        Epochs to look at; those without a finite level are left out.
     """
-    beyond = np.zeros(len(ranges), dtype=bool)
-    arc, other = place.constrained.arc_m, place.section.other_vertex
-    rows = np.flatnonzero((other >= 0) & np.isfinite(arc) & np.isfinite(model.wsse))
+    result = np.zeros(len(arc_m), dtype=bool)
+    rows = rows[np.isfinite(level_m[rows]) & np.isfinite(arc_m[rows]) & np.isfinite(model.wsse[rows])]
     if not len(rows):
-        return beyond
-    part = ranges.take(rows)
-    there = constrained_position(part, trajectory, other[rows], limits=config.constrained)
-    elsewhere = constrained_model(part, trajectory, there.arc_m, section=np.maximum(there.section, 0))
-    here = model.take(rows)
-    at_best, at_other = compact(here), compact(elsewhere)
-    variance = np.maximum(scale[rows], 1.0) ** 2
-    worse = (elsewhere.wsse - here.wsse) / variance
-    without = worse[:, None] - (_drops(at_other) - _drops(at_best)) / variance[:, None]
-    prior = risk.prior(systems)[at_best.channel]
-    allowed = chdtri(1, np.minimum(risk.risk_per_sample / np.maximum(prior, risk.risk_per_sample), 1.0))
-    with np.errstate(invalid="ignore"):
-        opened = worse <= chdtri(1, risk.risk_per_sample)
-        opened |= (at_best.used & (without <= allowed)).any(axis=1)
-        apart = np.linalg.norm(trajectory.at_arc(there.arc_m) - trajectory.at_arc(arc[rows]), axis=1)
-        beyond[rows] = opened & (apart > level_m[rows])
-    return beyond
+        return result
+    channels = int(np.count_nonzero(model.used[rows], axis=1).max())
+    size = max(1, _BLOCK_SIZE // (9 * channels**2))
+    for first in range(0, len(rows), size):
+        block = rows[first : first + size]
+        spent = _risk_of_block(index, arc_m[block], model.take(block), level_m[block], scale[block], systems, risk)
+        result[block] = spent > risk.risk_per_sample
+    return result
 
 
-def _drops(parts: Compact) -> Floats:
-    """Decrease of the sum of squares when each channel is left out, shape (T, n)."""
+def _risk_of_block(
+    index: SearchIndex,
+    arc_m: Floats,
+    model: LinearModel,
+    level_m: Floats,
+    scale: Floats,
+    systems: Sequence[str],
+    risk: RiskBudget,
+) -> Floats:
+    """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
+    parts, design, none = _whitened(model, index, np.maximum(scale, 1.0))
+    prior, allowed = np.where(parts.used, risk.prior(systems)[parts.channel], 0.0), risk.risk_per_sample
+    forms = _beside(none, _without_one(parts, design, none, prior))
+    spent = _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(allowed)))
+    left = np.flatnonzero(spent <= allowed)
+    if len(left) and parts.channel.shape[1] > 1:
+        pairs = _without_two(parts.take(left), design[left], none.take(left), prior[left])
+        spent[left] += _risk_beyond(pairs, _around(index, arc_m[left], level_m[left], pairs.radius_m(allowed)))
+    return spent
+
+
+def _beside(first: _Forms, second: _Forms) -> _Forms:
+    return _Forms(
+        *(
+            np.concatenate([getattr(first, name), getattr(second, name)], axis=1)
+            for name in ("prior", "constant", "slope", "matrix")
+        )
+    )
+
+
+def _whitened(model: LinearModel, index: SearchIndex, scale: Floats) -> tuple[Compact, Floats, _Forms]:
+    """Return the residuals with the map error in the noise, their change with the place, and the form without fault.
+
+    The map error is taken alike in all horizontal directions: another place has another tangent.
+    """
+    plan, height = index.trajectory.sigma_plan_m, index.trajectory.sigma_height_m
+    normal = np.linalg.inv(model.covariance_m2) - model.prior
+    prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
+    covariance = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)
+    whole = replace(model, covariance_m2=covariance)
+    parts = compact(whole)
+    spread = covariance @ prior
+    design = np.take_along_axis(model.design @ spread, parts.channel[..., None], axis=1) / scale[:, None, None]
+    misfit = np.take_along_axis(model.misfit, parts.channel, axis=1) / scale[:, None]
+    parts = replace(parts, residual=parts.residual / scale[:, None])
+    none = _Forms(
+        prior=np.full((len(scale), 1), 2.0),  # noise passes on either side
+        constant=np.einsum("tn,tn->t", misfit, parts.residual)[:, None],
+        slope=np.einsum("tni,tn->ti", design, misfit)[:, None],
+        matrix=(normal @ spread / scale[:, None, None] ** 2)[:, None],
+    )
+    return parts, design, none
+
+
+def _without_one(parts: Compact, design: Floats, none: _Forms, prior: Floats) -> _Forms:
+    """Forms with each channel left out, K = n."""
     share = np.einsum("tii->ti", parts.projector)
-    checked = parts.used & (share > LEAST_REDUNDANCY)
-    return np.where(checked, parts.residual**2 / np.where(checked, share, 1.0), 0.0)
+    checked = share > LEAST_REDUNDANCY
+    inverse = np.where(checked, 1.0 / np.where(checked, share, 1.0), 0.0)
+    return _Forms(
+        prior=prior,
+        constant=none.constant - inverse * parts.residual**2,
+        slope=none.slope - (inverse * parts.residual)[..., None] * design,
+        matrix=none.matrix - inverse[..., None, None] * design[..., None] * design[..., None, :],
+    )
+
+
+def _without_two(parts: Compact, design: Floats, none: _Forms, prior: Floats) -> _Forms:
+    """Forms with each pair of channels left out."""
+    i, j = np.triu_indices(parts.channel.shape[1], 1)
+    share = np.einsum("tii->ti", parts.projector)
+    a, b, c = share[:, i], parts.projector[:, i, j], share[:, j]
+    product = a * c
+    determinant = product - b * b
+    checked = (np.minimum(a, c) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
+    inverse = np.where(checked, 1.0 / np.where(checked, determinant, 1.0), 0.0)
+    one, two = parts.residual[:, i], parts.residual[:, j]
+    own_one, own_two = (c * one - b * two) * inverse, (a * two - b * one) * inverse
+    first, second = design[:, i], design[:, j]
+    move_one = (c[..., None] * first - b[..., None] * second) * inverse[..., None]
+    move_two = (a[..., None] * second - b[..., None] * first) * inverse[..., None]
+    return _Forms(
+        prior=prior[:, i] * prior[:, j],
+        constant=none.constant - one * own_one - two * own_two,
+        slope=none.slope - own_one[..., None] * first - own_two[..., None] * second,
+        matrix=none.matrix - move_one[..., None] * first[..., None, :] - move_two[..., None] * second[..., None, :],
+    )
+
+
+def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats) -> _Sections:
+    """Sections of the line within a radius of each position that has any off the tangent beyond its level.
+
+    Sections that the level cuts are divided there.
+    """
+    line = index.trajectory
+    here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)
+    axes = np.stack([line.tangent[here], line.across[here], line.up[here]], axis=1)
+    lists = index.tree.query_ball_point(place, radius_m + line.length_m.max(), return_sorted=True)
+    count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
+    vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
+    epoch = np.repeat(np.arange(len(arc_m)), count)
+    inside = vertex < len(line.length_m)
+    epoch, vertex = epoch[inside], vertex[inside]
+    start = np.einsum("pij,pj->pi", axes[epoch], line.ecef_m[vertex] - place[epoch])
+    tangent, length = np.einsum("pij,pj->pi", axes[epoch], line.tangent[vertex]), line.length_m[vertex]
+    # |start + s tangent| = level at both roots; between them is what the level reaches.
+    middle = -np.einsum("pi,pi->p", start, tangent)
+    square = middle**2 - np.einsum("pi,pi->p", start, start) + level_m[epoch] ** 2
+    half = np.sqrt(np.maximum(square, 0.0))
+    first, second = np.clip(middle - half, 0.0, length), np.clip(middle + half, 0.0, length)
+    first = np.where(square > 0, first, length)
+    edges = np.stack([np.zeros(len(epoch)), first, np.maximum(second, first), length], axis=1)
+    pair, piece = np.nonzero(np.diff(edges, axis=1) > 0)
+    low, high = edges[pair, piece], edges[pair, piece + 1]
+    ends = start[pair, None] + np.stack([low, high], axis=1)[..., None] * tangent[pair, None]
+    off = (np.abs(ends[..., 0]) < _ALONG * np.linalg.norm(ends, axis=2)).any(axis=1)
+    beyond = (piece != 1) & off
+    turning = np.zeros(len(arc_m), dtype=bool)
+    turning[epoch[pair[beyond]]] = True
+    return _Sections(epoch[pair], ends[:, 0], tangent[pair], high - low, beyond).take(turning[epoch[pair]])
+
+
+def _risk_beyond(forms: _Forms, sections: _Sections) -> Floats:
+    """Probability that the true place lies beyond the level, summed over the hypotheses, shape (T,)."""
+    spent = np.zeros(len(forms.prior))
+    epochs, starts, count = np.unique(sections.epoch, return_index=True, return_counts=True)
+    if not len(epochs):
+        return spent
+    forms = forms.take(epochs)
+    coefficients = forms.coefficients()
+    # Epochs of like numbers of sections together: no block is wider than it must be.
+    order = np.argsort(count, kind="stable")
+    size = max(1, _BLOCK_SIZE // max(1, int(count.max()) * forms.prior.shape[1]))
+    for first in range(0, len(order), size):
+        some = order[first : first + size]
+        place = np.arange(count[some].max())
+        there = place < count[some, None]
+        part = sections.take(np.where(there, starts[some, None] + place, starts[some, None]).ravel())
+        width = 3 * len(place)
+        values = part.monomials().reshape(len(some), width, 10) @ coefficients[some]
+        start, slope, curvature = np.moveaxis(values.reshape(len(some), len(place), 3, -1), 2, 0)
+        length = part.length_m.reshape(there.shape)[..., None]
+        step = np.clip(-0.5 * slope / np.where(curvature > 0, curvature, np.inf), 0.0, length)
+        least = start + step * (slope + step * curvature)
+        beyond = np.where(part.beyond.reshape(there.shape)[..., None], least, np.inf).min(axis=1)
+        excess = beyond - least.min(axis=1)
+        tail = np.where(excess > 0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
+        spent[epochs[some]] = (forms.prior[some] * tail).sum(axis=1)
+    return spent

@@ -133,7 +133,14 @@ def solve(
         level = protection_levels(corrected, model, offset, raim, scale, config)
         systems = [name[0] for name in corrected.satellite.tolist()]
         open_elsewhere = places_beyond_the_level(
-            ranges, trajectory, place, model, level.level.level_m, scale, systems, risk_of(config), config
+            index,
+            constrained.arc_m,
+            model,
+            level.level.level_m,
+            scale,
+            systems,
+            risk_of(config),
+            np.flatnonzero(place.section.excess > config.section.threshold),
         )
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
