@@ -51,6 +51,8 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "motion_weight": "mean weight of Dopplers and phases",
     "wheel_scale": "share that the wheel's way is too short by, as estimated",
     "force_offset_mps2": "offset of the accelerometer, as estimated",
+    "map_scale": "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
+    "pseudoranges keep moving against the map",
 }
 
 
@@ -107,5 +109,6 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "motion_weight": float_column(tracked.motion_weight),
             "wheel_scale": float_column(tracked.wheel_scale),
             "force_offset_mps2": float_column(tracked.force_offset_mps2),
+            "map_scale": float_column(tracked.map_scale),
         }
     )

@@ -54,6 +54,7 @@ def levelled(
     line: Line,
     dt: float,
     limits: TrackingLimits,
+    map_scale: float,
 ) -> Bank:
     """The bank after an epoch.
 
@@ -76,10 +77,11 @@ def levelled(
     line : Line
     dt : float [s]
     limits : TrackingLimits
+    map_scale : float
     """
     mean, covariance = before
     if len(bank.without):
-        means, covariances = predicted(bank.mean, bank.covariance, line, dt, limits)
+        means, covariances = predicted(bank.mean, bank.covariance, line, dt, limits, map_scale)
     else:
         means, covariances = bank.mean, bank.covariance
     names = _sources(rows, satellite)

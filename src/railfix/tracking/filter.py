@@ -16,6 +16,7 @@ from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.hypotheses import most_probable, on_the_line, surviving, with_map_error
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
+from railfix.tracking.misfit import code_shift, learn_map
 from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, write_place, write_rows
 from railfix.tracking.robust import (
@@ -109,7 +110,7 @@ def _step(
     if len(rows.variance):
         _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost)
     elif state.bank is not None:
-        means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits)
+        means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
     speed = float(state.mean[most_probable(state.log_probability), Unknown.SPEED])
     if abs(speed) > DIRECTION_MPS:
@@ -144,6 +145,7 @@ def _measure(
     prior = prior_of(rows, covariance)
     degrees, passes = limits.degrees_of_freedom, limits.passes
     weight = first_weights(rows, prior, degrees)
+    shift = code_shift(rows, prior, weight, most_probable(state.log_probability))
     update = robust_update(rows, prior, weight, degrees=degrees, passes=passes)
     doubtful = min(_least(update.weight[:, part]) for part in (rows.codes, rows.motion)) < _DOUBTFUL
     if doubtful:
@@ -173,8 +175,11 @@ def _measure(
         stepped = np.diagonal(covariance[best]) != np.diagonal(predicted_covariance[best])
         named = np.where(rows.column >= 0, chunk.satellite[rows.column], "")
         new = frozenset(state.satellite[chunk.fresh[epoch]].tolist())
-        state.bank = levelled(bank, rows, best, (mean[best], covariance[best]), stepped, named, new, line, dt, limits)
+        state.bank = levelled(
+            bank, rows, best, (mean[best], covariance[best]), stepped, named, new, line, dt, limits, state.map_scale
+        )
     learn(state, rows, update, best, dt, limits)
+    learn_map(state, 0.0 if best else shift, dt, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
 
 

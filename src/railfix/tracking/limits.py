@@ -49,7 +49,10 @@ class TrackingLimits(Settings):
         Local error of the map across the track and in height, and the length over which it changes: with it the
         change of the carrier phase cannot claim more than the shape of the line is known to.
     map_scale_m : float
-        Error of a length along the map [m per square root of m].
+        Error of a length along the map [m per square root of m]; a larger one is learnt where the codes show it.
+    map_misfit_sigmas, map_misfit_s, map_misfit_kept_s : float
+        The codes show it where their innovations, averaged over `map_misfit_s`, ask for another place by more than so
+        many standard deviations of that mean; what was learnt is forgotten within `map_misfit_kept_s`.
     map_absolute_m : float
         Length over which the absolute error of the map changes (sigmas are those of the trajectory).
     map_branch_m : float
@@ -107,6 +110,9 @@ class TrackingLimits(Settings):
     map_roughness_m: float = Field(default=0.3, gt=0)
     map_correlation_m: float = Field(default=50.0, gt=0)
     map_scale_m: float = Field(default=0.03, gt=0)
+    map_misfit_sigmas: float = Field(default=3.0, gt=0)
+    map_misfit_s: float = Field(default=30.0, gt=0)
+    map_misfit_kept_s: float = Field(default=300.0, gt=0)
     map_absolute_m: float = Field(default=500.0, gt=0)
     map_branch_m: float = Field(default=3.0, gt=0)
     decided_travel_m: float = Field(default=60.0, ge=0)

@@ -50,11 +50,13 @@ def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Flo
 _singer = lru_cache(maxsize=64)(singer_step)
 
 
-def predicted(mean: Floats, covariance: Floats, line: Line, dt: float, limits: TrackingLimits) -> tuple[Floats, Floats]:
+def predicted(
+    mean: Floats, covariance: Floats, line: Line, dt: float, limits: TrackingLimits, map_scale: float
+) -> tuple[Floats, Floats]:
     """Mean and covariance after an interval, shapes (H, N) and (H, N, N).
 
     The clones `Unknown.BEFORE` and `Unknown.SPEED_BEFORE` take place and speed, what begins anew at an epoch gets its
-    prior.
+    prior. `map_scale` is the factor on `TrackingLimits.map_scale_m`.
     """
     step, noise = _singer(dt, limits.acceleration_mps2, limits.acceleration_s)
     speed = np.abs(mean[:, Unknown.SPEED])
@@ -88,10 +90,15 @@ def predicted(mean: Floats, covariance: Floats, line: Line, dt: float, limits: T
     added[:, Unknown.RADAR] = RADAR_WALK**2 * dt
     added[:, OFFSETS:SATELLITES] = limits.offset_walk_m**2 * dt
     added[:, SATELLITES:] = (1.0 - code_kept**2)[:, None]
-    added[:, FRESH] = _fresh_variances(after, spread[:, 0, 0] + noise[0, 0] + _LEAST_STEP_M2, line, travel, limits)
+    length = (limits.map_scale_m * map_scale) ** 2 * travel
+    place = spread[:, Unknown.PLACE, Unknown.PLACE] + noise[0, 0] + _LEAST_STEP_M2
+    added[:, FRESH] = _fresh_variances(after, place, length, line, travel, limits)
+    added[:, Unknown.PLACE] += length
     diagonal = np.arange(mean.shape[1])
     spread[:, diagonal, diagonal] += added
     spread[:, :3, :3] += noise
+    # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
+    spread[:, Unknown.PLACE, Unknown.STEP_ALONG] = spread[:, Unknown.STEP_ALONG, Unknown.PLACE] = -length
     spread[:, Unknown.PHASE_CLOCK, Unknown.DRIFT] += walk * dt**2 / 2.0
     spread[:, Unknown.DRIFT, Unknown.PHASE_CLOCK] += walk * dt**2 / 2.0
     return after, spread
@@ -107,11 +114,13 @@ def _moved(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:
     return moved
 
 
-def _fresh_variances(mean: Floats, variance: Floats, line: Line, travel: Floats, limits: TrackingLimits) -> Floats:
+def _fresh_variances(
+    mean: Floats, variance: Floats, length: Floats, line: Line, travel: Floats, limits: TrackingLimits
+) -> Floats:
     """Variances of the clock of the codes and of the map's displacement to the right, up and along, shape (H, 4).
 
     The displacement's direction is also uncertain by how the line bends where the place is uncertain, with its
-    `variance`.
+    `variance`; `length` is the variance of the length run.
     """
     count = len(mean)
     _, axes = line.at(np.concatenate([mean[:, Unknown.PLACE], mean[:, Unknown.BEFORE]]))
@@ -121,5 +130,5 @@ def _fresh_variances(mean: Floats, variance: Floats, line: Line, travel: Floats,
     fresh = np.empty((count, 4))
     fresh[:, 0] = CODE_CLOCK_SIGMA_M**2
     fresh[:, 1:3] = rough[:, None] + place[:, None] * bend[:, 1:] ** 2
-    fresh[:, 3] = limits.map_scale_m**2 * travel + 1e-8
+    fresh[:, 3] = length + 1e-8
     return fresh

@@ -59,6 +59,8 @@ class Tracked:
     code_weight, motion_weight : ndarray, shape (T,)
         Mean weights of codes, and of Dopplers and phases.
     wheel_scale, force_offset_mps2, radar_scale : ndarray, shape (T,)
+    map_scale : ndarray, shape (T,)
+        Factor on the error of the map's lengths, 1 where codes do not contradict them (`misfit`).
     level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
         `bank.level_m`; NaN where levels are off.
     amount_m : ndarray, shape (T,) [m]
@@ -85,6 +87,7 @@ class Tracked:
     wheel_scale: Floats
     force_offset_mps2: Floats
     radar_scale: Floats
+    map_scale: Floats
     level_m: Floats
     level_noise_m: Floats
     separation_m: Floats
@@ -102,7 +105,7 @@ class Tracked:
         size = len(time)
         names = (
             "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
-            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "level_m", "level_noise_m",
+            "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m", "level_noise_m",
             "separation_m", "amount_m",
         )  # fmt: skip
         return cls(
@@ -145,6 +148,7 @@ def write_place(
     result.wheel_scale[epoch] = mean[Unknown.WHEEL]
     result.force_offset_mps2[epoch] = mean[Unknown.FORCE_OFFSET]
     result.radar_scale[epoch] = mean[Unknown.RADAR]
+    result.map_scale[epoch] = state.map_scale
     if state.bank is not None:
         level, noise, apart = level_m(state.bank, float(mean[Unknown.PLACE]), sigma, limits)
         # Contradicted by its measurements the track itself is in doubt, which no sub-filter beside it bounds.

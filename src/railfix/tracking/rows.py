@@ -261,7 +261,7 @@ def sensor_rows(
                 continue
             signed = float(way[epoch]) * sign
             value = signed * (1.0 + state[scale]) - moved
-            coefficients = {Unknown.PLACE: 1.0, Unknown.BEFORE: -1.0, scale: -signed}
+            coefficients = {Unknown.PLACE: 1.0, Unknown.BEFORE: -1.0, Unknown.STEP_ALONG: 1.0, scale: -signed}
             listed.append((coefficients, value, float(sigma[epoch]), kind))
     force, sigma = sensors.force_mps2, sensors.force_sigma_mps2
     if force is not None and sigma is not None and np.isfinite(force[epoch]):

@@ -21,7 +21,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.mean, state.covariance = begin(arc, sigma, satellites, line, limits)
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
         return False
-    mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits)
+    mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits, state.map_scale)
     state.mean, state.covariance = mean, covariance
     lost = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
@@ -52,6 +52,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     state.mean, state.covariance, state.origin_m = together[0], together[1], together[3]
     state.log_probability = together[2] - np.logaddexp.reduce(together[2])
     state.weak_motion_s = state.weak_code_s = 0.0
+    state.code_shift = (0.0, 0.0)
     return lost
 
 

@@ -110,6 +110,10 @@ class TrackState:
         How long the mean weights have been low.
     log_scale : tuple of float
         Logarithm of the variance of Dopplers and of phases against that of the limits.
+    code_shift : tuple of float
+        Mean of `misfit.code_shift` over the last epochs, and its variance.
+    map_log_scale : float
+        Logarithm of the variance of lengths along the map against that of the limits, at least 0.
     bank : Bank or None
         Where levels are asked for.
     unaided_m : float [m]
@@ -131,9 +135,16 @@ class TrackState:
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
     log_scale: tuple[float, float] = (0.0, 0.0)
+    code_shift: tuple[float, float] = (0.0, 0.0)
+    map_log_scale: float = 0.0
     bank: Bank | None = None
     unaided_m: float = 0.0
     direction: float = 0.0
+
+    @property
+    def map_scale(self) -> float:
+        """Factor on the error of lengths along the map, at least 1."""
+        return float(np.exp(0.5 * self.map_log_scale))
 
     @property
     def hypotheses(self) -> int:
@@ -163,6 +174,7 @@ class TrackState:
         self.log_probability = self.origin_m = np.empty(0)
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
+        self.code_shift = (0.0, 0.0)
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:
