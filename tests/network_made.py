@@ -8,14 +8,16 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
+from pyproj import CRS, Transformer
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.network import Link, Network
 from railfix.track.network_match import PlanLog, match
 from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, Segment
-from railfix.track.track import UNNAMED
+from railfix.track.track import UNNAMED, Track
 
 #: A unit of 2 km: the main track to a switch, two parallel tracks 3.6 m apart over 1 km, the main track again.
 UNIT_M = 2000.0
@@ -96,8 +98,45 @@ def made_run(
     north, east = to_degrees(error[:, 0], error[:, 1])
     start = np.datetime64("2024-01-01T00:00:00", "ns")
     seconds = np.arange(len(lat)) * np.timedelta64(1, "s")
-    log = PlanLog(path="made", time=start + seconds, latitude_deg=lat + north - 50.0, longitude_deg=lon + east - 5.0)
+    log = PlanLog(
+        path="made",
+        time=start + seconds,
+        latitude_deg=lat + north - 50.0,
+        longitude_deg=lon + east - 5.0,
+        sigma_m=np.full(len(lat), np.nan),
+    )
     return log, on
+
+
+def write_station(
+    path: Path, track: Track, *, crs: str = "EPSG:4326", loop_m: tuple[float, float], aside_m: float
+) -> None:
+    """A GeoPackage of a line with a loop beside it: tracks "west", "main", "loop" and "east", 3-D."""
+    import pyogrio
+    import shapely
+
+    from railfix.track.trajectory import Trajectory
+
+    line = Trajectory.from_track(track)
+    places = np.unique(np.concatenate([track.chainage_m, loop_m]))
+    ramp = np.clip(np.minimum(places - loop_m[0], loop_m[1] - places) / _RAMP_M, 0.0, 1.0)
+    shift = aside_m * (3.0 * ramp**2 - 2.0 * ramp**3)
+    points = line.at_arc(places)
+    aside = points + shift[:, None] * line.across[line.segment_at(places)[0]]
+    first, last = np.searchsorted(places, loop_m)
+    to_map = Transformer.from_crs("EPSG:4979", CRS(crs).to_3d(), always_xy=True)
+    shapes = []
+    for own in (points[: first + 1], points[first : last + 1], aside[first : last + 1], points[last:]):
+        latitude, longitude, height = geodetic_from_ecef(own)
+        shapes.append(shapely.LineString(np.stack(to_map.transform(longitude, latitude, height), axis=-1)))
+    pyogrio.raw.write(
+        path,
+        np.array([shapely.to_wkb(shape) for shape in shapes]),
+        [np.array(["west", "main", "loop", "east"], dtype=object)],
+        ["name"],
+        geometry_type="LineString Z",
+        crs=crs,
+    )
 
 
 def main() -> None:

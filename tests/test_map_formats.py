@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 from scipy.special import fresnel
 
 from railfix.core.errors import InputFileError, SettingsError
@@ -111,6 +113,54 @@ def test_heights_come_from_a_profile_or_from_positions(tmp_path: Path) -> None:
     log.write_text("time_gpst,latitude_deg,longitude_deg,height_m,quality\n" + "\n".join(rows[:300]) + "\n")
     with pytest.raises(InputFileError, match="give positions of the whole line"):
         read_track(path, heights=log)
+
+
+def _raster(path: Path, *, driver: str, crs: str | None, hole: bool = False) -> Path:
+    """A plane of heights about `LINE`: 480 m at 11 E, 700 m a degree of longitude, in cells of about 20 m."""
+    rasterio = pytest.importorskip("rasterio")
+    transformer = Transformer.from_crs("EPSG:4326", "EPSG:25832", always_xy=True)
+    x0, y0 = transformer.transform(10.99, 48.01)
+    east, north = x0 + 20.0 * (np.arange(150) + 0.5), y0 - 20.0 * (np.arange(120) + 0.5)
+    longitude, _ = transformer.transform(*np.meshgrid(east, north), direction="INVERSE")
+    cells = (480.0 + 700.0 * (longitude - 11.0)).astype(np.float32)
+    if hole:
+        cells[:, 60:70] = -9999.0
+    profile = {"width": 150, "height": 120, "count": 1, "dtype": "float32", "nodata": -9999.0, "crs": crs}
+    transform = rasterio.transform.from_origin(x0, y0, 20.0, 20.0)
+    with rasterio.open(path, "w", driver=driver, transform=transform, **profile) as raster:
+        raster.write(cells, 1)
+    return path
+
+
+@pytest.mark.parametrize(("name", "driver"), [("dtm.tif", "GTiff"), ("dtm.asc", "AAIGrid")])
+def test_heights_come_from_a_raster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, driver: str) -> None:
+    path = _write(tmp_path / "line.gpkg", "GPKG", LINE[:, :2].copy())
+    raster = _raster(tmp_path / name, driver=driver, crs="EPSG:25832")
+    track = read_track(path, heights=raster, height_datum="ellipsoidal", sigma_height_m=0.4)
+    assert np.abs(track.height_m - (480.0 + 700.0 * (LINE[:, 0] - 11.0))).max() < 0.01
+    assert track.sigma_height_m == 0.4
+    assert "those of the ground" in track.provenance.notes[-1]
+    monkeypatch.setattr("railfix.track.height_source._WINDOW_CELLS", 100)
+    windows = read_track(path, heights=raster, height_datum="ellipsoidal", sigma_height_m=0.4)
+    assert np.array_equal(windows.height_m, track.height_m)
+    with pytest.raises(SettingsError, match="--height-datum"):
+        read_track(path, heights=raster, sigma_height_m=0.4)
+    with pytest.raises(SettingsError, match="--height-sigma"):
+        read_track(path, heights=raster, height_datum="ellipsoidal")
+
+
+def test_rasters_that_cannot_be_used_are_one_sentence(tmp_path: Path) -> None:
+    path = _write(tmp_path / "line.gpkg", "GPKG", LINE[:, :2].copy())
+    read = partial(read_track, path, height_datum="ellipsoidal", sigma_height_m=0.4)
+    with pytest.raises(InputFileError, match=r"points of the map have no height, the first at chainage 418 m"):
+        read(heights=_raster(tmp_path / "hole.tif", driver="GTiff", crs="EPSG:25832", hole=True))
+    with pytest.raises(InputFileError, match=r"names no CRS; put a \.prj file"):
+        read(heights=_raster(tmp_path / "bare.asc", driver="AAIGrid", crs=None))
+    with pytest.raises(InputFileError, match="points of the map have no height, the first at chainage 0 m"):
+        read(heights=_raster(tmp_path / "elsewhere.tif", driver="GTiff", crs="EPSG:25833"))
+    (tmp_path / "text.tif").write_text("no raster")
+    with pytest.raises(InputFileError, match="GDAL cannot read this raster"):
+        read(heights=tmp_path / "text.tif")
 
 
 # --- alignments --------------------------------------------------------------

@@ -15,9 +15,10 @@ from network_made import made_network, made_run, segment, to_degrees
 from railfix.cli.map import app
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.track import read_track
-from railfix.track.network import Network, links_of_ends, read_network
+from railfix.track.network import Network
 from railfix.track.network_check import check_network
 from railfix.track.network_match import match, read_plan_positions, route_of
+from railfix.track.network_read import links_of_ends, read_network
 
 pytestmark = pytest.mark.requirement("A10")
 INFRABEL = {"latitude_deg": "latitude", "longitude_deg": "longitude", "time_gpst": "timestamp"}
@@ -184,8 +185,9 @@ def test_infrabel_runs_lie_on_tracks_where_the_positions_are_fixed(
     with path.open() as file:
         fixed = np.array([row["position_type"] == "NARROW_INT3" for row in csv.DictReader(file)])
     assert (np.abs(matched.offset_m[fixed]) <= 5.0).mean() > share
-    tracks = route_of(infrabel, matched)
+    tracks, left_out = route_of(infrabel, matched)
     assert 4 <= len(tracks) <= 12
+    assert not left_out
 
 
 def test_route_and_match_commands(recordings: Path, tmp_path: Path) -> None:

@@ -16,9 +16,10 @@ from railfix.core.files import write_whole
 from railfix.run.options import TrackReading
 from railfix.run.output import check_output_file
 from railfix.track import write_track_csv
-from railfix.track.network import TOLERANCE_M, Network, read_network
+from railfix.track.network import Network
 from railfix.track.network_check import check_network
 from railfix.track.network_match import Matched, PlanLog, match, read_plan_positions, route_of
+from railfix.track.network_read import TOLERANCE_M, read_network
 from railfix.track.read import track_of_segments
 
 #: Findings printed before the rest is only counted.
@@ -31,6 +32,15 @@ Tolerance = Annotated[
 Columns = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME=COLUMN", help="Column of a CSV log under another name; may be repeated."),
+]
+
+
+SameFrame = Annotated[
+    bool,
+    typer.Option(
+        "--same-frame",
+        help="The positions are in the frame of the map (RTK from its base stations), not in that of the satellites.",
+    ),
 ]
 
 
@@ -57,7 +67,7 @@ def _network(maps: list[Path], reading: TrackReading, tolerance: float) -> Netwo
 def network(
     maps: Maps,
     *,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate")],
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "height_sigma")],
     tolerance: Tolerance = TOLERANCE_M,
     out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
     overwrite: OverwriteOption = False,
@@ -113,11 +123,14 @@ def route(
     heights: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Heights of a map without: CSV by chainage_m or kilometrage_m, or positions of a run."
+            metavar="FILE",
+            help="Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid), CSV by chainage_m or "
+            "kilometrage_m, or positions of a run.",
         ),
     ] = None,
     column: Columns = None,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate")],
+    same_frame: SameFrame = False,
+    reading: Annotated[TrackReading, Without("reference")],
     tolerance: Tolerance = TOLERANCE_M,
     overwrite: OverwriteOption = False,
 ) -> None:
@@ -134,26 +147,52 @@ def route(
         raise SettingsError("give one of --tracks, --via and --positions")
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=maps)
     net = _network(maps, reading, tolerance)
+    notes: list[str] = []
     if tracks:
         passed = net.shortest_route([net.index_of(name.strip()) for name in tracks.split(",")])
     elif via:
         passed = net.shortest_route([_track_at(net, text) for text in via])
     elif positions is not None:
-        log = read_plan_positions(positions, columns=columns_of(column))
-        passed = route_of(net, match(net, log))
+        log, notes = _positions(positions, net, column, reading, same_frame=same_frame)
+        passed, left_out = route_of(net, match(net, log))
         if not passed:
             raise MismatchError(f"{positions}: no position lies near a track of the network")
+        if left_out:
+            beside = ", ".join(net.names[k] for k in left_out)
+            notes.append(f"the run turned back, perhaps over {beside}, which no route joins to the others")
     elif len(net.tracks) == 1:
         passed = [0]
     else:
         raise SettingsError(f"the map has {len(net.tracks)} tracks; give --tracks, --via or --positions")
-    track = track_of_segments([net.tracks[k] for k in passed], heights=heights, geoid=reading.geoid)
+    track = track_of_segments(
+        [net.tracks[k] for k in passed],
+        heights=heights,
+        geoid=reading.geoid,
+        height_datum=reading.height_datum,
+        sigma_height_m=reading.height_sigma,
+    )
     write_track_csv(track, out)
     console = console_of_tables()
     console.print(f"route: {', '.join(net.names[k] for k in passed)}", markup=False, soft_wrap=True)
     console.print(f"{len(track)} points, {track.chainage_m[-1]:,.1f} m")
-    show_notes(console, track.provenance.notes)
+    show_notes(console, [*notes, *track.provenance.notes])
     console.print(f"track map: {out}", markup=False, soft_wrap=True)
+
+
+def _positions(
+    path: Path, net: Network, column: list[str] | None, reading: TrackReading, *, same_frame: bool
+) -> tuple[PlanLog, list[str]]:
+    """Positions of a log in the frame of the network, and a note on their shift."""
+    log = read_plan_positions(path, columns=columns_of(column))
+    if same_frame:
+        return log, []
+    moved, shift = log.in_frame_of(net, epoch=reading.map_epoch, plate=reading.plate)
+    size = float(np.hypot(shift.east_m, shift.north_m))
+    note = (
+        f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
+        f"{shift.used}, the frame of the positions (--same-frame: they are in that of the map)"
+    )
+    return moved, [*shift.notes, *([note] if size > 0.0 else [])]
 
 
 def _track_at(net: Network, text: str) -> int:
@@ -175,27 +214,29 @@ def match_command(
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Positions on the network to write.")],
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
     sigma: Annotated[
-        float, typer.Option(metavar="M", help="Sigma of the distance from the track, map included.")
-    ] = 2.0,
+        float | None,
+        typer.Option(metavar="M", help="Sigma of the distance from the track, map included; else that of LOG, or 2 m."),
+    ] = None,
     column: Columns = None,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate")],
+    same_frame: SameFrame = False,
+    reading: Annotated[TrackReading, Without("reference", "height_sigma")],
     tolerance: Tolerance = TOLERANCE_M,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Put positions on the tracks of a network: track, chainage on it, probability, and the next best track.
 
-    Positions are taken in the frame of the map. Positions far from all tracks have none.
+    The map is moved to the frame of the positions at their time. Positions far from all tracks have none.
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
 
     Exit codes as `railfix --help` says.
     """
-    if not sigma > 0.0:
+    if sigma is not None and not sigma > 0.0:
         raise SettingsError("--sigma must be positive")
     for target in [out] if picture is None else [out, picture]:
         check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log])
     net = _network(maps, reading, tolerance)
-    positions = read_plan_positions(log, columns=columns_of(column))
+    positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
     matched = match(net, positions, sigma_m=sigma)
     write_whole(out, _matched_csv(net, positions, matched))
     console = console_of_tables()
@@ -204,7 +245,7 @@ def match_command(
         f"{len(on)} positions, {on.sum()} on a track ({on.mean():.1%}), {(np.abs(matched.offset_m) <= 5.0).mean():.1%} "
         f"within 5 m of it; {(matched.probability < 0.9).sum()} with a probability below 0.9"
     )
-    show_notes(console, net.notes)
+    show_notes(console, [*net.notes, *notes])
     if picture is not None:
         from railfix.report.plots.network import plot_network
 
@@ -215,11 +256,7 @@ def match_command(
 
 def _matched_csv(net: Network, log: PlanLog, matched: Matched) -> str:
     names = (*net.names, "")
-    kilometrage = np.full(len(matched.track), np.nan)
-    for k in np.unique(matched.track[matched.track >= 0]):
-        rows = matched.track == k
-        way = net.chainage_m[net.first_point[k] : net.first_point[k + 1]]
-        kilometrage[rows] = np.interp(matched.chainage_m[rows], way, net.tracks[k].kilometrage_m)
+    kilometrage = net.kilometrage_on(matched.track, matched.chainage_m)
     other = np.where(matched.candidates.track == matched.track[:, None], -1.0, matched.probabilities)
     second = np.argmax(other, axis=1)
     rows_of = np.arange(len(second))

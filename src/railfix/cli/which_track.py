@@ -9,7 +9,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from railfix.cli.console import console_of_tables
+from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.run.output import check_output_file
@@ -19,10 +19,9 @@ from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_t
 @from_models
 def which_track(
     inputs: WhichTrackInputs,
-    options: WhichTrackOptions,
+    options: Annotated[WhichTrackOptions, Without("reference", "height_sigma")],
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
     *,
-    crs: Annotated[str | None, typer.Option(metavar="EPSG", help="CRS of a map whose file does not name one.")] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="PICTURE", help="Picture of the probabilities over time (.png or .svg).")
     ] = None,
@@ -42,7 +41,7 @@ def which_track(
     if out is not None:
         check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
     settings, _ = settings_of(choices)
-    decision = which_track_files(inputs, options, settings, crs=crs)
+    decision = which_track_files(inputs, options, settings)
     console = console_of_tables()
     last = decision.posteriors[-1]
     decided = "" if np.isnan(decision.decided_s) else f", decided after {decision.decided_s:.0f} s"
@@ -55,6 +54,7 @@ def which_track(
         share = facing[k] / last.probability[k] if last.probability[k] > 0.0 and np.isfinite(facing[k]) else np.nan
         table.add_row(last.names[k], f"{last.probability[k]:.6f}", "" if np.isnan(share) else f"{share:.4f}")
     console.print(table)
+    show_notes(console, decision.notes)
     if out is not None:
         from railfix.report.plots.which_track import plot_track_decision
 

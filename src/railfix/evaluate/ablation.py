@@ -195,7 +195,7 @@ def ablate_files(
     ):
         entries = inputs.entries(pool, out)
         truth = None if inputs.truth is None else read_reference(inputs.truth, tuple(inputs.logs))
-        navigation, line, logs = open_inputs(inputs, options)
+        navigation, line, logs = open_inputs(inputs, options, config)
         screens, left_out = judging_screens(config, line.trajectories)
         # protection levels are not part of the result
         plain = config.model_copy(update={"protection": "off", "filter": "off"})

@@ -194,7 +194,7 @@ def find_trajectory(
     InputFileError
         The files cannot be read.
     """
-    tracks = list(files.track) or run.located("track")
+    tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.located("vehicle")
     if not tracks:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
@@ -245,7 +245,7 @@ def track_of(run: RunFolder, files: TrackFiles | None = None) -> Track:
         The files cannot be read.
     """
     files = files or TrackFiles()
-    paths = list(files.track) or run.located("track")
+    paths = list(files.track) or run.tracks
     if not paths:
         raise InputFileError(run.path / "run.json", "names no track; give it with --track")
     *first, last = _readings(run, files)

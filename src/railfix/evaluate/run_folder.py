@@ -75,6 +75,12 @@ class RunFolder(RunRecord):
         return dict(self._line.get("track") or {})
 
     @property
+    def tracks(self) -> list[Path]:
+        """Files of the track: that in the folder where the run moved, joined or raised it, else its inputs."""
+        name = self.track_facts.get("file")
+        return [self.path / str(name)] if name else self.located("track")
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Settings in force and kinds of input, by dotted name."""
         flat = flattened(self.record.get("settings_used") or {})

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
@@ -35,11 +36,13 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
+from railfix.run.route import RouteOfLog, find_route
 from railfix.run.sensors import read_sensors, until
-from railfix.run.sources import Line, Log, open_line
+from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
-from railfix.track import check_track
+from railfix.track import check_track, write_track_csv
+from railfix.track.network import Network
 
 
 class Progress(Protocol):
@@ -121,10 +124,10 @@ def run_files(
         ThreadPoolExecutor(max_workers=1) as pool,
     ):
         entries = inputs.entries(pool, out)
-        navigation, line, logs = open_inputs(inputs, options)
+        navigation, line, logs = open_inputs(inputs, options, config)
         processor = processor_of(config, navigation, line.trajectories)
         sensors = read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
-        tally = _position(logs, processor, sensors, folder, options, progress)
+        tally = _position(logs, line, processor, sensors, folder, options, progress)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
@@ -155,6 +158,8 @@ def run_files(
             wall_s=wall,
         )
         folder.write_json("run.json", record)
+        if not line.from_file:
+            write_track_csv(line.track, folder.staged(TRACK_FILE))
         files = folder.commit(_footer(record))
     return RunSummary(
         tally=tally, sigma=sigma, levels=found_levels, tracks=tracks, level_basis=level_basis, notes=notes, files=files,
@@ -162,13 +167,15 @@ def run_files(
     )  # fmt: skip
 
 
-def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Line, dict[Antenna, Log]]:
-    """Read navigation and line, and open the logs.
+def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple[Navigation, Line, dict[Antenna, Log]]:
+    """Read navigation and line, and open the logs; find the route in a network of tracks.
 
     Parameters
     ----------
     inputs : RunInputs
     options : RunOptions
+    config : Config
+        Of the positions that a route is found from.
 
     Returns
     -------
@@ -185,19 +192,34 @@ def open_inputs(inputs: RunInputs, options: RunOptions) -> tuple[Navigation, Lin
     navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
     if inputs.sp3:
         navigation = replace(navigation, precise=read_sp3(inputs.sp3))
-    line = open_line(
-        inputs.track, inputs.vehicle, antennas=tuple(inputs.logs), reading=options.track, at=time_of(navigation)
-    )
-    logs = {
-        name: Log(
+    at = time_of(navigation)
+
+    def log_of(paths: tuple[Path, ...]) -> Log:
+        return Log(
             paths=paths,
             chunk_epochs=options.chunk_epochs,
             broken_lines=options.broken_lines,
             start=options.start,
             end=options.end,
         )
-        for name, paths in inputs.logs.items()
-    }
+
+    def find(network: Network) -> RouteOfLog:
+        paths = next(iter(inputs.logs.values()))
+        if at is None:
+            raise MismatchError(f"{inputs.nav[0]}: has no record, so that no route through the network can be found")
+        parts = log_of(paths).parts()
+        return find_route(network, parts, navigation, config, path=str(paths[0]), time=at, reading=options.track)
+
+    line = open_line(
+        inputs.track,
+        inputs.vehicle,
+        antennas=tuple(inputs.logs),
+        reading=options.track,
+        heights=inputs.heights,
+        at=at,
+        find=find,
+    )
+    logs = {name: log_of(paths) for name, paths in inputs.logs.items()}
     return navigation, line, logs
 
 
@@ -211,6 +233,7 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
 
 def _position(
     logs: Mapping[Antenna, Log],
+    line: Line,
     processor: EpochProcessor,
     sensors: SensorSamples,
     folder: OutputFolder,
@@ -229,13 +252,16 @@ def _position(
         tally.add(result)
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
-        table = positions_table(result)
-        folder.append_parquet("positions.parquet", table)
-        folder.append_csv("positions.csv", rounded(table))
+        tables = {"positions": positions_table(result)}
+        if line.route is not None:
+            tables["positions"], tables["tracks"] = line.route.on_tracks(tables["positions"], line.track)
         if result.fusion:
-            train = train_table(result)
-            folder.append_parquet("train.parquet", train)
-            folder.append_csv("train.csv", rounded(train))
+            tables["train"] = train_table(result)
+            if line.route is not None:
+                tables["train"], _ = line.route.on_tracks(tables["train"], line.track)
+        for name, table in tables.items():
+            folder.append_parquet(f"{name}.parquet", table)
+            folder.append_csv(f"{name}.csv", rounded(table))
         if options.observations == "write":
             folder.append_parquet("observations.parquet", observations_table(result))
         if progress is not None:

@@ -65,12 +65,9 @@ class RunRecord:
     @cached_property
     def inputs(self) -> RunInputs:
         """Input files, where they are now."""
-        entries = [str(entry["input"]) for entry in self.entries]
-        single_files = ("vehicle", "config", "cn0_curve", "error_model", "truth")
-        values = {
-            name: self.located(name)[0] if name in single_files else tuple(self.located(name))
-            for name in dict.fromkeys(entries)
-        }
+        kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
+        several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
+        values = {name: tuple(self.located(name)) if name in several else self.located(name)[0] for name in kinds}
         return self._this_version(lambda: validated(RunInputs, values, source="inputs"))
 
     @cached_property

@@ -25,8 +25,20 @@ def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any
 
 def track_option() -> Any:
     """Return the field for the files of the track."""
-    text = "Track map, CSV or GeoJSON; several are joined to a route in the order given."
+    text = (
+        "Track map; several are joined to a route in the order given. Of one file with a network of tracks the route "
+        "is found from the log."
+    )
     return input_option(text, metavar="TRACK")
+
+
+def heights_option() -> Any:
+    """Return the field for a second source of heights."""
+    text = (
+        "Heights of a map without: a raster (GeoTIFF, ESRI ASCII grid), CSV by chainage_m or kilometrage_m, or "
+        "positions of a run."
+    )
+    return input_option(text, None)
 
 
 def vehicle_option() -> Any:
@@ -84,6 +96,8 @@ class RunInputs(InputFiles):
         Navigation files; precise orbits, which may be empty.
     track : tuple of Path
         Track map, joined to a route in this order.
+    heights : Path or None
+        Heights of a track map without.
     vehicle : Path or None
     tachometer, inertial, radar : Path or None
         Tables of the sensors on board.
@@ -104,6 +118,7 @@ class RunInputs(InputFiles):
         "Observation file of the rear antenna, where there is one.", (), metavar="OBS"
     )
     sp3: tuple[Path, ...] = input_option("Precise orbits and clocks, used in place of the broadcast ones.", ())
+    heights: Path | None = heights_option()
     vehicle: Path | None = vehicle_option()
     tachometer: Path | None = input_option(
         "Pulses of a tachometer: CSV or Parquet with time_gpst, pulse and, where it is known, direction; its wheel "

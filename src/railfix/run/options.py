@@ -23,6 +23,7 @@ class TrackReading(Settings):
     ----------
     crs, height_datum, geoid : str or None
         Where the track's own file does not say; see `railfix.track.read_track`.
+    height_sigma : float or None [m]
     map_epoch : float or None [year]
         Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).
     plate : str or None
@@ -37,6 +38,9 @@ class TrackReading(Settings):
         "Geoid of orthometric heights: japan (JPGEO2024), gsigeo2011, or a grid or CRS known to PROJ.",
         None,
         metavar="MODEL",
+    )
+    height_sigma: float | None = option(
+        "Standard deviation of the track's heights, in place of its own; of a raster needed.", None, metavar="M", gt=0
     )
     map_epoch: float | None = option(
         "Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).",

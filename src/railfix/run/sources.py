@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.errors import SettingsError
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.files import BrokenLines
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.run.inputs import Antenna
 from railfix.run.options import TrackReading
-from railfix.track import Track, read_track
+from railfix.run.route import RouteOfLog
+from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
+from railfix.track.network import Network
+from railfix.track.network_read import is_route, network_of
+from railfix.track.read import read_segments, track_of_segments
+from railfix.track.segment import Segment
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
+
+#: Track of a run that is not that of its files as they are, in the folder of results.
+TRACK_FILE: Final = "track.csv"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,18 +42,26 @@ class Line:
     trajectories : dict of str to Trajectory
     frame : FrameShift or None
         How the track was moved to the frame of the satellites; None where no time was given.
+    route : RouteOfLog or None
+        The route through a network of tracks that was found from the log; None where the files are one route.
+    from_file : bool
+        Whether the track is that of its files as they are: no route of a network, no heights of a second source, and
+        not moved to another frame.
     """
 
     track: Track
     vehicle: Vehicle | None
     trajectories: dict[str, Trajectory]
     frame: FrameShift | None = None
+    route: RouteOfLog | None = None
+    from_file: bool = True
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the map, the vehicle and the trajectories, each once."""
         notes = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
-        return tuple(dict.fromkeys([*notes, *self.track.provenance.notes, *(self.frame.notes if self.frame else ())]))
+        notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ())]
+        return tuple(dict.fromkeys([*(self.route.notes if self.route else ()), *notes]))
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -64,7 +80,9 @@ class Line:
                 "height_datum_asked": provenance.height_datum_asked,
                 "height_datum_used": provenance.height_datum_used,
                 "geoid": provenance.geoid,
+                "file": "" if self.from_file else TRACK_FILE,
             },
+            "route": None if self.route is None else self.route.facts,
             "vehicle": None if self.vehicle is None else self.vehicle.model_dump(mode="json"),
             "chainage_of": {name: trajectory.reference for name, trajectory in self.trajectories.items()},
         }
@@ -76,36 +94,75 @@ def open_line(
     *,
     antennas: tuple[Antenna, ...],
     reading: TrackReading,
+    heights: Path | None = None,
     at: np.datetime64 | None = None,
+    find: Callable[[Network], RouteOfLog] | None = None,
 ) -> Line:
     """Read the track and the vehicle, and compute the path of each antenna.
 
     With a time `at` the track is moved to the frame of the satellites then (`railfix.track.frames`); without it
-    the coordinates stay in the map's own frame.
+    the coordinates stay in the map's own frame. A single file whose tracks do not join to one route is a network:
+    `find` gives the route through it.
 
     Raises
     ------
     InputFileError, SettingsError, MismatchError
         A file is not what it should be, or track and vehicle do not fit.
     """
-    centreline = read_track(track, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    shift = None
+    segments = _segments(track, reading)
+    route = None
+    if len(track) == 1 and len(segments) > 1 and not is_route(segments):
+        if find is None:
+            raise MismatchError(
+                f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one with "
+                "'railfix map route'"
+            )
+        route = find(network_of(segments, track))
+        segments = [route.network.tracks[k] for k in route.tracks]
+    centreline = track_of_segments(
+        segments,
+        heights=heights,
+        geoid=reading.geoid,
+        name=None if route is None else track[0].stem,
+        height_datum=reading.height_datum,
+        sigma_height_m=reading.height_sigma,
+    )
+    shift, moved = None, centreline
     if at is not None:
-        centreline, shift = track_at(centreline, at, epoch=reading.map_epoch, plate=reading.plate)
+        moved, shift = track_at(centreline, at, epoch=reading.map_epoch, plate=reading.plate)
+    paths = _paths(moved, vehicle, antennas, reading)
+    return Line(
+        track=moved,
+        vehicle=paths[0],
+        trajectories=paths[1],
+        frame=shift,
+        route=route,
+        from_file=route is None and heights is None and moved is centreline,
+    )
+
+
+def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
+    if not track:
+        raise SettingsError("no track map was given")
+    return [
+        segment
+        for path in track
+        for segment in read_segments(path, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
+    ]
+
+
+def _paths(
+    track: Track, vehicle: Path | None, antennas: tuple[Antenna, ...], reading: TrackReading
+) -> tuple[Vehicle | None, dict[str, Trajectory]]:
+    """The vehicle, and the path of each antenna."""
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
                 f"the chainage of {reading.reference} was asked for, which only a vehicle file can give; name one"
             )
-        path = Trajectory.from_track(centreline)
-        return Line(track=centreline, vehicle=None, trajectories=dict.fromkeys(antennas, path), frame=shift)
+        return None, dict.fromkeys(antennas, Trajectory.from_track(track))
     body = read_vehicle(vehicle)
-    return Line(
-        track=centreline,
-        vehicle=body,
-        trajectories={n: antenna_trajectory(centreline, body, n, reference=reading.reference) for n in antennas},
-        frame=shift,
-    )
+    return body, {n: antenna_trajectory(track, body, n, reference=reading.reference) for n in antennas}
 
 
 @dataclass(kw_only=True)

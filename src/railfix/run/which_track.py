@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -32,14 +32,18 @@ from railfix.positioning.which_track import (
     track_posterior,
 )
 from railfix.run.inputs import InputFiles, input_option
+from railfix.run.options import TrackReading
 from railfix.run.sources import Log
-from railfix.track.network import Network, read_network
+from railfix.track.frames import in_map_frame
+from railfix.track.network import Network
+from railfix.track.network_read import read_network
 
 #: Satellites in fewer than this share of the epochs are left out, so that the mean is over the same ones.
 _SHARE: Final = 0.9
 #: Tracks within this of the train are hypotheses [m]; their points within the other are used.
 _NEAR_M: Final = 60.0
 _POINTS_M: Final = 400.0
+_MOST_TRACKS: Final = 64
 #: Residual standard deviation of satellite and atmosphere errors beside a base station [m]; it is at most 10 km away.
 _BESIDE_BASE_M: Final = 0.05
 #: Largest difference of mean places of the first and the last third of the log [m].
@@ -184,7 +188,7 @@ def _against_base(
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Tracks of a network near a place, east and north of it.
+    """Tracks of a network near a place in its frame, east and north of it.
 
     Raises
     ------
@@ -192,7 +196,7 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
         There is no track within 60 m.
     """
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
-    near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=32)
+    near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
     numbers = sorted(int(t) for t in near.track[0] if t >= 0)
     if not numbers:
         raise MismatchError(f"no track of the map lies within {_NEAR_M:g} m of the train")
@@ -225,12 +229,14 @@ class TrackDecision:
         Name, ``"none"``, or ``"undecided"``.
     decided_s : float
         NaN where undecided.
+    notes : tuple of str
     """
 
     seconds: Floats
     posteriors: tuple[TrackPosterior, ...]
     track: str
     decided_s: float
+    notes: tuple[str, ...] = ()
 
 
 def decide_track(
@@ -304,6 +310,9 @@ class WhichTrackOptions(Settings):
     risk, least_s : float
     prior : str or None
     start, end : datetime or None
+    same_frame : {"no", "yes"}
+        Whether the place of the base station, and so the train's, is in the frame of the map.
+    reading : TrackReading
     errors : StandstillErrors
     """
 
@@ -318,12 +327,16 @@ class WhichTrackOptions(Settings):
     )
     start: datetime | None = option("First epoch of the standstill, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")
+    same_frame: Literal["no", "yes"] = option(
+        "The place of the base station is in the frame of the map, not in that of the satellites.",
+        "no",
+        name="--same-frame",
+    )
+    reading: TrackReading = Field(default_factory=TrackReading)
     errors: StandstillErrors = Field(default_factory=StandstillErrors)
 
 
-def which_track_files(
-    inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config, *, crs: str | None = None
-) -> TrackDecision:
+def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
     """Read logs and map, and decide on which track the train stands.
 
     Raises
@@ -346,10 +359,26 @@ def which_track_files(
             codes.append(
                 standstill_codes(_observations(paths, options), navigation, config, base=base, origin_ecef_m=origin)
             )
-    network = read_network(inputs.map, crs=crs, height_datum="ellipsoidal")
+    reading = options.reading
+    network = read_network(
+        inputs.map, crs=reading.crs, height_datum=reading.height_datum or "ellipsoidal", geoid=reading.geoid
+    )
+    origin, notes = codes[0].origin_ecef_m, list(network.notes)
+    if options.same_frame == "no":
+        place, shift = in_map_frame(
+            origin[None], network.frame, codes[0].time[0], epoch=reading.map_epoch, plate=reading.plate,
+            named=network.named,
+        )  # fmt: skip
+        origin, size = place[0], float(np.hypot(shift.east_m, shift.north_m))
+        notes += shift.notes
+        if size > 0.0:
+            notes.append(
+                f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "
+                f"{shift.used}, the frame of the train's position"
+            )
     half = options.spacing / 2.0
-    return decide_track(
-        yard_tracks(network, codes[0].origin_ecef_m),
+    decision = decide_track(
+        yard_tracks(network, origin),
         codes,
         arms_m=(half, -half) if len(codes) == 2 else (0.0,),
         errors=options.errors,
@@ -357,6 +386,7 @@ def which_track_files(
         least_s=options.least_s,
         prior=_prior(options.prior, network),
     )
+    return replace(decision, notes=tuple(notes))
 
 
 def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observations:

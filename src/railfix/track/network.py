@@ -8,10 +8,8 @@ track to another only over a connection that is navigable: of a switch the stem 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
-from os import PathLike
 from typing import Final, cast
 
 import networkx as nx
@@ -19,21 +17,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, Indices, read_only
-from railfix.core.errors import InputFileError, MismatchError, SettingsError
-from railfix.core.files import ending
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.polyline import NearestOnPolyline, project_on_segments
-from railfix.track.read import read_segments
-from railfix.track.route import first_gap, one_frame, orient
+from railfix.track.route import one_frame
 from railfix.track.segment import Segment
-from railfix.track.track import UNNAMED
-from railfix.track.vector_file import read_layers
-from railfix.track.xml_files import Relation, read_railml_relations
+from railfix.track.track import UNNAMED, interpolate_kilometrage
 
-#: Ends nearer than this are one point, where the file states no connection [m].
-TOLERANCE_M: Final = 0.5
-#: Largest change of direction between two tracks that a train passes [rad]; the legs of a switch differ by about pi.
-_LARGEST_TURN_RAD: Final = np.radians(60.0)
 #: Way over which the direction of an end is taken [m].
 _DIRECTION_M: Final = 10.0
 #: Ways searched before the whole network is [m].
@@ -233,6 +223,16 @@ class Network:
             chainage[rows] = self.chainage_m[own][segment] + along
         return chainage, offset
 
+    def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
+        """Kilometrage of tracks at chainages on them, shape (n,); NaN where there is none."""
+        kilometrage = np.full(len(track), np.nan)
+        for number in np.unique(track[track >= 0]):
+            rows = track == number
+            own = slice(self.first_point[number], self.first_point[number + 1])
+            marking = self.tracks[number].kilometrage_m
+            kilometrage[rows] = interpolate_kilometrage(chainage_m[rows], self.chainage_m[own], marking)
+        return kilometrage
+
     def index_of(self, name: str) -> int:
         """Number of the track of a name.
 
@@ -266,6 +266,16 @@ class Network:
         MismatchError
             No route leads from one to the next without turning back.
         """
+        route = self.route_over(stops)
+        if route is None:
+            first = next(stop for k, stop in enumerate(stops, start=1) if self.route_over(stops[:k]) is None)
+            raise MismatchError(
+                f"no route without turning back leads to track {self.names[first]!r} over navigable connections"
+            )
+        return route
+
+    def route_over(self, stops: Sequence[int]) -> list[int] | None:
+        """Tracks of the shortest route that passes the given tracks in order; None where there is none."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         best: dict[int, tuple[float, list[int]]] = {4 * wanted[0] + e: (0.0, [wanted[0]]) for e in (1, 3)}
         for stop in wanted[1:]:
@@ -280,92 +290,9 @@ class Network:
                         passed = [n // 4 for n in path[entry] if n % 2 == 0]
                         reached[leave] = (cost + float(length[entry]), route + passed)
             if not reached:
-                raise MismatchError(
-                    f"no route without turning back leads to track {self.names[stop]!r} over navigable connections"
-                )
+                return None
             best = reached
         return min(best.values(), key=lambda item: item[0])[1]
-
-
-def read_network(
-    paths: Sequence[str | PathLike[str]],
-    *,
-    crs: str | None = None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
-    tolerance_m: float = TOLERANCE_M,
-) -> Network:
-    """Read a network of tracks from map files.
-
-    Parameters
-    ----------
-    paths : sequence of paths
-        As `railfix.track.read.read_segments` reads them.
-    crs, height_datum, geoid : str, optional
-        As for `railfix.track.read_track`.
-    tolerance_m : float [m]
-        Where the files state no connections: ends nearer than this are one point, and a track on which the end of
-        another lies is divided there.
-
-    Raises
-    ------
-    InputFileError, SettingsError
-    """
-    tracks: list[Segment] = []
-    relations: list[Relation] = []
-    for path in paths:
-        tracks += read_segments(path, crs=crs, height_datum=height_datum, geoid=geoid, duplicates="keep")
-        relations += _relations(path)
-    if relations:
-        return _of_relations(tracks, relations, str(paths[0]))
-    divided, cuts = _divided(tracks, tolerance_m)
-    network = Network(tracks=tuple(divided), links=())
-    note = f"connections from ends within {tolerance_m:g} m; {cuts} tracks divided where the end of another meets them"
-    return replace(network, links=links_of_ends(network, tolerance_m=tolerance_m), notes=(note,))
-
-
-def _relations(path: str | PathLike[str]) -> list[Relation]:
-    """Connections that a file states, empty where it states none."""
-    if ending(path) in (".xml", ".railml"):
-        return read_railml_relations(path)
-    if ending(path) not in (".geojson", ".json", ".gpkg", ".fgb"):
-        return []
-    relations = []
-    for _, rows, _ in read_layers(path, geometry="Point"):
-        for row in rows:
-            if {"netelementA", "netelementB", "positionOnA", "positionOnB"} <= set(row):
-                relations.append(
-                    Relation(
-                        name=str(row.get("id", "")),
-                        first=str(row["netelementA"]),
-                        second=str(row["netelementB"]),
-                        first_end=int(row["positionOnA"]),
-                        second_end=int(row["positionOnB"]),
-                        navigable=str(row.get("navigability") or "both").lower() != "none",
-                    )
-                )
-    return relations
-
-
-def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -> Network:
-    number = {track.metadata.get("name"): k for k, track in enumerate(tracks)}
-    known = [r for r in relations if r.first in number and r.second in number]
-    if not known:
-        raise InputFileError(path, f"none of its {len(relations)} net relations names a track of the file")
-    links = tuple(
-        Link(
-            first=number[r.first],
-            first_end=r.first_end,
-            second=number[r.second],
-            second_end=r.second_end,
-            navigable=r.navigable,
-        )
-        for r in known
-    )
-    note = f"connections as {len(known)} net relations of the file state them"
-    if len(known) < len(relations):
-        note += f"; {len(relations) - len(known)} relations name a track that it does not have"
-    return Network(tracks=tuple(tracks), links=links, notes=(note,))
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:
@@ -379,68 +306,3 @@ def end_points(network: Network) -> tuple[Floats, Floats]:
     ends = np.stack([points[first], points[last]], axis=1)
     outward = ends - np.stack([points[inner], points[outer]], axis=1)
     return ends, outward / np.linalg.norm(outward, axis=2, keepdims=True)
-
-
-def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
-    """Connections of ends that lie within a tolerance; navigable where the direction changes by less than 60 deg."""
-    ends, outward = end_points(network)
-    pairs = cKDTree(ends.reshape(-1, 3)).query_pairs(tolerance_m, output_type="ndarray")
-    pairs = pairs[np.lexsort(pairs.T[::-1])]
-    a, b = pairs.T
-    facing = np.einsum("ij,ij->i", outward.reshape(-1, 3)[a], outward.reshape(-1, 3)[b])
-    navigable = (facing < -np.cos(_LARGEST_TURN_RAD)) & (a // 2 != b // 2)
-    return tuple(
-        Link(first=i // 2, first_end=i % 2, second=j // 2, second_end=j % 2, navigable=n)
-        for i, j, n in zip(a.tolist(), b.tolist(), navigable.tolist(), strict=True)
-    )
-
-
-def is_route(segments: Sequence[Segment]) -> bool:
-    """Whether segments join to one route in their order: ends meet, and no train would have to turn back."""
-    if first_gap(segments) is not None:
-        return False
-    _, outward = end_points(Network(tracks=tuple(orient(segments)), links=()))
-    return bool((np.einsum("ij,ij->i", outward[:-1, 1], outward[1:, 0]) < -np.cos(_LARGEST_TURN_RAD)).all())
-
-
-def _divided(tracks: list[Segment], tolerance_m: float) -> tuple[list[Segment], int]:
-    """Tracks divided at inner points on which the end of another track lies, and how many were divided."""
-    whole = Network(tracks=tuple(tracks), links=())
-    latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
-    longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
-    near = whole.near(latitude, longitude, within_m=tolerance_m)
-    cuts: dict[int, list[float]] = {}
-    for end, column in zip(*np.nonzero(near.track >= 0), strict=True):
-        other, place = int(near.track[end, column]), float(near.chainage_m[end, column])
-        if other != end // 2 and tolerance_m < place < whole.length_m[other] - tolerance_m:
-            cuts.setdefault(other, []).append(place)
-    parts: list[Segment] = []
-    for k, track in enumerate(tracks):
-        if k not in cuts:
-            parts.append(track)
-            continue
-        way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
-        places = sorted(cuts[k])
-        places = [p for i, p in enumerate(places) if i == 0 or p - places[i - 1] > tolerance_m]
-        bounds = [0.0, *places, float(way[-1])]
-        for number, (low, high) in enumerate(pairwise(bounds), start=1):
-            parts.append(_part(track, way, low, high, number))
-    return parts, len(cuts)
-
-
-def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> Segment:
-    inside = (way > low + 1e-6) & (way < high - 1e-6)
-    place = np.concatenate([[low], way[inside], [high]])
-    columns = {
-        name: np.interp(place, way, getattr(track, name))
-        for name in ("latitude_deg", "longitude_deg", "height_m", "kilometrage_m", "cant_m", "gradient_permille")
-    }
-    nearest = np.clip(np.searchsorted(way, place), 0, len(way) - 1)
-    name = f"{track.metadata.get('name', track.source)}/{number}"
-    return replace(
-        track,
-        **columns,
-        radius_m=track.radius_m[nearest],
-        source=f"{track.file} ({name})",
-        metadata=track.metadata | {"name": name},
-    )

@@ -8,8 +8,10 @@ position counts for the share of the correlation time that it covers.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from typing import Final
 
@@ -17,21 +19,27 @@ import networkx as nx
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import ending
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import positions_times, renamed
+from railfix.track.frames import FrameShift, in_map_frame, kind_of_frame
 from railfix.track.network import Candidates, Network
+from railfix.track.track import SIGMA_PLAN_M
 
 #: Negative logarithm of the likelihood of a position on a track that the map does not have, beside one at distance 0.
 _UNMAPPED_COST: Final = 12.0
 #: Cost of passing from one track to another without a connection, and of leaving or entering the map.
 _JUMP_COST: Final = 18.0
 _LEAVE_COST: Final = 6.0
-#: Way by which the connection between two places may exceed the distance run [m].
+#: Standard deviation of the distance of a position from its track where its log states none [m].
+SIGMA_M: Final = 2.0
+#: Way by which the connection between two places may exceed their straight distance [m], and its share of it: a bend
+#: between two positions, as in a tunnel.
 _SLACK_M: Final = 30.0
+_SLACK_SHARE: Final = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +53,39 @@ class PlanLog:
         NaT where the log has none.
     latitude_deg, longitude_deg : ndarray, shape (n,)
         NaN where a row has no position.
+    sigma_m : ndarray, shape (n,) [m]
+        Standard deviation of one horizontal axis; NaN where the log has none.
     """
 
     path: str
     time: Datetimes
     latitude_deg: Floats
     longitude_deg: Floats
+    sigma_m: Floats
+
+    def in_frame_of(
+        self, network: Network, *, epoch: float | None = None, plate: str | None = None
+    ) -> tuple[PlanLog, FrameShift]:
+        """The positions, which are in the frame of the satellites, in that of the network.
+
+        Raises
+        ------
+        MismatchError
+            There is no position, or no time of the log in a network whose frame moves.
+        SettingsError
+            See `railfix.track.frames.points_at`.
+        """
+        times = self.time[~np.isnat(self.time)]
+        if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
+            raise MismatchError(
+                f"{self.path}: has no times, which the shift to the frame of the map needs; give positions in the "
+                "frame of the map (--same-frame)"
+            )
+        time = np.sort(times)[len(times) // 2] if len(times) else np.datetime64("now", "ns")
+        ecef = ecef_from_geodetic(self.latitude_deg, self.longitude_deg, np.zeros(len(self.latitude_deg)))
+        moved, shift = in_map_frame(ecef, network.frame, time, epoch=epoch, plate=plate, named=network.named)
+        latitude, longitude, _ = geodetic_from_ecef(moved)
+        return replace(self, latitude_deg=latitude, longitude_deg=longitude), shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,14 +95,14 @@ class Matched:
     Attributes
     ----------
     track : ndarray of int, shape (n,)
-        The most probable sequence; -1 where no track of the map fits.
+        The most probable sequence; -1 where no track of the map fits, and where there is no position.
     chainage_m, offset_m : ndarray, shape (n,)
         On that track, and distance in plan, positive to its right; NaN without a track.
     probability : ndarray, shape (n,)
-        Of that track given the whole log.
+        Of that track given the whole log; NaN where there is no position.
     candidates : Candidates
     probabilities : ndarray, shape (n, m)
-        Of each candidate; the rest to 1 is that of no mapped track.
+        Of each candidate; the rest to 1 is that of no mapped track. NaN where there is no position.
     """
 
     track: Indices
@@ -100,16 +135,23 @@ def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str]
                 time=positions_times(table),
                 latitude_deg=table.numbers("latitude_deg", blank=np.nan),
                 longitude_deg=table.numbers("longitude_deg", blank=np.nan),
+                sigma_m=np.full(len(table), np.nan),
             )
     elif columns:
         raise InputFileError(path, "columns can be renamed in a .csv file only")
     log = read_any_positions(path)
     latitude, longitude, _ = geodetic_from_ecef(log.ecef_m)
-    return PlanLog(path=str(path), time=log.time, latitude_deg=latitude, longitude_deg=longitude)
+    sigma = np.sqrt((log.sigma_m[:, :2] ** 2).mean(axis=1))
+    return PlanLog(path=str(path), time=log.time, latitude_deg=latitude, longitude_deg=longitude, sigma_m=sigma)
 
 
 def match(
-    network: Network, log: PlanLog, *, sigma_m: float = 2.0, within_m: float = 30.0, correlation_s: float = 20.0
+    network: Network,
+    log: PlanLog,
+    *,
+    sigma_m: float | None = None,
+    within_m: float = 30.0,
+    correlation_s: float = 20.0,
 ) -> Matched:
     """Match positions of a run to the tracks of a network.
 
@@ -118,8 +160,9 @@ def match(
     network : Network
     log : PlanLog
         In the order of travel, in the frame of the network.
-    sigma_m : float [m]
-        Standard deviation of the distance between position and track, map included.
+    sigma_m : float, optional [m]
+        Standard deviation of the distance between position and track, map included; by default that of the log
+        with `SIGMA_PLAN_M` of the map, and `SIGMA_M` where the log has none.
     within_m : float [m]
         Farthest track considered.
     correlation_s : float [s]
@@ -128,29 +171,65 @@ def match(
     Returns
     -------
     Matched
+
+    Raises
+    ------
+    MismatchError
+        There is no position.
     """
-    candidates = network.near(log.latitude_deg, log.longitude_deg, within_m=within_m)
+    given = np.flatnonzero(np.isfinite(log.latitude_deg))
+    if not len(given):
+        raise MismatchError(f"{log.path}: has no position")
+    latitude, longitude = log.latitude_deg[given], log.longitude_deg[given]
+    candidates = network.near(latitude, longitude, within_m=within_m)
     n, m = candidates.track.shape
-    point = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(n))
-    step = np.nan_to_num(np.linalg.norm(np.diff(point, axis=0), axis=1))
-    seconds = np.diff(log.time) / np.timedelta64(1, "s")
+    point = ecef_from_geodetic(latitude, longitude, np.zeros(n))
+    step = np.linalg.norm(np.diff(point, axis=0), axis=1)
+    seconds = np.diff(log.time[given]) / np.timedelta64(1, "s")
     weight = np.concatenate([[1.0], np.clip(np.where(np.isfinite(seconds), seconds, 0.4) / correlation_s, 1e-3, 1.0)])
     known = candidates.track >= 0
+    sigma = np.full(n, sigma_m) if sigma_m is not None else np.hypot(log.sigma_m[given], SIGMA_PLAN_M)
+    sigma = np.where(np.isfinite(sigma), sigma, SIGMA_M)[:, None]
     cost = np.full((n, m + 1), np.inf)
-    cost[:, :m] = np.where(known, 0.5 * (np.where(known, candidates.offset_m, 0.0) / sigma_m) ** 2, np.inf)
-    cost[:, m] = np.where(np.isfinite(log.latitude_deg), _UNMAPPED_COST, 0.0)
-    cost *= weight[:, None]
-    moves = _Transitions(network, candidates, step)
-    path, gamma = _decode(cost, moves)
+    cost[:, :m] = np.where(known, 0.5 * (np.where(known, candidates.offset_m, 0.0) / sigma) ** 2, np.inf)
+    cost[:, m] = _UNMAPPED_COST
+    path, gamma = _decode(cost * weight[:, None], _Transitions(network, candidates, step))
     rows, mapped = np.arange(n), path < m
     column = np.minimum(path, m - 1)
-    return Matched(
+    found = Matched(
         track=np.where(mapped, candidates.track[rows, column], -1),
         chainage_m=np.where(mapped, candidates.chainage_m[rows, column], np.nan),
         offset_m=np.where(mapped, candidates.offset_m[rows, column], np.nan),
         probability=gamma[rows, path],
         candidates=candidates,
         probabilities=gamma[:, :m],
+    )
+    return found if n == len(log.time) else _spread(found, given, len(log.time))
+
+
+def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
+    """Matched positions put on their rows of a log, the others without."""
+
+    def over(values: Floats, empty: float) -> Floats:
+        full = np.full((count, *values.shape[1:]), empty)
+        full[rows] = values
+        return full
+
+    def tracks(values: Indices) -> Indices:
+        full = np.full((count, *values.shape[1:]), -1, dtype=np.intp)
+        full[rows] = values
+        return full
+
+    near = matched.candidates
+    return Matched(
+        track=tracks(matched.track),
+        chainage_m=over(matched.chainage_m, np.nan),
+        offset_m=over(matched.offset_m, np.nan),
+        probability=over(matched.probability, np.nan),
+        candidates=Candidates(
+            track=tracks(near.track), chainage_m=over(near.chainage_m, np.nan), offset_m=over(near.offset_m, np.inf)
+        ),
+        probabilities=over(matched.probabilities, np.nan),
     )
 
 
@@ -160,7 +239,7 @@ class _Transitions:
     def __init__(self, network: Network, candidates: Candidates, step_m: Floats) -> None:
         self._network = network
         self._track, self._place = candidates.track, candidates.chainage_m
-        self._step = step_m
+        self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
         self._ways: dict[tuple[int, int], dict[int, float]] = {}
         same = (self._track[1:, None, :] == self._track[:-1, :, None]) & (self._track[:-1, :, None] >= 0)
         #: Cost to stay, shape (n - 1, m, m); other passages are computed where both ends have one.
@@ -183,7 +262,7 @@ class _Transitions:
         """Whether a train can have run from one place to the other in the distance between two positions."""
         a, b = int(self._track[k, i]), int(self._track[k + 1, j])
         place, target = float(self._place[k, i]), float(self._place[k + 1, j])
-        length, reach = self._network.length_m, float(self._step[k]) + _SLACK_M
+        length, reach = self._network.length_m, float(self._reach[k])
         for end in (0, 1):
             rest = place if end == 0 else float(length[a]) - place
             if rest > reach:
@@ -198,7 +277,7 @@ class _Transitions:
     def _from(self, track: int, end: int) -> dict[int, float]:
         if (track, end) not in self._ways:
             node = 4 * track + 2 * end + 1
-            reach = float(self._step.max(initial=0.0)) + _SLACK_M
+            reach = float(self._reach.max(initial=0.0))
             inside = node in self._network.graph
             self._ways[track, end] = (
                 dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach)) if inside else {}
@@ -235,10 +314,37 @@ def _normal(weights: Floats) -> Floats:
     return np.asarray(weights / weights.sum())
 
 
-def route_of(network: Network, matched: Matched) -> list[int]:
-    """Tracks that a run passed, in order; gaps are filled with the shortest way over navigable connections."""
+def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
+    """Tracks that a run passed, and those that it may have passed but no route can join to them.
+
+    Gaps are filled with the shortest way over navigable connections. A train that runs back over tracks it has
+    passed stays on the same route; where it runs back over others, the less probable ones are left out.
+
+    Returns
+    -------
+    route : list of int
+        In the order of travel; empty where no position is on a track.
+    left_out : list of int
+    """
     seen = matched.track[matched.track >= 0]
     if not len(seen):
-        return []
-    changes = np.concatenate([[True], np.diff(seen) != 0])
-    return network.shortest_route([int(t) for t in seen[changes]])
+        return [], []
+    passed = [int(t) for t in seen[np.concatenate([[True], np.diff(seen) != 0])]]
+    if (route := network.route_over(passed)) is not None:
+        return route, []
+    # the train turned back: of the legs between its turns the most probable one
+    legs: list[list[int]] = []
+    start = 0
+    while start < len(passed) - 1:
+        # a prefix of a route is one
+        count = bisect_left(range(2, len(passed) - start + 1), 1, key=partial(_ends_a_leg, network, passed[start:])) + 1
+        legs.append(network.shortest_route(passed[start : start + count]))
+        start += count - 1
+    share = {t: float(matched.probabilities[matched.candidates.track == t].sum()) for t in set(passed)}
+    route = max(legs, key=lambda leg: sum(share.get(t, 0.0) for t in set(leg)))
+    return route, [t for t in dict.fromkeys(passed) if t not in route]
+
+
+def _ends_a_leg(network: Network, passed: list[int], count: int) -> int:
+    """1 where no route leads over the first tracks, else 0."""
+    return int(network.route_over(passed[:count]) is None)

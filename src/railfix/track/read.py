@@ -83,11 +83,12 @@ def read_track(
     files = [paths] if isinstance(paths, str | PathLike) else list(paths)
     if not files:
         raise SettingsError("no track map was given")
-    segments: list[Segment] = []
-    for file in files:
-        segments += read_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
     return track_of_segments(
-        segments,
+        [
+            segment
+            for file in files
+            for segment in read_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
+        ],
         heights=heights,
         geoid=geoid,
         name=name,
@@ -114,7 +115,7 @@ def track_of_segments(
     if flat and heights is None:
         raise InputFileError(
             flat[0].source,
-            "the coordinates have no height; make a 3-D map with 'railfix map route MAP --heights FILE', the file a "
+            "the coordinates have no height; give --heights FILE (railfix run, railfix map route): a raster, a "
             "profile by chainage or a log of 3-D positions",
         )
     if heights is not None and len(flat) < len(segments):
@@ -129,8 +130,7 @@ def track_of_segments(
     )
     if heights is None:
         return track
-    raised = with_heights(track, heights, geoid=geoid)
-    return raised if sigma_height_m is None else replace(raised, sigma_height_m=sigma_height_m)
+    return with_heights(track, heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 
 
 def read_segments(

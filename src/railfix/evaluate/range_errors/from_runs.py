@@ -146,7 +146,7 @@ def _run_errors(
     """Range errors of one run, chunk by chunk."""
     past = read_record(source.run)
     past.check_inputs()
-    navigation, line, logs = open_inputs(past.inputs, past.options)
+    navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
     references = read_reference(source.reference, tuple(past.inputs.logs))
     processor, state = processor_of(past.config, navigation, line.trajectories), State()
     base: BaseStation | None = None

@@ -1,0 +1,338 @@
+"""Route of a log through a network of tracks, found from the log itself, and the tracks beside it as hypotheses.
+
+Conventional positions once a second are matched to the network (`railfix.track.network_match`); the most probable
+sequence of tracks is the route on which positions are computed, and every other track keeps its probability.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.errors import MismatchError
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.config import Config
+from railfix.pipeline.locate import locate
+from railfix.pipeline.received import known_from_start
+from railfix.run.options import TrackReading
+from railfix.track import Track
+from railfix.track.frames import in_map_frame
+from railfix.track.network import Network
+from railfix.track.network_match import Matched, PlanLog, match, route_of
+
+#: Interval of the positions that are matched [s].
+_INTERVAL_S: Final = 1.0
+#: Least probability of a track beside the route that is written and named.
+_LEAST_WRITTEN: Final = 1e-4
+_LEAST_NAMED: Final = 0.01
+#: Alternatives named in the notes; all are in ``run.json``.
+_NAMED: Final = 8
+#: Epochs of an alternative nearer than this belong together [s].
+_TOGETHER_S: Final = 60.0
+#: Name of a track that the map does not have.
+NONE: Final = "none"
+
+#: Columns that positions on a network have besides.
+ON_TRACK_COLUMNS: Final[dict[str, str]] = {
+    "track": "track of the network on which the position lies, of the route found from the log",
+    "track_chainage_m": "distance in plan along that track from its first point, of the antenna",
+    "track_probability": "probability of the route there, given the whole log; `tracks.csv` has the tracks beside it",
+}
+#: Columns of the table of tracks near each position.
+TRACK_COLUMNS: Final[dict[str, str]] = {
+    "time_gpst": "time tag of the receiver, GPS time",
+    "antenna": "`front` or `rear`",
+    "track": "track of the network; `none`: a track that the map does not have",
+    "on_route": "whether it is of the route on which the positions are computed",
+    "probability": "of this track given the whole log; the rows of an epoch and antenna add up to 1",
+    "chainage_m": "distance in plan along the track from its first point, of the nearest point to the position",
+    "kilometrage_m": "the line's own marking there, where the map has one",
+    "offset_m": "distance in plan from the position to the track",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Alternative:
+    """A stretch of the log on which a track beside the route is possible."""
+
+    track: str
+    instead_of: str
+    first: np.datetime64
+    last: np.datetime64
+    probability: float
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "track": self.track,
+            "instead_of": self.instead_of,
+            "first_epoch_gpst": str(self.first),
+            "last_epoch_gpst": str(self.last),
+            "largest_probability": round(self.probability, 6),
+        }
+
+    @property
+    def sentence(self) -> str:
+        """For the notes of a run."""
+        span = f"{str(self.first)[:19]} to {str(self.last)[11:19]}"
+        return f"route: from {span} the train may be on {self.track} instead of {self.instead_of} " + (
+            f"(probability up to {self.probability:.2f})"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RouteOfLog:
+    """Route of a log through a network, with the probability of every track near it.
+
+    Attributes
+    ----------
+    network : Network
+    tracks : tuple of int
+        Of the route, in order.
+    left_out : tuple of int
+        Tracks of the most probable sequence that no route joins to those: the train turned back over them.
+    log : PlanLog
+        Positions that were matched, in the frame of the network.
+    matched : Matched
+    time : datetime64
+        Of the frame's epoch.
+    reading : TrackReading
+    """
+
+    network: Network
+    tracks: tuple[int, ...]
+    left_out: tuple[int, ...]
+    log: PlanLog
+    matched: Matched
+    time: np.datetime64
+    reading: TrackReading
+
+    @cached_property
+    def probability(self) -> Floats:
+        """Probability of the route at each matched position, shape (n,)."""
+        return np.asarray((self.matched.probabilities * self._on_route).sum(axis=1))
+
+    @cached_property
+    def unmapped(self) -> Floats:
+        """Probability of a track that the map does not have, shape (n,)."""
+        return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
+
+    @cached_property
+    def _on_route(self) -> Floats:
+        return np.isin(self.matched.candidates.track, self.tracks).astype(np.float64)
+
+    @cached_property
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """Stretches on which a track beside the route has a probability of at least 1 %, the most probable first."""
+        names = (*self.network.names, NONE)
+        beside = np.where(self._on_route > 0.0, -1, self.matched.candidates.track)
+        found = []
+        for track in (*np.unique(beside[beside >= 0]).tolist(), -1):
+            share = self.unmapped
+            if track >= 0:
+                share = np.where(beside == track, self.matched.probabilities, 0.0).sum(axis=1)
+            rows = np.flatnonzero(share >= _LEAST_NAMED)
+            apart = np.diff(self.log.time[rows]) > np.timedelta64(round(_TOGETHER_S * 1e9), "ns")
+            for part in np.split(rows, np.flatnonzero(apart) + 1):
+                if len(part):
+                    top = int(part[np.argmax(share[part])])
+                    found.append(
+                        Alternative(
+                            track=names[track],
+                            instead_of=names[self._track_of_route(top)],
+                            first=self.log.time[part[0]],
+                            last=self.log.time[part[-1]],
+                            probability=float(share[top]),
+                        )
+                    )
+        return tuple(sorted(found, key=lambda item: -item.probability))
+
+    def _track_of_route(self, row: int) -> int:
+        """Track of the route nearest in time to a matched position."""
+        known = np.flatnonzero(np.isin(self.matched.track, self.tracks))
+        return int(self.matched.track[known[np.argmin(np.abs(known - row))]])
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the tracks of the route, in order."""
+        return [self.network.names[k] for k in self.tracks]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The route and what may be instead of it, one sentence each."""
+        low = float(self.probability.min())
+        first = (
+            f"route found from the log: {', '.join(self.names)}; chainage rises in this order; its probability is "
+            f"{self.probability.mean():.3f} on average and at least {low:.3f} (tracks.csv has every track near)"
+        )
+        if self.left_out:
+            beside = ", ".join(self.network.names[k] for k in self.left_out)
+            first += f"; the train turned back, perhaps over {beside}, which no route joins to these"
+        more = len(self.alternatives) - _NAMED
+        rest = (f"route: {more} more stretches with alternatives are in run.json",) if more > 0 else ()
+        return (*self.network.notes, first, *(a.sentence for a in self.alternatives[:_NAMED]), *rest)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "found_from": self.log.path,
+            "tracks": self.names,
+            "left_out": [self.network.names[k] for k in self.left_out],
+            "mean_probability": round(float(self.probability.mean()), 6),
+            "least_probability": round(float(self.probability.min()), 6),
+            "alternatives": [alternative.facts for alternative in self.alternatives],
+        }
+
+    def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
+        """A table of positions with its tracks, and every track near each position.
+
+        Parameters
+        ----------
+        table : polars.DataFrame
+            With time_gpst, antenna, chainage_m and ECEF coordinates.
+        line : Track
+            The route, whose sections are its tracks.
+
+        Returns
+        -------
+        polars.DataFrame
+            `table` with `ON_TRACK_COLUMNS`.
+        polars.DataFrame
+            `TRACK_COLUMNS`; no rows where there is no position.
+        """
+        chainage = table["chainage_m"].to_numpy()
+        ecef = table.select("x_m", "y_m", "z_m").to_numpy()
+        latitude, longitude = np.full(len(table), np.nan), np.full(len(table), np.nan)
+        known = np.isfinite(chainage) & np.isfinite(ecef[:, 0])
+        if known.any():
+            reading = self.reading
+            place, _ = in_map_frame(
+                ecef[known], self.network.frame, self.time, epoch=reading.map_epoch, plate=reading.plate
+            )
+            latitude[known], longitude[known], _ = geodetic_from_ecef(place)
+        number = np.where(known, self._section(line, chainage), -1)
+        along, _ = self.network.place_on(number, latitude, longitude)
+        epoch = self._nearest_epoch(table["time_gpst"].to_numpy())
+        share = np.where(known, self.probability[epoch], np.nan)
+        names = np.array([*self.network.names, None], dtype=object)
+        positions = table.with_columns(
+            pl.Series("track", names[number].tolist(), dtype=pl.String),
+            pl.Series("track_chainage_m", along, nan_to_null=True),
+            pl.Series("track_probability", share, nan_to_null=True),
+        )
+        candidates, probability = self.matched.candidates.track[epoch], self.matched.probabilities[epoch]
+        beside = np.where(self._on_route[epoch] > 0.0, -1, candidates)
+        rows, column = np.nonzero(known[:, None] & (beside >= 0) & (probability >= _LEAST_WRITTEN))
+        own, off = np.flatnonzero(known), np.flatnonzero(known & (self.unmapped[epoch] >= _LEAST_WRITTEN))
+        row = np.concatenate([own, rows, off])
+        track = np.concatenate([number[own], beside[rows, column], np.full(len(off), -1)])
+        at, offset = self.network.place_on(track, latitude[row], longitude[row])
+        long = (
+            table[row]
+            .select("time_gpst", "antenna")
+            .with_columns(
+                pl.Series("track", np.where(track < 0, NONE, names[track]).tolist(), dtype=pl.String),
+                pl.Series("on_route", np.arange(len(row)) < len(own)),
+                pl.Series(
+                    "probability",
+                    np.concatenate([share[own], probability[rows, column], self.unmapped[epoch][off]]),
+                ),
+                pl.Series("chainage_m", at, nan_to_null=True),
+                pl.Series("kilometrage_m", self.network.kilometrage_on(track, at), nan_to_null=True),
+                pl.Series("offset_m", offset, nan_to_null=True),
+            )
+        )
+        order = np.lexsort((-long["probability"].to_numpy(), row))
+        return positions, long[order]
+
+    def _section(self, line: Track, chainage_m: Floats) -> Integers:
+        """Track of the route at each chainage, shape (n,)."""
+        ends = line.chainage_m[np.flatnonzero(np.diff(line.section))]
+        return np.asarray(np.array(self.tracks)[np.searchsorted(ends, np.nan_to_num(chainage_m))], dtype=np.int64)
+
+    def _nearest_epoch(self, time: Any) -> Indices:
+        """The matched position nearest in time to each time, shape (n,)."""
+        after = np.clip(np.searchsorted(self.log.time, time), 1, max(len(self.log.time) - 1, 1))
+        before = after - 1
+        after = np.minimum(after, len(self.log.time) - 1)
+        nearer = time - self.log.time[before] <= self.log.time[after] - time
+        return np.asarray(np.where(nearer, before, after), dtype=np.intp)
+
+
+def find_route(
+    network: Network,
+    parts: Iterable[Observations],
+    navigation: Navigation,
+    config: Config,
+    *,
+    path: str,
+    time: np.datetime64,
+    reading: TrackReading,
+) -> RouteOfLog:
+    """Find the route of a log through a network.
+
+    Parameters
+    ----------
+    network : Network
+    parts : iterable of Observations
+        The log, in order of time.
+    navigation : Navigation
+    config : Config
+    path : str
+        Of the log, for messages.
+    time : datetime64
+        Of the frame's epoch.
+    reading : TrackReading
+
+    Raises
+    ------
+    MismatchError
+        The log has no position near a track, or no route leads over the tracks that it passes.
+    """
+    received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
+    located = []
+    for part in parts:
+        seconds = np.diff(part.time) / np.timedelta64(1, "s")
+        step = max(1, round(_INTERVAL_S / float(np.median(seconds)))) if len(seconds) else 1
+        located.append(locate(part[::step], received, config, book))
+    times, ecef, sigma = (
+        np.concatenate([getattr(part, name)[np.isfinite(part.ecef_m[:, 0])] for part in located] or [np.empty(0)])
+        for name in ("time", "ecef_m", "sigma_m")
+    )
+    if not len(times):
+        raise MismatchError(f"{path}: the log has no position, so that no route through the network can be found")
+    latitude, longitude, _ = geodetic_from_ecef(ecef)
+    positions = PlanLog(
+        path=path,
+        time=times,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        sigma_m=np.sqrt((sigma[:, :2] ** 2).mean(axis=1)),
+    )
+    positions, _ = positions.in_frame_of(network, epoch=reading.map_epoch, plate=reading.plate)
+    matched = match(network, positions)
+    tracks, left_out = route_of(network, matched)
+    if not tracks:
+        raise MismatchError(
+            f"{path}: no position lies near a track of the network; is it the map of this region, and its CRS right?"
+        )
+    return RouteOfLog(
+        network=network,
+        tracks=tuple(tracks),
+        left_out=tuple(left_out),
+        log=positions,
+        matched=matched,
+        time=time,
+        reading=reading,
+    )

@@ -1,0 +1,197 @@
+"""Runs on a network of tracks: the route found from the log, the tracks beside it, frames, evaluation."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from network_made import made_network, made_run, write_station
+from railfix.core.errors import MismatchError
+from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.evaluate import evaluate_run
+from railfix.evaluate.options import EvaluationOptions
+from railfix.evaluate.place import track_of
+from railfix.evaluate.run_folder import read_run
+from railfix.pipeline.config import Config
+from railfix.run import RunInputs, RunOptions, RunSummary, TrackReading, run_files
+from railfix.run.driver import open_inputs
+from railfix.run.sources import open_line
+from railfix.simulate.demonstration import demo_inputs, demo_truth
+from railfix.track import read_track
+from railfix.track.frames import points_at
+from railfix.track.network_match import match, route_of
+
+pytestmark = pytest.mark.requirement("A10")
+LOOP_M = (250.0, 550.0)
+ELLIPSOIDAL = RunOptions(track=TrackReading(height_datum="ellipsoidal"))
+
+
+def _demo_on(folder: Path, *, aside_m: float, crs: str = "EPSG:4326") -> RunInputs:
+    """The demo log on its own line, which has a loop beside it, as a GeoPackage."""
+    inputs = demo_inputs()
+    path = folder / "station.gpkg"
+    write_station(path, read_track(inputs.track), crs=crs, loop_m=LOOP_M, aside_m=aside_m)
+    return inputs.replaced(track=(path,), rear=(), vehicle=None)
+
+
+@pytest.fixture(scope="module")
+def near(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunInputs, RunSummary]:
+    folder = tmp_path_factory.mktemp("near")
+    inputs = _demo_on(folder, aside_m=4.5)
+    return inputs, run_files(inputs, Config(filter="track"), out=folder / "results", options=ELLIPSOIDAL)
+
+
+def test_route_is_found_and_the_loop_keeps_its_probability(near: tuple[RunInputs, RunSummary]) -> None:
+    _, summary = near
+    record = json.loads(summary.files["run.json"].read_text())
+    route = record["line"]["route"]
+    assert route["tracks"] == ["west", "main", "east"]
+    assert [a["track"] for a in route["alternatives"]] == ["loop"]
+    assert 0.05 < route["alternatives"][0]["largest_probability"] < 0.5
+    assert route["least_probability"] == pytest.approx(1.0 - route["alternatives"][0]["largest_probability"], abs=0.02)
+    notes = " ".join(summary.notes)
+    assert "route found from the log: west, main, east" in notes
+    assert "may be on loop instead of main" in notes
+
+
+def test_rows_name_their_track_and_the_probabilities_of_those_near(near: tuple[RunInputs, RunSummary]) -> None:
+    _, summary = near
+    rows = pl.read_parquet(summary.files["positions.parquet"])
+    placed = rows.filter(pl.col("chainage_m").is_not_null())
+    assert rows.filter(pl.col("chainage_m").is_null())["track"].null_count() == len(rows) - len(placed)
+    for name, low, high in (("west", 0.0, LOOP_M[0]), ("main", *LOOP_M), ("east", LOOP_M[1], 1e4)):
+        own = placed.filter(pl.col("track") == name)
+        assert len(own) > 20
+        assert own["chainage_m"].is_between(low - 0.01, high + 0.01).all()
+        # the antenna leans out of a track that has no chainage of its own, gradients are in the chainage of the line
+        along = own["chainage_m"] - low - own["track_chainage_m"]
+        assert along.abs().max() < 1.0  # type: ignore[operator]
+    near_ = pl.read_parquet(summary.files["tracks.parquet"])
+    sums = near_.group_by("time_gpst", "antenna").agg(pl.col("probability").sum())
+    assert len(sums) == len(placed)
+    assert (sums["probability"] - 1.0).abs().max() < 2e-3  # type: ignore[operator]
+    loop = near_.filter(pl.col("track") == "loop")
+    assert not loop["on_route"].any()
+    assert loop["offset_m"].median() == pytest.approx(4.5, abs=0.3)
+    train = pl.read_parquet(summary.files["train.parquet"])
+    assert train.filter(pl.col("chainage_m").is_not_null())["track"].null_count() == 0
+
+
+def test_results_are_those_on_the_route_given_as_a_map(near: tuple[RunInputs, RunSummary], tmp_path: Path) -> None:
+    _, summary = near
+    given = demo_inputs().replaced(rear=(), vehicle=None)
+    plain = run_files(given, Config(), out=tmp_path / "plain")
+    columns = ("time_gpst", "x_m", "y_m", "z_m", "status")
+    ours, theirs = (pl.read_parquet(s.files["positions.parquet"]).select(columns) for s in (summary, plain))
+    both = ours.join(theirs, on="time_gpst")
+    apart = both.select((pl.col("x_m") - pl.col("x_m_right")).abs()).to_series()
+    assert len(both) == len(theirs)
+    # the map has the points 250 and 550 m besides, which bend nothing
+    assert apart.max() < 1e-3  # type: ignore[operator]
+    assert "route" not in " ".join(plain.notes)
+
+
+def test_evaluation_reads_the_track_that_the_run_wrote(near: tuple[RunInputs, RunSummary]) -> None:
+    _, summary = near
+    folder = summary.files["run.json"].parent
+    assert track_of(read_run(folder)).chainage_m[-1] == pytest.approx(756.0, abs=1.0)
+    result = evaluate_run(folder, demo_truth(), options=EvaluationOptions(method="trajectory"))
+    assert result is not None
+
+
+def test_a_map_in_another_frame_is_moved_also_in_a_network(tmp_path: Path) -> None:
+    """JGD2011 has moved by decimetres since 2011: the same tracks named as WGS 84 are off by as much."""
+    frames = {}
+    for name, crs in (("wgs84", "EPSG:4326"), ("jgd2011", "EPSG:6668")):
+        (tmp_path / name).mkdir()
+        inputs = _demo_on(tmp_path / name, aside_m=4.5, crs=crs)
+        _, line, _ = open_inputs(inputs, ELLIPSOIDAL, Config())
+        frames[name] = line
+    shift = frames["jgd2011"].frame
+    assert shift is not None
+    assert 0.1 < np.hypot(shift.east_m, shift.north_m) < 0.6
+    assert frames["jgd2011"].route is not None
+    assert frames["jgd2011"].route.names == ["west", "main", "east"]
+    assert not frames["jgd2011"].from_file
+    # the line stands where the satellites have it, the route's positions where the map has it
+    moved = frames["jgd2011"].track.ecef_m - frames["wgs84"].track.ecef_m
+    assert np.linalg.norm(moved, axis=1) == pytest.approx(
+        np.linalg.norm([shift.east_m, shift.north_m, shift.up_m]), abs=0.6
+    )
+
+
+def test_evaluation_of_a_run_on_a_map_that_was_moved(tmp_path: Path) -> None:
+    """The track of the record is the map's own; positions lie where it was moved to."""
+    inputs = demo_inputs().replaced(rear=())
+    text = inputs.track[0].read_text()
+    path = tmp_path / "line.csv"
+    path.write_text("# crs: EPSG:6668\n" + "\n".join(x for x in text.splitlines() if not x.startswith("# crs")) + "\n")
+    summary = run_files(inputs.replaced(track=(path,)), Config(), out=tmp_path / "results")
+    assert "track.csv" in summary.files
+    evaluate_run(tmp_path / "results", demo_truth(), options=EvaluationOptions(method="trajectory"))
+
+
+def test_without_a_log_a_network_is_a_sentence(tmp_path: Path) -> None:
+    inputs = _demo_on(tmp_path, aside_m=4.5)
+    with pytest.raises(MismatchError, match=r"4 tracks that do not join to one route; .* 'railfix map route'"):
+        open_line(inputs.track, None, antennas=("front",), reading=TrackReading(height_datum="ellipsoidal"))
+
+
+def test_a_network_elsewhere_is_a_sentence(tmp_path: Path, recordings: Path) -> None:
+    folder = recordings / "rail" / "infrabel"
+    inputs = demo_inputs().replaced(track=(folder / "network_airport.geojson",))
+    with pytest.raises(MismatchError, match="no position lies near a track of the network"):
+        run_files(inputs, Config(), out=tmp_path / "results")
+
+
+def test_memory_of_the_track_is_kept_without_positions() -> None:
+    """A loop entered with good positions is still the loop after a gap, a tunnel, on it."""
+    net = made_network(10.0)
+    log, on = made_run(net, [0, 2, 3], rng=np.random.default_rng(5), sigma_m=0.2)
+    latitude = np.where((on == 2) & (np.cumsum(on == 2) > 40), np.nan, log.latitude_deg)
+    gap = type(log)(**{**vars(log), "latitude_deg": latitude})
+    matched = match(net, gap)
+    assert np.isnan(matched.probability[np.isnan(latitude)]).all()
+    assert set(matched.track[np.isfinite(latitude)].tolist()) == {0, 2, 3}
+    assert route_of(net, matched) == ([0, 2, 3], [])
+
+
+def test_a_train_that_runs_back_over_another_track_has_a_route_and_says_so() -> None:
+    net = made_network(10.0)
+    there, _ = made_run(net, [0, 1, 3], rng=np.random.default_rng(5), sigma_m=0.05)
+    back, _ = made_run(net, [0, 2, 3], rng=np.random.default_rng(6), sigma_m=0.05)
+    both = type(there)(
+        path="made",
+        time=np.concatenate([there.time, back.time + np.timedelta64(1, "h")]),
+        **{
+            name: np.concatenate([getattr(there, name), getattr(back, name)[::-1]])
+            for name in ("latitude_deg", "longitude_deg", "sigma_m")
+        },
+    )
+    route, left_out = route_of(net, match(net, both, sigma_m=0.3))
+    assert sorted([*route, *left_out]) == [0, 1, 2, 3]
+    assert len(left_out) == 1
+    assert left_out[0] in (1, 2)
+
+
+def test_positions_are_matched_in_the_frame_of_the_map() -> None:
+    """Positions of satellites on tracks in ETRS89: on them when moved, 0.8 m north-east of them as they are."""
+    made = made_network(10.0)
+    net = replace(made, tracks=tuple(replace(t, frame="EPSG:4258", crs="EPSG:4258") for t in made.tracks))
+    log, on = made_run(made, [0, 1, 3], rng=np.random.default_rng(5), sigma_m=1e-6)
+    ecef = ecef_from_geodetic(log.latitude_deg, log.longitude_deg, np.zeros(len(on)))
+    moved, _ = points_at(ecef, "EPSG:4258", log.time[0])
+    latitude, longitude, _ = geodetic_from_ecef(moved)
+    received = replace(log, latitude_deg=latitude, longitude_deg=longitude)
+    back, shift = received.in_frame_of(net)
+    assert np.abs(match(net, back, sigma_m=0.5).offset_m).max() < 1e-3
+    assert np.abs(match(net, received, sigma_m=0.5).offset_m) == pytest.approx(abs(shift.north_m), abs=0.05)
+    timeless = replace(received, time=np.full(len(on), np.datetime64("NaT", "ns")))
+    with pytest.raises(MismatchError, match=r"has no times.*--same-frame"):
+        timeless.in_frame_of(net)
+    assert timeless.in_frame_of(made)[1].method == "used as it is"
