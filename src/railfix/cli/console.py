@@ -57,19 +57,23 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    task = bar.add_task(work, total=1.0, epochs=0, rate=0.0)
 
-        def show(*, epochs: int, fraction: float) -> None:
-            elapsed = bar.tasks[task].elapsed or 0.0
-            bar.update(
-                task,
-                completed=fraction,
-                epochs=epochs,
-                rate=epochs / elapsed if elapsed > 0 else 0.0,
-            )
+    def show(*, epochs: int, fraction: float) -> None:
+        bar.start()  # its thread starts with the first epochs: a run forks before it has threads
+        elapsed = bar.tasks[task].elapsed or 0.0
+        bar.update(
+            task,
+            completed=fraction,
+            epochs=epochs,
+            rate=epochs / elapsed if elapsed > 0 else 0.0,
+        )
 
+    try:
         yield show
+    finally:
+        bar.stop()
 
 
 def show_summary(summary: RunSummary) -> None:

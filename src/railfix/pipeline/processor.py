@@ -169,28 +169,54 @@ class EpochProcessor:
             navigation=navigation,
             messages=messages,
         )
-        chunks = {
-            name: AntennaChunk(
-                self,
-                name,
-                part,
-                received,
-                state.antennas.get(name, AntennaState()),
-                state.fusion.get(name, FilterState()),
-                sensors,
-            )
-            for name, part in observations.items()
-        }
+        state = replace(state, received=received)
+        chunks = {name: self.chunk(name, part, state, sensors=sensors) for name, part in observations.items()}
         self.compare(chunks)
+        return self.gathered(chunks, state)
+
+    def chunk(
+        self, name: str, observations: Observations, state: State, *, sensors: SensorSamples | None = None
+    ) -> AntennaChunk:
+        """Return a chunk of one antenna, to be taken through its steps by `compare` and `gathered`.
+
+        Parameters
+        ----------
+        name : str
+            The antenna.
+        observations : Observations
+        state : State
+            After the chunk before this one.
+        sensors : SensorSamples, optional
+        """
+        return AntennaChunk(
+            self,
+            name,
+            observations,
+            state.received or self.received,
+            state.antennas.get(name, AntennaState()),
+            state.fusion.get(name, FilterState()),
+            sensors,
+        )
+
+    def gathered(self, chunks: Mapping[str, AntennaChunk], state: State) -> tuple[Result, State]:
+        """Return the results of compared chunks, and the state after them.
+
+        Parameters
+        ----------
+        chunks : mapping of str to AntennaChunk
+            By antenna.
+        state : State
+            Before them.
+        """
         results = {name: chunk.finished() for name, chunk in chunks.items()}
         tracks = {name: chunk.tracked for name, chunk in chunks.items() if chunk.tracked is not None}
-        result = Result(antennas=results, notes=(*received.notes, *self._lacking), fusion=tracks)
-        after = State(
+        notes = (*(state.received or self.received).notes, *self._lacking)
+        after = replace(
+            state,
             antennas={**state.antennas, **{name: chunk.state for name, chunk in chunks.items()}},
-            received=received,
             fusion={**state.fusion, **{name: chunks[name].filter_state for name in tracks}},
         )
-        return result, after
+        return Result(antennas=results, notes=notes, fusion=tracks), after
 
     def compare(self, chunks: Mapping[str, ChunkSteps]) -> None:
         """Take the same chunk of all antennas through the screens that compare them, up to their last step.

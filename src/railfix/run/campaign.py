@@ -44,7 +44,7 @@ class Campaign(Settings):
     track : tuple of Path
     vehicle, config : Path or None
     options : RunOptions
-        Of every run.
+        Of every run; each is one process, unless they say otherwise.
     """
 
     front: str
@@ -191,7 +191,7 @@ def position_run(run: CampaignRun) -> dict[str, Any]:
     try:
         check_folder(run.out, overwrite="replace")
         if not run.done:
-            options = run.options.replaced(overwrite="replace")
+            options = run.options.replaced(overwrite="replace", workers=run.options.workers or 1)
             run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:

@@ -6,7 +6,9 @@ import sys
 import time as clock
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,9 +21,9 @@ from railfix.io.sp3 import read_sp3
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, risk_of
-from railfix.pipeline.processor import EpochProcessor, State
-from railfix.pipeline.tables import observations_table, positions_table, rounded
-from railfix.pipeline.train_table import train_table
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.tables import in_time_order, rounded
+from railfix.run.antennas import AntennaRun, OtherProcess, processes
 from railfix.run.checks import (
     RECORD_REACH,
     check_positions,
@@ -30,14 +32,14 @@ from railfix.run.checks import (
     check_same_time,
     check_sbas_time,
 )
-from railfix.run.chunks import aligned
+from railfix.run.chunks import cuts
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
 from railfix.run.route import RouteOfLog, find_route
-from railfix.run.sensors import read_sensors, until
+from railfix.run.sensors import read_sensors
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
@@ -119,15 +121,25 @@ def run_files(
     config, options = config or Config(), options or RunOptions()
     inputs = inputs.with_settings(config)
     inputs.check()
-    with (
-        OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
-        ThreadPoolExecutor(max_workers=1) as pool,
-    ):
-        entries = inputs.entries(pool, out)
+    with ExitStack() as stack:
+        # Forked before any thread is started, and before polars starts its own.
+        others = [
+            stack.enter_context(OtherProcess(name, partial(_antenna_run, name, inputs, config, options)))
+            for name in tuple(inputs.logs)[1 : processes(options.workers)]
+        ]
+        folder = stack.enter_context(OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths))
+        entries = inputs.entries(stack.enter_context(ThreadPoolExecutor(max_workers=1)), out)
         navigation, line, logs = open_inputs(inputs, options, config)
         processor = processor_of(config, navigation, line.trajectories)
-        sensors = read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
-        tally = _position(logs, line, processor, sensors, folder, options, progress)
+        sensors = _sensors_of(inputs)
+        write = options.observations == "write"
+        runs: dict[str, AntennaRun | OtherProcess] = {
+            name: AntennaRun(name, processor, log, sensors, observations=write)
+            for name, log in logs.items()
+            if name not in {other.name for other in others}
+        }
+        runs |= {other.name: other.reads(logs[other.name]) for other in others}
+        tally = _position(runs, line, processor, folder, progress)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
@@ -231,41 +243,55 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
     return None if not len(clocks) else np.sort(clocks)[len(clocks) // 2]
 
 
+def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunOptions) -> AntennaRun:
+    """Return the run of one antenna, for a process of its own."""
+    navigation, line, logs = open_inputs(inputs, options, config)
+    processor = processor_of(config, navigation, line.trajectories)
+    return AntennaRun(name, processor, logs[name], _sensors_of(inputs), observations=options.observations == "write")
+
+
+def _sensors_of(inputs: RunInputs) -> SensorSamples:
+    return read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
+
+
 def _position(
-    logs: Mapping[Antenna, Log],
+    runs: Mapping[str, AntennaRun | OtherProcess],
     line: Line,
     processor: EpochProcessor,
-    sensors: SensorSamples,
     folder: OutputFolder,
-    options: RunOptions,
     progress: Progress | None,
 ) -> Tally:
-    """Position chunk by chunk: counts and rows."""
-    tally, state = Tally(min_satellites=processor.config.min_satellites), State()
-    received = np.datetime64("NaT", "ns")
-    for chunk in aligned({name: log.parts() for name, log in logs.items()}):
+    """Position chunk by chunk: counts and rows. Other processes come last in `runs`, and are asked first."""
+    tally, after = Tally(min_satellites=processor.config.min_satellites), np.datetime64("NaT", "ns")
+    for cut in cuts({name: run.more for name, run in runs.items()}):
         began = clock.perf_counter()
-        end = max(part.time[-1] for part in chunk.values() if len(part))
-        result, state = processor.process(chunk, state, sensors=until(sensors, received, end))
-        received = end
-        tally.took(result, clock.perf_counter() - began)
-        tally.add(result)
+        end = max(times[-1] for times in cut.values() if len(times))
+        chunks = {name: run for name, run in runs.items() if name in cut}
+        for name, run in reversed(chunks.items()):
+            run.begin(len(cut[name]), after, end)
+        after = end
+        processor.compare(chunks)
+        rows = {name: run.finished() for name, run in chunks.items()}
+        tally.took(cut.values(), clock.perf_counter() - began)
+        for name, of_antenna in rows.items():
+            tally.antennas[name] = of_antenna.tally
+            tally.notes.update(dict.fromkeys(of_antenna.notes))
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
-        tables = {"positions": positions_table(result)}
+        tables = {}
+        for table in ("positions", "train", "observations"):
+            if parts := [part for of_antenna in rows.values() if (part := getattr(of_antenna, table)) is not None]:
+                tables[table] = in_time_order(parts)
         if line.route is not None:
             tables["positions"], tables["tracks"] = line.route.on_tracks(tables["positions"], line.track)
-        if result.fusion:
-            tables["train"] = train_table(result)
-            if line.route is not None:
+            if "train" in tables:
                 tables["train"], _ = line.route.on_tracks(tables["train"], line.track)
-        for name, table in tables.items():
-            folder.append_parquet(f"{name}.parquet", table)
-            folder.append_csv(f"{name}.csv", rounded(table))
-        if options.observations == "write":
-            folder.append_parquet("observations.parquet", observations_table(result))
+        for name, joined in tables.items():
+            folder.append_parquet(f"{name}.parquet", joined)
+            if name != "observations":
+                folder.append_csv(f"{name}.csv", rounded(joined))
         if progress is not None:
-            progress(epochs=tally.epochs, fraction=min(log.share for log in logs.values()))
+            progress(epochs=tally.epochs, fraction=min(run.log.share for run in runs.values()))
     return tally
 
 

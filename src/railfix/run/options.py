@@ -67,6 +67,8 @@ class RunOptions(Settings):
         Epochs in memory at a time.
     start, end : datetime or None
         First epoch, and the time before which the last one lies, GPS time.
+    workers : int
+        See `railfix.run.antennas.processes`.
     track : TrackReading
     """
 
@@ -83,6 +85,14 @@ class RunOptions(Settings):
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
         "Epochs in memory at a time; the results do not depend on it.", 3000, name="--chunk", metavar="EPOCHS", ge=1
+    )
+    workers: int = option(
+        "Processes side by side: 2 gives each of two antennas its own (Linux); the results do not depend on it. 0: 2 "
+        "where that can be, otherwise 1.",
+        0,
+        metavar="N",
+        ge=0,
+        le=2,
     )
     track: TrackReading = Field(default_factory=TrackReading)
 

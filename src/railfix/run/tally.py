@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Masks
+from railfix.core.arrays import Datetimes, Masks
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.pipeline.processor import AntennaResult, Result
 
@@ -246,11 +247,11 @@ class Tally:
             self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites)).add(antenna)
         self.notes.update(dict.fromkeys(result.notes))
 
-    def took(self, result: Result, spent_s: float) -> None:
-        """Note how long the positions of one more chunk took."""
-        times = [antenna.time for antenna in result.antennas.values() if len(antenna.time)]
-        if times:
-            self.chunks.append((min(time[0] for time in times), sum(map(len, times)), spent_s))
+    def took(self, times: Iterable[Datetimes], spent_s: float) -> None:
+        """Note how long the positions of one more chunk took: its time tags by antenna, and the time [s]."""
+        some = [part for part in times if len(part)]
+        if some:
+            self.chunks.append((min(part[0] for part in some), sum(map(len, some)), spent_s))
 
     @property
     def epochs(self) -> int:
