@@ -226,8 +226,8 @@ def test_a_killed_centre_loses_no_acknowledged_report(tmp_path: Path, kills: int
 def test_documents_and_log_are_kept(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'centre.db'}"
     with Store(url) as store:
-        store.save_document("interlocking", "first")
-        store.save_document("interlocking", "second")
+        store.save(documents={"interlocking": "first"})
+        store.save(documents={"interlocking": "second"})
         for k in range(5):
             store.note(k, f"line {k}", train=k)
     with Store(url) as store:

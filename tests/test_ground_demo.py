@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import shutil
 import subprocess
 import tempfile
 import threading
@@ -21,7 +22,7 @@ from starlette.responses import HTMLResponse, StreamingResponse
 from starlette.routing import Route
 
 from railfix.ground.demo import FAULT_S, run_demo
-from railfix.ground.web import PageServer, page_app
+from railfix.ground.web import MOST_WRONG, SESSION_S, PageServer, Sessions, page_app
 from report_page import _OPTIONS, Page, browser, fetched
 
 pytestmark = [pytest.mark.requirement(row) for row in ("F1", "F2", "F3", "F4", "F5")]
@@ -104,7 +105,7 @@ def test_the_page_shows_trains_intervals_links_and_the_stop(
     _, state = demo
     hostile = {**state, "log": ["</script><b id='hostile'>x</b>", *state["log"]]}
     shown = [hostile]
-    with served(page_app(lambda: shown[0], lambda: None, password="secret")) as url:
+    with served(page_app(lambda: shown[0], {}, sessions=Sessions(password="secret"))) as url:
         document = browse(url, "--window-size=1250,1200", "--dump-dom")
         shown[0] = state
         picture = Path(os.environ.get("RAILFIX_SCREENSHOTS", tmp_path)) / "ground.png"
@@ -135,7 +136,7 @@ document.getElementById("phone").addEventListener("load", function () {
 
 @needs_browser
 def test_nothing_is_wider_than_a_telephone(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
-    app = page_app(lambda: demo[1], lambda: None, password="secret")
+    app = page_app(lambda: demo[1], {}, sessions=Sessions(password="secret"))
     app.router.routes.append(Route("/phone", lambda _: HTMLResponse(PHONE)))
     with served(app) as url:
         note = Page(browse(url + "phone", "--window-size=1000,3000", "--dump-dom")).by_id("narrow")
@@ -156,7 +157,7 @@ def test_the_page_connects_again_and_shows_newer_states(demo: tuple[dict[str, An
             iter([f"retry: 50\ndata: {json.dumps(states[k])}\n\n"]), media_type="text/event-stream"
         )
 
-    app = page_app(lambda: states[0], lambda: None, password="secret")
+    app = page_app(lambda: states[0], {}, sessions=Sessions(password="secret"))
     app.router.routes[:] = [route for route in app.router.routes if getattr(route, "path", "") != "/events"]
     app.router.routes.append(Route("/events", events))
     with served(app) as url:
@@ -166,25 +167,122 @@ def test_the_page_connects_again_and_shows_newer_states(demo: tuple[dict[str, An
     assert page.text.get("railfix-errors", "") == ""
 
 
-def test_orders_need_the_password(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
+class Browser:
+    """Requests to a page, with the cookie it has set."""
+
+    def __init__(self, url: str) -> None:
+        self.url, self.cookie = url, ""
+
+    def post(self, address: str, values: object = None, *, kind: str = "application/json") -> tuple[int, str | None]:
+        data = json.dumps({} if values is None else values).encode()
+        headers = {"Content-Type": kind, "Cookie": self.cookie}
+        request = urllib.request.Request(self.url + address, data=data, headers=headers, method="POST")
+        try:
+            answer = urllib.request.urlopen(request)
+        except urllib.error.HTTPError as error:
+            answer = error
+        with answer:
+            cookie = answer.headers.get("Set-Cookie")
+            if cookie is not None:
+                assert {"HttpOnly", "SameSite=strict"} <= set(cookie.split("; "))
+                self.cookie = cookie.split(";")[0]
+            return answer.status, json.load(answer)["refused"]
+
+
+def test_orders_need_a_log_in(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
     answers, asked = iter(["healthy for 3 s of the 300 s before a release", None]), []
 
-    def release() -> str | None:
-        asked.append(1)
+    def release(_: dict[str, Any]) -> str | None:
+        asked.append("release")
         return next(answers)
 
-    def post(url: str, password: str) -> tuple[int, str | None]:
-        request = urllib.request.Request(url + "release", data=password.encode(), method="POST")
-        try:
-            with urllib.request.urlopen(request) as answer:
-                return answer.status, json.load(answer)["refused"]
-        except urllib.error.HTTPError as error:
-            with error:
-                return error.code, json.load(error)["refused"]
+    def route(values: dict[str, Any]) -> str | None:
+        asked.append(f"route {values.get('train')}")
+        return None
 
-    with served(page_app(lambda: demo[1], release, password="secret")) as url:
-        assert post(url, "wrong") == (403, "wrong password")
-        assert post(url, "") == (403, "wrong password")
+    orders, now = {"release": release, "route": route}, [0.0]
+    sessions = Sessions(password="secret", clock=lambda: now[0])
+    with served(page_app(lambda: demo[1], orders, sessions=sessions)) as url:
+        desk, stranger = Browser(url), Browser(url)
+        for address in ("orders/release", "orders/route"):
+            assert desk.post(address, {"train": 1}) == (403, "log in first")
+        for wrong in ("wrong", "", None, 5):
+            assert desk.post("login", {"password": wrong})[0] == 403
+        assert desk.post("login", {"password": "secret"}, kind="text/plain")[0] == 403  # as a foreign page would
+        assert desk.post("orders/route", {"train": 1})[0] == 403
         assert asked == []
-        assert post(url, "secret") == (409, "healthy for 3 s of the 300 s before a release")
-        assert post(url, "secret") == (200, None)
+        assert desk.post("login", {"password": "secret"}) == (200, None)
+        assert desk.post("orders/release") == (409, "healthy for 3 s of the 300 s before a release")
+        assert desk.post("orders/release") == (200, None)
+        assert desk.post("orders/route", {"train": 2}) == (200, None)
+        assert desk.post("orders/route", {"train": 2}, kind="text/plain")[0] == 400
+        assert desk.post("orders/route", {"train": "2" * 2000})[0] == 400
+        assert desk.post("orders/points", {"train": 2})[0] == 404
+        assert asked == ["release", "release", "route 2"]
+        stranger.cookie = "railfix-session=guessed"
+        assert stranger.post("orders/route", {"train": 2})[0] == 403
+        now[0] += SESSION_S + 1.0
+        assert desk.post("orders/route", {"train": 2})[0] == 403  # ended by itself
+        for _ in range(MOST_WRONG):
+            stranger.post("login", {"password": "wrong"})
+        assert desk.post("login", {"password": "secret"})[0] == 403  # too many wrong ones
+        now[0] += 61.0
+        assert desk.post("login", {"password": "secret"})[0] == 200
+        assert desk.post("logout") == (200, None)
+        assert desk.post("orders/route", {"train": 2})[0] == 403
+
+
+DESK = """<!DOCTYPE html><iframe id="page" src="/"></iframe><script>
+document.getElementById("page").addEventListener("load", async function () {
+  const inner = this.contentDocument, note = document.createElement("div"), $ = id => inner.getElementById(id);
+  const wait = () => new Promise(done => setTimeout(done, 300));
+  const press = async (id) => { $(id).requestSubmit(); await wait(); return $("answer").textContent; };
+  note.id = "desk";
+  note.dataset.before = $("desk").hidden;
+  $("password").value = "wrong"; note.dataset.wrong = await press("login");
+  $("password").value = "secret"; note.dataset.right = await press("login");
+  note.dataset.open = !$("desk").hidden;
+  $("train").value = "2"; note.dataset.route = await press("route");
+  note.dataset.release = await press("release");
+  await press("logout"); note.dataset.after = $("desk").hidden;
+  note.dataset.errors = $("railfix-errors").textContent;
+  document.body.append(note);
+});</script>"""
+
+
+@needs_browser
+def test_orders_in_a_browser(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    asked = []
+
+    def route(values: dict[str, Any]) -> str | None:
+        asked.append(values)
+        return "train 1 comes the other way"
+
+    orders = {"route": route, "release": lambda _: None}
+    app = page_app(lambda: demo[1], orders, sessions=Sessions(password="secret"))
+    app.router.routes.append(Route("/test", lambda _: HTMLResponse(DESK)))
+    with served(app) as url:
+        note = Page(browse(url + "test", "--virtual-time-budget=20000", "--dump-dom")).by_id("desk")
+    assert (note["data-before"], note["data-open"], note["data-after"]) == ("true", "true", "true")
+    assert note["data-wrong"].startswith("wrong password")
+    assert (note["data-right"], note["data-route"], note["data-release"]) == (
+        "done", "train 1 comes the other way", "done",
+    )  # fmt: skip
+    assert asked == [{"train": 2}]
+    assert note["data-errors"] == ""
+
+
+@needs_browser
+def test_the_page_on_paper(demo: tuple[dict[str, Any], dict[str, Any]], tmp_path: Path) -> None:
+    """At most two pages of A4, with the picture, all tables and the log, without the desk for orders."""
+    paper = tmp_path / "page.pdf"
+    with served(page_app(lambda: demo[1], {}, sessions=Sessions(password="secret"))) as url:
+        browse(url, f"--print-to-pdf={paper}", "--no-pdf-header-footer")
+    data = paper.read_bytes()
+    assert 1 <= data.count(b"/Type /Page\n") <= 2
+    assert len(data) < 1_000_000
+    if program := shutil.which("pdftotext"):
+        text = subprocess.run([program, paper, "-"], capture_output=True, text=True, check=True).stdout
+        for word in ("STOP: satellites or jamming", "Trains", "Links", "Points", "Log", "heard again"):
+            assert word in text
+        assert "Log in" not in text

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from railfix.ground.authority import Authority
 from railfix.ground.interlocking import (
     ALL_RULES,
     Interlocking,
@@ -22,8 +23,9 @@ from railfix.ground.interlocking import (
 )
 from railfix.ground.interlocking_text import from_json, to_json
 from railfix.ground.layout import Layout, LoopStation, overlap
-from railfix.ground.traffic import traffic
-from railfix.io.train_message import MessageStatus, TrainMessage
+from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.ground.traffic import Conditions, traffic
+from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
 
 pytestmark = [pytest.mark.requirement("F4"), pytest.mark.requirement("F5")]
 
@@ -142,7 +144,7 @@ def violations(seeds: range, steps: int, rules: frozenset[Rule] = ALL_RULES) -> 
             if run.violations and rules != ALL_RULES:
                 break
         counted += run.violations
-        routes += run.arrivals
+        routes += run.centre.routes_set
     return counted, routes
 
 
@@ -163,10 +165,11 @@ NEEDED = {
     Rule.TRAIN_AHEAD: (1, "intervals overlap"),
     Rule.SAFE_REAR: (0, "train outside its interval"),
     Rule.SEQUENCE: (1, "intervals overlap"),
-    Rule.POINTS_LOCKED: (1, "points moved under a train"),
-    Rule.POINTS_DETECTED: (13, "train on moving points"),
+    Rule.POINTS_LOCKED: (0, "points moved under a train"),
+    Rule.POINTS_DETECTED: (56, "train on moving points"),
     Rule.PERSISTENCE: (1, "train outside its interval"),
     Rule.SUPERVISION: (0, "train outside its interval"),
+    Rule.FRESHNESS: (0, "runs without a fresh authority"),
 }
 
 
@@ -182,3 +185,52 @@ def test_the_direction_of_a_section_is_a_second_defence_behind_the_points() -> N
     assert violations(range(3), 150, ALL_RULES - {Rule.DIRECTION})[0] == Counter()
     counted, _ = violations(range(1, 2), 150, ALL_RULES - {Rule.DIRECTION, Rule.POINTS_LOCKED})
     assert counted["trains overlap"] > 0
+
+
+def test_trains_stop_within_the_time_limit_of_authorities_although_their_links_fail() -> None:
+    """A stop is ordered while links are out: with the time limit every train rests soon, without it one runs on."""
+    found = {}
+    for rules in (ALL_RULES, ALL_RULES - {Rule.FRESHNESS}):
+        run = traffic(3, rules=rules, conditions=Conditions(outage=0.01, suspension=0.01))
+        for _ in range(400):
+            run.step()
+        found[rules] = run.violations
+    assert found[ALL_RULES] == Counter()
+    assert found[ALL_RULES - {Rule.FRESHNESS}]["runs after a stop was ordered"] > 0
+
+
+def authority(number: int, *, report: int = 0, end_m: float = 500.0, direction: int = 1) -> Authority:
+    return Authority(
+        train=7, number=number, report=report, end_cm=round(end_m * 100), direction=direction, stopped=False
+    )
+
+
+def test_the_age_of_an_authority_is_that_of_the_report_it_answers() -> None:
+    train = OnBoard(direction=1, end_m=100.0, limits=OnBoardLimits(fresh_s=10.0))
+    assert train.brake_reason(0.0) == "no fresh authority"
+    train.reported(1, 50.0)
+    train.reported(2, 51.0)
+    assert train.receive(authority(1, report=1))
+    assert (train.age_s(55.0), train.end_m) == (5.0, 500.0)
+    assert train.brake_reason(60.0) is None
+    assert train.brake_reason(60.1) == "no fresh authority"
+    # delivered late by the link: as old as its report, not as its arrival
+    assert train.receive(authority(2, report=2))
+    assert train.brake_reason(61.1) == "no fresh authority"
+    # a centre that hears nothing repeats its authority in vain
+    train.reported(3, 62.0)
+    assert train.receive(authority(3, report=2))
+    assert train.brake_reason(62.0) == "no fresh authority"
+    assert not train.receive(authority(3, report=3))  # repeated
+    assert not train.receive(authority(4, report=3, direction=-1))
+    assert train.brake_reason(62.0) == "no fresh authority"
+    assert train.receive(authority(4, report=3, end_m=300.0))
+    assert (train.brake_reason(62.0), train.end_m) == (None, 500.0)  # never shortened
+
+
+def test_bytes_of_an_authority() -> None:
+    data = authority(9, report=3, end_m=-12.34, direction=-1).encode()
+    assert Authority.decode(data) == authority(9, report=3, end_m=-12.34, direction=-1)
+    for wrong in (data[:-1], data + b"x", b"\x02" + data[1:], data[:-2] + b"\x05" + data[-1:]):
+        with pytest.raises(MessageError):
+            Authority.decode(wrong)

@@ -255,8 +255,8 @@ def test_a_wrong_certificate_is_rejected(keys: Path, tmp_path: Path, kind: str) 
 
             plain = links.configuration
 
-            def without(path: Path, name: str, *, is_client: bool) -> Any:
-                settings = plain(path, name, is_client=is_client)
+            def without(path: Path, name: str, **rest: Any) -> Any:
+                settings = plain(path, name, **rest)
                 settings.certificate = settings.private_key = None
                 return settings
 

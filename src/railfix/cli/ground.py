@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -186,8 +186,123 @@ def demo(
         )
     except OSError as error:
         raise OutputError(f"the demonstration cannot use its loopback addresses ({error.strerror})") from None
+    _show_figures(figures)
+
+
+@app.command("centre", cls=Command)
+def centre(
+    path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="Line, trains, keys and addresses.")],
+    *,
+    page: Annotated[
+        str, typer.Option(metavar="HOST:PORT", help="Of the page; port 0 takes a free one.")
+    ] = "127.0.0.1:8000",
+    password: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Password for orders in its first line; a new one is printed without it."),
+    ] = None,
+    for_seconds: Annotated[
+        float | None, typer.Option("--for", metavar="S", min=0.0, help="End after this time; else at a signal.")
+    ] = None,
+) -> None:
+    r"""Supervise the trains of a line: reports in, authorities out, points and routes, with a page.
+
+    Trains connect over two QUIC links with certificates of `railfix ground keys`. Every report that is acknowledged
+    and every authority is in the database before it is sent, so the centre may be killed and started again at any
+    time. Reading the page is open; the release of a stop and routes by hand need a log-in. Points are simulated.
+
+        keys = "keys"
+        listen = { A = "127.0.1.1:4433", B = "127.0.2.1:4433" }
+        stations = [
+            { name = "West", begin_m = 0, end_m = 500 },
+            { name = "East", begin_m = 1500, end_m = 2000 },
+        ]
+        trains = [
+            { number = 1, station = "West", track = 1, direction = 1, front_m = 400, length_m = 80 },
+        ]
+
+    Example: `railfix ground centre line.toml --password secret.txt`
+
+    Exit codes as `railfix --help` says.
+    """
+    import asyncio
+    import secrets
+
+    from railfix.ground.serve import parse_address, read_password, run_centre
+
+    console = console_of_tables()
+    try:
+        address = parse_address(page)
+    except ValueError as error:
+        raise SettingsError(f"--page {page!r}: {error}") from None
+    word = secrets.token_urlsafe(12) if password is None else read_password(password)
+
+    def announce(url: str) -> None:
+        console.print(f"the page, to open in a browser: {url}", soft_wrap=True)
+        if password is None:
+            console.print(f"password for orders: {word}", soft_wrap=True)
+
+    figures = asyncio.run(run_centre(path, page=address, password=word, for_s=for_seconds, announce=announce))
+    _show_figures(figures)
+
+
+@app.command("train", cls=Command)
+def train(
+    number: Annotated[int, typer.Argument(metavar="N", min=1, help="Number of the train.")],
+    *,
+    keys: Annotated[Path, typer.Option(metavar="DIR", help="authority.pem and the train's own two files.")],
+    centre: Annotated[
+        list[str], typer.Option("--centre", metavar="HOST:PORT", help="Centre's address: of bearer A, then of B.")
+    ],
+    local: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST", help="Own address on a bearer: of A, then of B; else the system chooses."),
+    ] = None,
+    fresh: Annotated[
+        float, typer.Option(metavar="S", min=1.0, help="Time limit of authorities: older ones brake the train.")
+    ] = 15.0,
+    for_seconds: Annotated[
+        float | None, typer.Option("--for", metavar="S", min=0.0, help="End after this time.")
+    ] = None,
+) -> None:
+    """Carry the positions of a train to the centre over two links, and its authorities back.
+
+    Reads position messages as lines of JSON from standard input (`railfix live ... --send json@-`), reports the newest
+    every second, and writes each authority, and each beginning and end of braking, as a line of JSON.
+
+    Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
+
+    Exit codes as `railfix --help` says.
+    """
+    import asyncio
+
+    from railfix.ground.links import BEARERS
+    from railfix.ground.on_board import OnBoardLimits
+    from railfix.ground.serve import parse_address
+    from railfix.ground.train import run_train
+
+    hosts = local or ["0.0.0.0", "0.0.0.0"]
+    if len(centre) != 2 or len(hosts) != 2:
+        raise SettingsError("--centre and --local are given twice: for bearer A, then for B")
+    try:
+        addresses = dict(zip(BEARERS, map(parse_address, centre), strict=True))
+    except ValueError as error:
+        raise SettingsError(f"--centre: {error}") from None
+    work = run_train(
+        number,
+        keys,
+        addresses,
+        dict(zip(BEARERS, hosts, strict=True)),
+        write=lambda line: print(line, flush=True),
+        limits=OnBoardLimits(fresh_s=fresh),
+        for_s=for_seconds,
+    )
+    asyncio.run(work)
+
+
+def _show_figures(figures: dict[str, Any]) -> None:
+    """Print a table of what happened."""
     table = Table("what happened", "")
     for name, value in figures.items():
         text = ", ".join(f"{k} {v}" for k, v in value.items()) or "none" if isinstance(value, dict) else str(value)
         table.add_row(escape(name), text)
-    console.print(table)
+    console_of_tables().print(table)

@@ -98,7 +98,8 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
             raise SettingsError(f"{source}: setting {where} is missing") from None
         message = first["msg"].removeprefix("Value error, ")
         given = "" if isinstance(first["input"], (Mapping, BaseModel)) else f", got {first['input']!r}"
-        raise SettingsError(f"{source}: setting {where}: {message}{given}") from None
+        place = f"setting {where}: " if where else ""
+        raise SettingsError(f"{source}: {place}{message}{given}") from None
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:

@@ -93,6 +93,7 @@ class TrainRecord:
 class Rejection(Enum):
     """Reason of a report that changes nothing."""
 
+    UNKNOWN_TRAIN = "of a train that is not supervised"
     OTHER_TRAIN = "of another train"
     REPEATED = "repeated or older than the newest"
     NO_PLACE = "without a place"

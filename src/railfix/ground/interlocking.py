@@ -31,6 +31,7 @@ class Rule(Enum):
     POINTS_DETECTED = "an authority ends before points that are not detected in their position"
     PERSISTENCE = "granted authorities survive a restart of the centre"
     SUPERVISION = "a train is braked before the end of its authority"
+    FRESHNESS = "a train without a fresh authority is braked"
 
 
 ALL_RULES: Final = frozenset(Rule)
@@ -112,11 +113,14 @@ class Interlocking:
     points : mapping of PointName to PointState
     stopped : bool
         True while no authority is extended and no route set: satellite positioning is suspended.
+    granted : int
+        Number of the last authorities that were sent.
     """
 
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
     stopped: bool = False
+    granted: int = 0
 
 
 def interval_of(train: TrainInterval) -> tuple[float, float]:

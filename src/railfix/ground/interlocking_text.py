@@ -15,6 +15,7 @@ def to_json(state: Interlocking) -> str:
             "trains": [asdict(train) for train in state.trains.values()],
             "points": [[*name, asdict(point)] for name, point in state.points.items()],
             "stopped": state.stopped,
+            "granted": state.granted,
         }
     )
 
@@ -32,4 +33,4 @@ def from_json(text: str) -> Interlocking:
         )
         for station, side, item in values["points"]
     }
-    return Interlocking(trains=trains, points=points, stopped=values["stopped"])
+    return Interlocking(trains=trains, points=points, stopped=values["stopped"], granted=values["granted"])

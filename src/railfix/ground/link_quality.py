@@ -29,6 +29,8 @@ class LinkLimits(Settings):
         Frames of the response rate.
     place_m : float [m]
         Length of a place of the coverage map.
+    idle_s : float [s]
+        A connection without any packet for this time is made anew.
     """
 
     answer_s: float = Field(default=1.0, gt=0)
@@ -37,6 +39,7 @@ class LinkLimits(Settings):
     good_s: float = Field(default=30.0, ge=0)
     window: int = Field(default=60, ge=1)
     place_m: float = Field(default=100.0, gt=0)
+    idle_s: float = Field(default=5.0, gt=0)
 
 
 @dataclass(kw_only=True)

@@ -75,7 +75,8 @@ class TrainLinks:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _keep(self, name: LinkName) -> None:
-        settings = configuration(self._keys, f"train-{self.train}", is_client=True)
+        idle_s = self.meters[name].limits.idle_s
+        settings = configuration(self._keys, f"train-{self.train}", is_client=True, idle_s=idle_s)
         while True:
             try:
                 async with connected(
@@ -141,21 +142,34 @@ class CentreLinks:
     hosts : dict of {"A", "B"} to str
     received : callable
         Called with the train's number and the payload.
+    ports : dict of {"A", "B"} to int, optional
+        Free ones without it.
 
     Attributes
     ----------
     addresses : dict of {"A", "B"} to (str, int)
     masquerades : int
         Connections that were rejected for their certificate.
+    heard_s : dict of (int, {"A", "B"}) to float
+        Monotonic clock when a train's last frame came over a bearer.
     """
 
-    def __init__(self, keys: Path, hosts: dict[LinkName, str], *, received: Callable[[int, bytes], None]) -> None:
+    def __init__(
+        self,
+        keys: Path,
+        hosts: dict[LinkName, str],
+        *,
+        received: Callable[[int, bytes], None],
+        ports: dict[LinkName, int] | None = None,
+    ) -> None:
         self.addresses: dict[LinkName, tuple[str, int]] = {}
         self.receivers: dict[int, FrameReceiver] = {}
         self.masquerades = 0
-        self._keys, self._hosts, self._received = keys, hosts, received
+        self.heard_s: dict[tuple[int, LinkName], float] = {}
+        self._keys, self._hosts, self._ports, self._received = keys, hosts, ports or {}, received
         self._peers: dict[tuple[int, LinkName], LinkProtocol] = {}
-        self._sequence = self._echoes = first_sequence()
+        # of each train alone: `first_sequence` allows 10 frames a second
+        self._sequence: dict[tuple[int, FrameKind], int] = {}
         self._stack = AsyncExitStack()
 
     async def start(self) -> None:
@@ -163,7 +177,7 @@ class CentreLinks:
         settings = configuration(self._keys, "centre", is_client=False)
         for name in BEARERS:
             server, self.addresses[name] = await listen(
-                (self._hosts[name], 0),
+                (self._hosts[name], self._ports.get(name, 0)),
                 settings,
                 received=lambda protocol, data, name=name: self._frame(name, protocol, data),  # type: ignore[misc]
                 rejected=self._masquerade,
@@ -183,13 +197,13 @@ class CentreLinks:
 
     def send(self, train: int, payload: bytes) -> None:
         """Send a payload to a train on every link it has."""
-        self._sequence += 1
-        self._put(train, FrameKind.DATA, self._sequence, payload, BEARERS)
+        self._put(train, FrameKind.DATA, payload, BEARERS)
 
     def _masquerade(self) -> None:
         self.masquerades += 1
 
-    def _put(self, train: int, kind: FrameKind, sequence: int, payload: bytes, names: tuple[LinkName, ...]) -> None:
+    def _put(self, train: int, kind: FrameKind, payload: bytes, names: tuple[LinkName, ...]) -> None:
+        sequence = self._sequence[train, kind] = self._sequence.get((train, kind), first_sequence()) + 1
         frame = Frame(kind=kind, sender=CENTRE, sequence=sequence, time_ns=time.monotonic_ns(), payload=payload)
         for name in names:
             if (protocol := self._peers.get((train, name))) is not None:
@@ -209,11 +223,10 @@ class CentreLinks:
         answer, use = receiver.receive(name, data, now_ns)
         if answer is None:
             return
-        self._peers[train, name] = protocol
+        self._peers[train, name], self.heard_s[train, name] = protocol, time.monotonic()
         echo = Echo(
             sequence=answer.sequence, sent_ns=answer.time_ns, received_ns=now_ns, answered_ns=time.monotonic_ns()
         )
-        self._echoes += 1
-        self._put(train, FrameKind.ECHO, self._echoes, echo.encode(), (name,))
+        self._put(train, FrameKind.ECHO, echo.encode(), (name,))
         if use is not None:
             self._received(train, use.payload)

@@ -23,18 +23,18 @@ from cryptography import x509
 
 #: Name of the protocol in the handshake.
 PROTOCOL: Final = "railfix-link/1"
-#: A connection without any packet ends after this time [s].
-IDLE_S: Final = 10.0
+#: A connection without any packet ends after this time [s]; so the trains of a centre that was killed connect again.
+IDLE_S: Final = 5.0
 _REJECTED: Final = 0x101
 
 
-def configuration(folder: Path, name: str, *, is_client: bool) -> QuicConfiguration:
+def configuration(folder: Path, name: str, *, is_client: bool, idle_s: float = IDLE_S) -> QuicConfiguration:
     """Return the settings of an end from the files that `railfix.ground.keys.write_keys` wrote."""
     settings = QuicConfiguration(
         is_client=is_client,
         alpn_protocols=[PROTOCOL],
         max_datagram_frame_size=65_536,
-        idle_timeout=IDLE_S,
+        idle_timeout=idle_s,
         verify_mode=ssl.CERT_REQUIRED,
         cadata=(folder / "authority.pem").read_bytes(),
         server_name="centre" if is_client else None,

@@ -5,6 +5,7 @@ Everything that is acknowledged or granted is committed before: a centre that is
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -76,17 +77,14 @@ class Store:
         self._connection.close()
         self._engine.dispose()
 
-    def save(self, *records: TrainRecord) -> None:
-        """Commit the newest reports of trains together; afterwards they may be acknowledged."""
+    def save(self, *records: TrainRecord, documents: Mapping[str, str] | None = None) -> None:
+        """Commit the newest reports of trains and named texts together; afterwards they may be acknowledged."""
         with self._connection.begin():
             for record in records:
                 message = None if record.message is None else encode(record.message)
                 self._put(TRAINS, {"train": record.train}, {"sequence": record.sequence, "message": message})
-
-    def save_document(self, name: str, text: str) -> None:
-        """Commit a named text, for example the state of the interlocking."""
-        with self._connection.begin():
-            self._put(DOCUMENTS, {"name": name}, {"text": text})
+            for name, text in (documents or {}).items():
+                self._put(DOCUMENTS, {"name": name}, {"text": text})
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
         """Commit a line of the log."""

@@ -9,22 +9,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
-from railfix.ground.interlocking import (
-    ALL_RULES,
-    Interlocking,
-    InterlockingLimits,
-    PointState,
-    Rule,
-    TrainInterval,
-    extended,
-    interval_of,
-    points_reported,
-    released,
-    report_received,
-    route_requested,
-)
+from railfix.ground.authority import Authority
+from railfix.ground.interlocking import ALL_RULES, Interlocking, Rule, interval_of
 from railfix.ground.interlocking_text import from_json, to_json
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
+from railfix.ground.on_board import OnBoard
+from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 BRAKING_MPS2: Final = 0.7
@@ -49,29 +39,30 @@ class SimulatedTrain:
 
     Attributes
     ----------
-    number, direction : int
+    number : int
     front_m, speed_mps : float
-    end_m : float [m]
-        End of its authority as received.
+    on_board : OnBoard
     tracks : dict of int to int
         Track in each station that the points have led it to.
     """
 
     number: int
-    direction: int
     front_m: float
     tracks: dict[int, int]
-    end_m: float
+    on_board: OnBoard
     length_m: float = 80.0
     speed_mps: float = 0.0
     top_mps: float = 22.0
     error_m: float = 0.0
     bound_m: float = 5.0
     sequence: int = 0
-    authority: int = -1
     blind_until_s: float = -1.0
-    stop: bool = False
     waits_s: float = 0.0
+
+    @property
+    def direction(self) -> int:
+        """Running direction."""
+        return self.on_board.direction
 
     @property
     def rear_m(self) -> float:
@@ -81,6 +72,7 @@ class SimulatedTrain:
     def message(self, now_s: float) -> TrainMessage:
         """Return the position message of an instant."""
         self.sequence += 1
+        self.on_board.reported(self.sequence, now_s)
         time = 1_400_000_000_000_000_000 + round(now_s * 1e9)
         head: dict[str, Any] = {
             "train": self.number,
@@ -108,14 +100,15 @@ class SimulatedTrain:
 
     def step(self, now_s: float, rules: frozenset[Rule]) -> None:
         """Run for a step of time below the braking curve to the end of the authority."""
-        room = self.direction * (self.end_m - self.front_m - self.error_m) - self.bound_m - STOP_SHORT_M
+        room = self.direction * (self.on_board.end_m - self.front_m - self.error_m) - self.bound_m - STOP_SHORT_M
         wanted = min(self.top_mps, self.speed_mps + ACCELERATION_MPS2 * STEP_S)
         if Rule.SUPERVISION in rules:
             lag = 1.5 * BRAKING_MPS2 * STEP_S
             wanted = min(wanted, (lag**2 + 2.0 * BRAKING_MPS2 * max(room, 0.0)) ** 0.5 - lag)
         elif room <= 0.0:
             wanted = 0.0
-        if self.stop or now_s < self.blind_until_s:
+        braked = self.on_board.stopped if Rule.FRESHNESS not in rules else self.on_board.brake_reason(now_s) is not None
+        if braked or now_s < self.blind_until_s:
             wanted = 0.0
         after = max(wanted, self.speed_mps - BRAKING_MPS2 * STEP_S, 0.0)
         after = 0.0 if after < 0.05 else after
@@ -139,6 +132,8 @@ class Conditions:
         Probability a second that the centre stops for up to 30 s and is restarted from its store.
     blind : float
         Probability a second that a train's sensors fail for up to 40 s.
+    suspension : float
+        Probability a second that satellite positioning is suspended for up to 120 s: trains stop.
     """
 
     loss: float = 0.3
@@ -146,6 +141,7 @@ class Conditions:
     outage: float = 0.002
     restart: float = 0.004
     blind: float = 0.001
+    suspension: float = 0.001
 
 
 @dataclass(kw_only=True)
@@ -154,30 +150,38 @@ class Traffic:
 
     Attributes
     ----------
+    centre : Supervision
     violations : Counter of str
         Invariants that were broken, by kind and in seconds.
-    arrivals : int
-        Routes that were set.
     """
 
-    layout: Layout
     trains: dict[int, SimulatedTrain]
-    state: Interlocking
+    centre: Supervision
     random: random.Random
     conditions: Conditions
-    rules: frozenset[Rule] = ALL_RULES
-    limits: InterlockingLimits = field(default_factory=InterlockingLimits)
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)
-    arrivals: int = 0
-    refusals: Counter[str] = field(default_factory=Counter)
     restarts: int = 0
     moving: dict[PointName, float] = field(default_factory=dict)
     _mail: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     _silent_until: dict[int, float] = field(default_factory=dict)
     _centre_back_s: float = -1.0
+    _suspended_until_s: float = -1.0
+    _stopped_s: float | None = None
     _stored: Interlocking | None = None
-    _grants: int = 0
+
+    def __post_init__(self) -> None:
+        self.centre.command = self.command
+
+    @property
+    def layout(self) -> Layout:
+        """Line."""
+        return self.centre.layout
+
+    @property
+    def rules(self) -> frozenset[Rule]:
+        """Rules that are kept."""
+        return self.centre.rules
 
     def step(self) -> None:
         """Run everything for a step of time and check the invariants."""
@@ -189,14 +193,13 @@ class Traffic:
             train.step(self.now_s, self.rules)
             self._lead(train, before)
             self._change_ends(train)
-            message = train.message(self.now_s)
-            self._send_report(message)
+            self._send_report(train.message(self.now_s))
         due = [item for item in self._mail if item[0] <= self.now_s]
         self._mail = [item for item in self._mail if item[0] > self.now_s]
         for _, _, deliver in sorted(due, key=lambda item: item[:2]):
             deliver()
         if self.now_s >= self._centre_back_s:
-            self._centre()
+            self._advance_centre()
         self._check()
 
     def _disturb(self) -> None:
@@ -204,10 +207,12 @@ class Traffic:
         if self.now_s >= self._centre_back_s and rng.random() < conditions.restart:
             self._centre_back_s = self.now_s + rng.uniform(1.0, 30.0)
             self.restarts += 1
-            self.state = from_json(to_json(self._stored or self.state))
+            self.centre.state = from_json(to_json(self._stored or self.centre.state))
             if Rule.PERSISTENCE not in self.rules:
-                trains = {n: replace(t, end_m=t.front_m) for n, t in self.state.trains.items()}
-                self.state = replace(self.state, trains=trains)
+                trains = {n: replace(t, end_m=t.front_m) for n, t in self.centre.state.trains.items()}
+                self.centre.state = replace(self.centre.state, trains=trains)
+        if rng.random() < conditions.suspension:
+            self._suspended_until_s = self.now_s + rng.uniform(30.0, 120.0)
         for train in self.trains.values():
             if rng.random() < conditions.outage:
                 self._silent_until[train.number] = self.now_s + rng.uniform(5.0, 60.0)
@@ -225,50 +230,25 @@ class Traffic:
 
     def _report(self, message: TrainMessage) -> None:
         if self.now_s >= self._centre_back_s:
-            self.state = report_received(self.state, message, self.layout, rules=self.rules)
+            self.centre.report(message, self.now_s)
 
-    def _centre(self) -> None:
-        """Release, route, extend; store; send."""
-        self.state = released(self.state, self.now_s, self.layout, limits=self.limits)
-        for number, train in self.state.trains.items():
-            if not self._wants_route(train):
-                continue
-            self.state, moved, reason = route_requested(self.state, number, self.layout, rules=self.rules)
-            if reason is not None:
-                self.refusals[reason.split()[-1] if "taken" not in reason else "taken"] += 1
-                continue
-            self.arrivals += 1
-            for name in moved:
-                self._command(name)
-        self.state = extended(self.state, self.layout, limits=self.limits, rules=self.rules)
-        self._stored = self.state
-        self._grants += 1
-        for number, train in self.state.trains.items():
-            self._send_authority(number, self._grants, train.direction, train.end_m)
+    def _advance_centre(self) -> None:
+        """Let the centre work for a step: store, then send."""
+        self.centre.state = replace(self.centre.state, stopped=self.now_s < self._suspended_until_s)
+        authorities = self.centre.advance(self.now_s)
+        self._stored = self.centre.state
+        for authority in authorities:
+            self._send(authority.train, partial(self.authority, authority))
 
     def _send_report(self, message: TrainMessage) -> None:
         self._send(message.train, partial(self._report, message))
 
-    def _send_authority(self, number: int, grant: int, direction: int, end_m: float) -> None:
-        stopped = self.state.stopped
-        self._send(number, partial(self._authority, number, grant, direction, end_m, stopped=stopped))
+    def authority(self, authority: Authority) -> None:
+        """Take an authority on board."""
+        self.trains[authority.train].on_board.receive(authority)
 
-    def _wants_route(self, train: TrainInterval) -> bool:
-        ahead = train.station + train.direction
-        if not 0 <= ahead < len(self.layout.stations):
-            return False
-        inner = self.layout.stations[train.station].inner_m
-        way = train.direction * ((inner[1] if train.direction > 0 else inner[0]) - train.front_m)
-        return way < 700.0
-
-    def _authority(self, number: int, grant: int, direction: int, end_m: float, *, stopped: bool) -> None:
-        train = self.trains[number]
-        if grant <= train.authority or direction != train.direction:
-            return
-        train.authority, train.stop = grant, stopped
-        train.end_m = direction * max(direction * end_m, direction * train.end_m)
-
-    def _command(self, name: PointName) -> None:
+    def command(self, name: PointName) -> None:
+        """Move points; they are detected in their new position after some seconds."""
         self.moving[name] = self.now_s + self.random.uniform(3.0, 7.0)
         low, high = self.layout.zone_m(name)
         for train in self.trains.values():
@@ -279,11 +259,11 @@ class Traffic:
         for name, until in list(self.moving.items()):
             if self.now_s >= until and self.now_s >= self._centre_back_s:
                 del self.moving[name]
-                self.state = points_reported(self.state, name, self.state.points[name].wanted)
+                self.centre.detected(name)
 
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
         """Let points lead a train that runs onto them."""
-        for name, point in self.state.points.items():
+        for name, point in self.centre.state.points.items():
             low, high = self.layout.zone_m(name)
             entered = (low, high) if train.direction > 0 else (-high, -low)
             if not train.direction * before_m < entered[0] <= train.direction * train.front_m:
@@ -302,16 +282,17 @@ class Traffic:
         turns = station == (last if train.direction > 0 else 0) and train.speed_mps == 0.0
         train.waits_s = train.waits_s + STEP_S if turns else 0.0
         if turns and station is not None and train.waits_s > 20.0:
-            train.front_m, train.direction = train.rear_m, -train.direction
-            train.end_m, train.waits_s = train.front_m, 0.0
+            train.front_m = train.rear_m
+            train.on_board.turned(-train.direction, train.front_m)
+            train.waits_s = 0.0
             train.tracks = {station: train.tracks[station]}
 
     def _check(self) -> None:
         trains = list(self.trains.values())
         true = {t.number: self.layout.pieces(t.rear_m, t.front_m, t.tracks) for t in trains}
-        known = {n: self.layout.pieces(*interval_of(t), t.tracks) for n, t in self.state.trains.items()}
+        known = {n: self.layout.pieces(*interval_of(t), t.tracks) for n, t in self.centre.state.trains.items()}
         for k, first in enumerate(trains):
-            supervised = self.state.trains[first.number]
+            supervised = self.centre.state.trains[first.number]
             if supervised.direction == first.direction:
                 rear, end = interval_of(supervised)
                 inside = first.direction * (first.rear_m - rear) >= -1e-6
@@ -324,17 +305,31 @@ class Traffic:
                 if overlap(known[first.number], known[second.number]):
                     self.violations["intervals overlap"] += 1
         self._check_sections()
+        self._check_stops()
 
     def _check_sections(self) -> None:
         for k in range(len(self.layout.stations) - 1):
             first, last = self.layout.stations[k].end_m, self.layout.stations[k + 1].begin_m
             directions = {
                 t.direction
-                for t in self.state.trains.values()
+                for t in self.centre.state.trains.values()
                 if min(interval_of(t)) < last and max(interval_of(t)) > first
             }
             if len(directions) > 1:
                 self.violations["opposing trains in a section"] += 1
+
+    def _check_stops(self) -> None:
+        """Trains brake once their authority is too old, and so at the latest after an order to stop."""
+        stopped = self.centre.state.stopped and self.now_s >= self._centre_back_s
+        self._stopped_s = (self.now_s if self._stopped_s is None else self._stopped_s) if stopped else None
+        for train in self.trains.values():
+            limit_s = train.on_board.limits.fresh_s
+            late_s = train.on_board.age_s(self.now_s) - limit_s - 2.0 * STEP_S
+            if late_s > 0.0 and train.speed_mps > max(0.0, train.top_mps - BRAKING_MPS2 * late_s):
+                self.violations["runs without a fresh authority"] += 1
+            rest_s = limit_s + train.top_mps / BRAKING_MPS2 + 3.0 * STEP_S
+            if self._stopped_s is not None and self.now_s - self._stopped_s > rest_s and train.speed_mps > 0.0:
+                self.violations["runs after a stop was ordered"] += 1
 
 
 def traffic(
@@ -344,44 +339,39 @@ def traffic(
     layout: Layout | None = None,
     rules: frozenset[Rule] = ALL_RULES,
     conditions: Conditions | None = None,
-    **settings: Any,
 ) -> Traffic:
     """Return traffic at its start: trains at rest in stations, at places that the seed chooses."""
     layout, rng = layout or line_with_loops(), random.Random(seed)
     last = len(layout.stations) - 1
     slots = [(k, track) for k in range(last + 1) for track in (1, 2)]
-    simulated, supervised = {}, {}
+    simulated, supervised = {}, []
     for number, (station, track) in enumerate(rng.sample(slots, trains), start=1):
         direction = 1 if station == 0 else -1 if station == last else 1 if track == 1 else -1
         inner = layout.stations[station].inner_m
         front = (inner[1] if direction > 0 else inner[0]) - direction * rng.uniform(60.0, 120.0)
         train = SimulatedTrain(
             number=number,
-            direction=direction,
             front_m=front,
             tracks={station: track},
-            end_m=front,
+            on_board=OnBoard(direction=direction, end_m=front),
             top_mps=rng.uniform(12.0, 25.0),
             length_m=rng.uniform(40.0, 150.0),
         )
         simulated[number] = train
-        supervised[number] = TrainInterval(
-            train=number,
-            direction=direction,
-            rear_m=train.rear_m - direction * 5.0,
-            front_m=front + direction * 5.0,
-            end_m=front + direction * 5.0,
-            sequence=0,
-            tracks={station: track},
-            station=station,
+        supervised.append(
+            standing_train(
+                number,
+                direction=direction,
+                front_m=front,
+                length_m=train.length_m,
+                bound_m=5.0,
+                station=station,
+                track=track,
+            )
         )
-    state = Interlocking(trains=supervised, points={name: PointState() for name in layout.points()})
     return Traffic(
-        layout=layout,
         trains=simulated,
-        state=state,
+        centre=Supervision(layout=layout, state=at_start(layout, supervised), rules=rules),
         random=rng,
-        rules=rules,
         conditions=conditions or Conditions(),
-        **settings,
     )

@@ -1,6 +1,6 @@
 """Page of the control centre: the line with trains, intervals and authorities, links, alarms and log.
 
-Reading is open; orders need the password. Nothing comes from outside the server.
+Reading is open; orders need a log-in. Nothing comes from outside the server.
 """
 
 from __future__ import annotations
@@ -9,10 +9,13 @@ import asyncio
 import json
 import secrets
 import socket
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import uvicorn
 from starlette.applications import Starlette
@@ -21,26 +24,77 @@ from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 #: Time between two events of the page [s].
-EVENT_S = 0.5
-_HEADERS = {
+EVENT_S: Final = 0.5
+#: A log-in ends after this time without an order [s].
+SESSION_S: Final = 1800.0
+#: Wrong passwords within `WRONG_S` after which every log-in is refused for that time.
+MOST_WRONG: Final = 10
+WRONG_S: Final = 60.0
+_COOKIE: Final = "railfix-session"
+_LONGEST_BODY: Final = 1000
+_HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "connect-src 'self'; img-src data:; form-action 'self'; base-uri 'none'; frame-ancestors 'self'",
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
 }
 
+#: An order: takes the values of the request, returns the reason of a refusal.
+Order = Callable[[dict[str, Any]], str | None]
 
-def page_app(snapshot: Callable[[], dict[str, Any]], release: Callable[[], str | None], *, password: str) -> Starlette:
+
+@dataclass(kw_only=True)
+class Sessions:
+    """Log-ins of the page.
+
+    Attributes
+    ----------
+    password : str
+    clock : callable
+    """
+
+    password: str
+    clock: Callable[[], float] = time.monotonic
+    _ends: dict[str, float] = field(default_factory=dict)
+    _wrong: list[float] = field(default_factory=list)
+
+    def log_in(self, password: str) -> str | None:
+        """Return the token of a new session; None where the password is wrong, or too many were."""
+        now = self.clock()
+        self._wrong = [at for at in self._wrong if now - at < WRONG_S]
+        self._ends = {token: end for token, end in self._ends.items() if end > now}
+        if len(self._wrong) >= MOST_WRONG:
+            return None
+        if not secrets.compare_digest(password.encode(), self.password.encode()):
+            self._wrong.append(now)
+            return None
+        token = secrets.token_urlsafe(32)
+        self._ends[token] = now + SESSION_S
+        return token
+
+    def log_out(self, token: str) -> None:
+        """End a session."""
+        self._ends.pop(token, None)
+
+    def valid(self, token: str) -> bool:
+        """Whether a session is open; it is prolonged."""
+        now = self.clock()
+        if self._ends.get(token, -1.0) <= now:
+            return False
+        self._ends[token] = now + SESSION_S
+        return True
+
+
+def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
     """Return the web application.
 
     Parameters
     ----------
     snapshot : callable
         Plain values for the page; ``done`` ends its events.
-    release : callable
-        Releases a stop; returns the reason of a refusal.
-    password : str
-        Asked for with every order.
+    orders : dict of str to callable
+        Orders by the last part of their address: ``release``, ``route``.
+    sessions : Sessions
     """
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
 
@@ -50,7 +104,7 @@ def page_app(snapshot: Callable[[], dict[str, Any]], release: Callable[[], str |
         return HTMLResponse(template.replace("/*STATE*/null", state), headers=_HEADERS)
 
     async def state(_: Request) -> Response:
-        return JSONResponse(snapshot(), headers=_HEADERS)
+        return _answer(snapshot())
 
     async def stream() -> AsyncIterator[str]:
         while True:
@@ -63,21 +117,65 @@ def page_app(snapshot: Callable[[], dict[str, Any]], release: Callable[[], str |
     async def events(_: Request) -> Response:
         return StreamingResponse(stream(), media_type="text/event-stream", headers=_HEADERS)
 
+    async def login(request: Request) -> Response:
+        values = await _values(request)
+        token = None if values is None else sessions.log_in(str(values.get("password", "")))
+        if token is None:
+            return _answer({"refused": "wrong password, or too many wrong ones within a minute"}, 403)
+        answer = _answer({"refused": None})
+        secure = request.url.scheme == "https"
+        answer.set_cookie(_COOKIE, token, httponly=True, samesite="strict", secure=secure, max_age=int(SESSION_S))
+        return answer
+
+    async def logout(request: Request) -> Response:
+        sessions.log_out(request.cookies.get(_COOKIE, ""))
+        return _answer({"refused": None})
+
     async def order(request: Request) -> Response:
-        body = await request.body()
-        if len(body) > 1000 or not secrets.compare_digest(body, password.encode()):
-            return JSONResponse({"refused": "wrong password"}, status_code=403, headers=_HEADERS)
-        reason = release()
-        return JSONResponse({"refused": reason}, status_code=200 if reason is None else 409, headers=_HEADERS)
+        given = orders.get(request.path_params["name"])
+        if given is None:
+            return _answer({"refused": "there is no such order"}, 404)
+        if not sessions.valid(request.cookies.get(_COOKIE, "")):
+            return _answer({"refused": "log in first"}, 403)
+        values = await _values(request)
+        if values is None:
+            return _answer({"refused": "a JSON object was expected"}, 400)
+        reason = given(values)
+        return _answer({"refused": reason}, 200 if reason is None else 409)
 
     return Starlette(
         routes=[
             Route("/", page),
             Route("/state", state),
             Route("/events", events),
-            Route("/release", order, methods=["POST"]),
+            Route("/login", login, methods=["POST"]),
+            Route("/logout", logout, methods=["POST"]),
+            Route("/orders/{name}", order, methods=["POST"]),
         ]
     )
+
+
+def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
+    return JSONResponse(values, status_code=status, headers=_HEADERS)
+
+
+async def _values(request: Request) -> dict[str, Any] | None:
+    """Return the JSON object of a request; None where it has none.
+
+    Another page cannot send this content type without being asked by the browser, which is refused.
+    """
+    if request.headers.get("content-type") != "application/json":
+        return None
+    body = b""
+    async for part in request.stream():
+        body += part
+        if len(body) > _LONGEST_BODY:
+            return None
+    try:
+        values = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None
 
 
 class _Server(uvicorn.Server):
@@ -90,7 +188,7 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """Server of the page on a loopback address.
+    """Server of the page.
 
     Parameters
     ----------
@@ -98,18 +196,25 @@ class PageServer:
     host : str
     port : int
         0 takes a free one.
+    certificate : (Path, Path), optional
+        Certificate and key: the page is served by TLS.
 
     Attributes
     ----------
     url : str
     """
 
-    def __init__(self, app: Starlette, *, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(
+        self, app: Starlette, *, host: str = "127.0.0.1", port: int = 0, certificate: tuple[Path, Path] | None = None
+    ) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._socket.bind((host, port))
-        self.url = "http://{}:{}/".format(*self._socket.getsockname()[:2])
-        self._server = _Server(uvicorn.Config(app, log_level="error", lifespan="off", timeout_graceful_shutdown=1))
+        secured = {} if certificate is None else {"ssl_certfile": certificate[0], "ssl_keyfile": str(certificate[1])}
+        address = "{}:{}".format(*self._socket.getsockname()[:2])
+        self.url = f"{'https' if secured else 'http'}://{address}/"
+        settings: dict[str, Any] = {"log_level": "error", "lifespan": "off", "timeout_graceful_shutdown": 1, **secured}
+        self._server = _Server(uvicorn.Config(app, **settings))
         self._task: asyncio.Task[None] | None = None
 
     async def start(self) -> None:

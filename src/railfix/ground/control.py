@@ -1,0 +1,246 @@
+"""Control centre at work: supervision with its store, the monitor of satellite positioning, log, and page values.
+
+What is acknowledged or granted is committed before it is sent: a centre that is killed at any moment goes on from
+what its trains know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from railfix.ground.authority import Authority
+from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
+from railfix.ground.interlocking import interval_of
+from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.layout import PointName
+from railfix.ground.monitor import MonitorLimits, MonitorState, advance, release
+from railfix.ground.monitor import Order as MonitorOrder
+from railfix.ground.reference_curve import ReferenceCurve
+from railfix.ground.store import Store
+from railfix.ground.supervision import Supervision
+from railfix.ground.triangle import Verdict
+from railfix.ground.web import Order
+from railfix.io.train_message import MessageError, decode
+
+#: Names of the stored documents.
+_INTERLOCKING, _CAUSE = "interlocking", "cause of the stop"
+
+
+@dataclass(kw_only=True)
+class ControlCentre:
+    """Control centre.
+
+    Attributes
+    ----------
+    supervision : Supervision
+    store : Store
+    curves : dict of int to ReferenceCurve
+        By direction.
+    send : callable
+        Sends bytes to a train.
+    clock : callable
+        Centre's clock, which never runs backwards [s].
+    wall_ns : callable
+        Time for the log [ns].
+    monitor : MonitorState or None
+        Of satellite positioning; None where nothing judges it.
+    rejected : dict of str to int
+        Reports that did not count, by reason.
+    """
+
+    supervision: Supervision
+    store: Store
+    curves: dict[int, ReferenceCurve]
+    send: Callable[[int, bytes], None]
+    clock: Callable[[], float]
+    wall_ns: Callable[[], int]
+    monitor: MonitorState | None = None
+    times: MonitorLimits = field(default_factory=MonitorLimits)
+    lines: list[str] = field(default_factory=list)
+    reports: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)
+    stop_s: float | None = None
+    _routes: dict[int, int] = field(init=False)
+    _verdict: tuple[Verdict, int] | None = None
+    _judged: Verdict | None = None
+
+    def __post_init__(self) -> None:
+        self._routes = {n: train.station for n, train in self.supervision.state.trains.items()}
+
+    @classmethod
+    def restored(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
+        """Return the centre with what a process before has stored; at the first start as `supervision` has it.
+
+        Trains are unknown until they are heard, and points that were moving are moved again.
+
+        Parameters
+        ----------
+        supervision : Supervision
+        store : Store
+        judged : bool
+            Whether a triangle judges satellite positioning: then the first start is a stop, to be released by hand.
+        rest : Any
+            Further attributes.
+        """
+        text, monitor = store.document(_INTERLOCKING), MonitorState() if judged else None
+        if text is not None:
+            state = from_json(text)
+            supervision.state = state
+            supervision.records = store.records()
+            if judged:
+                cause = store.document(_CAUSE)
+                monitor = MonitorState(stopped=state.stopped, cause=Verdict[cause] if state.stopped and cause else None)
+        centre = cls(supervision=supervision, store=store, monitor=monitor, **rest)
+        if monitor is not None:
+            centre.monitor = replace(monitor, complete_s=centre.clock(), since_s=centre.clock())
+        supervision.state = replace(supervision.state, stopped=monitor is not None and monitor.stopped)
+        for name, point in supervision.state.points.items():
+            if point.detected is None:
+                supervision.command(name)
+        centre.log("centre started" if text is None else "centre started again; every train is unknown")
+        return centre
+
+    def log(self, text: str, *, train: int | None = None) -> None:
+        """Write a line of the log."""
+        self.lines.append(f"{self.clock():.0f} s: {text}")
+        del self.lines[:-200]
+        self.store.note(self.wall_ns(), text, train=train)
+
+    def report(self, number: int, payload: bytes) -> None:
+        """Take a report that came over the links of a train."""
+        try:
+            message = decode(payload)
+        except MessageError:
+            self._reject("no position message")
+            return
+        if message.train != number:
+            self._reject("of another train")
+            return
+        before = self.supervision.records.get(number, TrainRecord(train=number))
+        reason = self.supervision.report(message, self.clock())
+        if reason is not None:
+            self._reject(reason.value)
+            return
+        self.reports += 1
+        after = self.supervision.records[number]
+        if before.state in (TrainState.SIMULATED, TrainState.ERROR):
+            self.log(f"train {number}: heard again, place jumps by {after.jump_m or 0.0:.1f} m", train=number)
+        elif before.state is TrainState.UNKNOWN:
+            self.log(f"train {number}: heard", train=number)
+
+    def judge(self, verdict: Verdict, receiver: int = -1) -> None:
+        """Take the newest verdict on satellite positioning."""
+        self._verdict = verdict, receiver
+
+    def step(self) -> None:
+        """Judge, release, route, extend; commit; then send. To be called every second."""
+        now = self.clock()
+        self._monitor(now)
+        authorities = self.supervision.advance(now)
+        state = self.supervision.state
+        for number, train in state.trains.items():
+            if train.station != self._routes[number]:
+                self._routes[number] = train.station
+                station = self.supervision.layout.stations[train.station].name
+                self.log(f"train {number}: route to {station}, track {train.tracks[train.station]}", train=number)
+        for number, record in self.supervision.records.items():
+            after = time_passed(
+                record, now, curves=self.curves, authority_m=state.trains[number].end_m, limits=self.limits
+            )
+            if after.state is not record.state:
+                self.log(f"train {number}: {after.state.value}", train=number)
+            self.supervision.records[number] = after
+        cause = None if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
+        self.store.save(
+            *self.supervision.records.values(), documents={_INTERLOCKING: to_json(state), _CAUSE: cause or ""}
+        )
+        for authority in authorities:
+            self._send(authority)
+
+    @property
+    def limits(self) -> CentreLimits:
+        """Times of the centre."""
+        return self.supervision.centre
+
+    def release(self) -> str | None:
+        """Release a stop by hand; return the reason of a refusal."""
+        if self.monitor is None:
+            return "there is no stop to release"
+        self.monitor, orders, reason = release(self.monitor, self.clock(), limits=self.times)
+        if orders:
+            self.supervision.state = replace(self.supervision.state, stopped=False)
+            self.log("stop released by hand")
+        return reason
+
+    def set_route(self, train: int) -> str | None:
+        """Set a train's route to the next station by hand; return the reason of a refusal."""
+        reason = self.supervision.set_route(train)
+        self.log(f"train {train}: route asked for by hand{'' if reason is None else f', refused: {reason}'}")
+        return reason
+
+    def _send(self, authority: Authority) -> None:
+        self.send(authority.train, authority.encode())
+
+    def _reject(self, reason: str) -> None:
+        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+
+    def _monitor(self, now: float) -> None:
+        if self.monitor is None:
+            return
+        verdict, receiver = self._verdict or (None, -1)
+        self._verdict, self._judged = None, verdict
+        self.monitor, orders = advance(self.monitor, now, verdict, receiver=receiver, limits=self.times)
+        for order in orders:
+            self.log(f"triangle: {order.value}")
+            if order is MonitorOrder.STOP:
+                self.stop_s = now
+        self.supervision.state = replace(self.supervision.state, stopped=self.monitor.stopped)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return plain values of trains, points, monitor and log for the page."""
+        layout, state = self.supervision.layout, self.supervision.state
+        trains = []
+        for number, train in state.trains.items():
+            record = self.supervision.records.get(number, TrainRecord(train=number))
+            rear, front = interval_of(train)
+            pieces = layout.pieces(rear, front, train.tracks)
+            speed = 0 if record.message is None else record.message.speed_cmps or 0
+            trains.append({
+                "number": number, "state": record.state.value, "shown": record.shown_m, "speed": abs(speed) / 100.0,
+                "direction": train.direction, "rear": rear, "front": front, "end": train.end_m, "jump": record.jump_m,
+                "pieces": [[0 if lane == 0 else 2 - lane % 2, low, high] for lane, low, high in pieces],
+            })  # fmt: skip
+        points = [
+            {"name": self.point_name(name), "wanted": point.wanted, "detected": point.detected,
+             "locked": list(point.locked)}
+            for name, point in state.points.items()
+        ]  # fmt: skip
+        return {
+            "now": self.clock(), "trains": trains, "points": points, "log": self.lines[:-25:-1],
+            "stations": [{"name": s.name, "begin": s.begin_m, "end": s.end_m, "points": s.points_m}
+                         for s in layout.stations],
+            "monitor": self._monitor_values(), "routes": self.supervision.routes, "rejected": dict(self.rejected),
+        }  # fmt: skip
+
+    def point_name(self, point: PointName) -> str:
+        """Return the name of points for people."""
+        return f"{self.supervision.layout.stations[point[0]].name} {'lower' if point[1] < 0 else 'upper'}"
+
+    def _monitor_values(self) -> dict[str, Any]:
+        if self.monitor is None:
+            return {"verdict": "judged by nothing", "stopped": False, "cause": None}
+        cause = "not yet released" if self.monitor.cause is None else self.monitor.cause.name.lower().replace("_", " ")
+        verdict = "no verdict" if self._judged is None else self._judged.name.lower().replace("_", " ")
+        return {"verdict": verdict, "stopped": self.monitor.stopped, "cause": cause if self.monitor.stopped else None}
+
+
+def orders_of(centre: ControlCentre) -> dict[str, Order]:
+    """Return the orders of the page: release of a stop, and routes."""
+
+    def route(values: dict[str, Any]) -> str | None:
+        train = values.get("train")
+        return centre.set_route(train) if type(train) is int else "train: a number was expected"
+
+    return {"release": lambda _: centre.release(), "route": route}

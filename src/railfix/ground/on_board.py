@@ -1,0 +1,90 @@
+"""Supervision on board: the newest authority of the centre and its time limit."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Final
+
+from pydantic import Field
+
+from railfix.core.settings import Settings
+from railfix.ground.authority import Authority
+
+#: Reports of which the time of sending is remembered.
+REMEMBERED: Final = 600
+
+
+class OnBoardLimits(Settings):
+    """Limits on board.
+
+    Attributes
+    ----------
+    fresh_s : float [s]
+        Time limit of authorities: the train brakes where the newest one answers a report that was sent longer ago.
+    """
+
+    fresh_s: float = Field(default=15.0, gt=0)
+
+
+@dataclass(kw_only=True)
+class OnBoard:
+    """Authority of a train, as known on board.
+
+    The age of an authority is counted from the sending of the report that it answers, on the train's monotonic clock.
+    It is never too small, whatever the links do, and clocks of train and centre need not agree.
+
+    Attributes
+    ----------
+    direction : {-1, 1}
+    end_m : float [m]
+        End of the authority; it is only ever extended.
+    number : int
+        Of the newest authority, -1 before the first.
+    stopped : bool
+        The newest authority is an order to stop.
+    answered_s : float or None [s]
+        When the newest report was sent that an authority has answered; None before the first.
+    """
+
+    direction: int
+    end_m: float
+    limits: OnBoardLimits = field(default_factory=OnBoardLimits)
+    number: int = -1
+    stopped: bool = False
+    answered_s: float | None = None
+    _sent: OrderedDict[int, float] = field(default_factory=OrderedDict)
+
+    def reported(self, sequence: int, now_s: float) -> None:
+        """Note a report that is sent."""
+        self._sent[sequence] = now_s
+        if len(self._sent) > REMEMBERED:
+            self._sent.popitem(last=False)
+
+    def receive(self, authority: Authority) -> bool:
+        """Take an authority; return whether it counts: it is newer, and for this direction."""
+        if authority.number <= self.number or authority.direction != self.direction:
+            return False
+        self.number, self.stopped = authority.number, authority.stopped
+        self.end_m = self.direction * max(self.direction * authority.end_cm / 100.0, self.direction * self.end_m)
+        if (sent_s := self._sent.get(authority.report)) is not None:
+            self.answered_s = sent_s
+        return True
+
+    def age_s(self, now_s: float) -> float:
+        """Age of the newest authority at most [s]; infinite before the first."""
+        return float("inf") if self.answered_s is None else now_s - self.answered_s
+
+    def fresh(self, now_s: float) -> bool:
+        """Whether the newest authority is within its time limit."""
+        return self.age_s(now_s) <= self.limits.fresh_s
+
+    def brake_reason(self, now_s: float) -> str | None:
+        """Return why the train brakes to a stop, None where it may run up to the end of its authority."""
+        if self.stopped:
+            return "ordered to stop"
+        return None if self.fresh(now_s) else "no fresh authority"
+
+    def turned(self, direction: int, front_m: float) -> None:
+        """Begin in the other direction, with no authority beyond the front."""
+        self.direction, self.end_m = direction, front_m

@@ -1,0 +1,341 @@
+"""The centre as a process: its file, links, page, and simulated points."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.settings import Settings, load_settings
+from railfix.ground.centre import CentreLimits
+from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.interlocking import InterlockingLimits, TrainInterval
+from railfix.ground.layout import Layout, LoopStation, PointName
+from railfix.ground.link_quality import LinkName
+from railfix.ground.links import BEARERS, CentreLinks
+from railfix.ground.monitor import MonitorLimits
+from railfix.ground.reference_curve import ReferenceCurve
+from railfix.ground.store import Store
+from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.web import PageServer, Sessions, page_app
+
+#: Period of the centre's work [s].
+STEP_S = 1.0
+
+
+def parse_address(text: object) -> tuple[str, int]:
+    """Return host and port of ``HOST:PORT``.
+
+    Raises
+    ------
+    ValueError
+        The text has another form.
+    """
+    host, _, port = str(text).rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65_535:
+        raise ValueError("HOST:PORT was expected, for example 127.0.0.1:4433")
+    return host, int(port)
+
+
+Address = Annotated[tuple[str, int], BeforeValidator(parse_address)]
+
+
+class TrainPlace(Settings):
+    """Train at rest at the first start of the centre.
+
+    Attributes
+    ----------
+    number : int
+    station : str
+    track : {1, 2}
+    direction : {-1, 1}
+        In which the front looks, against chainage.
+    front_m, length_m : float [m]
+        Front end and length.
+    bound_m : float [m]
+        The front is at most so far from `front_m`.
+    """
+
+    number: int = Field(gt=0, lt=1 << 32)
+    station: str
+    track: Literal[1, 2]
+    direction: Literal[-1, 1]
+    front_m: float
+    length_m: float = Field(gt=0)
+    bound_m: float = Field(default=10.0, ge=0)
+
+
+class CentreFile(Settings):
+    """File of a centre; paths are relative to it.
+
+    Attributes
+    ----------
+    keys : Path
+        Folder with ``authority.pem``, ``centre.pem`` and ``centre.key`` of ``railfix ground keys``.
+    listen : dict of {"A", "B"} to HOST:PORT
+        Address of each bearer.
+    stations : tuple of LoopStation
+    trains : tuple of TrainPlace
+        Where they are at the first start; afterwards the database knows.
+    database : str
+        File of SQLite, or the address of an SQL database (``postgresql+psycopg://...``).
+    routes : {"automatic", "by hand"}
+        Whether a train that nears the end of its track is given the route to the next station.
+    speed_mps : float [m/s]
+        Of the reference run curve, for simulated running.
+    points_s : float [s]
+        Time in which the simulated points move: there is no interface to real ones.
+    centre, interlocking, monitor : settings
+        `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
+    """
+
+    keys: Path
+    listen: dict[LinkName, Address]
+    stations: Annotated[tuple[LoopStation, ...], Field(min_length=2)]
+    trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
+    database: str = "centre.db"
+    routes: Literal["automatic", "by hand"] = "automatic"
+    speed_mps: float = Field(default=20.0, gt=0)
+    points_s: float = Field(default=5.0, ge=0)
+    centre: CentreLimits = CentreLimits()
+    interlocking: InterlockingLimits = InterlockingLimits()
+    monitor: MonitorLimits = MonitorLimits()
+
+    @model_validator(mode="after")
+    def _both_bearers_and_known_places(self) -> Self:
+        if set(self.listen) != set(BEARERS):
+            raise ValueError("listen has an address for each of A and B")
+        layout, numbers = self.layout, [train.number for train in self.trains]
+        if len(set(numbers)) < len(numbers):
+            raise ValueError("two trains have the same number")
+        for train in self.trains:
+            low, high = sorted((train.front_m, train.front_m - train.direction * train.length_m))
+            found = layout.station_at(low - train.bound_m, high + train.bound_m)
+            if found is None or layout.stations[found].name != train.station:
+                raise ValueError(
+                    f"train {train.number} does not stand between the points of {train.station} "
+                    f"({low - train.bound_m:.0f} to {high + train.bound_m:.0f} m)"
+                )
+        places = [(train.station, train.track) for train in self.trains]
+        if len(set(places)) < len(places):
+            raise ValueError("two trains stand on the same track")
+        return self
+
+    @property
+    def layout(self) -> Layout:
+        """Line."""
+        return Layout(stations=self.stations)
+
+    def intervals(self) -> list[TrainInterval]:
+        """Return the intervals of the trains at the first start."""
+        names = [station.name for station in self.stations]
+        return [
+            standing_train(
+                train.number,
+                direction=train.direction,
+                front_m=train.front_m,
+                length_m=train.length_m,
+                bound_m=train.bound_m,
+                station=names.index(train.station),
+                track=train.track,
+            )
+            for train in self.trains
+        ]
+
+    def curves(self) -> dict[int, ReferenceCurve]:
+        """Return the reference run curves by direction, which stop in the middle of each station."""
+        stops = np.array([0.5 * (station.begin_m + station.end_m) for station in self.stations])
+        return {
+            1: ReferenceCurve.between_stations(stops, speed_mps=self.speed_mps),
+            -1: ReferenceCurve.between_stations(stops[::-1], speed_mps=self.speed_mps),
+        }
+
+
+@dataclass(kw_only=True)
+class SimulatedPoints:
+    """Points that are detected in their new position some seconds after the command."""
+
+    move_s: float
+    clock: Callable[[], float]
+    _until: dict[PointName, float] = field(default_factory=dict)
+
+    def command(self, point: PointName) -> None:
+        """Begin to move points."""
+        self._until[point] = self.clock() + self.move_s
+
+    def detected(self) -> list[PointName]:
+        """Return the points that have come to their position since the last call."""
+        done = [point for point, until in self._until.items() if until <= self.clock()]
+        for point in done:
+            del self._until[point]
+        return done
+
+
+async def run_centre(
+    path: Path,
+    *,
+    page: tuple[str, int] = ("127.0.0.1", 0),
+    password: str,
+    for_s: float | None = None,
+    announce: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Run the centre until SIGINT or SIGTERM, or for a time; return figures of what happened.
+
+    Parameters
+    ----------
+    path : Path
+        File of the centre, `CentreFile`.
+    page : (str, int)
+        Host and port of the page, port 0 takes a free one; beyond loopback addresses it is served by TLS with the
+        centre's certificate.
+    password : str
+        For orders.
+    for_s : float, optional [s]
+    announce : callable
+        Called with the address of the page once trains can connect.
+
+    Raises
+    ------
+    InputFileError
+        The file, a key or the database cannot be read.
+    SettingsError
+        A setting is wrong, or an address cannot be listened at.
+    """
+    settings = load_settings(CentreFile, path, what="a file of a centre")
+    keys = path.parent / settings.keys
+    for name in ("authority.pem", "centre.pem", "centre.key"):
+        if not (keys / name).is_file():
+            raise InputFileError(keys / name, "is not there; railfix ground keys writes it")
+    database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
+    end = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, end.set)
+    with Store(database) as store:
+        field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
+        supervision = Supervision(
+            layout=settings.layout,
+            state=at_start(settings.layout, settings.intervals()),
+            command=field_points.command,
+            routes=settings.routes,
+            limits=settings.interlocking,
+            centre=settings.centre,
+        )
+        links = CentreLinks(
+            keys,
+            {name: settings.listen[name][0] for name in BEARERS},
+            ports={name: settings.listen[name][1] for name in BEARERS},
+            received=lambda number, payload: control.report(number, payload),
+        )
+        control = ControlCentre.restored(
+            supervision,
+            store,
+            judged=False,
+            curves=settings.curves(),
+            send=links.send,
+            clock=time.monotonic,
+            wall_ns=time.time_ns,
+            times=settings.monitor,
+        )
+        _check_line(control, path)
+        done = False
+
+        def snapshot() -> dict[str, Any]:
+            now = time.monotonic()
+            heard = [
+                {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,
+                 "silent_s": None if (at := links.heard_s.get((n, bearer))) is None else now - at}
+                for n in supervision.state.trains
+                for bearer in BEARERS
+            ]  # fmt: skip
+            return {**control.snapshot(), "links": heard, "done": done}
+
+        app = page_app(snapshot, orders_of(control), sessions=Sessions(password=password))
+        loopback = page[0] == "localhost" or _is_loopback(page[0])
+        certificate = None if loopback else (keys / "centre.pem", keys / "centre.key")
+        try:
+            await links.start()
+            server = PageServer(app, host=page[0], port=page[1], certificate=certificate)
+        except OSError as error:
+            await links.stop()
+            raise SettingsError(f"{path}: an address of listen or --page cannot be used ({error.strerror})") from None
+        await server.start()
+        announce(server.url)
+        try:
+            work = asyncio.create_task(_work(control, field_points))
+            ending = asyncio.create_task(end.wait())
+            await asyncio.wait([work, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+            if work.done():
+                work.result()
+            for task in (work, ending):
+                task.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await task
+        finally:
+            done = True
+            await links.stop()
+            await server.stop()
+        return {
+            "reports used": control.reports,
+            "routes set": supervision.routes_set,
+            "reports rejected": dict(control.rejected),
+            "frames rejected": {threat.value: n for threat, n in sorted(links.threats().items(), key=str) if n},
+        }
+
+
+async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
+    """Work every second."""
+    loop = asyncio.get_running_loop()
+    due = loop.time()
+    while True:
+        for point in points.detected():
+            control.supervision.detected(point)
+        control.step()
+        due = max(due + STEP_S, loop.time())
+        await asyncio.sleep(due - loop.time())
+
+
+def _check_line(control: ControlCentre, path: Path) -> None:
+    """Raise where the database is of another line than the file."""
+    layout, state = control.supervision.layout, control.supervision.state
+    if set(state.points) != set(layout.points()) or any(
+        train.station >= len(layout.stations) for train in state.trains.values()
+    ):
+        raise InputFileError(path, "the database is of a line with other stations; name another database")
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def read_password(path: Path) -> str:
+    """Return the first line of a file that its owner alone can read.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, is empty, or others can read it.
+    """
+    try:
+        shared = path.stat().st_mode & 0o077
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputFileError(path, f"cannot be read as a password ({error})") from None
+    if shared:
+        raise InputFileError(path, "others can read it; allow only its owner to (chmod 600)")
+    if not lines or not lines[0]:
+        raise InputFileError(path, "is empty; a password in its first line was expected")
+    return lines[0]

@@ -1,0 +1,143 @@
+"""Supervision of the trains of a line by the centre: reports in, authorities out, without input or output.
+
+The one path for `railfix.ground.control` (the centre with its store and page) and for the simulated traffic of the
+tests (`railfix.ground.traffic`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from railfix.ground.authority import Authority
+from railfix.ground.centre import CentreLimits, Rejection, TrainRecord
+from railfix.ground.centre import report_received as record_received
+from railfix.ground.interlocking import (
+    ALL_RULES,
+    Interlocking,
+    InterlockingLimits,
+    PointState,
+    Rule,
+    TrainInterval,
+    extended,
+    points_reported,
+    released,
+    report_received,
+    route_requested,
+)
+from railfix.ground.layout import Layout, PointName
+from railfix.io.train_message import TrainMessage
+
+#: A train within this distance of the end of its track asks for the next route [m].
+ROUTE_AHEAD_M = 700.0
+
+
+@dataclass(kw_only=True)
+class Supervision:
+    """Supervised trains of a line.
+
+    Attributes
+    ----------
+    layout : Layout
+    state : Interlocking
+    command : callable
+        Called with points that have to move; `detected` is called when they have.
+    routes : {"automatic", "by hand"}
+    records : dict of int to TrainRecord
+    refusals : Counter of str
+        Routes refused, by reason.
+    routes_set : int
+    """
+
+    layout: Layout
+    state: Interlocking
+    command: Callable[[PointName], None] = lambda _: None
+    routes: Literal["automatic", "by hand"] = "automatic"
+    rules: frozenset[Rule] = ALL_RULES
+    limits: InterlockingLimits = field(default_factory=InterlockingLimits)
+    centre: CentreLimits = field(default_factory=CentreLimits)
+    records: dict[int, TrainRecord] = field(default_factory=dict)
+    refusals: Counter[str] = field(default_factory=Counter)
+    routes_set: int = 0
+
+    def report(self, message: TrainMessage, now_s: float) -> Rejection | None:
+        """Take a report; return why it does not count, None where it does."""
+        if message.train not in self.state.trains:
+            return Rejection.UNKNOWN_TRAIN
+        record = self.records.get(message.train, TrainRecord(train=message.train))
+        self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
+        if reason is None or Rule.SEQUENCE not in self.rules:
+            self.state = report_received(self.state, message, self.layout, rules=self.rules)
+        return reason
+
+    def detected(self, point: PointName) -> None:
+        """Take the detection of points in the position they were commanded to."""
+        self.state = points_reported(self.state, point, self.state.points[point].wanted)
+
+    def set_route(self, train: int) -> str | None:
+        """Set a route to the next station; return the reason of a refusal."""
+        if train not in self.state.trains:
+            return f"there is no train {train}"
+        self.state, moved, reason = route_requested(self.state, train, self.layout, rules=self.rules)
+        if reason is not None:
+            self.refusals[reason] += 1
+            return reason
+        self.routes_set += 1
+        for point in moved:
+            self.command(point)
+        return None
+
+    def advance(self, now_s: float) -> list[Authority]:
+        """Release points, set routes, extend authorities; return what is sent once the state is stored."""
+        self.state = released(self.state, now_s, self.layout, limits=self.limits)
+        if self.routes == "automatic":
+            for number, train in self.state.trains.items():
+                if self._wants_route(train):
+                    self.set_route(number)
+        self.state = extended(self.state, self.layout, limits=self.limits, rules=self.rules)
+        self.state = replace(self.state, granted=self.state.granted + 1)
+        return [
+            Authority(
+                train=number,
+                number=self.state.granted,
+                report=max(self.records[number].sequence, 0) if number in self.records else 0,
+                end_cm=train.direction * int(train.direction * train.end_m * 100.0 // 1.0),
+                direction=1 if train.direction > 0 else -1,
+                stopped=self.state.stopped,
+            )
+            for number, train in self.state.trains.items()
+        ]
+
+    def _wants_route(self, train: TrainInterval) -> bool:
+        ahead = train.station + train.direction
+        if not 0 <= ahead < len(self.layout.stations):
+            return False
+        inner = self.layout.stations[train.station].inner_m
+        way = train.direction * ((inner[1] if train.direction > 0 else inner[0]) - train.front_m)
+        return way < ROUTE_AHEAD_M
+
+
+def standing_train(
+    train: int, *, direction: int, front_m: float, length_m: float, bound_m: float, station: int, track: int
+) -> TrainInterval:
+    """Return the interval of a train at rest in a station, whose front is known within a bound."""
+    ahead = front_m + direction * bound_m
+    return TrainInterval(
+        train=train,
+        direction=direction,
+        rear_m=front_m - direction * (length_m + bound_m),
+        front_m=ahead,
+        end_m=ahead,
+        sequence=0,
+        tracks={station: track},
+        station=station,
+    )
+
+
+def at_start(layout: Layout, trains: list[TrainInterval]) -> Interlocking:
+    """Return the interlocking with trains at rest and every point detected on track 1."""
+    return Interlocking(
+        trains={train.train: train for train in trains}, points={name: PointState() for name in layout.points()}
+    )

@@ -1,0 +1,132 @@
+"""A train's end of the links: positions of ``railfix live`` to the centre, authorities back."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from railfix.core.errors import InputFileError
+from railfix.ground.authority import Authority
+from railfix.ground.link_quality import LinkName
+from railfix.ground.links import TrainLinks, first_sequence
+from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.io.train_message import MessageError, TrainMessage, encode, from_json
+
+#: Time between two reports, and between two looks at the age of the authority [s].
+REPORT_S, LOOK_S = 1.0, 0.1
+
+
+async def run_train(
+    train: int,
+    keys: Path,
+    addresses: dict[LinkName, tuple[str, int]],
+    local: dict[LinkName, str],
+    *,
+    lines: AsyncIterator[str] | None = None,
+    write: Callable[[str], None],
+    limits: OnBoardLimits | None = None,
+    for_s: float | None = None,
+) -> None:
+    """Send the newest position every second, and write authorities and braking as lines of JSON.
+
+    Parameters
+    ----------
+    train : int
+    keys : Path
+        Folder with ``authority.pem`` and the train's own two files.
+    addresses : dict of {"A", "B"} to (str, int)
+        Centre's address on each bearer.
+    local : dict of {"A", "B"} to str
+        Local address of each bearer.
+    lines : asynchronous iterator of str, optional
+        Position messages as `railfix.io.train_message.to_json` writes them; standard input without it.
+    write : callable
+    limits : OnBoardLimits, optional
+    for_s : float, optional [s]
+
+    Raises
+    ------
+    InputFileError
+        A key is not there, or a line is no position message.
+    """
+    for name in ("authority.pem", f"train-{train}.pem", f"train-{train}.key"):
+        if not (keys / name).is_file():
+            raise InputFileError(keys / name, "is not there; railfix ground keys writes it")
+    desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits())
+    links = TrainLinks(train, keys, addresses, local, received=desk.received)
+    await links.start()
+    reading = asyncio.create_task(desk.read(_standard_input() if lines is None else lines))
+    sending = asyncio.create_task(desk.work(links))
+    try:
+        done, _ = await asyncio.wait([reading, sending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in (reading, sending):
+            task.cancel()
+        await links.stop()
+
+
+class _Desk:
+    """Newest position, newest authority, and whether the train brakes."""
+
+    def __init__(self, *, train: int, write: Callable[[str], None], limits: OnBoardLimits) -> None:
+        self._train, self._write, self._limits = train, write, limits
+        self._newest: TrainMessage | None = None
+        self._sequence = first_sequence()
+        self._on_board: OnBoard | None = None
+        self._reason: str | None = ""
+
+    async def read(self, lines: AsyncIterator[str]) -> None:
+        async for line in lines:
+            if line.strip():
+                self._newest = from_json(line)
+
+    async def work(self, links: TrainLinks) -> None:
+        due = time.monotonic()
+        while True:
+            now = time.monotonic()
+            if self._newest is not None and now >= due:
+                self._report(links, self._newest, now)
+                self._newest, due = None, now + REPORT_S
+            if self._on_board is not None and (reason := self._on_board.brake_reason(now)) != self._reason:
+                self._reason = reason
+                self._line(brake=reason is not None, reason=reason)
+            await asyncio.sleep(LOOK_S)
+
+    def _report(self, links: TrainLinks, message: TrainMessage, now_s: float) -> None:
+        # numbers go on rising where the source of the positions is started again
+        self._sequence += 1
+        message = message.replaced(train=self._train, sequence=self._sequence)
+        if message.facing != 0 and message.chainage_cm is not None:
+            front = message.chainage_cm / 100.0
+            if self._on_board is None:
+                self._on_board = OnBoard(direction=message.facing, end_m=front, limits=self._limits)
+            elif self._on_board.direction != message.facing and message.standstill:
+                self._on_board.turned(message.facing, front)
+        if self._on_board is not None:
+            self._on_board.reported(self._sequence, now_s)
+        links.send(encode(message), chainage_m=(message.chainage_cm or 0) / 100.0, direction=message.facing)
+
+    def received(self, payload: bytes) -> None:
+        """Take an authority from the links."""
+        try:
+            authority = Authority.decode(payload)
+        except MessageError as error:
+            self._line(rejected=str(error))
+            return
+        if self._on_board is not None and authority.train == self._train and self._on_board.receive(authority):
+            self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(time.monotonic()), 3))
+
+    def _line(self, **values: Any) -> None:
+        self._write(json.dumps(values))
+
+
+async def _standard_input() -> AsyncIterator[str]:
+    while line := await asyncio.to_thread(sys.stdin.readline):
+        yield line

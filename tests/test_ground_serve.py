@@ -1,0 +1,320 @@
+"""``railfix ground centre`` and ``railfix ground train``: killed and started again, routes by hand, wrong files."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from railfix.cli.ground import app
+from railfix.ground.authority import Authority
+from railfix.ground.control import ControlCentre, orders_of
+from railfix.ground.interlocking import Interlocking, TrainInterval
+from railfix.ground.interlocking_text import from_json
+from railfix.ground.keys import write_keys
+from railfix.ground.link_quality import LinkLimits
+from railfix.ground.links import BEARERS, TrainLinks, first_sequence
+from railfix.ground.monitor import MonitorLimits
+from railfix.ground.on_board import OnBoard, OnBoardLimits
+from railfix.ground.serve import STEP_S, run_centre
+from railfix.ground.store import Store
+from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.traffic import SimulatedTrain, line_with_loops
+from railfix.ground.train import run_train
+from railfix.ground.triangle import Verdict
+from railfix.io.train_message import encode, to_json
+
+pytestmark = pytest.mark.requirement("F2")
+
+HOSTS = {"A": "127.0.1.1", "B": "127.0.2.1"}
+LOCAL = {"A": "127.0.1.31", "B": "127.0.2.31"}
+
+
+def free_port(host: str) -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Keys and the file of a centre: a line of three stations, train 1 in the first."""
+    folder = tmp_path_factory.mktemp("centre")
+    write_keys(folder / "keys", [1])
+    ports = {name: free_port(host) for name, host in HOSTS.items()}
+    stations = ", ".join(
+        f'{{ name = "{s.name}", begin_m = {s.begin_m}, end_m = {s.end_m} }}' for s in line_with_loops(3).stations
+    )
+    (folder / "line.toml").write_text(f"""
+keys = "keys"
+listen = {{ A = "{HOSTS["A"]}:{ports["A"]}", B = "{HOSTS["B"]}:{ports["B"]}" }}
+stations = [{stations}]
+trains = [{{ number = 1, station = "A", track = 1, direction = 1, front_m = 300, length_m = 80, bound_m = 5 }}]
+""")
+    (folder / "password").write_text("secret\n")
+    (folder / "password").chmod(0o600)
+    return folder
+
+
+def addresses(folder: Path) -> dict[str, tuple[str, int]]:
+    line = next(line for line in (folder / "line.toml").read_text().splitlines() if line.startswith("listen"))
+    texts = [part.split('"')[1] for part in line.split("=", 1)[1].split(",")]
+    return {name: (text.split(":")[0], int(text.split(":")[1])) for name, text in zip(BEARERS, texts, strict=True)}
+
+
+def started(folder: Path, *options: str) -> subprocess.Popen[str]:
+    """A centre that has printed the address of its page."""
+    words = [sys.executable, "-m", "railfix", "ground", "centre", str(folder / "line.toml"), "--page", "127.0.0.1:0"]
+    words += ["--password", str(folder / "password"), "--for", "60", *options]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert "http://127.0.0.1:" in line, line + process.stdout.read()
+    return process
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.slow)])
+def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path, kills: int) -> None:
+    """Reports that an authority has acknowledged, the authority itself, and its number are in the store."""
+    rng = random.Random(kills)
+    database = tmp_path / "centre.db"
+    source = (folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"')
+    (tmp_path / "line.toml").write_text(f'database = "{database}"\n{source}')
+    (tmp_path / "password").write_bytes((folder / "password").read_bytes())
+    (tmp_path / "password").chmod(0o600)
+
+    async def work() -> None:
+        train = SimulatedTrain(
+            number=1, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0), length_m=80.0,
+            sequence=first_sequence(),
+        )  # fmt: skip
+        newest: list[Authority] = []
+        sent: set[int] = set()
+
+        def received(payload: bytes) -> None:
+            authority = Authority.decode(payload)
+            assert authority.report in sent | {0}
+            assert train.on_board.receive(authority)
+            newest.append(authority)
+
+        limits = LinkLimits(idle_s=2.0)
+        links = TrainLinks(1, folder / "keys", addresses(folder), LOCAL, received=received, limits=limits)
+        await links.start()
+        process = await asyncio.to_thread(started, tmp_path)
+        for kill in range(kills):
+            end = asyncio.get_running_loop().time() + rng.uniform(0.0, 2.0)
+            before = len(newest)
+            while asyncio.get_running_loop().time() < end or len(newest) < before + 1:
+                message = train.message(time.monotonic())
+                train.front_m = max(train.front_m, min(train.front_m + 4.0, train.on_board.end_m - 10.0))
+                sent.add(message.sequence)
+                links.send(encode(message))
+                await asyncio.sleep(rng.uniform(0.1, 0.3))
+                assert asyncio.get_running_loop().time() < end + 40.0, "the centre does not answer"
+            process.send_signal(signal.SIGKILL)
+            process.communicate()
+            with Store(f"sqlite:///{database}") as store:
+                stored, state = store.records()[1], from_json(store.document("interlocking") or "")
+                last = store.log(last=10_000)
+            assert stored.sequence >= newest[-1].report
+            assert stored.sequence in sent
+            assert state.granted >= newest[-1].number
+            assert state.trains[1].end_m >= newest[-1].end_cm / 100.0
+            assert state.trains[1].rear_m <= train.rear_m
+            assert sum(text.startswith("centre started") for _, _, text in last) == kill + 1
+            process = await asyncio.to_thread(started, tmp_path)
+        before = len(newest)
+        for _ in range(400):
+            if len(newest) > before:
+                break
+            message = train.message(time.monotonic())
+            sent.add(message.sequence)
+            links.send(encode(message))
+            await asyncio.sleep(0.1)
+        assert len(newest) > before
+        assert [a.number for a in newest] == sorted({a.number for a in newest})
+        assert max(a.end_cm for a in newest) == 192_000  # end of the track in B, less the margin
+        await links.stop()
+        process.terminate()
+        output, _ = await asyncio.to_thread(process.communicate)
+        assert process.returncode == 0, output
+        assert "reports used" in output
+
+    asyncio.run(asyncio.wait_for(work(), 60.0 + 40.0 * kills))
+
+
+def test_positions_go_to_the_centre_and_authorities_come_back(folder: Path, tmp_path: Path) -> None:
+    """``railfix ground train``: it brakes until it has a fresh authority, and again without one."""
+    simulated = SimulatedTrain(number=9, front_m=300.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=300.0))
+    source = (folder / "line.toml").read_text().replace('"keys"', f'"{folder / "keys"}"')
+    (tmp_path / "line.toml").write_text(source)
+    lines: list[dict[str, Any]] = []
+
+    async def positions() -> AsyncIterator[str]:
+        while True:
+            yield to_json(simulated.message(0.0)) + "\n"
+            await asyncio.sleep(0.1)
+
+    async def work() -> None:
+        begun = asyncio.Event()
+        centre = asyncio.create_task(
+            run_centre(tmp_path / "line.toml", password="secret", announce=lambda _: begun.set())
+        )
+        await begun.wait()
+        train = asyncio.create_task(
+            run_train(
+                1, folder / "keys", addresses(folder), LOCAL, lines=positions(), limits=OnBoardLimits(fresh_s=4.0),
+                write=lambda line: lines.append(json.loads(line)),
+            )
+        )  # fmt: skip
+        for task, done in (
+            (centre, lambda: {"brake": False, "reason": None} in lines and len(lines) > 3),
+            (train, lambda: lines[-1].get("brake")),
+        ):
+            while not done():
+                await asyncio.sleep(0.02)
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+
+    asyncio.run(asyncio.wait_for(work(), 60.0))
+    assert lines[0] == {"brake": True, "reason": "no fresh authority"}
+    authority = next(line for line in lines if "end_cm" in line)
+    assert (authority["train"], authority["direction"], authority["stopped"]) == (1, 1, False)
+    assert authority["age_s"] < 4.0
+    assert {"brake": False, "reason": None} in lines
+    assert lines[-1] == {"brake": True, "reason": "no fresh authority"}
+
+
+@pytest.fixture
+def centre(tmp_path: Path) -> Iterator[tuple[ControlCentre, list[Authority], list[float]]]:
+    """A centre by hand: train 1 up in A, train 2 down in C, routes by hand; what it sends, and its clock."""
+    layout, sent, now = line_with_loops(3), [], [100.0]
+    with Store(f"sqlite:///{tmp_path / 'centre.db'}") as store:
+        yield restored(store, layout_state(), sent, now), sent, now
+    assert layout == line_with_loops(3)
+
+
+def layout_state() -> Interlocking:
+    def standing(train: int, direction: int, front: float, station: int) -> TrainInterval:
+        return standing_train(
+            train, direction=direction, front_m=front, length_m=80.0, bound_m=5.0, station=station, track=train
+        )
+
+    return at_start(line_with_loops(3), [standing(1, 1, 400.0, 0), standing(2, -1, 3100.0, 2)])
+
+
+def restored(store: Store, state: Interlocking, sent: list[Authority], now: list[float]) -> ControlCentre:
+    moved: list[Any] = []
+    supervision = Supervision(layout=line_with_loops(3), state=state, command=moved.append, routes="by hand")
+    control = ControlCentre.restored(
+        supervision, store, judged=True, curves={}, send=lambda _, data: sent.append(Authority.decode(data)),
+        clock=lambda: now[0], wall_ns=lambda: 0, times=MonitorLimits(healthy_s=5.0),
+    )  # fmt: skip
+    control.moved = moved  # type: ignore[attr-defined]
+    return control
+
+
+@pytest.mark.requirement("F5")
+def test_routes_and_the_release_by_hand(
+    centre: tuple[ControlCentre, list[Authority], list[float]],
+) -> None:
+    control, sent, now = centre
+    orders = orders_of(control)
+
+    def seconds(count: int, verdict: Verdict | None) -> None:
+        for _ in range(count):
+            now[0] += 1.0
+            if verdict is not None:
+                control.judge(verdict)
+            control.step()
+
+    seconds(1, Verdict.HEALTHY)
+    assert sent[-1].stopped  # a first start has to be released
+    assert orders["route"]({"train": 1}) == "satellite positioning is suspended"
+    assert (orders["release"]({}) or "").startswith("healthy for 0 s")
+    seconds(6, Verdict.HEALTHY)
+    assert orders["release"]({}) is None
+    seconds(1, Verdict.HEALTHY)
+    assert not sent[-1].stopped
+    assert {a.train: a.end_cm for a in sent[-2:]} == {1: 42_000, 2: 308_000}  # no route without an order
+    assert orders["route"]({"train": "1"}) == "train: a number was expected"
+    assert orders["route"]({"train": 5}) == "there is no train 5"
+    assert orders["route"]({"train": 1}) is None
+    seconds(1, Verdict.HEALTHY)
+    assert sent[-2].end_cm == 192_000
+    assert "A" in control.point_name((0, 1))
+    for line in ("stop released by hand", "train 1: route asked for by hand", "train 1: route to B, track 1"):
+        assert any(line in text for text in control.lines)
+
+    seconds(4, None)  # nothing judges any more
+    assert sent[-1].stopped
+    assert control.snapshot()["monitor"] == {"verdict": "no verdict", "stopped": True, "cause": "monitor lost"}
+    control.supervision.state = replace(
+        control.supervision.state,
+        points={
+            **control.supervision.state.points,
+            (1, -1): replace(control.supervision.state.points[1, -1], detected=None),
+        },
+    )
+    seconds(1, None)
+    again = restored(control.store, layout_state(), sent, now)  # as after a kill
+    assert again.monitor is not None
+    assert (again.monitor.stopped, again.monitor.cause) == (True, Verdict.MONITOR_LOST)
+    assert again.supervision.state.trains[1].end_m == 1920.0
+    assert again.moved == [(1, -1)]  # type: ignore[attr-defined]
+    numbers = [a.number for a in sent]
+    again.step()
+    assert sent[-1].number > max(numbers)
+    assert sent[-1].stopped
+
+
+def test_a_centre_counts_what_does_not_count(centre: tuple[ControlCentre, list[Authority], list[float]]) -> None:
+    control, _, _ = centre
+    train = SimulatedTrain(number=1, front_m=400.0, tracks={0: 1}, on_board=OnBoard(direction=1, end_m=400.0))
+    good = train.message(0.0)
+    control.report(1, encode(good))
+    control.report(1, encode(good))
+    control.report(2, encode(good))
+    control.report(1, b"no message")
+    control.report(9, encode(good.replaced(train=9)))
+    assert control.reports == 1
+    assert sorted(control.rejected.values()) == [1, 1, 1, 1]
+    assert STEP_S == 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("track = 1", "track = 3"), "trains.0.track"),
+        (("front_m = 300", "front_m = 90"), "does not stand between the points of A"),
+        (("listen", "lisen"), "unknown setting lisen"),
+        ((":", ";"), "HOST:PORT was expected"),
+        (('keys = "keys"', 'keys = "none"'), "railfix ground keys writes it"),
+    ],
+)
+def test_a_wrong_file_of_a_centre_is_one_sentence(
+    folder: Path, tmp_path: Path, change: tuple[str, str], words: str
+) -> None:
+    (tmp_path / "line.toml").write_text((folder / "line.toml").read_text().replace(*change))
+    if change[0] != 'keys = "keys"':
+        (tmp_path / "keys").symlink_to(folder / "keys")
+    done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--for", "1"])
+    assert words in " ".join(done.output.split())
+    open_to_all = tmp_path / "password"
+    open_to_all.write_text("secret")
+    done = CliRunner().invoke(app, ["centre", str(tmp_path / "line.toml"), "--password", str(open_to_all)])
+    assert "others can read it" in " ".join(done.output.split())
