@@ -47,8 +47,8 @@ STAGES: Final = (
     ("protection level", "railfix.pipeline.solution", "protection_levels"),
     ("open places", "railfix.pipeline.solution", "places_beyond_the_level"),
     ("results", "railfix.pipeline.processor", "antenna_result"),
-    ("results", "railfix.run.tally", "Tally.add"),
-    ("tables", "railfix.run.driver", "positions_table"),
+    ("results", "railfix.run.tally", "AntennaTally.add"),
+    ("tables", "railfix.run.antennas", "positions_table"),
     ("tables", "railfix.run.output", "OutputFolder.append_csv"),
     ("tables", "railfix.run.output", "OutputFolder.append_parquet"),
     ("tables", "railfix.run.output", "OutputFolder.commit"),
@@ -104,7 +104,7 @@ def watched() -> Stages:
         setattr(holder, function, stages.timed(name, getattr(holder, function)))
     from railfix.run import driver
 
-    driver.aligned = stages.iterated("reading", driver.aligned)  # type: ignore[assignment]
+    driver.cuts = stages.iterated("reading", driver.cuts)
     return stages
 
 
@@ -133,7 +133,7 @@ def main() -> None:
         for number in range(options.rounds + 1):
             stages.spent.clear()
             begin = time.process_time()
-            summary = run_files(inputs, Config(filter="off"), out=Path(scratch) / f"out{number}", options=RunOptions())
+            summary = run_files(inputs, Config(filter="off"), out=Path(scratch) / f"out{number}", options=RunOptions(workers=1))
             whole = time.process_time() - begin
             epochs = summary.tally.epochs
             spent = {**stages.spent, "all": whole, "everything else": whole - sum(stages.spent.values())}
