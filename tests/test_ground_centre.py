@@ -11,6 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,6 +27,7 @@ from railfix.ground.centre import (
 from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.store import Store
 from railfix.io.train_message import MessageStatus, TrainMessage
+from railfix.simulate.demonstration import demo_truth
 
 pytestmark = pytest.mark.requirement("F2")
 
@@ -244,3 +246,37 @@ def test_another_database() -> None:
         store.save(record)
         store.save(record)
         assert store.records()[7].message == record.message
+
+
+@pytest.mark.parametrize("facing", [1, -1])
+def test_a_run_with_a_coverage_hole_is_simulated_and_resynchronised(facing: int) -> None:
+    """The demonstration run at 1 Hz, out of coverage for 40 s; the other way round the line is mirrored."""
+    truth = pl.read_csv(demo_truth(), schema_overrides={"time_gpst": pl.Datetime("ns")}).filter(antenna="front")
+    seconds = (truth["time_gpst"] - truth["time_gpst"][0]).dt.total_nanoseconds().to_numpy() / 1e9
+    place = truth["chainage_m"].to_numpy()
+    place = place if facing > 0 else 10_000.0 - place
+    ends = np.sort([place.min() - 500.0, place.max() + 500.0])[::facing]
+    curve = ReferenceCurve.between_stations(ends, speed_mps=15.0)
+    last, hole = 90, range(25, 65)  # the train turns back at 100 s
+    record, shown = TrainRecord(train=7), []
+    for second in range(last):
+        true = float(np.interp(second, seconds, place))
+        if second not in hole:
+            report = message(second + 1, true, facing=facing, age_s=0.0)
+            record, reason = report_received(record, report, float(second), limits=LIMITS)
+            assert reason is None
+        record = time_passed(record, float(second), curves={facing: curve}, limits=LIMITS)
+        if record.state is TrainState.SIMULATED:
+            shown.append((second, record.shown_m))
+        elif record.state is TrainState.TRACKED and second not in hole:
+            assert record.shown_m == pytest.approx(true, abs=0.006)
+    assert [second for second, _ in shown] == list(range(hole[0] + 3, hole[-1] + 1))  # silent for more than 3 s
+    # by place on the curve, from the last report on
+    begun, first = np.interp(hole[0] - 1, seconds, place), hole[0] - 1
+    running = np.interp(facing * begun, facing * curve.chainage_m, curve.running_s)
+    for second, simulated in shown:
+        expected = np.interp(running + second - first, curve.running_s, curve.chainage_m)
+        assert simulated == pytest.approx(expected, abs=0.02)
+    back = hole[-1] + 1
+    assert record.jump_m == pytest.approx(facing * (np.interp(back, seconds, place) - shown[-1][1]), abs=0.02)
+    assert abs(record.jump_m) > 1.0

@@ -232,7 +232,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
         both = OUTAGE_BOTH_S[0] <= now < OUTAGE_BOTH_S[1]
         for (number, bearer), relay in relays.items():
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
-            relay.up = not (alone or (both and number == 1))
+            relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
         await asyncio.sleep(max(0.0, start + traffic.now_s / speed - loop.time()))
 

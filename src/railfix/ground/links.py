@@ -10,7 +10,7 @@ from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Literal
 
-from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, Threat
+from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, ReceiverLimits, Threat
 from railfix.ground.link_quality import LinkChoice, LinkLimits, LinkMeter, LinkName
 from railfix.ground.quic import LinkProtocol, configuration, connected, listen
 
@@ -144,6 +144,7 @@ class CentreLinks:
         Called with the train's number and the payload.
     ports : dict of {"A", "B"} to int, optional
         Free ones without it.
+    limits : ReceiverLimits, optional
 
     Attributes
     ----------
@@ -161,12 +162,14 @@ class CentreLinks:
         *,
         received: Callable[[int, bytes], None],
         ports: dict[LinkName, int] | None = None,
+        limits: ReceiverLimits | None = None,
     ) -> None:
         self.addresses: dict[LinkName, tuple[str, int]] = {}
         self.receivers: dict[int, FrameReceiver] = {}
         self.masquerades = 0
         self.heard_s: dict[tuple[int, LinkName], float] = {}
         self._keys, self._hosts, self._ports, self._received = keys, hosts, ports or {}, received
+        self._limits = limits or ReceiverLimits()
         self._peers: dict[tuple[int, LinkName], LinkProtocol] = {}
         # of each train alone: `first_sequence` allows 10 frames a second
         self._sequence: dict[tuple[int, FrameKind], int] = {}
@@ -215,7 +218,7 @@ class CentreLinks:
             self._masquerade()
             return
         train, now_ns = int(name_of_train), time.monotonic_ns()
-        receiver = self.receivers.setdefault(train, FrameReceiver(sender=train))
+        receiver = self.receivers.setdefault(train, FrameReceiver(sender=train, limits=self._limits))
         if self._peers.get((train, name)) is not protocol and all(
             known.ended for (number, _), known in self._peers.items() if number == train
         ):

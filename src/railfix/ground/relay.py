@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import random
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from pydantic import Field
@@ -23,6 +24,11 @@ class RelaySettings(Settings):
         Delay of each datagram, and the largest random one on top of it: datagrams overtake each other.
     bit_errors : float
         Probability that one bit of a datagram is flipped.
+    repeats : float
+        Probability that a datagram is sent a second time, up to `repeat_s` later.
+    repeat_s : float [s]
+    insertions : float
+        Probability that a foreign datagram of random bytes, with the head of the one before, is put after a datagram.
     seed : int
     """
 
@@ -30,7 +36,55 @@ class RelaySettings(Settings):
     delay_s: float = Field(default=0.0, ge=0)
     jitter_s: float = Field(default=0.0, ge=0)
     bit_errors: float = Field(default=0.0, ge=0, le=1)
+    repeats: float = Field(default=0.0, ge=0, le=1)
+    repeat_s: float = Field(default=0.5, ge=0)
+    insertions: float = Field(default=0.0, ge=0, le=1)
     seed: int = 0
+
+
+class Disturbance:
+    """Seeded disturbance of packets of any kind.
+
+    Attributes
+    ----------
+    settings : RelaySettings
+        May be replaced while packets pass.
+    up : bool
+        False: an outage, every packet is lost.
+    counts : Counter of str
+    """
+
+    def __init__(self, settings: RelaySettings) -> None:
+        self.settings, self.up = settings, True
+        self.counts: Counter[str] = Counter()
+        self._random = random.Random(settings.seed)
+
+    def packet(self, data: bytes, send: Callable[[bytes], None]) -> None:
+        """Pass a packet on, by `send`, or not."""
+        settings, rng = self.settings, self._random
+        self.counts["datagrams"] += 1
+        if not self.up or rng.random() < settings.loss:
+            self.counts["lost"] += 1
+            return
+        if rng.random() < settings.bit_errors:
+            self.counts["bit errors"] += 1
+            bit = rng.randrange(8 * len(data))
+            data = data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
+        delay = settings.delay_s + rng.uniform(0.0, settings.jitter_s)
+        self._later(delay, data, send)
+        if rng.random() < settings.repeats:
+            self.counts["repeated"] += 1
+            self._later(delay + rng.uniform(0.0, settings.repeat_s), data, send)
+        if rng.random() < settings.insertions:
+            self.counts["inserted"] += 1
+            self._later(delay, data[:20] + rng.randbytes(max(len(data) - 20, 1)), send)
+
+    @staticmethod
+    def _later(delay_s: float, data: bytes, send: Callable[[bytes], None]) -> None:
+        if delay_s > 0.0:
+            asyncio.get_running_loop().call_later(delay_s, send, data)
+        else:
+            send(data)
 
 
 class Relay(asyncio.DatagramProtocol):
@@ -43,16 +97,14 @@ class Relay(asyncio.DatagramProtocol):
 
     Attributes
     ----------
-    up : bool
-        False: an outage, every datagram is lost.
-    counts : Counter of str
+    disturbance : Disturbance
+    address : (str, int)
     """
 
     def __init__(self, target: tuple[str, int], settings: RelaySettings) -> None:
-        self.up = True
-        self.counts: Counter[str] = Counter()
+        self.disturbance = Disturbance(settings)
         self.address: tuple[str, int] = ("", 0)
-        self._target, self._settings, self._random = target, settings, random.Random(settings.seed)
+        self._target = target
         self._here: asyncio.DatagramTransport | None = None
         self._there: asyncio.DatagramTransport | None = None
         self._client: Any = None
@@ -81,22 +133,11 @@ class Relay(asyncio.DatagramProtocol):
             self._pass(data, self._here, self._client)
 
     def _pass(self, data: bytes, transport: asyncio.DatagramTransport | None, address: Any) -> None:
-        settings, rng = self._settings, self._random
-        self.counts["datagrams"] += 1
-        if not self.up or rng.random() < settings.loss:
-            self.counts["lost"] += 1
-            return
-        if rng.random() < settings.bit_errors:
-            self.counts["bit errors"] += 1
-            bit = rng.randrange(8 * len(data))
-            data = data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
-        delay = settings.delay_s + rng.uniform(0.0, settings.jitter_s)
-
-        def send() -> None:
+        def send(datagram: bytes) -> None:
             if transport is not None and not transport.is_closing():
-                transport.sendto(data, address)
+                transport.sendto(datagram, address)
 
-        asyncio.get_running_loop().call_later(delay, send) if delay > 0.0 else send()
+        self.disturbance.packet(data, send)
 
 
 class _Back(asyncio.DatagramProtocol):
