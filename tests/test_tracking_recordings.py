@@ -9,6 +9,9 @@ import pytest
 
 import filter_score
 import recordings_score
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline.config import Config
+from railfix.run.processor import processor_of
 
 #: Recording: median, 95th percentile, largest error [m], 95th percentile of error over sigma.
 BOUNDS = {
@@ -37,3 +40,22 @@ def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> Non
     assert np.percentile(error, 95) < p95
     assert error.max() < largest
     assert np.percentile(error / found.sigma_m[case.observed], 95) < ratio
+
+
+@pytest.mark.requirement("E5", "C2")
+@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0])
+def test_half_a_day_at_rest_is_not_averaged_away(recordings: Path, azimuth_deg: float) -> None:
+    """Errors of orbits and ionosphere last hours: a filter that averages over them states centimetres."""
+    folder = recordings / "static" / "ESBC_2020177"
+    observations = read_observations(next(folder.glob("*_MO.crx.gz")))[:1440]
+    place = observations.header.approximate_ecef_m
+    trajectory = recordings_score.straight_line(place, azimuth_deg)
+    config = Config(filter="track", elevation={"mask_deg": 10.0})
+    navigation = read_navigation(next(folder.glob("*_MN.rnx.gz")))
+    result, _ = processor_of(config, navigation, {"front": trajectory}).process({"front": observations})
+    tracked, single = result.fusion["front"].tracked, result.antennas["front"]
+    station, _ = trajectory.nearest(place[None])
+    error = np.abs(tracked.arc_m - float(station[0]))
+    assert np.percentile(error / tracked.sigma_m, 95) < 2.5
+    assert np.percentile(error, 95) < 1.25 * np.percentile(np.abs(single.arc_m - float(station[0])), 95)
+    assert np.median(tracked.sigma_m) > 0.7

@@ -38,6 +38,9 @@ class TrackingLimits(Settings):
         shifted by up to the speed, at rest not at all) and its correlation time.
     phase_floor_m, phase_zenith_m : float
         The same of the change of a carrier phase over an epoch.
+    phase_walk_m : float
+        Displacement in the square root of a second by what changes the phases of all satellites slowly: ionosphere,
+        troposphere, orbits and clocks, 0.5 mm/s along the line for half an hour.
     clock_walk_mps : float
         Change of the drift of the receiver's clock in the square root of a second: 1.7e-9 of the frequency,
         what quartz oscillators without an oven show when shaken.
@@ -96,7 +99,7 @@ class TrackingLimits(Settings):
     code_correlation_m: float = Field(default=100.0, gt=0)
     code_white_share: float = Field(default=0.5, gt=0)
     slow_code_m: float = Field(default=1.0, ge=1e-6)
-    slow_code_s: float = Field(default=600.0, gt=0)
+    slow_code_s: float = Field(default=7200.0, gt=0)
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
     doppler_error_mps: float = Field(default=0.01, gt=0)
@@ -104,6 +107,7 @@ class TrackingLimits(Settings):
     doppler_correlation_s: float = Field(default=10.0, gt=0)
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
+    phase_walk_m: float = Field(default=0.03, ge=0)
     clock_walk_mps: float = Field(default=0.5, gt=0)
     offset_walk_m: float = Field(default=0.02, gt=0)
     offset_prior_m: float = Field(default=30.0, gt=0)

@@ -90,7 +90,7 @@ def predicted(
     added[:, Unknown.RADAR] = RADAR_WALK**2 * dt
     added[:, OFFSETS:SATELLITES] = limits.offset_walk_m**2 * dt
     added[:, SATELLITES:] = (1.0 - code_kept**2)[:, None]
-    length = (limits.map_scale_m * map_scale) ** 2 * travel
+    length = (limits.map_scale_m * map_scale) ** 2 * travel + limits.phase_walk_m**2 * dt
     place = spread[:, Unknown.PLACE, Unknown.PLACE] + noise[0, 0] + _LEAST_STEP_M2
     added[:, FRESH] = _fresh_variances(after, place, length, line, travel, limits)
     added[:, Unknown.PLACE] += length
