@@ -162,22 +162,28 @@ def moved(line: Trajectory, across_m: float, up_m: float) -> Trajectory:
 
 def map_rows() -> Iterator[str]:
     """The map beside the line and above it: what the status, the statistic and the level say of it."""
-    yield "        map off by [m]      % of the epochs with a position          largest    median"
-    yield "log     right     up      ok  ambiguous   off map  map offset  other  statistic  level [m]"
+    yield "        map off by [m]  % of the epochs with a position                largest  detectable [m]  level [m]"
+    yield "log     right     up    ok  ambiguous  off map map offset  other statistic  across   up  median  over ok amb"
     for name, case in cases().items():
         for across, up in OFFSETS_M:
-            result = case.solved(line=moved(case.trajectory, across, up))
+            wrong = replace(case, trajectory=moved(case.trajectory, across, up))
+            result = wrong.solved()
             has = np.isfinite(result.chainage_m)
             shares = [
                 100.0 * float((result.status[has] == s).mean())
                 for s in (Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.MAP_OFFSET)
             ]
-            statistic = result.map_offset.statistic
-            largest = float(np.nanmax(statistic)) if np.isfinite(statistic).any() else np.nan
-            level, _ = bounds(result)
+            offset = result.map_offset
+            known = np.isfinite(offset.statistic).any()
+            largest = float(np.nanmax(offset.statistic)) if known else np.nan
+            detectable = np.nanmedian(offset.detectable_m, axis=0) if known else [np.nan, np.nan]
+            level, calm = bounds(result)
+            over = calm & (wrong.errors(result)[0] > level)
+            doubtful = result.status == Status.AMBIGUOUS
             yield (
-                f"{name:6s} {across:6d} {up:6d} {shares[0]:7.1f} {shares[1]:10.1f} {shares[2]:9.1f} {shares[3]:11.1f} "
-                f"{100.0 - sum(shares):6.1f} {largest:10.1f} {np.nanmedian(level):10.1f}"
+                f"{name:6s} {across:6d} {up:6d} {shares[0]:5.1f} {shares[1]:10.1f} {shares[2]:8.1f} {shares[3]:10.1f} "
+                f"{100.0 - sum(shares):6.1f} {largest:9.1f} {detectable[0]:7.1f} {detectable[1]:5.1f} "
+                f"{np.nanmedian(level):7.1f} {(over & ~doubtful).sum():7d} {(over & doubtful).sum():4d}"
             )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +17,7 @@ from railfix.integrity.protection.separation import (
     Separations,
     all_in_view,
     without_constellation,
+    without_map,
     without_one,
     without_two,
 )
@@ -88,6 +90,46 @@ def test_every_subset_equals_solving_without_it(seed, system, scale, fault):
         members = np.array([s == letter for s in systems])
         got = without_constellation(model, members, all_of, bias[None])
         compare(got, 0, tuple(np.flatnonzero(members).tolist()), solved, bias)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    system=st.sampled_from(SYSTEMS[1:]),
+    scale=st.sampled_from([1.0, 0.5, 3.0]),
+    seen=st.sampled_from([(0.0, 0.0), (4.5, -10.0), (-20.0, 37.0), None]),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, scale, seen):
+    """The offset of the last minutes in place of the map, or nothing; alone and without each satellite."""
+    systems, ties = system
+    ranges = oracle.made(ARC, systems, seed=seed, tie_sigma_m=ties, faults_m={1: 12.0})
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    case = oracle.problem_on_line(ranges, 0, ARC[0])
+    before = protection_oracle.Resolved(case, scale)
+    n, sigma = len(systems), np.array([2.0, 5.0]) if seen is not None else np.array([1e4, 1e4])
+    unit = case.scale_of[1:3]
+    design, observed = case.design / scale, case.observed / scale
+    design[[n, n + 1], [1, 2]] = unit / sigma
+    observed[n : n + 2] = np.array(seen or (0.0, 0.0)) / sigma
+    solved = protection_oracle.Resolved(replace(case, design=design, observed=observed), 1.0)
+    if before.all.sigma_m > 50.0 or not solved.all.determined:
+        return
+    bias = np.random.default_rng(seed).uniform(0.0, 1.0, n)
+    information = np.zeros((1, 2, 2)) if seen is None else np.diag(sigma**-2.0)[None]
+    full = all_in_view(model, np.array([scale]), bias[None])
+    alone, with_one = without_map(full, model, np.array([seen or (0.0, 0.0)]), information)
+    for got, column, answer in [
+        (alone, 0, solved.all),
+        *((with_one, c, solved.without((c,))) for c in range(n)),
+    ]:
+        if not answer.determined or answer.sigma_m > 20.0:
+            continue
+        effect = float((np.abs(answer.operator[:n]) * bias / (scale * case.sigma_m)).sum())
+        assert got.sigma_m[0, column] == pytest.approx(answer.sigma_m, rel=1e-3)
+        assert got.bias_m[0, column] == pytest.approx(
+            abs(answer.place_m - before.all.place_m) + effect, rel=1e-3, abs=1e-3
+        )
+        assert got.moved_m[0, column] == got.separation_sigma_m[0, column] == 0.0
 
 
 def test_subsets_that_leave_no_position_are_found():

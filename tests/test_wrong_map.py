@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +30,12 @@ def moved(trajectory: Trajectory, *, across_m: float = 0.0, up_m: float = 0.0) -
     return replace(trajectory, ecef_m=trajectory.ecef_m + across_m * across + up_m * up)
 
 
-def on_a_map(*, across_m: float = 0.0, up_m: float = 0.0) -> AntennaResult:
+@cache
+def on_a_map(*, across_m: float = 0.0, up_m: float = 0.0, map_prior: float = 1e-4) -> AntennaResult:
     """The front antenna of the demonstration on a moved map."""
     line = moved(clean_trajectories()["front"], across_m=across_m, up_m=up_m)
-    processor = EpochProcessor(parse_config({}), {"front": line}, navigation=read_navigation(demo_files()["nav"]))
+    config = parse_config({"risk": {"map_prior": map_prior}})
+    processor = EpochProcessor(config, {"front": line}, navigation=read_navigation(demo_files()["nav"]))
     return processor.process({"front": demo_observations()["front"]})[0].antennas["front"]
 
 
@@ -96,6 +99,46 @@ def test_a_small_offset_is_a_term_of_the_level(right: AntennaResult, offset: dic
 
 
 @pytest.mark.requirement("C4")
+@pytest.mark.parametrize("part", [0, 1], ids=["across", "up"])
+def test_the_status_names_what_is_detectable(right: AntennaResult, part: int) -> None:
+    """The right map shows its own offset, so that one of the detectable size counts from there."""
+    late = np.arange(len(right)) > 1500
+    offset = right.map_offset
+    shown = float(np.nanmedian((offset.across_m, offset.up_m)[part][late]))
+    size = float(np.nanmedian(offset.detectable_m[late, part]))
+    names = ("across_m", "up_m")
+    for factor, least, most in ((1.3, 0.95, 1.0), (0.4, 0.0, 0.01)):
+        result = on_a_map(**{names[part]: -np.copysign(factor * size - abs(shown), shown)})
+        observed = late & (result.status != Status.NO_OBSERVATION)
+        told = np.isin(result.status[observed], [Status.MAP_OFFSET, Status.OFF_MAP])
+        assert least <= told.mean() <= most, (factor, size, told.mean())
+
+
+@pytest.mark.requirement("C2")
+def test_a_map_that_is_not_found_wrong_is_within_the_level(right: AntennaResult) -> None:
+    """The position without the map, at the prior of a wrong map, with and without a faulty satellite."""
+    wrong = on_a_map(up_m=20.0)
+    free = on_a_map(up_m=20.0, map_prior=0.0)
+    assert wrong.protection is not None
+    assert free.protection is not None
+    assert right.protection is not None
+    with_it, without_it = wrong.protection.level.level_m, free.protection.level.level_m
+    has = np.isfinite(without_it)
+    assert (with_it[has] >= without_it[has] * (1.0 - 1e-3)).all()
+    assert np.percentile(with_it[has] / without_it[has], 95) > 1.02
+    # A prior of one in a hundred counts more.
+    more = on_a_map(up_m=20.0, map_prior=1e-2).protection
+    assert more is not None
+    has &= np.isfinite(with_it)
+    assert np.median(more.level.level_m[has] / with_it[has]) > 1.01
+    clean = right.protection.level.level_m
+    covered = on_a_map(map_prior=0.0).protection
+    assert covered is not None
+    finite = np.isfinite(clean)
+    assert np.median(clean[finite] / covered.level.level_m[finite]) < 1.01
+
+
+@pytest.mark.requirement("C4")
 def test_a_run_on_a_map_without_the_geoid_says_so(tmp_path: Path) -> None:
     """``railfix run`` with every height 37 m too low: a note with the size and the likely cause."""
     files = demo_files()
@@ -106,3 +149,4 @@ def test_a_run_on_a_map_without_the_geoid_says_so(tmp_path: Path) -> None:
     summary = run_files(inputs, out=tmp_path / "results")
     notes = [note for note in summary.notes if "the map" in note]
     assert any("contradicts the positions" in note and "geoid" in note for note in notes), summary.notes
+    assert any("m in height is not excluded" in note for note in notes), summary.notes

@@ -54,6 +54,7 @@ def level_facts(config: Config) -> dict[str, Any]:
         "k_of_whole_risk": round(risk.sample_k, 3),
         "satellite_prior": dict(risk.satellite_prior),
         "local_prior": risk.local_prior,
+        "map_prior": risk.map_prior,
         "false_alarm": risk.false_alarm,
     }
 
@@ -81,7 +82,8 @@ def protection_levels(
     model : LinearModel
         Of the positions on the line.
     offset : MapOffset
-        What of it lies beyond its own sigma is a bias of the level.
+        What of it lies beyond its own sigma is a bias of the level; what it would not find is covered by the hypothesis
+        of a wrong map.
     raim : RaimResult
     scale : ndarray, shape (T,)
         The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, also for an error model.
@@ -100,6 +102,7 @@ def protection_levels(
         scale=np.maximum(scale, 1.0),
         bias_m=None if config.error_model is None else corrected.bias_m,
         map_bias_m=np.stack(offset.beyond_m, axis=1),
+        map_seen=offset.seen,
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)

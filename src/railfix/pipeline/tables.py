@@ -95,6 +95,8 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "map_offset_across_m": "mean of the 3-D positions of the last minutes, right of the line in the direction of "
     "rising chainage; empty for the first minute",
     "map_offset_up_m": "the same, above the line",
+    "map_detectable_across_m": "smallest offset of the map across the line that the status `map_offset` names (99 %)",
+    "map_detectable_up_m": "the same, in height",
     "map_offset_statistic": "square of that offset in its own sigmas (noise, satellites, atmosphere, stated error of "
     "the map); status `map_offset` from 13.8 on",
     "conventional_x_m": "3-D single point, ECEF",
@@ -189,6 +191,8 @@ def antenna_positions(name: str, result: AntennaResult) -> pl.DataFrame:
     columns["conventional_offset_m"] = float_column(result.conventional_offset_m)
     columns["map_offset_across_m"] = float_column(result.map_offset.across_m)
     columns["map_offset_up_m"] = float_column(result.map_offset.up_m)
+    columns["map_detectable_across_m"] = float_column(result.map_offset.detectable_m[:, 0])
+    columns["map_detectable_up_m"] = float_column(result.map_offset.detectable_m[:, 1])
     columns["map_offset_statistic"] = float_column(result.map_offset.statistic)
     for axis, column in enumerate(("conventional_x_m", "conventional_y_m", "conventional_z_m")):
         columns[column] = float_column(result.conventional_ecef_m[:, axis])

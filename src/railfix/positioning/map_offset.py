@@ -9,10 +9,11 @@ stated error of the map.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
-from scipy.special import chdtri
+from scipy.special import chdtri, chndtrinc
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
@@ -37,6 +38,8 @@ class MapOffsetLimits(Settings):
         Probability that noise alone passes the test (chi-square, two degrees of freedom): of the note, of the status.
         The nominal sigmas are assumptions; on the recordings, with a right map and all screens, the statistic
         stays below the threshold of the status, 13.8 (``tests/integrity_tables.py``).
+    missed : float
+        Probability that the status misses an offset of the smallest detectable size.
     """
 
     window_s: float = Field(default=120.0, gt=0)
@@ -44,6 +47,7 @@ class MapOffsetLimits(Settings):
     least_samples: float = Field(default=3.0, gt=0)
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
     risk: float = Field(default=1e-3, gt=0, lt=1)
+    missed: float = Field(default=1e-2, gt=0, lt=1)
 
     @property
     def note_threshold(self) -> float:
@@ -54,6 +58,11 @@ class MapOffsetLimits(Settings):
     def threshold(self) -> float:
         """Statistic from which on epochs have the status."""
         return float(chdtri(2, self.risk))
+
+    @cached_property
+    def detectable_sigmas(self) -> float:
+        """Offset that the status misses with the probability `missed` (non-central chi-square) [sigmas]."""
+        return float(np.sqrt(chndtrinc(self.threshold, 2, self.missed)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,17 +92,35 @@ class MapOffset:
     ----------
     across_m, up_m : ndarray, shape (T,) [m]
         Right of the line in the direction of rising chainage, and above it.
-    across_sigma_m, up_sigma_m : ndarray, shape (T,) [m]
-        Standard deviations of a right map: noise, satellites, atmosphere and the stated error of the map.
+    covariance_m2 : ndarray, shape (T, 2, 2) [m^2]
+        Of a right map, across and up: noise, satellites, atmosphere and the stated error of the map.
     statistic : ndarray, shape (T,)
         Square of the offset in sigmas, both components together.
+    detectable_m : ndarray, shape (T, 2) [m]
+        Smallest offsets across and up that the test finds, each alone; smaller ones are not excluded.
     """
 
     across_m: Floats
     up_m: Floats
-    across_sigma_m: Floats
-    up_sigma_m: Floats
+    covariance_m2: Floats
     statistic: Floats
+    detectable_m: Floats
+
+    @property
+    def across_sigma_m(self) -> Floats:
+        """Standard deviation across, shape (T,) [m]."""
+        return np.asarray(np.sqrt(self.covariance_m2[:, 0, 0]))
+
+    @property
+    def up_sigma_m(self) -> Floats:
+        """Standard deviation above, shape (T,) [m]."""
+        return np.asarray(np.sqrt(self.covariance_m2[:, 1, 1]))
+
+    @property
+    def seen(self) -> tuple[Floats, Floats]:
+        """Offset (T, 2) [m] and its inverse covariance (T, 2, 2) [1/m^2]; 0 without a window."""
+        offset = np.stack([self.across_m, self.up_m], axis=1)
+        return np.nan_to_num(offset), np.nan_to_num(_inverse_2x2(self.covariance_m2))
 
     @property
     def beyond_m(self) -> tuple[Floats, Floats]:
@@ -175,8 +202,9 @@ def map_offset(
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])
     known = of_noise + sums[:, [5, 6, 6, 7]].reshape(-1, 2, 2) / sums[:, 8, None, None]
     known = known + np.diag([trajectory.sigma_plan_m**2, trajectory.sigma_height_m**2])
-    statistic = np.einsum("ti,tij,tj->t", mean, _inverse_2x2(known), mean)
-    sigma = np.sqrt(known[:, [0, 1], [0, 1]])
+    inverse = _inverse_2x2(known)
+    statistic = np.einsum("ti,tij,tj->t", mean, inverse, mean)
+    detectable = limits.detectable_sigmas / np.sqrt(inverse[:, [0, 1], [0, 1]])
 
     def judged(values: Floats) -> Floats:
         return np.where(enough, values, np.nan)
@@ -184,9 +212,9 @@ def map_offset(
     result = MapOffset(
         across_m=judged(mean[:, 0]),
         up_m=judged(mean[:, 1]),
-        across_sigma_m=judged(sigma[:, 0]),
-        up_sigma_m=judged(sigma[:, 1]),
+        covariance_m2=np.where(enough[:, None, None], known, np.nan),
         statistic=judged(statistic),
+        detectable_m=np.where(enough[:, None], detectable, np.nan),
     )
     return result, MapOffsetState(time=time[-1], age=float(age[-1]), sums=after) if len(time) else state
 

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
@@ -323,11 +324,24 @@ def notes_of(
         if offset is not None and offset.statistic > note_statistic:
             doubt = "contradicts the positions" if antenna.status["map_offset"] else "may be wrong"
             notes.append(f"{name}: the map {doubt}: {offset.text}")
+        if antenna.positioned:
+            notes.append(f"{name}: {_undetected(antenna.map_detectable_m)}")
         off = antenna.status["off_map"]
         if off > 0.1 * antenna.positioned:
             which = "every position is" if off == antenna.positioned else f"{off} of {antenna.positioned} positions are"
             notes.append(f"{name}: {which} off the map; is this the right track?")
     return tuple(dict.fromkeys(notes))
+
+
+def _undetected(detectable_m: Floats) -> str:
+    """Which offsets of the map the run does not exclude, one clause."""
+    if np.isnan(detectable_m).any():
+        return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
+    (across, up), (most_across, most_up) = detectable_m.tolist()
+    return (
+        f"an error of the map below {across:.0f} m across or {up:.0f} m in height is not excluded; where the ranges "
+        f"are worst, below {most_across:.0f} m or {most_up:.0f} m (columns map_detectable_*)"
+    )
 
 
 def _map_notes(line: Line) -> Iterator[str]:

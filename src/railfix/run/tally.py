@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
 from railfix.pipeline.processor import AntennaResult, Result
 
@@ -80,6 +80,8 @@ class AntennaTally:
         Epochs with a conventional position.
     conventional_nearest_m : float
         Least distance of a conventional position from the trajectory; NaN when there was none.
+    map_detectable_m : ndarray, shape (2, 2) [m]
+        Least and largest offset across (first column) and up that a window finds; NaN without any window.
     map_offset : MapOffsetFound or None
         Where the 3-D positions contradicted the map most; None before there were enough.
     """
@@ -104,6 +106,7 @@ class AntennaTally:
     conventional: int = 0
     conventional_nearest_m: float = float("nan")
     map_offset: MapOffsetFound | None = None
+    map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
         """Count one more chunk."""
@@ -134,6 +137,9 @@ class AntennaTally:
         offset = result.map_offset
         if not np.isfinite(offset.statistic).any():
             return
+        least, largest = np.nanmin(offset.detectable_m, axis=0), np.nanmax(offset.detectable_m, axis=0)
+        known = self.map_detectable_m
+        self.map_detectable_m = np.stack([np.fmin(known[0], least), np.fmax(known[1], largest)])
         worst = int(np.nanargmax(offset.statistic))
         if self.map_offset is None or offset.statistic[worst] > self.map_offset.statistic:
             self.map_offset = MapOffsetFound(

@@ -39,6 +39,7 @@ from railfix.integrity.protection.separation import (
     all_in_view,
     without_constellation,
     without_constellation_and_one,
+    without_map,
     without_one,
     without_three,
     without_two,
@@ -138,6 +139,7 @@ class _Plan:
     pairs: Masks  # two faults are likelier than their share
     triples: Masks  # three faults are likelier than what may stay unchecked
     k_false_alarm: Floats
+    map_prior: float  # of a wrong map; 0: no hypothesis
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,7 @@ def along_track_level(
     scale: ArrayLike = 1.0,
     bias_m: ArrayLike | None = None,
     map_bias_m: ArrayLike | None = None,
+    map_seen: tuple[Floats, Floats] | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
     """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension, up to two satellites).
@@ -177,6 +180,9 @@ def along_track_level(
         Largest nominal bias of each range, as a paired overbound gives it; none: 0.
     map_bias_m : array_like, shape (T, 2) or (2,) [m], optional
         Offset of the map across and up that is not within its sigma; none: 0.
+    map_seen : tuple of ndarray, shapes (T, 2) [m] and (T, 2, 2) [1/m^2], optional
+        Place of the antenna across and above the line without the map, and its inverse covariance (0: unknown). With it
+        a wrong map, alone and with each faulty satellite, is a hypothesis of prior `RiskBudget.map_prior`.
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
 
@@ -203,16 +209,17 @@ def along_track_level(
     bias = None if bias_m is None else np.broadcast_to(np.asarray(bias_m, dtype=np.float64), (epochs, channels))
     offset = None if map_bias_m is None else np.broadcast_to(np.asarray(map_bias_m, dtype=np.float64), (epochs, 2))
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
-    plan = _plan(model, systems, risk, out)
+    plan = _plan(model, systems, risk, out, wrong_map=map_seen is not None)
     result = _empty(epochs, plan)
     for block in _blocks(model, np.flatnonzero(located)):
         some = None if bias is None else bias[block]
         moved = None if offset is None else offset[block]
-        _level_of_block(result, block, model.take(block), plan, scale[block], some, moved)
+        seen = None if map_seen is None else (map_seen[0][block], map_seen[1][block])
+        _level_of_block(result, block, model.take(block), plan, scale[block], some, moved, seen)
     return result
 
 
-def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers) -> _Plan:
+def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers, *, wrong_map: bool) -> _Plan:
     """Divide the risk of each epoch."""
     prior = model.used * risk.prior(systems)
     # Excluded satellites count among those that may be faulty, with the largest prior.
@@ -229,6 +236,9 @@ def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Int
         together += group_prior[:, c] * pair_sum(prior * ~members)
     three = more_than_two(everyone)
     triples = three > risk.unchecked_share * risk.risk_per_sample
+    map_prior = risk.map_prior if wrong_map else 0.0
+    # A wrong map with a constellation, or with two satellites.
+    together += map_prior * (group_prior.sum(axis=1) + pair_sum(everyone))
     beyond = np.where(triples, more_than_three(everyone), three) + together + pair_sum(group_prior)
     n = np.count_nonzero(model.used, axis=1)
     left = risk.sample_risk(n, out, beyond)
@@ -250,6 +260,7 @@ def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Int
         pairs=pairs,
         triples=triples,
         k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1))),
+        map_prior=map_prior,
     )
 
 
@@ -296,6 +307,7 @@ def _level_of_block(
     scale: Floats,
     bias: Floats | None,
     map_bias: Floats | None,
+    map_seen: tuple[Floats, Floats] | None,
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
     full = all_in_view(model, scale, bias, map_bias)
@@ -308,6 +320,11 @@ def _level_of_block(
     for c, (_, members) in enumerate(plan.groups):
         single_separations.append(without_constellation(model, members, full, bias))
         single_prior.append(plan.group_prior[rows, c : c + 1])
+    wrong_map = None
+    if map_seen is not None and plan.map_prior > 0.0:
+        wrong_map = without_map(full, model, *map_seen)
+        single_separations.append(wrong_map[0])
+        single_prior.append(np.full((len(rows), 1), plan.map_prior))
     single_fault = _part(
         _beside(single_separations), np.concatenate(single_prior, axis=1), plan.one[rows], k_false_alarm, sigma
     )
@@ -322,6 +339,9 @@ def _level_of_block(
         of_group = members[full.channel] & full.used
         double_separations.append(without_constellation_and_one(full, of_group))
         double_prior.append(plan.group_prior[rows, c : c + 1] * prior * ~of_group)
+    if wrong_map is not None:
+        double_separations.append(wrong_map[1])
+        double_prior.append(plan.map_prior * prior)
     double_fault = _nothing(len(rows))
     if double_separations:
         every = np.concatenate(double_prior, axis=1)
@@ -346,16 +366,9 @@ def _level_of_block(
         above, [noise, single_fault.tails, double_fault.tails, triple_fault.tails], remaining_risk
     )
     result.level_m[rows], result.sigma_m[rows] = level, sigma
-    result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = (
-        fault_free,
-        single_fault.level_m,
-        double_fault.level_m,
-    )
-    result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = (
-        k_fault_free,
-        single_fault.k,
-        double_fault.k,
-    )
+    result.fault_free_m[rows], result.k_fault_free[rows] = fault_free, k_fault_free
+    result.one_fault_m[rows], result.k_one_fault[rows] = single_fault.level_m, single_fault.k
+    result.two_fault_m[rows], result.k_two_faults[rows] = double_fault.level_m, double_fault.k
     result.k_false_alarm[rows] = k_false_alarm
     result.separation[rows] = np.maximum(
         np.maximum(single_fault.separation, double_fault.separation), triple_fault.separation
@@ -364,10 +377,9 @@ def _level_of_block(
     at = np.arange(len(rows))
     has_single = (single_fault.worst >= 0) & (single_fault.worst < n)
     result.worst_one[rows] = np.where(has_single, full.channel[at, np.where(has_single, single_fault.worst, 0)], -1)
-    letters = np.array([*(letter for letter, _ in plan.groups), ""])
-    result.worst_constellation[rows] = letters[
-        np.where(single_fault.worst >= n, single_fault.worst - n, len(plan.groups))
-    ]
+    # The last two are a wrong map, and none.
+    letters = np.array([*(letter for letter, _ in plan.groups), "", ""])
+    result.worst_constellation[rows] = letters[np.where(single_fault.worst >= n, single_fault.worst - n, -1)]
     if n > 1:
         has_pair = (double_fault.worst >= 0) & (double_fault.worst < len(first)) & bool(pairs.any())
         places = np.stack([first, second], axis=1)[np.where(has_pair, double_fault.worst, 0)]

@@ -89,6 +89,9 @@ class RiskBudget(Settings):
     local_prior : float
         Probability that a satellite's range is off at a time by local causes that the screens left, on top of
         that: multipath, interference. An assumption until measured on the line (P1 7).
+    map_prior : float
+        Probability that the map at a place is wrong by more than its stated error: the next track, heights without
+        the geoid, another reference frame. An assumption; 0: no such hypothesis.
     priors : {"assumed", "measured"}
         Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are
         called indicative in every output: they carry no risk an hour.
@@ -107,6 +110,7 @@ class RiskBudget(Settings):
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
+    map_prior: float = Field(default=1e-4, ge=0, lt=1)
     priors: Literal["assumed", "measured"] = "assumed"
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 

@@ -12,14 +12,14 @@ with a the response of the position to one sigma across and up, is therefore tak
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
-from railfix.integrity.raim.model import LinearModel, compact
+from railfix.integrity.raim.model import LinearModel, compact, regular_inverse
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
 _NO_EFFECT: Final = 1e-6
@@ -263,6 +263,63 @@ def without_constellation(model: LinearModel, members: Masks, full: AllInView, b
         bias[:, None],
         blind[:, None],
     )
+
+
+def without_map(
+    full: AllInView, model: LinearModel, seen_m: Floats, information: Floats
+) -> tuple[Separations, Separations]:
+    """The map left out, alone (K = 1) and with each channel (K = n).
+
+    What takes the place of the map is its offset as the positions in space of the last minutes show it. Without one
+    the position is that in space. The distance from the position of all is computed and counts whole, so that nothing
+    is left to be tested.
+
+    Parameters
+    ----------
+    full : AllInView
+    model : LinearModel
+    seen_m : ndarray, shape (T, 2) [m]
+        Place of the antenna across and above the line over minutes; any finite value where nothing is known.
+    information : ndarray, shape (T, 2, 2) [1/m^2]
+        Inverse covariance of that; 0 where nothing is known.
+    """
+    square = full.scale[:, None, None] ** 2
+    of_map = np.zeros((len(model), 3, 3))
+    of_map[:, 1:, 1:] = square * information
+    normal = np.linalg.inv(model.covariance_m2) - model.prior
+    covariance = regular_inverse(normal + of_map)
+    blind: Masks = np.asarray(~np.isfinite(covariance).all(axis=(1, 2)))
+    covariance = np.where(blind[:, None, None], np.eye(3), covariance)
+    ask = np.matmul(model.misfit[:, None, :], model.design)[:, 0]
+    ask[:, 1:] += np.einsum("tij,tj->ti", of_map[:, 1:, 1:], seen_m)
+    shift = np.einsum("tij,tj->ti", covariance, ask) - model.step_m
+    parts = compact(replace(model, covariance_m2=covariance))
+    residual = model.residual - np.einsum("tmi,ti->tm", model.design, shift)
+    nothing = np.zeros((len(model), 2))
+    free = replace(
+        full,
+        projector=parts.projector,
+        residual=np.where(parts.used, np.take_along_axis(residual, parts.channel, axis=1), 0.0),
+        gain_m=parts.gain_m[..., 0],
+        map_gain_m=np.zeros(full.map_gain_m.shape),
+        map_m=nothing,
+        variance_m2=covariance[:, 0, 0],
+        map_bias=nothing,
+    )
+    one = without_one(free)
+    alone = Separations(
+        sigma_m=np.where(blind, np.inf, free.sigma_m)[:, None],
+        separation_sigma_m=np.zeros((len(model), 1)),
+        moved_m=np.zeros((len(model), 1)),
+        bias_m=np.where(blind, 0.0, np.abs(shift[:, 0]) + free.bias_m)[:, None],
+    )
+    with_one = Separations(
+        sigma_m=np.where(blind[:, None], np.inf, one.sigma_m),
+        separation_sigma_m=np.zeros(one.moved_m.shape),
+        moved_m=np.zeros(one.moved_m.shape),
+        bias_m=np.where(np.isfinite(one.sigma_m), np.abs(shift[:, :1] + one.moved_m) + one.bias_m, 0.0),
+    )
+    return alone, with_one
 
 
 def without_constellation_and_one(full: AllInView, members: Masks) -> Separations:
