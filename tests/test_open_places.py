@@ -15,8 +15,15 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Status
 from railfix.integrity.protection import SATELLITE_PRIOR, RiskBudget
 from railfix.integrity.raim import constrained_model
+from railfix.io.rinex import read_navigation, read_observations
+from railfix.pipeline import open_places
+from railfix.pipeline.config import Config
 from railfix.pipeline.open_places import places_beyond_the_level
 from railfix.positioning.section_search import SearchIndex
+from railfix.run.processor import processor_of
+from railfix.simulate.demonstration import demo_inputs
+from railfix.track import read_track
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +109,33 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
         if not 0.9 < expected / risk.risk_per_sample < 1.1:
             assert found[t] == (expected > risk.risk_per_sample), (rows[t], expected)
     assert 0 < open_ones < len(rows)
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.parametrize("share", [1.0, 0.2])
+def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """A bound of the risk decides most epochs of the demonstration; without it the same epochs are open."""
+    inputs = demo_inputs()
+    assert inputs.vehicle is not None
+    path = antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front")
+    log = {"front": read_observations(inputs.front)[::4]}
+    result = processor_of(Config(), read_navigation(inputs.nav), {"front": path}).process(log)[0].antennas["front"]
+    assert result.protection is not None
+    level, arc = share * result.protection.level.level_m, result.constrained.arc_m
+    model = constrained_model(ranges_of(result), path, arc, section=np.maximum(result.constrained.section, 0))
+    systems = [name[0] for name in result.satellite[result.columns].tolist()]
+    scale, rows = np.maximum(result.noise_scale, 1.0), np.flatnonzero(np.isfinite(level))
+    looked_at: list[int] = []
+    exact = open_places._risk_of_block
+
+    def counted(index: SearchIndex, arc_m: np.ndarray, *rest: object) -> np.ndarray:
+        looked_at.append(len(arc_m))
+        return exact(index, arc_m, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(open_places, "_risk_of_block", counted)
+    bounded = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), rows)
+    assert 0 < sum(looked_at) < 0.3 * len(rows)
+    monkeypatch.setattr(open_places, "risk_off_tangent", lambda *arrays: np.full(len(arrays[-1]), 1.0))
+    every = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), rows)
+    np.testing.assert_array_equal(bounded, every)
+    assert every.any() == (share < 1.0)

@@ -133,7 +133,9 @@ def main() -> None:
         for number in range(options.rounds + 1):
             stages.spent.clear()
             begin = time.process_time()
-            summary = run_files(inputs, Config(filter="off"), out=Path(scratch) / f"out{number}", options=RunOptions(workers=1))
+            summary = run_files(
+                inputs, Config(filter="off"), out=Path(scratch) / f"out{number}", options=RunOptions(workers=1)
+            )
             whole = time.process_time() - begin
             epochs = summary.tally.epochs
             spent = {**stages.spent, "all": whole, "everything else": whole - sum(stages.spent.values())}

@@ -8,7 +8,7 @@ place, which is evaluated along the line around the position.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Final
@@ -22,6 +22,7 @@ from railfix.integrity.protection.risk import one_sided_k
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact, compact
+from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import inverse_3x3
 from railfix.positioning.section_search import SearchIndex
 
@@ -29,6 +30,10 @@ from railfix.positioning.section_search import SearchIndex
 _ALONG: Final = 0.9945
 #: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
 _FURTHEST_M: Final = 5000.0
+#: Distance up to which the line is looked over for parts off the tangent before anything else [m].
+_CLEAR_M: Final = 200.0
+#: Points this near to a tangent are not off it beyond any level [m].
+_ON_TANGENT_M: Final = 1e-3
 #: Share of the risk of a sample below which places are not looked for.
 _NEGLIGIBLE: Final = 0.01
 #: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
@@ -139,26 +144,164 @@ def places_beyond_the_level(
     if not len(rows):
         return result
     channels = int(np.count_nonzero(model.used[rows], axis=1).max())
-    size = max(1, _BLOCK_SIZE // (9 * channels**2))
+    size = max(1, _BLOCK_SIZE // channels**2)
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
-        spent = _risk_of_block(index, arc_m[block], model.take(block), level_m[block], scale[block], systems, risk)
-        result[block] = spent > risk.risk_per_sample
+        parts, design, none = _whitened(model.take(block), index, np.maximum(scale[block], 1.0))
+        prior = np.where(parts.used, risk.prior(systems)[parts.channel], 0.0)
+        clear_m = np.maximum(level_m[block], _off_tangent_m(index, arc_m[block]))
+        bound = risk_off_tangent(
+            parts.projector, parts.residual, design, prior, none.slope[:, 0], none.matrix[:, 0], clear_m
+        )
+        near = np.flatnonzero(bound > risk.risk_per_sample)
+        for some in np.array_split(near, 1 + 9 * len(near) // size) if len(near) else ():
+            rest = block[some]
+            spent = _risk_of_block(
+                index, arc_m[rest], level_m[rest], parts.take(some), design[some], none.take(some), prior[some], risk
+            )
+            result[rest] = spent > risk.risk_per_sample
     return result
+
+
+def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
+    """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
+
+    The same for all positions on a section; at most `_CLEAR_M`.
+    """
+    line = index.trajectory
+    section = line.segment_at(arc_m)[0]
+    new = np.unique(section[np.isnan(index.off_tangent_m[section])])
+    if len(new):
+        middle = line.ecef_m[new] + 0.5 * line.length_m[new, None] * line.tangent[new]
+        reach = _CLEAR_M + 0.5 * line.length_m[new] + line.length_m.max()
+        lists = index.tree.query_ball_point(middle, reach)
+        count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
+        vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
+        row = np.repeat(np.arange(len(new)), count)
+        other = (vertex < len(line.length_m)) & (vertex != new[row])
+        row, vertex = row[other], vertex[other]
+        own, tangent = line.length_m[new[row]], line.tangent[new[row]]
+        along, distance, off = [], [], np.zeros(len(row), dtype=bool)
+        for end in (vertex, vertex + 1):
+            away = line.ecef_m[end] - line.ecef_m[new[row]]
+            ahead = np.einsum("pi,pi->p", away, tangent)
+            # Of all places on the section, the one abeam or nearest sees the end furthest off the tangent.
+            least = np.maximum(np.maximum(ahead - own, -ahead), 0.0)
+            beside = np.linalg.norm(away - ahead[:, None] * tangent, axis=1)
+            distance.append(np.hypot(least, beside))
+            off |= (least < _ALONG * distance[-1]) & (beside > _ON_TANGENT_M)
+            along.append(ahead)
+        # A section that passes by has ends in both directions, and a middle off the tangent.
+        passing = np.minimum(np.maximum(*along), own) - np.maximum(np.minimum(*along), 0.0) > _ON_TANGENT_M
+        near = np.where(off | passing, np.minimum(*distance) - line.length_m[vertex], _CLEAR_M)
+        clear = np.full(len(new), _CLEAR_M)
+        np.minimum.at(clear, row, near)
+        index.off_tangent_m[new] = np.maximum(clear, 0.0)
+    return np.asarray(index.off_tangent_m[section])
+
+
+@compiled_by("open_places")
+def risk_off_tangent(
+    projector: Floats,
+    residual: Floats,
+    design: Floats,
+    prior: Floats,
+    slope: Floats,
+    matrix: Floats,
+    clear_m: Floats,
+) -> Floats:
+    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
+
+    At a distance D from the position a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
+    least, c its lowest place, C the inverse of its matrix and s its slope.
+
+    Parameters
+    ----------
+    projector : ndarray, shape (T, n, n)
+    residual, prior : ndarray, shape (T, n)
+    design : ndarray, shape (T, n, 3)
+    slope : ndarray, shape (T, 3)
+    matrix : ndarray, shape (T, 3, 3)
+        Of the form without a fault.
+    clear_m : ndarray, shape (T,) [m]
+        Distance within which no place is off the tangent.
+
+    Returns
+    -------
+    ndarray, shape (T,)
+        Summed over no fault, one faulty satellite and two.
+    """
+    share = np.einsum("tii->ti", projector)
+    s = [slope[:, a, None] for a in range(3)]
+    entries = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    m = {(a, b): matrix[:, a, b, None] for a, b in entries}
+    f = [design[..., a] for a in range(3)]
+    total = _bounded(np.full((len(clear_m), 1), 2.0), s, m, clear_m)
+
+    checked = share > LEAST_REDUNDANCY
+    inverse = np.where(checked, 1.0 / np.where(checked, share, 1.0), 0.0)
+    own = inverse * residual
+    scaled = [inverse * f[a] for a in range(3)]
+    total += _bounded(
+        prior, [s[a] - own * f[a] for a in range(3)], {(a, b): m[a, b] - scaled[a] * f[b] for a, b in entries}, clear_m
+    )
+
+    n = prior.shape[1]
+    i, j = np.triu_indices(n, 1)
+    a_i, b_ij, c_j = share[:, i], np.take(projector.reshape(-1, n * n), i * n + j, axis=1), share[:, j]
+    product = a_i * c_j
+    determinant = product - b_ij * b_ij
+    checked = (np.minimum(a_i, c_j) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
+    inverse = np.where(checked, 1.0 / np.where(checked, determinant, 1.0), 0.0)
+    a_i, b_ij, c_j = a_i * inverse, b_ij * inverse, c_j * inverse
+    one, two = residual[:, i], residual[:, j]
+    own_one, own_two = c_j * one - b_ij * two, a_i * two - b_ij * one
+    first, second = [f[a][:, i] for a in range(3)], [f[a][:, j] for a in range(3)]
+    move_one = [c_j * first[a] - b_ij * second[a] for a in range(3)]
+    move_two = [a_i * second[a] - b_ij * first[a] for a in range(3)]
+    return total + _bounded(
+        prior[:, i] * prior[:, j],
+        [s[a] - own_one * first[a] - own_two * second[a] for a in range(3)],
+        {(a, b): m[a, b] - move_one[a] * first[b] - move_two[a] * second[b] for a, b in entries},
+        clear_m,
+    )
+
+
+def _bounded(
+    prior: Floats, slope: Sequence[Floats], matrix: Mapping[tuple[int, int], Floats], clear_m: Floats
+) -> Floats:
+    """Return the bound of `risk_off_tangent` over K hypotheses, shape (T,): prior (T, K), parts of slope and matrix."""
+    xx, xy, xz, yy, yz, zz = (matrix[key] for key in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    s, t, u = slope
+    c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+    determinant = xx * c_xx + xy * c_xy + xz * c_xz
+    regular = determinant > 1e-12 * ((xx + yy + zz) / 3.0) ** 3
+    inverse = 1.0 / np.where(regular, determinant, 1.0)
+    x, y, z = (
+        (c_xx * s + c_xy * t + c_xz * u) * inverse,
+        (c_xy * s + c_yy * t + c_yz * u) * inverse,
+        (c_xz * s + c_yz * t + c_zz * u) * inverse,
+    )
+    gap = np.maximum(clear_m[:, None] - np.sqrt(x * x + y * y + z * z), 0.0)
+    spread = np.where(regular, (c_xx + c_yy + c_zz) * inverse, np.inf)
+    excess = gap * gap / spread - np.maximum(x * s + y * t + z * u, 0.0)
+    tail = np.where(excess > 0.0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
+    return np.asarray((prior * tail).sum(axis=1))
 
 
 def _risk_of_block(
     index: SearchIndex,
     arc_m: Floats,
-    model: LinearModel,
     level_m: Floats,
-    scale: Floats,
-    systems: Sequence[str],
+    parts: Compact,
+    design: Floats,
+    none: _Forms,
+    prior: Floats,
     risk: RiskBudget,
 ) -> Floats:
     """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
-    parts, design, none = _whitened(model, index, np.maximum(scale, 1.0))
-    prior, allowed = np.where(parts.used, risk.prior(systems)[parts.channel], 0.0), risk.risk_per_sample
+    allowed = risk.risk_per_sample
     forms = _beside(none, _without_one(parts, design, none, prior))
     spent = _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(allowed)))
     left = np.flatnonzero(spent <= allowed)

@@ -133,10 +133,21 @@ class _Stretches:
 
 
 class SearchIndex:
-    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length."""
+    """Search structures of a trajectory, built once: a k-d tree, and stretches of rising length.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+    tree : cKDTree
+        Of its points.
+    off_tangent_m : ndarray, shape (V - 1,) [m]
+        Distance of each section from the parts of the line off its tangent, filled in where a train comes along
+        (`pipeline.open_places`); NaN elsewhere.
+    """
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
+        self.off_tangent_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
         self.tree = cKDTree(points)
         self.levels: list[_Stretches] = []
