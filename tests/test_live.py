@@ -24,9 +24,10 @@ from railfix.io import read_any_positions
 from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
 from railfix.live.channels import TwoChannels, compare, digests
 from railfix.live.engine import LiveEngine, LiveOutput
-from railfix.live.session import Metrics, run_session
+from railfix.live.forms import nmea_bytes, tpv_bytes
+from railfix.live.metrics import Metrics
+from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
-from railfix.live.sinks import nmea_bytes, tpv_bytes
 from railfix.live.sources import _Chunks, check_source
 from railfix.live.stream import ReceiverState, receive_bytes, single_epochs
 from railfix.simulate.demo_data import demo_files
@@ -213,15 +214,18 @@ def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) 
     async def session(source: str | None) -> list[LiveOutput]:
         outputs: list[LiveOutput] = []
         engine = LiveEngine(
-            railfix.EpochProcessor(railfix.Config(), trajectory), LiveSettings(period_s=1.0, no_input="skip")
+            railfix.EpochProcessor(railfix.Config(), trajectory),
+            LiveSettings(period_s=1.0, no_input="skip", reconnect="off"),
         )
         if source is not None:
-            await run_session(engine, {"front": source}, [], speed=None, observe=outputs.append)
+            await run_session(engine, {"front": source}, [], speed=None, hooks=Hooks(observe=outputs.append))
             return outputs
         ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
         server = asyncio.create_task(serve_in_fragments(data, 5, ready))
         port = await ready
-        await run_session(engine, {"front": f"tcp://127.0.0.1:{port}"}, [], speed=None, observe=outputs.append)
+        await run_session(
+            engine, {"front": f"tcp://127.0.0.1:{port}"}, [], speed=None, hooks=Hooks(observe=outputs.append)
+        )
         await server
         return outputs
 
@@ -309,7 +313,7 @@ def test_messages_of_the_demonstration(logs: dict[str, tuple[Observations, ...]]
     tpv = json.loads(tpv_bytes(output))
     assert tpv["lat"] == pytest.approx(latitude, abs=1e-8)
     assert (tpv["class"], tpv["mode"]) == ("TPV", 3)
-    assert Metrics().text({"paired": 3}).count("# TYPE") == 4
+    assert Metrics(epochs={"paired": 3}).text().count("# TYPE") == 8
 
 
 def test_bounds_of_the_filter_where_it_has_a_level(logs: dict[str, tuple[Observations, ...]]) -> None:

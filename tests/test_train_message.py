@@ -86,7 +86,8 @@ def test_size_and_keys_of_a_message() -> None:
     assert KEYS["chainage_cm"] == 6
     assert KEYS["status"] == 14
     assert KEYS["complete"] == 19
-    assert len(KEYS) == 19
+    assert KEYS["sigma_cm"] == 20
+    assert len(KEYS) == 20
 
 
 @given(data=st.binary(max_size=300))
@@ -130,6 +131,6 @@ def test_position_report_by_hand() -> None:
     assert report["V_TRAIN"] == 18  # 90.4 km/h in steps of 5
     assert (report["Q_DIRLRBG"], report["Q_DLRBG"], report["Q_DIRTRAIN"]) == (1, 1, 0)
     with pytest.raises(ValueError, match="nearer reference"):
-        etcs_report(PLACED, reference_cm=10_000_000, reference=77)
+        etcs_report(PLACED, reference_cm=100_000_000, reference=77)
     with pytest.raises(ValueError, match="without a position"):
         etcs_report(TrainMessage(train=1, sequence=1, time_ns=1, sent_ns=1, line=1), reference_cm=0, reference=1)

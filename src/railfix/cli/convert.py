@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, from_models
 from railfix.core.errors import SettingsError
+from railfix.run.options import LogReading
 
 
+@from_models
 def convert(
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG...", help="Logs of one receiver: UBX, RTCM 3, or RINEX; plain or packed."),
+        typer.Argument(metavar="LOG...", help="Logs of one receiver: UBX, SBF, RTCM 3, or RINEX; plain or packed."),
     ],
+    reading: LogReading,
     *,
     out: Annotated[
         Path | None,
@@ -28,20 +30,13 @@ def convert(
     rinex: Annotated[
         Literal["3", "4"], typer.Option("--rinex", help="Version of RINEX to write: 3 (3.04) or 4 (4.02).")
     ] = "3",
-    date: Annotated[
-        datetime | None,
-        typer.Option(
-            metavar="DATE",
-            formats=["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"],
-            help="A time within half a week of RTCM 3 logs, whose observations carry no week.",
-        ),
-    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Write the observations and the ephemerides of receiver logs as RINEX files.
 
     The kind of a log is detected from its content. UBX needs RXM-RAWX for observations and RXM-SFRBX for
-    ephemerides; RTCM 3 MSM4 to MSM7 and 1019, 1020, 1042, 1044, 1046. Skipped items (damaged bytes, unknown
+    ephemerides; SBF MeasEpoch and raw navigation pages; RTCM 3 MSM4 to MSM7 and 1019, 1020, 1042,
+    1044, 1046. Skipped items (damaged bytes, unknown
     signals, messages of other kinds) are counted and printed.
 
     Example: `railfix convert drive.ubx --out drive.rnx --nav-out drive.nav`
@@ -53,7 +48,7 @@ def convert(
     from railfix.run.convert import Conversion, convert_logs
 
     result = convert_logs(
-        Conversion(logs=tuple(logs), out=out, nav_out=nav_out, rinex=rinex, date=date),
+        Conversion(logs=tuple(logs), out=out, nav_out=nav_out, rinex=rinex, reading=reading),
         overwrite="replace" if overwrite else "refuse",
     )
     for line in result:

@@ -8,10 +8,16 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, from_models
+from railfix.cli.settings import Choices, set_value, settings_of
+from railfix.run.options import LogReading, TrackReading
 
 
+@from_models
 def live(
+    choices: Choices,
+    reading: TrackReading,
+    logs: LogReading,
     *,
     front: Annotated[
         str,
@@ -29,19 +35,13 @@ def live(
         list[Path] | None,
         typer.Option("--nav", metavar="FILE", help="Navigation files known from the start."),
     ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="TOML", help="Settings of the positioning.")
-    ] = None,
-    setting: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting over the file's.")
-    ] = None,
     live_setting: Annotated[
         list[str] | None,
         typer.Option(
             "--live",
             metavar="KEY=VALUE",
-            help="One setting of live operation: period_s=0.1, pair_wait_s, train, line, "
-            "facing, front_offset_m, length_m.",
+            help="One setting of live operation: period_s=0.1, pair_wait_s, reconnect, train, line, facing, "
+            "front_offset_m, length_m and others; may be repeated.",
         ),
     ] = None,
     send: Annotated[
@@ -49,8 +49,8 @@ def live(
         typer.Option(
             "--send",
             metavar="FORM@TARGET",
-            help="Where messages go: json, cbor, nmea or tpv at -, a file, udp://HOST:PORT, tcp-server://HOST:PORT or "
-            "mqtt://HOST:PORT/TOPIC. Default: json@-.",
+            help="Where messages go: json, cbor, nmea, tpv, etcs, positions or train at -, a file, udp://HOST:PORT, "
+            "tcp-server://HOST:PORT or mqtt://[USER:PASSWORD@]HOST:PORT/TOPIC. Default: json@-.",
         ),
     ] = None,
     speed: Annotated[
@@ -64,6 +64,17 @@ def live(
     metrics: Annotated[
         str | None, typer.Option("--metrics", metavar="HOST:PORT", help="Serve Prometheus text at /metrics.")
     ] = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            "--state",
+            metavar="FILE",
+            help="Write what a restarted session needs into this file now and then, and continue from it.",
+        ),
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", metavar="FILE", help="Also log into this file, which rotates.")
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Also write the tables of results into this folder.")
     ] = None,
@@ -71,9 +82,10 @@ def live(
 ) -> None:
     r"""Position a train from its receivers' streams, one message a period.
 
-    Streams are UBX or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from the
-    moment they are complete. The answers are those of `railfix run` on the same epochs. A period without input has
-    a message too. The program ends when the sources end, or on SIGINT or SIGTERM.
+    Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages mixed; ephemerides are used from
+    the moment they are complete, SBAS messages with `--sbas stream`. The answers are those of `railfix run` on the
+    same epochs. A period without input has a message too. Connections that break are opened again. The program ends
+    when files end, or on SIGINT or SIGTERM; SIGHUP reloads nothing, and says so.
 
     Example:
 
@@ -87,30 +99,29 @@ def live(
     sources: dict[Literal["front", "rear"], str] = {"front": front}
     if rear is not None:
         sources["rear"] = rear
+    settings, asked = settings_of(choices)
+    if "filter" not in asked:
+        settings = settings.replaced(filter="track")
+    live_values: dict[str, Any] = {}
+    for text in live_setting or ():
+        set_value(live_values, text)
     inputs = LiveInputs(
         sources=sources,
         track=tuple(track),
         vehicle=vehicle,
         nav=tuple(nav or ()),
-        config=config,
-        settings=_pairs(setting),
-        live=_pairs(live_setting),
+        config=settings,
+        reading=reading,
+        logs=logs,
+        live=live_values,
         send=tuple(send or ("json@-",)),
         speed=speed,
         channels=2 if channels == "2" else 1,
         metrics=metrics,
+        state=state,
+        log=log,
         out=out,
         overwrite="replace" if overwrite else "refuse",
     )
     for line in asyncio.run(run_live(inputs)):
         typer.echo(line, err=True)
-
-
-def _pairs(settings: list[str] | None) -> dict[str, Any]:
-    """Nested values of KEY=VALUE settings."""
-    from railfix.cli.settings import set_value
-
-    values: dict[str, Any] = {}
-    for text in settings or ():
-        set_value(values, text)
-    return values

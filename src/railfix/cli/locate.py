@@ -11,6 +11,7 @@ from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.run.locate import LocateInputs, locate_files
+from railfix.run.options import LogReading
 from railfix.run.output import check_output_file
 
 
@@ -18,6 +19,7 @@ from railfix.run.output import check_output_file
 def locate(
     inputs: LocateInputs,
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
+    reading: LogReading,
     *,
     out: Annotated[Path, typer.Option(metavar="FILE.pos", help="Positions to write, RTKLIB's solution format.")],
     overwrite: OverwriteOption = False,
@@ -33,7 +35,7 @@ def locate(
     """
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
     settings, _ = settings_of(choices)
-    summary = locate_files(inputs, settings, out=out)
+    summary = locate_files(inputs, settings, out=out, reading=reading)
     console = console_of_tables()
     north, east, up = summary.sigma_m
     console.print(

@@ -64,8 +64,8 @@ class Choices(Settings):
         metavar="TOML",
     )
     sbas: tuple[Path, ...] = option(
-        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B); its corrections replace the models, and satellites "
-        "without a valid one are rejected.",
+        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word stream for those in the receivers' "
+        "own logs and streams; their corrections replace the models, and satellites without a valid one are rejected.",
         (),
         metavar="FILE",
         panel=INPUTS,
@@ -110,7 +110,8 @@ def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
     if choices.error_model is not None:
         values["error_model"] = str(choices.error_model)
     if choices.sbas:
-        values["sbas"] = [str(path) for path in choices.sbas]
+        words = [str(path) for path in choices.sbas]
+        values["sbas"] = "stream" if words == ["stream"] else words
     if choices.without:
         dropped = [name for text in choices.without for name in _screens("--without", text)]
         values["screens"] = [name for name in parse_config(values, source=source).screens if name not in dropped]

@@ -187,6 +187,7 @@ def ablate_files(
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
+    config = inputs.with_own_sbas(config)
     inputs = inputs.with_settings(config)
     inputs.check()
     with (

@@ -95,6 +95,8 @@ class TrainMessage(Settings):
         Train length.
     complete : bool
         Train integrity confirmed.
+    sigma_cm : int or None [cm]
+        Standard deviation of the place along the line, rounded up.
     """
 
     train: Unsigned
@@ -116,6 +118,7 @@ class TrainMessage(Settings):
     track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
     length_cm: Unsigned = 0
     complete: bool = False
+    sigma_cm: Unsigned | None = None
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
@@ -235,6 +238,10 @@ def from_json(line: str) -> TrainMessage:
     return _validated(values)
 
 
+#: Largest value of a length of packet 0; one more means unknown.
+_LARGEST_LENGTH: Final = 32_766
+
+
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
     """Fields of a position report, packet 0 (SUBSET-026 v4, 7.4.2.1), against a reference location of the line.
 
@@ -256,20 +263,25 @@ def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> 
         raise ValueError("a message without a position has no packet 0")
     distance = message.chainage_cm - reference_cm
     metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
-    # Whole metres (Q_SCALE 1); doubts are rounded up, with the rounding of the distance, so that they stay bounds.
-    rounded = {"D_LRBG": round(metres["D_LRBG"] / 100)}
-    rest = metres["D_LRBG"] - 100 * rounded["D_LRBG"]
-    rounded["L_DOUBTOVER"] = -(-(metres["L_DOUBTOVER"] + abs(rest)) // 100)
-    rounded["L_DOUBTUNDER"] = -(-(metres["L_DOUBTUNDER"] + abs(rest)) // 100)
+    # Whole metres (Q_SCALE 1), tens of metres where these do not reach (Q_SCALE 2); doubts are rounded up, with the
+    # rounding of the distance, so that they stay bounds.
+    largest = max(metres.values())
+    scale, unit = (1, 100) if largest <= 100 * _LARGEST_LENGTH - 200 else (2, 1000)
+    rounded = {"D_LRBG": round(metres["D_LRBG"] / unit)}
+    rest = metres["D_LRBG"] - unit * rounded["D_LRBG"]
+    rounded["L_DOUBTOVER"] = -(-(metres["L_DOUBTOVER"] + abs(rest)) // unit)
+    rounded["L_DOUBTUNDER"] = -(-(metres["L_DOUBTUNDER"] + abs(rest)) // unit)
     for name, value in rounded.items():
-        if value > 32_766:
-            raise ValueError(f"{name} is {value} m, at most 32766 m can be reported; take a nearer reference")
+        if value > _LARGEST_LENGTH:
+            raise ValueError(
+                f"{name} is {value * unit / 100:.0f} m, at most 327660 m can be reported; take a nearer reference"
+            )
     side = {1: 1, -1: 0, 0: 2}
     along = 0 if distance == 0 else (1 if distance > 0 else -1)
     speed = abs(message.speed_cmps or 0) * 36 // 1000 // 5  # V_TRAIN counts steps of 5 km/h
     return {
         "NID_PACKET": 0,
-        "Q_SCALE": 1,
+        "Q_SCALE": scale,
         "NID_LRBG": reference,
         "D_LRBG": rounded["D_LRBG"],
         "Q_DIRLRBG": side[message.facing],

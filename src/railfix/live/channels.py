@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
-from collections import Counter
+from collections import Counter, deque
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ from railfix.core.errors import ChannelsDisagreeError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import encode
-from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.engine import EngineState, LiveEngine, LiveOutput
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.sbas import SbasMessages
@@ -99,6 +99,30 @@ class TwoChannels:
     def settings(self) -> LiveSettings:
         """Settings of both channels."""
         return self.engine.settings
+
+    @property
+    def told(self) -> deque[str]:
+        """Sentences of the first channel for the log."""
+        return self.engine.told
+
+    @property
+    def uses_sbas(self) -> bool:
+        """As `LiveEngine.uses_sbas`."""
+        return self.engine.uses_sbas
+
+    def start(self, *, now_ns: int) -> None:
+        """As `LiveEngine.start`."""
+        self.engine.start(now_ns=now_ns)
+        self._call("start", now_ns=now_ns)
+
+    def saved(self) -> EngineState | None:
+        """As `LiveEngine.saved`."""
+        return self.engine.saved()
+
+    def resume(self, saved: EngineState) -> None:
+        """As `LiveEngine.resume`."""
+        self.engine.resume(saved)
+        self._call("resume", saved)
 
     def learn(self, navigation: Navigation) -> None:
         """As `LiveEngine.learn`."""

@@ -5,30 +5,38 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
+import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from pydantic import Field
 
 from railfix.core.errors import SettingsError
-from railfix.core.settings import Settings, read_toml, validated
-from railfix.gnss.navigation import Navigation
+from railfix.core.settings import Settings, validated
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
-from railfix.live.engine import LiveEngine
+from railfix.live.console import SessionLog
+from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.metrics import Metrics, serve_metrics
+from railfix.live.outlets import Outlet
 from railfix.live.record import ResultTables
-from railfix.live.session import Metrics, run_session, serve_metrics
+from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink
-from railfix.live.sources import check_source
-from railfix.pipeline.config import Config, parse_config
+from railfix.live.sources import check_source, is_file
+from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
-from railfix.ranges.cn0_curve import read_cn0_curve
-from railfix.ranges.error_model import read_error_model
-from railfix.run.options import TrackReading
-from railfix.run.sources import open_line
+from railfix.run.driver import time_of
+from railfix.run.options import LogReading, TrackReading
+from railfix.run.processor import processor_of
+from railfix.run.sources import Line, open_line
+
+#: Longest distance from the reference location that a position report of ETCS can say, doubts apart [m].
+_REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
 class LiveInputs(Settings):
@@ -38,19 +46,31 @@ class LiveInputs(Settings):
     track: tuple[Path, ...]
     vehicle: Path | None = None
     nav: tuple[Path, ...] = ()
-    config: Path | None = None
-    settings: dict[str, Any] = Field(default_factory=dict)
+    config: Config = Field(default_factory=lambda: Config(filter="track"))
+    reading: TrackReading = Field(default_factory=TrackReading)
+    logs: LogReading = Field(default_factory=LogReading)
     live: dict[str, Any] = Field(default_factory=dict)
     send: tuple[str, ...] = ("json@-",)
     speed: float | None = None
     channels: Literal[1, 2] = 1
     metrics: str | None = None
+    state: Path | None = None
+    log: Path | None = None
     out: Path | None = None
     overwrite: Literal["refuse", "replace"] = "refuse"
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Files that the positions depend on, by their role."""
+        named = {f"track {k}": path for k, path in enumerate(self.track)}
+        given = {"vehicle": self.vehicle, "cn0 curve": self.config.cn0_curve, "error model": self.config.error_model}
+        return named | {name: path for name, path in given.items() if path is not None}
 
 
 async def run_live(inputs: LiveInputs) -> list[str]:
     """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each.
+
+    SIGHUP reloads nothing: it is logged and counted.
 
     Raises
     ------
@@ -60,84 +80,119 @@ async def run_live(inputs: LiveInputs) -> list[str]:
     for source in inputs.sources.values():
         check_source(source)
     live = validated(LiveSettings, inputs.live, source="--live")
-    processor = _processor(inputs)
-    sinks = [await open_sink(text, overwrite=inputs.overwrite) for text in inputs.send]
-    engine: LiveEngine | TwoChannels = (
-        TwoChannels(processor, live) if inputs.channels == 2 else LiveEngine(processor, live)
-    )
-    metrics, server = Metrics(), None
-    try:
+    line, processor = _prepared(inputs)
+    if any(text.startswith("etcs@") for text in inputs.send):
+        _check_reference(line, live)
+    replay = inputs.speed is None and all(is_file(source) for source in inputs.sources.values())
+    async with contextlib.AsyncExitStack() as held:
+        messages_on_terminal = sys.stdout.isatty() and any(text.endswith("@-") for text in inputs.send)
+        log = SessionLog(inputs.log, live, status=not messages_on_terminal)
+        held.callback(log.close)
+        sinks = []
+        for text in inputs.send:
+            full = "wait" if replay else "drop"
+            sinks.append(await open_sink(text, live, overwrite=inputs.overwrite, full=full))
+            held.callback(sinks[-1].close)
+        engine: LiveEngine | TwoChannels = LiveEngine(processor, live)
+        if inputs.channels == 2:
+            engine = TwoChannels(processor, live)
+            held.callback(engine.close)
+        metrics = Metrics()
         if inputs.metrics is not None:
-            host, _, port = inputs.metrics.rpartition(":")
-            if not host or not port.isdigit():
-                raise SettingsError(f"--metrics {inputs.metrics!r}: expected HOST:PORT, for example 127.0.0.1:9100")
-            server = await serve_metrics(metrics, engine, host, int(port))
-        with contextlib.ExitStack() as held:
-            tables = None
-            if inputs.out is not None:
-                files = (*inputs.track, *inputs.nav, *filter(None, (inputs.vehicle, inputs.config)))
-                tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=files))
-            session = asyncio.create_task(
-                run_session(
-                    engine,
-                    dict(inputs.sources.items()),
-                    sinks,
-                    speed=inputs.speed,
-                    metrics=metrics,
-                    observe=None if tables is None else tables.add,
-                )
+            held.callback((await serve_metrics(metrics, inputs.metrics)).close)
+        hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
+        session = asyncio.create_task(
+            run_session(
+                engine,
+                dict(inputs.sources.items()),
+                sinks,
+                speed=inputs.speed,
+                metrics=metrics,
+                hooks=hooks,
+                date=inputs.logs.instant,
+                streams=streams,
             )
-            loop = asyncio.get_running_loop()
-            for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, session.cancel)
-            with contextlib.suppress(asyncio.CancelledError):
-                await session
-    finally:
-        for sink in sinks:
-            sink.close()
-        if server is not None:
-            server.close()
-        if isinstance(engine, TwoChannels):
-            engine.close()
-    return _summary(metrics, engine)
+        )
+
+        def hung_up() -> None:
+            metrics.hangups += 1
+            log.say("SIGHUP: nothing is reloaded; settings, map and vehicle are those of the start; restart to change")
+
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, session.cancel)
+        loop.add_signal_handler(signal.SIGHUP, hung_up)
+        with contextlib.suppress(asyncio.CancelledError):
+            await session
+    return metrics.summary()
 
 
-def _summary(metrics: Metrics, engine: LiveEngine | TwoChannels) -> list[str]:
-    lines = [f"{sum(metrics.messages.values()):,} messages"]
-    lines += [f"  {status.name.lower()}: {number:,}" for status, number in sorted(metrics.messages.items())]
-    lines += [f"epochs {fate}: {number:,}" for fate, number in sorted(engine.counts.items())]
-    lines += [f"skipped: {number:,} {what}" for what, number in sorted(metrics.skipped.items()) if number]
-    if metrics.processing_s:
-        p50, p99 = (1e3 * float(np.quantile(metrics.processing_s, q)) for q in (0.5, 0.99))
-        lines.append(f"processing of the last {len(metrics.processing_s)} messages: median {p50:.1f}, p99 {p99:.1f} ms")
-    return lines
+def _hooks(
+    inputs: LiveInputs,
+    live: LiveSettings,
+    engine: LiveEngine | TwoChannels,
+    log: SessionLog,
+    held: contextlib.AsyncExitStack,
+    *,
+    full: str,
+) -> tuple[Hooks, Mapping[str, Any]]:
+    """Tables of results, state file and status line; and the streams' states where the state file is used."""
+    observe, save, streams = None, None, {}
+    if inputs.out is not None:
+        files = (*inputs.track, *inputs.nav, *filter(None, (inputs.vehicle,)))
+        tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=files))
+        rows: Outlet[LiveOutput] = Outlet(f"tables {inputs.out}", tables.add, waiting=live.waiting * 10, full=full)
+        held.callback(_closed, rows, log)
+        observe = rows.send
+    if inputs.state is not None:
+        path, under = (
+            inputs.state,
+            belongs_to(
+                inputs.files, {"settings": inputs.config, "track reading": inputs.reading}, tuple(inputs.sources)
+            ),
+        )
+        loaded = load_state(path, under)
+        log.say(loaded.outcome)
+        if loaded.session is not None:
+            engine.resume(loaded.session.engine)
+            streams = dict(loaded.session.streams)
+        states: Outlet[SavedSession] = Outlet(
+            f"state file {path}", lambda session: write_state(path, session, under), waiting=1
+        )
+        held.callback(_closed, states, log)
+        save = states.send
+    return Hooks(observe=observe, save=save, show=log.show if log.shows_status else None), streams
 
 
-def _processor(inputs: LiveInputs) -> EpochProcessor:
-    """The epoch processor with everything known from the start."""
-    values = {} if inputs.config is None else read_toml(inputs.config, what="a configuration file")
-    config: Config = parse_config(
-        _over({"filter": "track", **values}, inputs.settings), source=str(inputs.config or "--set")
-    )
-    if config.sbas:
-        raise SettingsError("sbas names recorded messages; live, SBAS messages come with the receivers' streams")
-    navigation: Navigation = read_navigation(list(inputs.nav)) if inputs.nav else no_navigation()
-    at = navigation.kepler.toc.max() if len(navigation.kepler) else np.datetime64("now", "ns")
-    line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.sources), reading=TrackReading(), at=at)
-    return EpochProcessor(
-        config,
-        line.trajectories,
-        navigation=navigation,
-        error_model=None if config.error_model is None else read_error_model(config.error_model),
-        cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
-    )
+def _closed(outlet: Outlet[Any], log: SessionLog) -> None:
+    """Close an outlet; what it lacks is logged."""
+    outlet.close()
+    if outlet.dropped or outlet.failed:
+        log.say(f"{outlet.name}: {outlet.dropped} items dropped, {outlet.failed} refused {outlet.failure}")
 
 
-def _over(values: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Nested settings with changes put over them."""
-    merged = dict(values)
-    for name, change in changes.items():
-        before = merged.get(name)
-        both = isinstance(before, dict) and isinstance(change, dict)
-        merged[name] = _over(before, change) if both and isinstance(before, dict) else change
-    return merged
+def _prepared(inputs: LiveInputs) -> tuple[Line, EpochProcessor]:
+    """The line, and the epoch processor with everything known from the start."""
+    config = inputs.config
+    if config.sbas and config.sbas != "stream":
+        raise SettingsError(
+            "--sbas names recorded messages; live they come with the receivers' streams (--sbas stream), and "
+            "--set sbas_prn=PRN names the satellite"
+        )
+    navigation = no_navigation()
+    if inputs.nav:
+        navigation = read_navigation(list(inputs.nav), date=inputs.logs.instant)
+    at = time_of(navigation)
+    if at is None:
+        at = np.datetime64("now", "ns") if inputs.logs.instant is None else inputs.logs.instant
+    line = open_line(inputs.track, inputs.vehicle, antennas=tuple(inputs.sources), reading=inputs.reading, at=at)
+    return line, processor_of(config, navigation, line.trajectories)
+
+
+def _check_reference(line: Line, live: LiveSettings) -> None:
+    ends = (0.0, float(line.track.chainage_m[-1]))
+    if max(abs(end - live.reference_m) for end in ends) > _REACH_OF_REFERENCE_M:
+        raise SettingsError(
+            f"--live reference_m={live.reference_m:g}: the line reaches from 0 to {ends[1]:.0f} m, a position report "
+            f"{_REACH_OF_REFERENCE_M:.0f} m from its reference; name a reference nearer to the line"
+        )

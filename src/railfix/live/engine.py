@@ -1,13 +1,13 @@
 """Live positioning: epochs of one or two antennas in, one result and one message a period out.
 
 The same `EpochProcessor` as for logs, fed one epoch at a time; its state is carried here. Nothing is read from files
-and nothing grows: at most a few epochs wait for their pair.
+and nothing grows: at most a few epochs wait for their pair, and expired records and SBAS messages are dropped.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,6 +20,7 @@ from railfix.io.train_message import TrainMessage
 from railfix.live.message import message_of, no_input_message
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.received import merged_navigation
 from railfix.pipeline.results import Result, State
 from railfix.ranges.sbas import SbasMessages
 
@@ -33,6 +34,45 @@ class LiveOutput:
 
     message: TrainMessage
     result: Result | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineState:
+    """What a restarted session continues from.
+
+    Attributes
+    ----------
+    state : State
+    done_ns : int [ns]
+        Time tag of the last epoch, GPS time since 1980.
+    last_tag : mapping of str to int [ns]
+        Last time tag of each antenna.
+    sequence : int
+        Number of the last message.
+    """
+
+    state: State
+    done_ns: int
+    last_tag: Mapping[str, int]
+    sequence: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class _FromSatellites:
+    """Records and SBAS messages; `heard` counts such arrivals."""
+
+    heard: int
+    navigation: Navigation | None = None
+    messages: SbasMessages | None = None
+
+    def with_later(self, later: _FromSatellites) -> _FromSatellites:
+        """Both together."""
+        navigation, messages = self.navigation, self.messages
+        if later.navigation is not None:
+            navigation = later.navigation if navigation is None else merged_navigation(navigation, later.navigation)
+        if later.messages is not None:
+            messages = later.messages if messages is None else messages.joined(later.messages)
+        return _FromSatellites(heard=later.heard, navigation=navigation, messages=messages)
 
 
 @dataclass(frozen=True)
@@ -61,34 +101,68 @@ class LiveEngine:
     ----------
     counts : Counter of str
         Epochs by what became of them: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
-        "tag step", "restart", "no input".
+        "tag step", "restart", "no input", "dropped, too many waiting".
+    told : deque of str
+        Sentences for the log on what happened: restarts, what became of a saved state.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
         self.processor = processor
         self.settings = settings
         self.counts: Counter[str] = Counter()
+        self.told: deque[str] = deque(maxlen=100)
         self._antennas = tuple(processor.trajectories)
         self._waiting: dict[str, deque[_Waiting]] = {name: deque() for name in self._antennas}
         self._last_tag: dict[str, int] = {}
         self._backward: dict[str, list[int]] = {name: [] for name in self._antennas}
         self._done_ns = -1
         self._state: State | None = None
-        self._from_satellites: deque[tuple[int, Navigation | None, SbasMessages | None]] = deque()
-        self._heard = 0
+        self._saved: EngineState | None = None
+        self._from_satellites: deque[_FromSatellites] = deque()
+        self._heard = self._heard_at_push = 0
         self._sequence = 0
         self._due_ns: int | None = None
         self._tolerance_ns = round(processor.config.antenna_pair.tag_tolerance_s * 1e9)
 
     def learn(self, navigation: Navigation) -> None:
         """Take navigation records; they are used from the next epoch on."""
-        self._heard += 1
-        self._from_satellites.append((self._heard, navigation, None))
+        self._hear(_FromSatellites(heard=self._heard + 1, navigation=navigation))
 
     def hear(self, messages: SbasMessages) -> None:
         """Take SBAS messages; they are used from the next epoch on."""
-        self._heard += 1
-        self._from_satellites.append((self._heard, None, messages))
+        self._hear(_FromSatellites(heard=self._heard + 1, messages=messages))
+
+    def _hear(self, item: _FromSatellites) -> None:
+        self._heard = item.heard
+        last = self._from_satellites[-1] if self._from_satellites else None
+        if last is not None and last.heard > self._heard_at_push:  # no epoch came between
+            self._from_satellites[-1] = last.with_later(item)
+        else:
+            self._from_satellites.append(item)
+
+    @property
+    def uses_sbas(self) -> bool:
+        """Whether the settings ask for the SBAS messages of the streams."""
+        return self.processor.config.sbas == "stream"
+
+    def start(self, *, now_ns: int) -> None:
+        """Start the clock: from here on every period has a message, also before the first epoch."""
+        self._due_ns = now_ns if self._due_ns is None else self._due_ns
+
+    def saved(self) -> EngineState | None:
+        """What a restarted session continues from; None before the first epoch."""
+        if self._state is None:
+            return None
+        return EngineState(
+            state=self._state, done_ns=self._done_ns, last_tag=dict(self._last_tag), sequence=self._sequence
+        )
+
+    def resume(self, saved: EngineState) -> None:
+        """Continue from a saved state, if the first epoch comes within `LiveSettings.state_age_s` of its last one.
+
+        Otherwise its navigation records, SBAS messages and sequence number alone are used; `told` says which.
+        """
+        self._saved = saved
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
         """Take one epoch of an antenna.
@@ -104,6 +178,9 @@ class LiveEngine:
         if antenna not in self._waiting:
             raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)
+        self._heard_at_push = self._heard
+        if self._saved is not None:
+            self._resume_at(waiting.tag_ns, self._saved)
         if self._due_ns is None:
             self._due_ns = now_ns
         if not self._in_order(antenna, waiting.tag_ns):
@@ -113,6 +190,25 @@ class LiveEngine:
             queue.popleft()
             self.counts["dropped, too many waiting"] += 1
         queue.append(waiting)
+
+    def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
+        """Take over a saved state where an epoch with this tag may follow it."""
+        self._saved = None
+        self._sequence = max(self._sequence, saved.sequence)
+        age_s = (tag_ns - saved.done_ns) * 1e-9
+        if 0.0 < age_s <= self.settings.state_age_s:
+            self._state, self._done_ns, self._last_tag = saved.state, saved.done_ns, dict(saved.last_tag)
+            self.told.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
+        else:
+            self._state = State(received=saved.state.received)
+            allowed = f"0 to {self.settings.state_age_s:g} s (state_age_s) were allowed"
+            self.told.append(
+                f"state file: not used but for ephemerides and the sequence number: its last epoch is {age_s:.1f} s "
+                f"before the first new one, {allowed}"
+            )
+        # What was known from the start of this session counts beside what the file has.
+        known = self.processor.received.navigation
+        self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
         """Whether an epoch is new; a receiver that was restarted with older tags begins anew."""
@@ -141,6 +237,7 @@ class LiveEngine:
     def _restart(self) -> None:
         """Begin anew after a receiver's restart: only what was received from satellites is kept."""
         self.counts["restart"] += 1
+        self.told.append("a receiver came back with older time tags: positioning begins anew")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
         for name in self._antennas:
@@ -163,7 +260,7 @@ class LiveEngine:
             self.counts["no input"] += 1
             self._sequence += 1
             self._due_ns += period
-            last = max(self._last_tag.values(), default=0)
+            last = max(self._last_tag.values(), default=sent_ns or 0)
             message = no_input_message(
                 self.settings, sequence=self._sequence, time_ns=last, sent_ns=last if sent_ns is None else sent_ns
             )
@@ -199,12 +296,13 @@ class LiveEngine:
             yield together
 
     def _processed(self, heads: dict[str, _Waiting], now_ns: int, sent_ns: int | None) -> LiveOutput:
-        state, heard = self._state, max(head.heard for head in heads.values())
-        while self._from_satellites and self._from_satellites[0][0] <= heard:
-            _, navigation, messages = self._from_satellites.popleft()
-            _, state = self.processor.process({}, state, navigation=navigation, messages=messages)
+        heard, news = max(head.heard for head in heads.values()), _FromSatellites(heard=0)
+        while self._from_satellites and self._from_satellites[0].heard <= heard:
+            news = news.with_later(self._from_satellites.popleft())
         epochs = {name: head.epoch for name, head in heads.items()}
-        result, self._state = self.processor.process(epochs, state)
+        result, self._state = self.processor.process(
+            epochs, self._state, navigation=news.navigation, messages=news.messages
+        )
         self._done_ns = max(int((part.time[-1] - GPS_EPOCH).astype(np.int64)) for part in epochs.values())
         self._sequence += 1
         self._due_ns = now_ns

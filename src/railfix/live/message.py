@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TypeGuard
 
 import numpy as np
 
@@ -37,8 +38,8 @@ def no_input_message(settings: LiveSettings, *, sequence: int, time_ns: int, sen
 def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns: int) -> TrainMessage:
     """The message of one processed epoch.
 
-    The place is that of the filter along the track where it runs, else that of the single epoch; of two antennas
-    the one with the smaller protection level. The bounds are the filter's over- and under-reading amounts where it
+    The place is that of the filter along the track where it runs, else that of the single epoch, of the antenna that
+    `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it
     has a level (`tracking.level`); else the protection level of the single epoch, widened by the distance of the
     filter's place from it, so that they hold for both.
 
@@ -50,7 +51,7 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     sequence : int
     sent_ns : int [ns]
     """
-    name = min(result.antennas, key=lambda antenna: _level_m(result.antennas[antenna]))
+    name = antenna_of(result)
     antenna = result.antennas[name]
     track = result.fusion.get(name)
     sources = Source(0)
@@ -58,12 +59,15 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
         if other.n_used[-1] > 0:
             sources |= _SOURCE_OF_ANTENNA.get(used, Source(0))
     place, status = _place_and_status(antenna, track)
+    sigma_m = float(antenna.along_sigma_m[-1] if not _filtered(track) else track.tracked.sigma_m[-1])
     values: dict[str, object] = {}
     level = _level_m(antenna)
     single = float(antenna.chainage_m[-1])
     if math.isfinite(place):
         front = place + settings.facing * settings.front_offset_m
         values["chainage_cm"] = round(front * 100.0)
+        if math.isfinite(sigma_m):
+            values["sigma_cm"] = _up_cm(sigma_m)
         bound = level + abs(place - single) + 0.01 if math.isfinite(single) else math.inf
         amount = math.nan if track is None or not len(track) else float(track.tracked.amount_m[-1])
         if math.isfinite(amount):  # the filter has a level of its own
@@ -98,12 +102,30 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     )
 
 
+def antenna_of(result: Result) -> str:
+    """The antenna whose place goes out: one that has a place, of two the one with the smaller protection level."""
+
+    def worth(name: str) -> tuple[bool, float]:
+        antenna, track = result.antennas[name], result.fusion.get(name)
+        if not _filtered(track):
+            return not math.isfinite(float(antenna.chainage_m[-1])), _level_m(antenna)
+        level = float(track.tracked.level_m[-1])
+        return False, level if math.isfinite(level) else _level_m(antenna)
+
+    return min(result.antennas, key=worth)
+
+
+def _filtered(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
+    """Whether the filter along the track has a place."""
+    return track is not None and len(track) > 0 and math.isfinite(float(track.chainage_m[-1]))
+
+
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
     """Place [m], NaN without one, and what it is worth."""
     single = Status(int(antenna.status[-1]))
     place = float(antenna.chainage_m[-1])
     available = antenna.protection is None or antenna.protection.status[-1] != LevelStatus.ALARM
-    if track is None or not len(track) or not math.isfinite(float(track.chainage_m[-1])):
+    if not _filtered(track):
         if not math.isfinite(place):
             return place, MessageStatus.NO_POSITION
         return place, MessageStatus.POSITION if single is Status.OK and available else MessageStatus.DOUBTFUL

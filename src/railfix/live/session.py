@@ -4,101 +4,78 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import logging
 import time
-from collections import Counter
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Final
 
 import numpy as np
 
+from railfix.core.files import FilePath
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
-from railfix.gnss.observations import Observations
-from railfix.io.receiver.log import head_of, is_receiver_log
+from railfix.io.receiver.log import StreamState, head_of, is_receiver_log
 from railfix.io.rinex import scan_observations
-from railfix.io.train_message import MessageStatus
 from railfix.live.channels import TwoChannels
 from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.metrics import Metrics
 from railfix.live.sinks import Sink
-from railfix.live.sources import read_source
-from railfix.live.stream import ReceiverState, receive_bytes, single_epochs
+from railfix.live.sources import Connected, Lost, hidden, is_file, read_source
+from railfix.live.state import SavedSession
+from railfix.live.stream import Received, ReceiverState, receive_bytes, single_epochs
+from railfix.ranges.sbas import from_receiver
 
-#: Blocks of bytes that may wait for the processor before a source is held back.
-_LONGEST_QUEUE = 64
+#: Items that may wait for the processor before a source is held back.
+_LONGEST_QUEUE: Final = 64
+#: Messages between two collections of garbage, in idle time.
+_BETWEEN_COLLECTIONS: Final = 100
+#: How often the status is shown [s].
+_STATUS_S: Final = 0.5
 #: A time after all epochs [ns].
-_END_NS = 1 << 62
+_END_NS: Final = 1 << 62
+
+_LOG: Final = logging.getLogger("railfix.live")
+_Queue = asyncio.Queue[tuple[str, Received | None]]
 
 
-@dataclass(kw_only=True)
-class Metrics:
-    """Counts and times of a session.
+@dataclass(frozen=True, kw_only=True)
+class Hooks:
+    """What else a session does.
 
     Attributes
     ----------
-    messages : Counter of MessageStatus
-    skipped : Counter of str
-        Bytes and messages of the receivers that were not used.
-    processing_s : list of float
-        Of the last messages, at most 1000.
-    started : float
+    observe : callable or None
+        Called with every output, after the sinks.
+    save : callable or None
+        Called every `LiveSettings.state_every_s`, in idle time, with what a restart needs.
+    show : callable or None
+        Called with a text for the status line, twice a second.
     """
 
-    messages: Counter[MessageStatus] = field(default_factory=Counter)
-    skipped: Counter[str] = field(default_factory=Counter)
-    processing_s: list[float] = field(default_factory=list)
-    started: float = field(default_factory=time.monotonic)
-
-    def took(self, seconds: float, outputs: list[LiveOutput]) -> None:
-        """Count messages and the time they took together."""
-        for output in outputs:
-            self.messages[output.message.status] += 1
-            self.processing_s.append(seconds / len(outputs))
-        del self.processing_s[:-1000]
-
-    def text(self, counts: Mapping[str, int]) -> str:
-        """The metrics in the text format of Prometheus (version 0.0.4)."""
-        lines = ["# TYPE railfix_messages_total counter"]
-        lines += [
-            f'railfix_messages_total{{status="{status.name.lower()}"}} {self.messages[status]}'
-            for status in MessageStatus
-        ]
-        lines.append("# TYPE railfix_epochs_total counter")
-        lines += [f'railfix_epochs_total{{fate="{fate}"}} {number}' for fate, number in sorted(counts.items())]
-        lines.append("# TYPE railfix_skipped_total counter")
-        lines += [f'railfix_skipped_total{{what="{what}"}} {number}' for what, number in sorted(self.skipped.items())]
-        if self.processing_s:
-            lines.append("# TYPE railfix_processing_seconds summary")
-            for quantile in (0.5, 0.99):
-                value = float(np.quantile(self.processing_s, quantile))
-                lines.append(f'railfix_processing_seconds{{quantile="{quantile}"}} {value:.6f}')
-        lines.append("# TYPE railfix_uptime_seconds gauge")
-        lines.append(f"railfix_uptime_seconds {time.monotonic() - self.started:.1f}")
-        return "\n".join(lines) + "\n"
+    observe: Callable[[LiveOutput], None] | None = None
+    save: Callable[[SavedSession], None] | None = None
+    show: Callable[[str], None] | None = None
 
 
-async def serve_metrics(metrics: Metrics, engine: LiveEngine | TwoChannels, host: str, port: int) -> asyncio.Server:
-    """Serve ``/metrics`` over HTTP."""
+@dataclass(kw_only=True)
+class _Clocks:
+    """When things were done last, monotonic time."""
 
-    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        request = await reader.readline()
-        found = request.split(b" ")[1:2] == [b"/metrics"]
-        body = metrics.text(engine.counts).encode() if found else b"not found; see /metrics\n"
-        head = f"HTTP/1.1 {'200 OK' if found else '404 Not Found'}\r\nContent-Type: text/plain; version=0.0.4\r\n"
-        writer.write(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
-        await writer.drain()
-        writer.close()
-
-    return await asyncio.start_server(answer, host, port)
+    saved: float = field(default_factory=time.monotonic)
+    shown: float = 0.0
+    since_collection: int = 0
 
 
 async def run_session(
     engine: LiveEngine | TwoChannels,
     sources: Mapping[str, str],
-    sinks: list[Sink],
+    sinks: Sequence[Sink],
     *,
     speed: float | None,
     metrics: Metrics | None = None,
-    observe: Callable[[LiveOutput], None] | None = None,
+    hooks: Hooks | None = None,
+    date: np.datetime64 | None = None,
+    streams: Mapping[str, ReceiverState] | None = None,
 ) -> Metrics:
     """Process sources until all have ended.
 
@@ -107,66 +84,92 @@ async def run_session(
     engine : LiveEngine or TwoChannels
     sources : mapping of str to str
         By antenna; see `railfix.live.sources.read_source`. RINEX observation files are replayed as well.
-    sinks : list of Sink
+    sinks : sequence of Sink
     speed : float or None
         For recorded files: times as fast as recorded. None: as fast as they go; the clock is then that of the time
         tags (set `LiveSettings.no_input` to "skip" for one message an epoch and no more).
     metrics : Metrics, optional
-    observe : callable, optional
-        Called with every output, after the sinks.
+    hooks : Hooks, optional
+    date : datetime64, optional
+        Some time within half a week of RTCM 3 streams, whose observations carry no week: now where they are live.
+    streams : mapping of str to ReceiverState, optional
+        State of the receivers' streams to continue from.
 
     Raises
     ------
     InputFileError
-        A source cannot be opened, or breaks.
+        A source cannot be opened, or breaks and is not opened again.
+    OutputError
+        A sink of a replay cannot be written.
     ChannelsDisagreeError
         Two channels differ.
     """
-    metrics = metrics or Metrics()
-    queue: asyncio.Queue[tuple[str, bytes | Observations | None]] = asyncio.Queue(_LONGEST_QUEUE)
-    replay = speed is None and all(_is_file(source) for source in sources.values())
-    states = {name: ReceiverState() for name in sources}
+    metrics, hooks, clocks = metrics or Metrics(), hooks or Hooks(), _Clocks()
+    metrics.epochs, metrics.sinks = engine.counts, sinks
+    replay = speed is None and all(is_file(source) for source in sources.values())
+    states = {name: (streams or {}).get(name) or _fresh(source, date) for name, source in sources.items()}
+    queue: _Queue = asyncio.Queue(_LONGEST_QUEUE)
     running, read_to_ns = set(sources), dict.fromkeys(sources, -1)
     gc.collect()
     gc.freeze()
-    pumps = [asyncio.create_task(_pump(name, source, speed, queue)) for name, source in sources.items()]
+    gc.disable()  # collections come in idle time
+    if not replay:
+        engine.start(now_ns=time.monotonic_ns())
+    pumps = [
+        asyncio.create_task(_pump(name, source, states[name], speed, engine, metrics, queue))
+        for name, source in sources.items()
+    ]
     try:
         while running:
             for pump in pumps:
-                if pump.done():
-                    pump.result()  # an error of a source ends the session
+                if pump.done() and queue.empty():
+                    pump.result()  # an error of a source ends the session, after what came before it
             wait = None if replay else max(engine.wait_s(now_ns=time.monotonic_ns()), 0.001)
             item = await _next(queue, wait, pumps)
             now = time.monotonic_ns()
             if item is not None:
-                name, data = item
-                if data is None:
+                name, received = item
+                if received is None:
                     running.discard(name)
                     read_to_ns.pop(name)
                 else:
-                    states[name], tag_ns = _take(engine, name, data, states[name], metrics, None if replay else now)
+                    states[name] = received.after
+                    tag_ns = _take(engine, name, received, metrics, None if replay else now)
                     read_to_ns[name] = max(read_to_ns[name], tag_ns)
-            if replay:
-                # The clock is the tag up to which all files have been read: no pair is torn, whatever file is ahead.
-                _emit(engine, sinks, metrics, observe, min(read_to_ns.values(), default=_END_NS), None)
-            else:
-                _emit(engine, sinks, metrics, observe, now, _gps_now_ns())
+            # In a replay the clock is the tag up to which all files have been read: no pair is torn, whatever file is
+            # ahead.
+            clock, sent = (min(read_to_ns.values(), default=_END_NS), None) if replay else (now, _gps_now_ns())
+            outputs = _emit(engine, sinks, metrics, hooks, clock, sent)
+            if queue.empty() or replay:
+                _in_idle_time(engine, states, outputs, metrics, hooks, clocks)
+        _save(engine, states, hooks)
+    except asyncio.CancelledError:
+        _save(engine, states, hooks)
+        raise
     finally:
         for pump in pumps:
             pump.cancel()
+        gc.enable()
         gc.unfreeze()
     return metrics
 
 
-def _is_file(source: str) -> bool:
-    return Path(source.removeprefix("file:")).is_file()
+def _fresh(source: str, date: np.datetime64 | None) -> ReceiverState:
+    """State of a stream before its first byte."""
+    if date is None and not is_file(source):
+        date = np.datetime64(time.time_ns(), "ns")  # leap seconds do not matter here
+    return ReceiverState() if date is None else ReceiverState(stream=StreamState(time=date.astype("datetime64[ns]")))
+
+
+def _save(engine: LiveEngine | TwoChannels, states: Mapping[str, ReceiverState], hooks: Hooks) -> None:
+    """Hand over what a restart needs, where there is something and somebody wants it."""
+    if hooks.save is not None and (saved := engine.saved()) is not None:
+        hooks.save(SavedSession(engine=saved, streams={name: state.after_break() for name, state in states.items()}))
 
 
 async def _next(
-    queue: asyncio.Queue[tuple[str, bytes | Observations | None]],
-    wait_s: float | None,
-    pumps: list[asyncio.Task[None]],
-) -> tuple[str, bytes | Observations | None] | None:
+    queue: _Queue, wait_s: float | None, pumps: list[asyncio.Task[None]]
+) -> tuple[str, Received | None] | None:
     """The next data; None after `wait_s`, or when a source has ended by an error."""
     if not queue.empty():
         return queue.get_nowait()
@@ -180,78 +183,97 @@ async def _next(
 
 
 async def _pump(
-    name: str, source: str, speed: float | None, queue: asyncio.Queue[tuple[str, bytes | Observations | None]]
+    name: str,
+    source: str,
+    state: ReceiverState,
+    speed: float | None,
+    engine: LiveEngine | TwoChannels,
+    metrics: Metrics,
+    queue: _Queue,
 ) -> None:
-    """Move a source's data into the queue, then None."""
-    parts: AsyncIterator[bytes | Observations] = (
-        _epochs(source, speed) if _is_rinex(source) else read_source(source, speed=speed)
-    )
-    async for part in parts:
-        await queue.put((name, part))
+    """Move what a source's data complete into the queue, then None; recorded epochs wait for their time."""
+    pace = _Pace(speed) if speed is not None and is_file(source) else None
+    async for received in _received(name, source, state, engine, metrics):
+        if pace is not None and received.epochs:
+            await pace.wait(received.epochs[-1].time[-1])
+        await queue.put((name, received))
     await queue.put((name, None))
 
 
-def _is_rinex(source: str) -> bool:
-    path = source.removeprefix("file:")
-    return Path(path).is_file() and not is_receiver_log(head_of(path))
+class _Pace:
+    """Waits until a recorded time tag is due."""
+
+    def __init__(self, speed: float) -> None:
+        self._speed = speed
+        self._began = 0.0
+        self._first: np.datetime64 | None = None
+
+    async def wait(self, tag: np.datetime64) -> None:
+        now = asyncio.get_running_loop().time()
+        if self._first is None:
+            self._began, self._first = now, tag
+        due = self._began + float((tag - self._first) / np.timedelta64(1, "s")) / self._speed
+        await asyncio.sleep(max(0.0, due - now))
 
 
-async def _epochs(source: str, speed: float | None) -> AsyncIterator[Observations]:
-    """A RINEX file epoch by epoch, paced by its time tags where a speed is given."""
-    loop = asyncio.get_running_loop()
-    began, first = loop.time(), None
-    for piece in scan_observations(source.removeprefix("file:"), epochs=200):
-        for epoch in single_epochs(piece):
-            if speed is not None:
-                first = epoch.time[0] if first is None else first
-                due = began + float((epoch.time[0] - first) / np.timedelta64(1, "s")) / speed
-                await asyncio.sleep(max(0.0, due - loop.time()))
-            yield epoch
-            await asyncio.sleep(0)
+async def _received(
+    name: str, source: str, state: ReceiverState, engine: LiveEngine | TwoChannels, metrics: Metrics
+) -> AsyncIterator[Received]:
+    """What a source's data complete, item by item; breaks of its connection are logged and counted."""
+    if source != "-" and is_file(source) and not is_receiver_log(head_of(_path(source))):
+        for piece in scan_observations(_path(source), epochs=200):
+            for epoch in single_epochs(piece):
+                yield Received(epochs=(epoch,), after=state)
+                await asyncio.sleep(0)
+        return
+    async for part in read_source(source, engine.settings):
+        if isinstance(part, bytes):
+            items, state = receive_bytes(part, state)
+            for item in items:
+                yield item
+        elif isinstance(part, Lost):
+            metrics.lost[hidden(source)] += 1
+            state = state.after_break()
+            _LOG.warning("%s: %s: %s; next attempt in %.1f s", name, hidden(source), part.reason, part.wait_s)
+        elif isinstance(part, Connected):
+            again = f", after {part.broken} breaks" if part.broken else ""
+            _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
 
-def _take(
-    engine: LiveEngine | TwoChannels,
-    name: str,
-    data: bytes | Observations,
-    state: ReceiverState,
-    metrics: Metrics,
-    now_ns: int | None,
-) -> tuple[ReceiverState, int]:
-    """Hand some data of one source to the engine; without a clock the epochs arrive at their tags.
+def _path(source: str) -> FilePath:
+    return source.removeprefix("file:")
 
-    Returns the stream's new state, and the tag of its last epoch [ns], -1 without one.
+
+def _take(engine: LiveEngine | TwoChannels, name: str, received: Received, metrics: Metrics, now_ns: int | None) -> int:
+    """Hand what one source has completed to the engine; without a clock the epochs arrive at their tags.
+
+    Returns the tag of the last epoch [ns], -1 without one.
     """
+    metrics.skipped.update(received.passed_over)
+    metrics.skipped["bytes outside messages"] += received.skipped_bytes
+    metrics.skipped["messages with a bad checksum"] += received.bad_checksums
+    if received.navigation is not None:
+        engine.learn(received.navigation)
+    if received.sbas is not None and engine.uses_sbas:
+        messages = from_receiver(received.sbas, source=name)
+        metrics.skipped.update({f"SBAS messages: {why}": n for why, n in messages.rejected.items() if n})
+        if len(messages):
+            engine.hear(messages)
     tag_ns = -1
-    if isinstance(data, Observations):
-        tag_ns = _push(engine, name, data, now_ns)
-    else:
-        items, state = receive_bytes(data, state)
-        for received in items:
-            metrics.skipped.update(received.passed_over)
-            metrics.skipped["bytes outside messages"] += received.skipped_bytes
-            metrics.skipped["messages with a bad checksum"] += received.bad_checksums
-            if received.navigation is not None:
-                engine.learn(received.navigation)
-            for epoch in received.epochs:
-                tag_ns = _push(engine, name, epoch, now_ns)
-    return state, tag_ns
-
-
-def _push(engine: LiveEngine | TwoChannels, name: str, epoch: Observations, now_ns: int | None) -> int:
-    tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
-    engine.push(name, epoch, now_ns=tag_ns if now_ns is None else now_ns)
+    for epoch in received.epochs:
+        tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
+        engine.push(name, epoch, now_ns=tag_ns if now_ns is None else now_ns)
     return tag_ns
 
 
 def _emit(
     engine: LiveEngine | TwoChannels,
-    sinks: list[Sink],
+    sinks: Sequence[Sink],
     metrics: Metrics,
-    observe: Callable[[LiveOutput], None] | None,
+    hooks: Hooks,
     now_ns: int,
     sent_ns: int | None,
-) -> None:
+) -> list[LiveOutput]:
     began = time.perf_counter()
     outputs = engine.poll(now_ns=now_ns, sent_ns=sent_ns)
     if outputs:
@@ -259,8 +281,55 @@ def _emit(
     for output in outputs:
         for sink in sinks:
             sink.send(output)
-        if observe is not None:
-            observe(output)
+        if hooks.observe is not None:
+            hooks.observe(output)
+    return outputs
+
+
+def _in_idle_time(
+    engine: LiveEngine | TwoChannels,
+    states: Mapping[str, ReceiverState],
+    outputs: Sequence[LiveOutput],
+    metrics: Metrics,
+    hooks: Hooks,
+    clocks: _Clocks,
+) -> None:
+    """Log, status, state and garbage, while no data wait."""
+    while engine.told:
+        _LOG.warning("%s", engine.told.popleft())
+    now = time.monotonic()
+    if hooks.show is not None and outputs and now - clocks.shown >= _STATUS_S:
+        clocks.shown = now
+        hooks.show(status_text(outputs[-1], metrics))
+    if outputs and now - clocks.saved >= engine.settings.state_every_s:
+        clocks.saved = now
+        _save(engine, states, hooks)
+    clocks.since_collection += len(outputs)
+    if clocks.since_collection >= _BETWEEN_COLLECTIONS:
+        clocks.since_collection = 0
+        gc.collect()
+
+
+def status_text(output: LiveOutput, metrics: Metrics) -> str:
+    """The status line: time, status, place, speed, satellites, processing time, what was lost."""
+    message = output.message
+    at = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
+    words = [f"{np.datetime_as_string(at, unit='ms')[11:]} GPST", message.status.name.lower()]
+    if message.chainage_cm is not None:
+        bound = "" if message.over_cm is None else f" ± {message.over_cm / 100:.1f}"
+        words.append(f"{message.chainage_cm / 100:,.1f}{bound} m")
+    if message.speed_cmps is not None:
+        words.append(f"{message.speed_cmps * 0.036:.0f} km/h")
+    if output.result is not None:
+        used = "+".join(str(int(antenna.n_used[-1])) for antenna in output.result.antennas.values())
+        words.append(f"{used} satellites")
+    words.append(f"{1e3 * float(np.median(metrics.processing_s)):.0f} ms")
+    words.append(f"{sum(metrics.messages.values()):,} messages")
+    if lost := sum(metrics.lost.values()):
+        words.append(f"connections lost {lost}")
+    if dropped := sum(sink.dropped + sink.failed for sink in metrics.sinks):
+        words.append(f"not delivered {dropped}")
+    return "  ".join(words)
 
 
 def _gps_now_ns() -> int:

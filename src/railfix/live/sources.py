@@ -6,16 +6,16 @@ import asyncio
 import base64
 import io
 import sys
-from collections.abc import AsyncIterator
+import threading
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
-import numpy as np
-
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import open_stream
-from railfix.io.receiver.log import StreamState, decode
+from railfix.live.settings import LiveSettings
 
 _BLOCK = 4096
 _FORMS = (
@@ -23,6 +23,25 @@ _FORMS = (
 )
 #: Longest wait for a connection, and for the first line of an answer [s].
 _CONNECT_S = 10.0
+#: Longest wait for a byte of a serial line in one call [s].
+_SERIAL_S = 0.05
+#: Longest header of a caster's answer [bytes].
+_HEADER_BYTES = 65_536
+
+
+@dataclass(frozen=True)
+class Connected:
+    """A connection was opened; `broken` tells how many times it had been lost before."""
+
+    broken: int
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A connection broke; the next attempt follows after `wait_s`."""
+
+    reason: str
+    wait_s: float
 
 
 def check_source(source: str) -> None:
@@ -39,78 +58,106 @@ def check_source(source: str) -> None:
         except ValueError:
             port = None
         if not parts.hostname or port is None or (parts.scheme == "ntrip" and not parts.path.strip("/")):
-            raise SettingsError(f"source {source!r}: expected {_FORMS}")
-    elif parts.scheme and parts.scheme not in ("serial", "file") and not Path(source).exists():
+            raise SettingsError(f"source {hidden(source)!r}: expected {_FORMS}")
+    elif parts.scheme == "serial":
+        _baud(source)
+    elif parts.scheme and parts.scheme != "file" and not Path(source).exists():
         raise SettingsError(f"source {source!r}: expected {_FORMS}")
 
 
-async def read_source(source: str, *, speed: float | None) -> AsyncIterator[bytes]:
-    """Bytes of a source as they arrive.
+def is_file(source: str) -> bool:
+    """Whether a source is a recorded file."""
+    return source != "-" and urlsplit(source).scheme not in ("tcp", "ntrip", "serial")
 
-    Parameters
-    ----------
-    source : str
-    speed : float or None
-        For files: times as fast as recorded; None is as fast as they can be read.
+
+def hidden(source: str) -> str:
+    """A source as it may be shown: without the password."""
+    parts = urlsplit(source)
+    return source if parts.password is None else source.replace(f":{parts.password}@", ":***@", 1)
+
+
+async def read_source(source: str, settings: LiveSettings) -> AsyncIterator[bytes | Connected | Lost]:
+    """Bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
 
     Raises
     ------
     InputFileError
-        The source cannot be opened, or ends by an error.
+        The source cannot be opened, or breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
         async for data in _standard_input():
             yield data
-    elif parts.scheme == "tcp":
-        async for data in _tcp(source, parts.hostname or "", parts.port or 0, b""):
-            yield data
-    elif parts.scheme == "ntrip":
-        async for data in _ntrip(source):
-            yield data
-    elif parts.scheme == "serial":
-        async for data in _serial(source, parts.path or parts.netloc, parse_qs(parts.query)):
+    elif is_file(source):
+        async for data in _file(source.removeprefix("file:")):
             yield data
     else:
-        async for data in _file(source.removeprefix("file:"), speed):
-            yield data
+        opened: dict[str, Callable[[], AsyncIterator[bytes]]] = {
+            "tcp": lambda: _tcp(source, b"", settings.silence_s),
+            "ntrip": lambda: _ntrip(source, settings.silence_s),
+            "serial": lambda: _serial(source, settings.silence_s),
+        }
+        async for part in _kept_open(opened[parts.scheme], settings):
+            yield part
 
 
-async def _file(path: str, speed: float | None) -> AsyncIterator[bytes]:
-    """A recorded log, block by block, or paced by the time tags of its epochs."""
-    loop = asyncio.get_running_loop()
-    began, first_tag, state = loop.time(), None, StreamState()
+async def _kept_open(
+    opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
+) -> AsyncIterator[bytes | Connected | Lost]:
+    """Bytes of a connection, opened again with growing waits where it breaks; empty bytes say that it is open."""
+    broken, wait_s, ever_open = 0, settings.reconnect_first_s, False
+    while True:
+        reason = "the other end has closed the connection"
+        try:
+            async for data in opened():
+                if data:
+                    wait_s = settings.reconnect_first_s
+                    yield data
+                else:
+                    ever_open = True
+                    yield Connected(broken)
+        except InputFileError as error:
+            if not ever_open or settings.reconnect == "off":
+                raise
+            reason = error.message
+        if settings.reconnect == "off":
+            return
+        broken += 1
+        yield Lost(reason, wait_s)
+        await asyncio.sleep(wait_s)
+        wait_s = min(2.0 * wait_s, settings.reconnect_longest_s)
+
+
+async def _file(path: str) -> AsyncIterator[bytes]:
     with open_stream(path, content="bytes") as stream:
-        while block := stream.read(_BLOCK if speed is not None else 16 * _BLOCK):
-            if speed is not None:
-                piece, state = decode(block, state)
-                if len(piece.measurements.time):
-                    tag = piece.measurements.time[-1]
-                    first_tag = tag if first_tag is None else first_tag
-                    due = began + float((tag - first_tag) / np.timedelta64(1, "s")) / speed
-                    await asyncio.sleep(max(0.0, due - loop.time()))
+        while block := stream.read(16 * _BLOCK):
             yield block
             await asyncio.sleep(0)
 
 
-async def _tcp(source: str, host: str, port: int, request: bytes) -> AsyncIterator[bytes]:
+async def _tcp(source: str, request: bytes, silence_s: float) -> AsyncIterator[bytes]:
+    """Empty bytes once connected, then what arrives."""
+    parts = urlsplit(source)
     try:
-        reader, writer = await asyncio.wait_for(asyncio.open_connection(host, port), _CONNECT_S)
+        reader, writer = await asyncio.wait_for(asyncio.open_connection(parts.hostname, parts.port), _CONNECT_S)
     except (OSError, TimeoutError) as error:
-        raise InputFileError(source, f"cannot be connected to ({error or 'no answer'})") from None
+        raise InputFileError(hidden(source), f"cannot be connected to ({error or 'no answer'})") from None
     try:
         if request:
             writer.write(request)
             await writer.drain()
-        while data := await reader.read(_BLOCK):
+        yield b""
+        while data := await asyncio.wait_for(reader.read(_BLOCK), silence_s):
             yield data
+    except TimeoutError:
+        raise InputFileError(hidden(source), f"has sent nothing for {silence_s:g} s") from None
     except OSError as error:
-        raise InputFileError(source, f"the connection broke ({error})") from None
+        raise InputFileError(hidden(source), f"the connection broke ({error})") from None
     finally:
         writer.close()
 
 
-async def _ntrip(source: str) -> AsyncIterator[bytes]:
+async def _ntrip(source: str, silence_s: float) -> AsyncIterator[bytes]:
     """A mount point of an NTRIP caster, version 2, or 1 where the caster answers so."""
     parts = urlsplit(source)
     head = [
@@ -124,27 +171,40 @@ async def _ntrip(source: str) -> AsyncIterator[bytes]:
         login = f"{unquote(parts.username)}:{unquote(parts.password or '')}"
         head.append("Authorization: Basic " + base64.b64encode(login.encode()).decode())
     request = ("\r\n".join(head) + "\r\n\r\n").encode()
-    answer, chunked, answered, body = b"", False, False, _Chunks()
-    async for data in _tcp(source, parts.hostname or "", parts.port or 0, request):
+    answer, answered, body = b"", False, None
+    async for data in _tcp(source, request, silence_s):
         if answered:
-            yield body.take(data) if chunked else data
+            if content := data if body is None else body.take(data):
+                yield content
             continue
         answer += data
         first = answer.split(b"\r\n", 1)[0]
         if first.startswith(b"ICY 200") and b"\r\n" in answer:
-            answered, rest = True, answer.split(b"\r\n", 1)[1].removeprefix(b"\r\n")
+            rest = answer.split(b"\r\n", 1)[1].removeprefix(b"\r\n")
         elif first.startswith(b"HTTP/") and b"\r\n\r\n" in answer:
             header, rest = answer.split(b"\r\n\r\n", 1)
             if b" 200" not in first:
-                raise InputFileError(source, f"the caster answers {first.decode('latin-1')!r}")
-            answered, chunked = True, b"transfer-encoding: chunked" in header.lower()
-        elif b"\r\n" in answer and not first.startswith((b"HTTP/", b"ICY")):
-            raise InputFileError(source, f"the caster answers {first[:80].decode('latin-1')!r}")
-        elif len(answer) > 65_536:
-            raise InputFileError(source, "the caster's answer has no end of its header")
+                raise _refused(source, first)
+            body = _Chunks() if b"transfer-encoding: chunked" in header.lower() else None
+        elif b"\r\n" in answer and not first.startswith((b"HTTP/", b"ICY 200")):
+            raise _refused(source, first)
+        elif len(answer) > _HEADER_BYTES:
+            raise InputFileError(hidden(source), "the caster's answer has no end of its header")
         else:
             continue
-        yield body.take(rest) if chunked else rest
+        answered = True
+        yield b""
+        if content := rest if body is None else body.take(rest):
+            yield content
+    if not answered:
+        raise InputFileError(hidden(source), "the caster has closed the connection without an answer")
+
+
+def _refused(source: str, first: bytes) -> InputFileError:
+    text = first[:80].decode("latin-1")
+    hint = "; is the mount point right?" if "SOURCETABLE" in text else ""
+    hint = "; are user and password right?" if "401" in text else hint
+    return InputFileError(hidden(source), f"the caster answers {text!r}{hint}")
 
 
 class _Chunks:
@@ -155,7 +215,13 @@ class _Chunks:
         self._left = 0
 
     def take(self, data: bytes) -> bytes:
-        """Content of some more bytes."""
+        """Content of some more bytes.
+
+        Raises
+        ------
+        InputFileError
+            What stands where the length of a chunk should be is none.
+        """
         self._buffer += data
         content = b""
         while self._buffer:
@@ -165,29 +231,60 @@ class _Chunks:
                 content += part
                 continue
             line, end, rest = self._buffer.removeprefix(b"\r\n").partition(b"\r\n")
-            if not end:
+            if not end and len(line) < _BLOCK:
                 break
-            self._buffer, self._left = rest, int(line.split(b";")[0] or b"0", 16)
+            try:
+                self._left = int(line.split(b";")[0] or b"0", 16)
+            except ValueError:
+                raise InputFileError("the caster", f"sends {line[:20]!r} in place of the length of a chunk") from None
+            self._buffer = rest
         return content
 
 
-async def _serial(source: str, device: str, query: dict[str, list[str]]) -> AsyncIterator[bytes]:
+def _baud(source: str) -> int:
+    text = parse_qs(urlsplit(source).query).get("baud", ["115200"])[0]
+    if not text.isdigit() or not urlsplit(source).path:
+        raise SettingsError(f"source {source!r}: expected {_FORMS}")
+    return int(text)
+
+
+async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
+    """Empty bytes once the line is open, then what arrives; a thread of its own reads, so that no byte overflows."""
     try:
         import serial
     except ModuleNotFoundError:
         raise SettingsError(f"source {source!r}: serial lines need pyserial; install railfix[live]") from None
     try:
-        port = serial.Serial(device, int(query.get("baud", ["115200"])[0]), timeout=0.05)
+        port = serial.Serial(urlsplit(source).path, _baud(source), timeout=_SERIAL_S)
     except (OSError, ValueError) as error:
         raise InputFileError(source, f"cannot be opened ({error})") from None
-    with port:
-        while True:
+    loop, arrived, ended = asyncio.get_running_loop(), asyncio.Queue[bytes | OSError](), threading.Event()
+
+    def read() -> None:
+        item: bytes | OSError = b""
+        while not ended.is_set() and isinstance(item, bytes):
             try:
-                data = await asyncio.to_thread(port.read, _BLOCK)
+                # The first byte, waited for, and what has come with it: nothing waits for more than there is.
+                item = bytes(port.read(1))
+                item += bytes(port.read(port.in_waiting)) if item else b""
             except OSError as error:
-                raise InputFileError(source, f"the line broke ({error})") from None
-            if data:
-                yield data
+                item = error
+            if item and not loop.is_closed():
+                loop.call_soon_threadsafe(arrived.put_nowait, item)
+
+    thread = threading.Thread(target=read, name=f"railfix {source}", daemon=True)
+    thread.start()
+    try:
+        yield b""
+        while isinstance(item := await asyncio.wait_for(arrived.get(), silence_s), bytes):
+            yield item
+        raise InputFileError(source, f"the line broke ({item})")
+    except TimeoutError:
+        raise InputFileError(source, f"has sent nothing for {silence_s:g} s") from None
+    finally:
+        ended.set()
+        thread.join(1.0)
+        port.close()
 
 
 async def _standard_input() -> AsyncIterator[bytes]:

@@ -1,4 +1,4 @@
-"""Bytes of one receiver as single epochs and navigation records, as they become complete."""
+"""Bytes of one receiver as single epochs, navigation records and SBAS messages, as they become complete."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from railfix.io.receiver.ephemerides import navigation_of
 from railfix.io.receiver.framing import find_frames
 from railfix.io.receiver.log import StreamState, decode
 from railfix.io.receiver.measurements import Tracking, observations_of
+from railfix.io.receiver.subframes import SbasFrames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +23,10 @@ class ReceiverState:
 
     stream: StreamState = field(default_factory=StreamState)
     tracking: Tracking = field(default_factory=Tracking)
+
+    def after_break(self) -> ReceiverState:
+        """The state after a break of the connection: the start of a frame whose end never comes is dropped."""
+        return replace(self, stream=replace(self.stream, rest=b""))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,29 +38,34 @@ class Received:
     epochs : tuple of Observations
         One epoch each, with the channels observed in it.
     navigation : Navigation or None
+    sbas : SbasFrames or None
     skipped_bytes, bad_checksums : int
     passed_over : mapping of str to int
+    after : ReceiverState
+        Of the stream after these bytes.
     """
 
     epochs: tuple[Observations, ...]
-    navigation: Navigation | None
-    skipped_bytes: int
-    bad_checksums: int
-    passed_over: dict[str, int]
+    navigation: Navigation | None = None
+    sbas: SbasFrames | None = None
+    skipped_bytes: int = 0
+    bad_checksums: int = 0
+    passed_over: dict[str, int] = field(default_factory=dict)
+    after: ReceiverState = field(default_factory=ReceiverState)
 
 
 def receive_bytes(data: bytes, state: ReceiverState) -> tuple[list[Received], ReceiverState]:
     """What some bytes of a receiver complete, in the order of the stream; any cutting of the stream gives the same.
 
     Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
+    Epochs with repeated or older time tags are kept: `LiveEngine.push` judges them.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
     items, place = [], 0
     for end in [*np.unique(ends[(ends > 0) & (ends < len(data))]).tolist(), len(data)]:
-        item, state = _receive(data[place:end], state)
-        place = end
-        items.append(item)
+        items.append(_receive(data[place:end], state))
+        place, state = end, items[-1].after
     return items, state
 
 
@@ -69,18 +79,21 @@ def epoch_ends(buffer: Bytes) -> Indices:
     )
 
 
-def _receive(data: bytes, state: ReceiverState) -> tuple[Received, ReceiverState]:
+def _receive(data: bytes, state: ReceiverState) -> Received:
     piece, stream = decode(data, state.stream)
-    observations, tracking = observations_of(piece.measurements, state.tracking)
+    observations, tracking = observations_of(
+        piece.measurements, replace(state.tracking, last=np.datetime64("NaT", "ns"))
+    )
     records = piece.ephemerides
-    received = Received(
+    return Received(
         epochs=single_epochs(observations),
         navigation=navigation_of(records) if records.records or records.klobuchar else None,
+        sbas=piece.sbas if len(piece.sbas) else None,
         skipped_bytes=piece.skipped_bytes,
         bad_checksums=piece.bad_checksums,
         passed_over={**observations.skipped, **records.skipped},
+        after=ReceiverState(stream=stream, tracking=tracking),
     )
-    return received, ReceiverState(stream=stream, tracking=tracking)
 
 
 def single_epochs(observations: Observations) -> tuple[Observations, ...]:

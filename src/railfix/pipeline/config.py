@@ -146,9 +146,10 @@ class Config(ScreenSettings):
         Selection of the ranges of an epoch that agree with each other; clock offsets and noise are estimated from them.
     map_offset : MapOffsetLimits
         Test of the map against the 3-D positions of the last minutes.
-    sbas : tuple of path
-        Logs of SBAS messages: their corrections take the place of the models, and satellites without a valid
-        one are rejected. None: no SBAS.
+    sbas : tuple of path, or "stream"
+        Logs of SBAS messages, or "stream" for those that the receivers themselves send (`railfix live`; in
+        `railfix run` those in the receivers' logs): their corrections take the place of the models, and satellites
+        without a valid one are rejected. Empty: no SBAS.
     sbas_prn : int or "best"
         GEO whose messages are used; "best" is the one with the most usable fast corrections.
     sbas_limits : SbasLimits
@@ -210,7 +211,7 @@ class Config(ScreenSettings):
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()
     noise: CodeNoise = CodeNoise()
-    sbas: tuple[Path, ...] = ()
+    sbas: tuple[Path, ...] | Literal["stream"] = ()
     sbas_prn: int | Literal["best"] = "best"
     sbas_limits: SbasLimits = SbasLimits()
     error_model: Path | None = None

@@ -7,9 +7,11 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from railfix.core.arrays import Floats
+from railfix.core.arrays import Floats, Strings
 from railfix.core.errors import SettingsError
+from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
+from railfix.gnss.orbits.record_selection import VALIDITY_S, validity_s
 from railfix.pipeline.config import Config
 from railfix.ranges.sbas import SbasCorrections, SbasMessages, SbasState
 
@@ -82,7 +84,11 @@ def known_from_start(
     SettingsError
         SBAS and precise ephemerides together, or no message of the GEO asked for.
     """
-    received = _with_notes(Received(navigation=navigation or no_navigation()), config)
+    received = Received(navigation=navigation or no_navigation())
+    if messages is None and config.sbas == "stream":
+        state = _empty_state(config)
+        return _with_notes(replace(received, messages=state, sbas=state.corrections), config)
+    received = _with_notes(received, config)
     if messages is None:
         return received
     try:
@@ -110,8 +116,9 @@ def receive(
     time : datetime64[ns]
         Of the next epoch, NaT where there is none; SBAS messages that neither it nor a later one can use are dropped.
     navigation : Navigation, optional
-        New records, ionospheric coefficients or precise ephemerides. Records received again are dropped; newer
-        coefficients and precise ephemerides replace the older ones.
+        New records, ionospheric coefficients or precise ephemerides. Records received again are dropped, and so are
+        those that have expired by `time`, but for the newest of a satellite; newer coefficients and precise
+        ephemerides replace the older ones.
     messages : SbasMessages, optional
         New messages; without any so far, every satellite is rejected until the corrections are complete.
 
@@ -127,19 +134,26 @@ def receive(
     """
     if navigation is None and messages is None:
         return before
-    after = before if navigation is None else replace(before, navigation=_merged(before.navigation, navigation))
+    after = before
+    if navigation is not None:
+        after = replace(before, navigation=_current(merged_navigation(before.navigation, navigation), time))
     if messages is not None:
         state = before.messages
         if state is None:
-            if config.sbas_prn == "best":
-                raise SettingsError(
-                    "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN"
-                )
-            state = SbasState(prn=config.sbas_prn, limits=config.sbas_limits)
+            state = _empty_state(config)
         state = state.received(messages)
         state = state if np.isnat(time) else state.kept_from(time)
         after = replace(after, messages=state, sbas=state.corrections)
     return _with_notes(after, config)
+
+
+def _empty_state(config: Config) -> SbasState:
+    """Return SBAS without a message so far."""
+    if config.sbas_prn == "best":
+        raise SettingsError(
+            "sbas_prn = best: the best GEO is known only after all messages are received; give its PRN (sbas_prn = 137)"
+        )
+    return SbasState(prn=config.sbas_prn, limits=config.sbas_limits)
 
 
 def _with_notes(received: Received, config: Config) -> Received:
@@ -152,7 +166,29 @@ def _with_notes(received: Received, config: Config) -> Received:
     )
 
 
-def _merged(old: Navigation, new: Navigation) -> Navigation:
+def _current(navigation: Navigation, time: np.datetime64) -> Navigation:
+    """Return navigation data without records that no epoch from `time` on can use."""
+    if np.isnat(time):
+        return navigation
+    kepler, glonass = navigation.kepler, navigation.glonass
+    return replace(
+        navigation,
+        kepler=_unexpired(kepler, np.char.add(kepler.satellite, kepler.message), validity_s(kepler), time),
+        glonass=_unexpired(glonass, glonass.satellite, np.full(len(glonass), VALIDITY_S["R"]), time),
+    )
+
+
+def _unexpired(table: Records, label: Strings, validity: Floats, time: np.datetime64) -> Records:
+    """Return the rows of a table that are valid at `time` or later, and the newest one of each label."""
+    kept = table.toe + timedelta(validity) >= time
+    if kept.all():
+        return table
+    order = np.argsort(table.toe, kind="stable")
+    kept[order[len(order) - 1 - np.unique(label[order][::-1], return_index=True)[1]]] = True
+    return replace(table, **{item.name: getattr(table, item.name)[kept] for item in fields(table)})
+
+
+def merged_navigation(old: Navigation, new: Navigation) -> Navigation:
     """Return old and new navigation data together."""
     return Navigation(
         kepler=_united(old.kepler, new.kepler, _KEPLER_KEY),

@@ -139,9 +139,10 @@ def _read(inputs: ReferenceInputs, line: Line, options: ReferenceOptions) -> tup
     ]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
-        navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
+        date = None if options.date is None else np.datetime64(options.date, "ns")
+        navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=date)
         for name, paths in inputs.logs.items():
-            log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines)
+            log = Log(paths=paths, chunk_epochs=_CHUNK, broken_lines=options.broken_lines, date=date)
             antenna_dopplers = dopplers_of_log(
                 concatenate(list(log.parts())), navigation, systems=SYSTEMS, signals=DEFAULT_SIGNALS
             )

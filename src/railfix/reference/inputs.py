@@ -102,10 +102,12 @@ class ReferenceOptions(Settings):
     overwrite : {"refuse", "replace"}
     track : TrackReading
     date : date or None
-        UTC date of NMEA logs that have none.
+        Of NMEA logs that have none (UTC), and of RTCM 3 logs (to within half a week).
     """
 
-    date: dt.date | None = option("UTC date of an NMEA log without RMC sentences.", None, metavar="DATE")
+    date: dt.date | None = option(
+        "UTC date of an NMEA log without RMC sentences, or of an RTCM 3 log.", None, metavar="DATE"
+    )
     broken_lines: BrokenLines = option(
         "Count broken lines of the input files and continue, instead of stopping.", "stop", name="--lenient"
     )

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import AwareDatetime, NaiveDatetime
+from pydantic import Field
 
 from railfix.core.settings import Settings
 from railfix.gnss.observations import ObservationHeader
 from railfix.io.logs import read_navigation, scan_observations
 from railfix.io.rinex import write_navigation, write_observations
+from railfix.run.options import LogReading
 from railfix.run.output import Overwrite, check_output_file
 
 
@@ -27,15 +28,14 @@ class Conversion(Settings):
         RINEX observation and navigation file to write.
     rinex : {"3", "4"}
         Version 3.04 or 4.02.
-    date : datetime or None
-        Some time within half a week of RTCM 3 logs, GPS time.
+    reading : LogReading
     """
 
     logs: tuple[Path, ...]
     out: Path | None = None
     nav_out: Path | None = None
     rinex: Literal["3", "4"] = "3"
-    date: NaiveDatetime | AwareDatetime | None = None
+    reading: LogReading = Field(default_factory=LogReading)
 
 
 def convert_logs(conversion: Conversion, *, overwrite: Overwrite = "refuse") -> list[str]:
@@ -51,7 +51,7 @@ def convert_logs(conversion: Conversion, *, overwrite: Overwrite = "refuse") -> 
     for target in (conversion.out, conversion.nav_out):
         if target is not None:
             check_output_file(target, overwrite=overwrite, inputs=conversion.logs)
-    date = None if conversion.date is None else np.datetime64(conversion.date.replace(tzinfo=None), "ns")
+    date = conversion.reading.instant
     version: Literal["3.04", "4.02"] = "3.04" if conversion.rinex == "3" else "4.02"
     lines: list[str] = []
     if conversion.out is not None:

@@ -120,6 +120,8 @@ def run_files(
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
+    inputs.check()
+    config = inputs.with_own_sbas(config)
     inputs = inputs.with_settings(config)
     inputs.check()
     with ExitStack() as stack:
@@ -202,7 +204,7 @@ def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple
     InputFileError, SettingsError, MismatchError
         A file is not what it should be, or track and vehicle do not fit.
     """
-    navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines)
+    navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=options.logs.instant)
     if inputs.sp3:
         navigation = replace(navigation, precise=read_sp3(inputs.sp3))
     at = time_of(navigation)
@@ -214,6 +216,7 @@ def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple
             broken_lines=options.broken_lines,
             start=options.start,
             end=options.end,
+            date=options.logs.instant,
         )
 
     def find(network: Network) -> RouteOfLog:

@@ -8,9 +8,10 @@ from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import fingerprint
 from railfix.core.settings import Settings, option
+from railfix.io.receiver.log import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 
 Antenna = Literal["front", "rear"]
@@ -139,8 +140,24 @@ class RunInputs(InputFiles):
     )
 
     def with_settings(self, config: Config) -> Self:
-        """Return the same with the files that settings name."""
-        return self.replaced(cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=config.sbas)
+        """Return the same with the files that settings name (`with_own_sbas` comes before)."""
+        sbas = () if config.sbas == "stream" else config.sbas
+        return self.replaced(cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=sbas)
+
+    def with_own_sbas(self, config: Config) -> Config:
+        """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.
+
+        Raises
+        ------
+        SettingsError
+            None of the logs is a receiver's.
+        """
+        if config.sbas != "stream":
+            return config
+        logs = tuple(path for paths in self.logs.values() for path in paths if is_receiver_log(head_of(path)))
+        if not logs:
+            raise SettingsError("sbas = stream: RINEX logs carry no SBAS messages; name a log of them (--sbas FILE)")
+        return config.replaced(sbas=logs)
 
     @property
     def logs(self) -> dict[Antenna, tuple[Path, ...]]:

@@ -12,12 +12,13 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import NoPositionError
 from railfix.core.files import BrokenLines, write_whole
 from railfix.core.geodesy import geodetic_from_ecef
-from railfix.io.rinex import read_navigation
+from railfix.io.logs import read_navigation
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import locate
 from railfix.pipeline.received import known_from_start
 from railfix.run.inputs import InputFiles, input_option
+from railfix.run.options import LogReading
 from railfix.run.sources import Log
 
 
@@ -44,7 +45,13 @@ class LocateSummary:
 
 
 def locate_files(
-    inputs: LocateInputs, config: Config, *, out: Path, broken_lines: BrokenLines = "stop", chunk_epochs: int = 3000
+    inputs: LocateInputs,
+    config: Config,
+    *,
+    out: Path,
+    reading: LogReading | None = None,
+    broken_lines: BrokenLines = "stop",
+    chunk_epochs: int = 3000,
 ) -> LocateSummary:
     """Compute positions of a log and write them as an RTKLIB solution file with quality 5 (single).
 
@@ -55,8 +62,10 @@ def locate_files(
         No epoch has a position.
     """
     inputs.check_files()
-    received = known_from_start(config, navigation=read_navigation(inputs.nav, broken_lines=broken_lines))
-    log, book = Log(paths=inputs.log, chunk_epochs=chunk_epochs, broken_lines=broken_lines), ChannelBook(config)
+    date = (reading or LogReading()).instant
+    received = known_from_start(config, navigation=read_navigation(inputs.nav, broken_lines=broken_lines, date=date))
+    log = Log(paths=inputs.log, chunk_epochs=chunk_epochs, broken_lines=broken_lines, date=date)
+    book = ChannelBook(config)
     parts = [locate(part, received, config, book) for part in log.parts()]
     if not any(np.isfinite(part.ecef_m).any() for part in parts):
         raise NoPositionError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Final, Literal, Self
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from railfix.core.files import BrokenLines
@@ -53,6 +54,25 @@ class TrackReading(Settings):
     reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
 
 
+class LogReading(Settings):
+    """How to read receiver logs.
+
+    Attributes
+    ----------
+    date : datetime or None
+        Some time within half a week of RTCM 3 logs, GPS time: their observations carry no week.
+    """
+
+    date: datetime | None = option(
+        "Some time within half a week of RTCM 3 logs, GPS time: their observations carry no week.", None, metavar="TIME"
+    )
+
+    @property
+    def instant(self) -> np.datetime64 | None:
+        """The date as the readers take it."""
+        return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
+
+
 class RunOptions(Settings):
     """Options of a run that do not change the positions.
 
@@ -70,6 +90,7 @@ class RunOptions(Settings):
     workers : int
         See `railfix.run.antennas.processes`.
     track : TrackReading
+    logs : LogReading
     """
 
     start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
@@ -95,6 +116,7 @@ class RunOptions(Settings):
         le=2,
     )
     track: TrackReading = Field(default_factory=TrackReading)
+    logs: LogReading = Field(default_factory=LogReading)
 
     @field_validator("start", "end")
     @classmethod

@@ -37,7 +37,7 @@ def processor_of(config: Config, navigation: Navigation, trajectories: Mapping[s
         config,
         trajectories,
         navigation=navigation,
-        messages=read_sbas(list(config.sbas)) if config.sbas else None,
+        messages=read_sbas(list(config.sbas)) if config.sbas and config.sbas != "stream" else None,
         error_model=None if config.error_model is None else read_error_model(config.error_model),
         cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
     )

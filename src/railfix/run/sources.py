@@ -176,6 +176,8 @@ class Log:
     broken_lines : {"stop", "count"}
     start, end : datetime or None
         First epoch, and the time before which the last one lies.
+    date : datetime64 or None
+        Of RTCM 3 logs; see `railfix.run.options.LogReading`.
     share : float
         Part of the files that has been read, 0 to 1.
     problems : list of str
@@ -189,6 +191,7 @@ class Log:
     broken_lines: BrokenLines = "stop"
     start: datetime | None = None
     end: datetime | None = None
+    date: np.datetime64 | None = None
     share: float = 0.0
     problems: list[str] = field(default_factory=list)
     skipped: Counter[str] = field(default_factory=Counter)
@@ -207,6 +210,7 @@ class Log:
             broken_lines=self.broken_lines,
             start=None if self.start is None else np.datetime64(self.start, "ns"),
             end=None if self.end is None else np.datetime64(self.end, "ns"),
+            date=self.date,
             progress=self._read_to,
         )
         for piece in pieces:

@@ -18,7 +18,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ece
 from railfix.core.settings import Settings, option
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations, concatenate
-from railfix.io.rinex import read_navigation
+from railfix.io.logs import read_navigation
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.config import Config
 from railfix.pipeline.locate import AntennaRanges, antenna_ranges, locate
@@ -32,7 +32,7 @@ from railfix.positioning.which_track import (
     track_posterior,
 )
 from railfix.run.inputs import InputFiles, input_option
-from railfix.run.options import TrackReading
+from railfix.run.options import LogReading, TrackReading
 from railfix.run.sources import Log
 from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
@@ -313,6 +313,7 @@ class WhichTrackOptions(Settings):
     same_frame : {"no", "yes"}
         Whether the place of the base station, and so the train's, is in the frame of the map.
     reading : TrackReading
+    logs : LogReading
     errors : StandstillErrors
     """
 
@@ -333,6 +334,7 @@ class WhichTrackOptions(Settings):
         name="--same-frame",
     )
     reading: TrackReading = Field(default_factory=TrackReading)
+    logs: LogReading = Field(default_factory=LogReading)
     errors: StandstillErrors = Field(default_factory=StandstillErrors)
 
 
@@ -348,7 +350,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
         raise SettingsError("a base station needs both --base and --base-place")
     if inputs.rear and not options.spacing > 0.0:
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front one")
-    navigation = read_navigation(inputs.nav)
+    navigation = read_navigation(inputs.nav, date=options.logs.instant)
     base = None
     if options.base_place is not None:
         base = BaseStation(observations=_observations(inputs.base, options), ecef_m=_place(options.base_place))
@@ -390,7 +392,8 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
 
 
 def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observations:
-    parts = list(Log(paths=paths, chunk_epochs=3000, start=options.start, end=options.end).parts())
+    log = Log(paths=paths, chunk_epochs=3000, start=options.start, end=options.end, date=options.logs.instant)
+    parts = list(log.parts())
     if not parts:
         raise InputFileError(paths[0], "there is no epoch in the time asked for")
     return concatenate(parts)

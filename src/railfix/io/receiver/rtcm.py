@@ -130,16 +130,22 @@ def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
 
 
 def unfinished_epoch(frames: Frames) -> int | None:
-    """Place of the first message of the last epoch, where more messages of that epoch are to follow (DF393)."""
+    """Place of the first message of the last epoch, where more messages of that epoch are to follow (DF393).
+
+    An epoch whose last message is missing ends where a message of the same number has another time.
+    """
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
         return None
-    last = completes_epoch(frames, chosen)
-    if last[-1]:
-        return None
-    complete = np.flatnonzero(last)
-    first = chosen[complete[-1] + 1] if len(complete) else chosen[0]
-    return int(frames.frame_start[first])
+    after = np.flatnonzero(completes_epoch(frames, chosen))
+    tail = chosen[after[-1] + 1 :] if len(after) else chosen
+    times = unsigned(bits_of(frames, tail, 56), 24, 30).tolist()
+    first, seen = None, dict[int, int]()
+    for index, time in zip(tail[::-1].tolist(), times[::-1], strict=True):
+        if seen.setdefault(int(frames.kind[index]), time) != time:
+            break
+        first = int(frames.frame_start[index])
+    return first
 
 
 def _of_number(frames: Frames, number: int, near: np.datetime64) -> Iterator[tuple[Integers, Measurements]]:

@@ -69,7 +69,8 @@ class SbasFrames:
     Attributes
     ----------
     time : ndarray of datetime64[ns], shape (N,)
-        Epoch of the receiver before the message; NaT before it knew the time.
+        1 ns after the receiver's epoch before the message, because that epoch came too early to use it; NaT before the
+        receiver knew the time.
     prn : ndarray of int, shape (N,)
     octets : ndarray of uint8, shape (N, 32)
         The 250 bits from the first preamble bit on, zero behind.
@@ -89,7 +90,7 @@ def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
     octets = subframes.words[rows, :8].astype(">u4").view(np.uint8).reshape(len(rows), 32).copy()
     octets[:, 31] &= 0xC0
     prn = np.array([100 + int(name[1:]) for name in subframes.satellite[rows].tolist()], dtype=np.int64)
-    return SbasFrames(time=time[rows], prn=prn, octets=octets)
+    return SbasFrames(time=time[rows] + np.timedelta64(1, "ns"), prn=prn, octets=octets)
 
 
 def packed_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:

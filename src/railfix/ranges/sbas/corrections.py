@@ -336,8 +336,9 @@ class SbasState:
     messages: SbasMessages = field(default_factory=SbasMessages.none)
 
     def received(self, messages: SbasMessages) -> SbasState:
-        """The state after more messages; those of other PRNs are left out."""
-        return replace(self, messages=self.messages.joined(messages.of(self.prn)))
+        """The state after more messages; those of other PRNs, and repeated ones of a second receiver, are left out."""
+        joined = self.messages.joined(messages.of(self.prn))
+        return replace(self, messages=joined.take(~joined.repeated()))
 
     @cached_property
     def corrections(self) -> SbasCorrections:

@@ -307,6 +307,7 @@ def _checked(gathered: _Gathered, sources: tuple[str, ...]) -> SbasMessages:
     kept = kept.take(np.lexsort((kept.prn, kept.time)))
     repeated = np.zeros(len(kept), dtype=bool)
     repeated[1:] = (kept.time[1:] == kept.time[:-1]) & (kept.prn[1:] == kept.prn[:-1])
+    repeated |= kept.repeated()
     gathered.rejected["duplicate"] += int(repeated.sum())
     kept = kept.take(~repeated)
     notes = [*gathered.notes, *_parity_notes(sources, source, carried), *_order_notes(kept)]

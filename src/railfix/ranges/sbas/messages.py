@@ -19,6 +19,8 @@ PREAMBLES: Final = (0x53, 0x9A, 0xC6)
 DATA_BITS: Final = 226
 PARITY_BITS: Final = 24
 ROW_BYTES: Final = 32
+#: The same message twice within this time was passed on by two receivers.
+_REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
 
 def message_parity(bits: Bytes) -> Integers:
@@ -166,6 +168,19 @@ class SbasMessages:
             rejected=dict(Counter(self.rejected) + Counter(later.rejected)),
             notes=tuple(dict.fromkeys((*self.notes, *later.notes))),
         )
+
+    def repeated(self) -> Masks:
+        """Messages that another receiver has passed on before: the same bits of one PRN within 1 s, shape (N,).
+
+        The preambles of messages that follow each other differ, so that no GEO sends the same 250 bits twice in a row.
+        """
+        again = np.zeros(len(self), dtype=bool)
+        order = np.lexsort((self.time, self.prn))
+        for back in range(1, 4):
+            later, earlier = order[back:], order[:-back]
+            same = (self.prn[later] == self.prn[earlier]) & (self.bits[later] == self.bits[earlier]).all(axis=1)
+            again[later] |= same & (self.time[later] - self.time[earlier] <= _REPEATED_WITHIN)
+        return again
 
     def take(self, rows: Masks | Integers) -> SbasMessages:
         """Some of the messages."""

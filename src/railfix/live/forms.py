@@ -1,0 +1,172 @@
+"""Forms of a message: bytes of one output.
+
+``json`` (a line a message), ``cbor`` (`railfix.io.train_message`; in files and streams each message comes after its
+length in two bytes, most significant first), ``nmea`` (GGA, RMC, GST), ``tpv`` (TPV of gpsd), ``etcs`` (position
+report of SUBSET-026, packet 0, a line of JSON), ``positions`` and ``train`` (rows of the tables of results, a line of
+JSON each).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+import polars as pl
+
+from railfix.core.timescale import GPS_EPOCH, gpst_minus_utc
+from railfix.io.train_message import MessageStatus, TrainMessage, encode, etcs_report, to_json
+from railfix.live.engine import LiveOutput
+from railfix.live.message import antenna_of
+from railfix.live.settings import LiveSettings
+from railfix.pipeline.tables import positions_table
+from railfix.pipeline.train_table import train_table
+
+Form = Callable[[LiveOutput], bytes]
+#: Longest doubt of a position report, with room for the rounding of the distance [cm].
+_LONGEST_DOUBT_CM: Final = 32_700_000
+
+
+def json_bytes(output: LiveOutput) -> bytes:
+    """One line of JSON."""
+    return to_json(output.message).encode() + b"\n"
+
+
+def cbor_bytes(output: LiveOutput) -> bytes:
+    """CBOR preceded by its length in two bytes."""
+    data = encode(output.message)
+    return len(data).to_bytes(2, "big") + data
+
+
+def nmea_bytes(output: LiveOutput) -> bytes:
+    """NMEA 0183 sentences GGA, RMC and GST of the place of the message's antenna; nothing without input."""
+    place = _geodetic(output)
+    if output.result is None:
+        return b""
+    utc = _utc(output.message)
+    clock = f"{utc[11:13]}{utc[14:16]}{utc[17:19]}.{utc[20:22]}"
+    day = f"{utc[8:10]}{utc[5:7]}{utc[2:4]}"
+    valid = output.message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
+    used = max((int(a.n_used[-1]) for a in output.result.antennas.values()), default=0)
+    if place is None:
+        sentences = [f"GPGGA,{clock},,,,,0,{used:02d},,,M,,M,,", f"GPRMC,{clock},V,,,,,,,{day},,,N"]
+        return b"".join(map(_sentence, sentences))
+    latitude, longitude, height, sigma = place
+    angles = (
+        f"{_angle(latitude, 2)},{'N' if latitude >= 0 else 'S'},{_angle(longitude, 3)},{'E' if longitude >= 0 else 'W'}"
+    )
+    quality = (6 if output.message.status is MessageStatus.COASTING else 1) if valid else 0
+    knots = abs(output.message.speed_cmps or 0) * 0.01 * 3600.0 / 1852.0
+    sentences = [
+        f"GPGGA,{clock},{angles},{quality},{used:02d},,{height:.2f},M,0.00,M,,",
+        f"GPRMC,{clock},{'A' if valid else 'V'},{angles},{knots:.2f},,{day},,,{'A' if valid else 'N'}",
+        f"GPGST,{clock},,{sigma:.2f},,,{sigma:.2f},{sigma:.2f},{2 * sigma:.2f}",
+    ]
+    return b"".join(map(_sentence, sentences))
+
+
+def tpv_bytes(output: LiveOutput) -> bytes:
+    """A report of gpsd's class TPV as a line of JSON; heights are above the ellipsoid (altHAE)."""
+    place = _geodetic(output)
+    report: dict[str, Any] = {"class": "TPV", "device": "railfix", "mode": 1, "time": _utc(output.message)[:23] + "Z"}
+    if place is not None:
+        latitude, longitude, height, sigma = place
+        report |= {"mode": 3, "lat": round(latitude, 9), "lon": round(longitude, 9), "altHAE": round(height, 3)}
+        report["eph"] = round(sigma, 3)
+    if output.message.speed_cmps is not None:
+        report["speed"] = abs(output.message.speed_cmps) / 100.0
+    return json.dumps(report, separators=(",", ":")).encode() + b"\n"
+
+
+def etcs_form(settings: LiveSettings) -> Form:
+    """Position reports of SUBSET-026, packet 0, against the reference location of the settings, a line of JSON each.
+
+    Nothing without a position, and where a doubt is longer than the packet can say (327 km).
+    """
+
+    def etcs_bytes(output: LiveOutput) -> bytes:
+        message = output.message
+        if message.chainage_cm is None or message.over_cm is None or message.over_cm >= _LONGEST_DOUBT_CM:
+            return b""
+        report = etcs_report(message, reference_cm=round(settings.reference_m * 100.0), reference=settings.reference)
+        return json.dumps(report, separators=(",", ":")).encode() + b"\n"
+
+    return etcs_bytes
+
+
+def positions_rows(output: LiveOutput) -> bytes:
+    """Rows of ``positions.parquet``, a line of JSON an antenna; nothing without input."""
+    return b"" if output.result is None else _json_rows(positions_table(output.result))
+
+
+def train_rows(output: LiveOutput) -> bytes:
+    """Rows of ``train.parquet``, a line of JSON an antenna; nothing without input or filter."""
+    return b"" if output.result is None or not output.result.fusion else _json_rows(train_table(output.result))
+
+
+def _json_rows(table: pl.DataFrame) -> bytes:
+    """Rows as lines of JSON, all digits; null where there is no number, infinities as words."""
+    texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
+    lines = []
+    for row in texts.iter_rows(named=True):
+        values = {
+            name: None if value != value else str(value) if value in (math.inf, -math.inf) else value
+            for name, value in row.items()
+        }
+        lines.append(json.dumps(values, separators=(",", ":"), allow_nan=False))
+    return "".join(line + "\n" for line in lines).encode()
+
+
+def forms(settings: LiveSettings) -> dict[str, Form]:
+    """The forms by name."""
+    return {
+        "json": json_bytes,
+        "cbor": cbor_bytes,
+        "nmea": nmea_bytes,
+        "tpv": tpv_bytes,
+        "etcs": etcs_form(settings),
+        "positions": positions_rows,
+        "train": train_rows,
+    }
+
+
+def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
+    """Latitude, longitude [deg], ellipsoidal height and along-track sigma [m] of the antenna of the message."""
+    if output.result is None:
+        return None
+    name = antenna_of(output.result)
+    antenna, track = output.result.antennas[name], output.result.fusion.get(name)
+    if track is not None and len(track) and math.isfinite(float(track.chainage_m[-1])):
+        values = (track.latitude_deg[-1], track.longitude_deg[-1], track.height_m[-1], track.tracked.sigma_m[-1])
+    else:
+        values = (antenna.latitude_deg[-1], antenna.longitude_deg[-1], antenna.height_m[-1], antenna.along_sigma_m[-1])
+    if not all(math.isfinite(float(value)) for value in values):
+        return None
+    return float(values[0]), float(values[1]), float(values[2]), float(values[3])
+
+
+def _utc(message: TrainMessage) -> str:
+    """UTC of a message, ISO 8601 to the microsecond."""
+    gpst = GPS_EPOCH + np.timedelta64(message.time_ns, "ns")
+    return str((gpst - gpst_minus_utc(gpst).astype("timedelta64[s]")).astype("datetime64[us]"))
+
+
+def _angle(value: float, digits: int) -> str:
+    """Degrees and minutes as NMEA writes them, ddmm.mmmmmmm."""
+    minutes = round(abs(value) * 60.0, 7)
+    return f"{int(minutes // 60):0{digits}d}{minutes % 60:010.7f}"
+
+
+def _sentence(body: str) -> bytes:
+    checksum = 0
+    for value in body.encode("ascii"):
+        checksum ^= value
+    return f"${body}*{checksum:02X}\r\n".encode("ascii")
+
+
+def whole_message(form: Form, output: LiveOutput) -> bytes:
+    """A message for a target that keeps messages apart: without the length that streams need."""
+    data = form(output)
+    return data[2:] if form is cbor_bytes else data

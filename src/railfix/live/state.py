@@ -1,0 +1,170 @@
+"""State file: what a restarted session continues from, written now and then, checked before it is used.
+
+A line of JSON says what the state belongs to: versions, hashes of map, vehicle and settings, length and SHA-256 of
+what follows, the state itself. It is read back only if all of these are the same, and holds plain values, arrays and
+data classes of this package alone: other classes are refused while reading.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import pickle
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+import railfix
+from railfix.core.errors import OutputError
+from railfix.core.files import file_sha256
+from railfix.core.settings import Settings
+from railfix.live.engine import EngineState
+from railfix.live.stream import ReceiverState
+
+_FORM: Final = "railfix live state 1"
+#: Classes beside those of this package that a state consists of.
+_PLAIN: Final = {
+    ("numpy", "dtype"),
+    ("numpy", "ndarray"),
+    ("numpy", "datetime64"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
+    ("numpy.core.multiarray", "_reconstruct"),
+    ("numpy.core.multiarray", "scalar"),
+    ("numpy.core.numeric", "_frombuffer"),
+    ("builtins", "set"),
+    ("builtins", "frozenset"),
+    ("builtins", "slice"),
+    ("collections", "Counter"),
+    ("collections", "OrderedDict"),
+    ("types", "MappingProxyType"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SavedSession:
+    """State of a session: of the engine, and of each receiver's stream."""
+
+    engine: EngineState
+    streams: Mapping[str, ReceiverState]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Loaded:
+    """A state file as it was found.
+
+    Attributes
+    ----------
+    session : SavedSession or None
+        None where the file is not used.
+    outcome : str
+        One sentence for the log.
+    """
+
+    session: SavedSession | None
+    outcome: str
+
+
+def belongs_to(
+    files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
+) -> dict[str, Any]:
+    """What a state is made under; a state of anything else is not used.
+
+    Parameters
+    ----------
+    files : mapping of str to Path
+        Track, vehicle, models: by their role.
+    settings : mapping of str to Settings
+    antennas : tuple of str
+    """
+    return {
+        "version": f"railfix {railfix.__version__}, numpy {np.__version__}, Python {platform.python_version()}",
+        "antennas": list(antennas),
+        **{name: file_sha256(path) for name, path in files.items()},
+        **{
+            name: hashlib.sha256(json.dumps(values.model_dump(mode="json"), sort_keys=True).encode()).hexdigest()
+            for name, values in settings.items()
+        },
+    }
+
+
+def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
+    """Write a state file whole, or leave the one before.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    content = pickle.dumps(session, protocol=5)
+    head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(json.dumps(head).encode() + b"\n" + content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: the state cannot be written ({error.strerror or error})") from None
+
+
+def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
+    """Read a state file, if there is one that belongs to this session.
+
+    Parameters
+    ----------
+    path : Path
+    under : mapping
+        Of `belongs_to`.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        return Loaded(session=None, outcome=f"state file {path}: there is none yet, positioning begins anew")
+    except OSError as error:
+        return _refused(path, f"cannot be read ({error.strerror})")
+    line, _, content = data.partition(b"\n")
+    try:
+        head = json.loads(line)
+    except ValueError:
+        return _refused(path, "is no state file")
+    if not isinstance(head, dict) or head.get("form") != _FORM:
+        return _refused(path, "is no state file of this version")
+    for name, value in under.items():
+        if head.get(name) != value:
+            return _refused(path, f"was made with another {name}")
+    if {name for name in head if name not in ("form", "bytes", "sha256")} != set(under):
+        return _refused(path, "was made with other files")
+    if len(content) != head.get("bytes") or hashlib.sha256(content).hexdigest() != head.get("sha256"):
+        return _refused(path, "is damaged or cut off")
+    try:
+        session = _Plain(io.BytesIO(content)).load()
+    except (pickle.UnpicklingError, AttributeError, ImportError, TypeError, ValueError, EOFError) as error:
+        return _refused(path, f"holds no state ({error})")
+    if not isinstance(session, SavedSession):
+        return _refused(path, "holds no state of a session")
+    return Loaded(session=session, outcome=f"state file {path}: belongs to this map, vehicle and settings")
+
+
+def _refused(path: Path, why: str) -> Loaded:
+    return Loaded(session=None, outcome=f"state file {path}: not used, because it {why}; positioning begins anew")
+
+
+class _Plain(pickle.Unpickler):
+    """Reads values, arrays and classes of this package; nothing else is imported or called."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """A class of this package or one of `_PLAIN`."""
+        if (module.split(".")[0] == "railfix" and "." not in name) or (module, name) in _PLAIN:
+            found = super().find_class(module, name)
+            if isinstance(found, type) or (module, name) in _PLAIN:
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no part of a state")

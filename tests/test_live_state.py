@@ -1,0 +1,149 @@
+"""State file of a live session: continued with it or without, never with a stale one in silence."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+import railfix
+from railfix.cli import app
+from railfix.io.train_message import from_json
+from railfix.live.engine import EngineState
+from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.pipeline.results import State
+from railfix.simulate.demo_data import demo_files
+from ubx_made import log_of
+
+pytestmark = pytest.mark.requirement("A8")
+RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
+SPLIT, EPOCHS = 30, 50
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A log of 5 s, its first 3 s, the rest, and the rest after a gap of two minutes."""
+    folder, observations = tmp_path_factory.mktemp("logs"), railfix.read_observations(demo_files()["front"])
+    pieces = {
+        "whole": observations[:EPOCHS],
+        "first": observations[:SPLIT],
+        "rest": observations[SPLIT:EPOCHS],
+        "late": observations[SPLIT + 1200 : EPOCHS + 1200],
+    }
+    paths = {}
+    for name, piece in pieces.items():
+        assert len(piece) > 0
+        paths[name] = folder / f"{name}.ubx"
+        paths[name].write_bytes(log_of(piece))
+    return paths
+
+
+def live(
+    log: Path, folder: Path, name: str, *words: str, track: Path | None = None
+) -> tuple[pl.DataFrame, list[int], str]:
+    """Rows of the filter, sequence numbers of the messages, and what was logged."""
+    files, out = demo_files(), folder / name
+    command = ["live", "--front", str(log), "--track", str(track or files["track"]), "--vehicle", str(files["vehicle"])]
+    command += [
+        "--nav",
+        str(files["nav"]),
+        "--out",
+        str(out),
+        "--live",
+        "no_input=skip",
+        "--log",
+        str(folder / f"{name}.log"),
+    ]
+    done = RUNNER.invoke(app, [*command, "--send", f"json@{folder / name}.jsonl", *words])
+    assert done.exit_code == 0, done.output
+    numbers = [from_json(line).sequence for line in (folder / f"{name}.jsonl").read_text().splitlines()]
+    return pl.read_parquet(out / "train.parquet"), numbers, (folder / f"{name}.log").read_text()
+
+
+def test_a_restart_continues_as_without_one(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Filter and sequence of two sessions with a state file are those of one session over the whole log."""
+    state = ["--state", str(tmp_path / "state")]
+    whole, _, _ = live(parts["whole"], tmp_path, "whole")
+    first, numbers, told = live(parts["first"], tmp_path, "first", *state)
+    assert "there is none yet" in told
+    rest, later, told = live(parts["rest"], tmp_path, "rest", *state)
+    assert "positioning continues 0.1 s after" in told
+    assert later == list(range(numbers[-1] + 1, numbers[-1] + 1 + EPOCHS - SPLIT))
+    both = pl.concat([first, rest])
+    assert both["status"].to_list() == whole["status"].to_list()
+    assert "tracking" in both["status"].to_list()[SPLIT:]
+    for name in ("chainage_m", "along_sigma_m", "speed_mps", "branch_probability"):
+        assert np.array_equal(both[name].to_numpy(), whole[name].to_numpy(), equal_nan=True), name
+    without, _, _ = live(parts["rest"], tmp_path, "without")
+    assert not np.array_equal(without["along_sigma_m"].to_numpy(), rest["along_sigma_m"].to_numpy(), equal_nan=True)
+
+
+def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_path: Path) -> None:
+    """Too old, another map, other settings, damaged: told, and the positions are those of a fresh start."""
+    path = tmp_path / "state"
+    live(parts["first"], tmp_path, "first", "--state", str(path))
+    kept = path.read_bytes()
+    fresh, _, _ = live(parts["rest"], tmp_path, "fresh")
+    other = tmp_path / "track.csv"
+    other.write_bytes(demo_files()["track"].read_bytes() + b"\n")
+    cases = {
+        "map": (kept, [], other, "was made with another track 0"),
+        "settings": (kept, ["--set", "largest_sigma_m=19"], None, "was made with another settings"),
+        "damaged": (kept[:-1], [], None, "is damaged or cut off"),
+        "changed": (kept[:-1] + bytes([kept[-1] ^ 1]), [], None, "is damaged or cut off"),
+        "text": (b"hello", [], None, "is no state file"),
+    }
+    for name, (content, words, track, says) in cases.items():
+        path.write_bytes(content)
+        rows, numbers, told = live(parts["rest"], tmp_path, name, "--state", str(path), *words, track=track)
+        assert f"not used, because it {says}; positioning begins anew" in told, name
+        assert numbers[0] == 1
+        if not words:
+            assert np.array_equal(rows["chainage_m"].to_numpy(), fresh["chainage_m"].to_numpy(), equal_nan=True), name
+    path.write_bytes(kept)
+    rows, numbers, told = live(parts["late"], tmp_path, "late", "--state", str(path))
+    late, _, _ = live(parts["late"], tmp_path, "late alone")
+    assert "not used but for ephemerides and the sequence number: its last epoch is 120.1 s before" in told
+    assert numbers[0] == SPLIT + 1
+    assert np.array_equal(rows["chainage_m"].to_numpy(), late["chainage_m"].to_numpy(), equal_nan=True)
+    path.write_bytes(kept)
+    _, _, told = live(parts["first"], tmp_path, "again", "--state", str(path))
+    assert "its last epoch is -2.9 s before the first new one, 0 to 60 s (state_age_s) were allowed" in told
+
+
+class Evil:
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        import os
+
+        return os.system, ("echo evil",)
+
+
+def test_only_values_of_the_package_are_read(tmp_path: Path) -> None:
+    """A file with a valid head whose content would run a program."""
+    import hashlib
+
+    path, under = tmp_path / "state", {"settings": "x"}
+    saved = SavedSession(engine=EngineState(state=State(), done_ns=1, last_tag={}, sequence=1), streams={})
+    write_state(path, saved, under)
+    assert load_state(path, under).session == saved
+    content = pickle.dumps(Evil())
+    head = {"form": "railfix live state 1", **under, "bytes": len(content)}
+    head["sha256"] = hashlib.sha256(content).hexdigest()
+    path.write_bytes(json.dumps(head).encode() + b"\n" + content)
+    loaded = load_state(path, under)
+    assert loaded.session is None
+    assert "is no part of a state" in loaded.outcome
+
+
+def test_everything_that_positions_depend_on_is_in_the_hash(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.write_text("1")
+    first = belongs_to({"track 0": file}, {"settings": railfix.Config()}, ("front",))
+    file.write_text("2")
+    second = belongs_to({"track 0": file}, {"settings": railfix.Config(min_satellites=4)}, ("front", "rear"))
+    assert {name for name in first if first[name] != second[name]} == {"track 0", "settings", "antennas"}
