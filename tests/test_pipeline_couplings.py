@@ -14,10 +14,12 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.integrity.raim import Outcome
-from railfix.pipeline import fault_exclusion
+from railfix.pipeline import fault_exclusion, solution
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
+from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.robust_fit import RobustFit
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 
 #: Forty epochs in the open, and the satellite that gets a fault.
@@ -109,6 +111,52 @@ def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.Mo
     assert solved
     assert (found.raim.outcome[::2] == Outcome.UNRESOLVED).all()
     assert (found.raim.outcome[1::2] == Outcome.EXCLUDED_ONE).all()
+
+
+def faults(*sizes_m: float) -> np.ndarray:
+    """Errors of as many satellites as sizes, the one of `used_satellite` first."""
+    good = np.flatnonzero((FAULTY.reason == 0).all(axis=0)).tolist()
+    channels = [used_satellite(), *(c for c in good if c != used_satellite())]
+    change = np.zeros(FRONT.code_m.shape)
+    for channel, size in zip(channels, sizes_m, strict=False):
+        change[:, channel] = size
+    return change
+
+
+@pytest.mark.requirement("B4")
+def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two that disagree with the rest the rest can be faulty: nothing is excluded, and a check has failed."""
+    observations, original = with_code(FRONT, faults(60.0, 90.0)), solution.robust_fit
+    believed = front_alone(observations, BASE)
+    assert (believed.raim.outcome == Outcome.EXCLUDED_TWO).all()
+
+    def keeps_all(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
+        return replace(original(ranges, *args, **options), kept=ranges.weight > 0)
+
+    monkeypatch.setattr(solution, "robust_fit", keeps_all)
+    doubted = front_alone(observations, BASE)
+    assert (doubted.raim.outcome == Outcome.UNRESOLVED).all()
+    assert (doubted.status == Status.INCONSISTENT).all()
+    assert not doubted.raim.excluded.any()
+    fixed = front_alone(observations, BASE | {"raim": {"mode": "fixed", "fixed_limit_m2": 100.0}})
+    assert (fixed.raim.outcome == Outcome.EXCLUDED_TWO).all()
+
+
+@pytest.mark.requirement("B4")
+def test_an_unresolved_fault_leaves_the_ranges_of_the_robust_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three faults are more than RAIM excludes: the position is that of the rest, and its status a failed check."""
+    change, original = faults(60.0, 90.0, 130.0), solution.robust_fit
+    faulty = (change != 0)[:, FAULTY.columns]
+
+    def rejects_them(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
+        return replace(original(ranges, *args, **options), kept=(ranges.weight > 0) & ~faulty)
+
+    monkeypatch.setattr(solution, "robust_fit", rejects_them)
+    found = front_alone(with_code(FRONT, change), BASE | {"noise_scale": {"prior": 1e6}})
+    assert (found.raim.outcome == Outcome.UNRESOLVED).all()
+    assert (found.status == Status.INCONSISTENT).all()
+    assert np.array_equal(found.raim.excluded[:, FAULTY.columns], faulty)
+    assert np.abs(found.chainage_m - FAULTY.chainage_m).max() < 3.0
 
 
 @pytest.mark.requirement("B3")

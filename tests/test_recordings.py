@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import integrity_tables
 import recordings_score
 from railfix.evaluate import Score, along_track_error, interpolate_reference
 from railfix.io.position_log import read_positions
@@ -103,6 +104,33 @@ def test_screens_reach_their_figures(recordings: Path, name, setting, rate, p50_
     hold(outcome.constrained, rate=rate, p50_m=p50_m, p95_m=p95_m, wrong_place=wrong_place)
     if name == "urbannav_f9p":
         assert outcome.constrained.max_m < 20.0
+
+
+@pytest.mark.requirement("B4")
+@pytest.mark.parametrize("name", sorted(recordings_score.RECORDINGS))
+def test_all_screens_are_no_worse_than_none(recordings: Path, name: str):
+    """95th percentile, largest error and wrong places, by straight distance on the map."""
+    run = recordings_score.RECORDINGS[name]
+    none, every = run(recordings, recordings_score.SETTINGS), run(recordings, CONFIGURATIONS["kept"])
+    assert none.straight is not None
+    assert every.straight is not None
+    assert every.straight.p95_m <= none.straight.p95_m
+    assert every.straight.max_m <= none.straight.max_m
+    assert every.constrained.wrong_place <= none.constrained.wrong_place
+
+
+@pytest.mark.requirement("C3")
+@pytest.mark.parametrize("name", ["F9P", "M8T", "Pixel", "Japan"])
+def test_stated_sigmas_hold_in_a_straight_line(recordings: Path, name: str):
+    """Errors to the place on the map, other passes of the course included, over the stated sigma."""
+    assert recordings.is_dir()
+    case = integrity_tables.cases()[name]
+    result = case.solved()
+    error, _ = case.errors(result)
+    known = np.isfinite(error)
+    p68, p95 = np.percentile(error[known] / result.along_sigma_m[known], [68, 95])
+    assert 0.8 <= p68 <= 1.2
+    assert p95 <= 2.4
 
 
 @pytest.mark.requirement("B4")

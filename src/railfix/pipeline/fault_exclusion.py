@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.raim import (
     Exclusion,
     LinearModel,
@@ -33,11 +33,16 @@ def fault_free(
     index: SearchIndex,
     place: Place,
     scale: Floats,
+    agreeing: Masks,
     config: Config,
     *,
     predicted: PredictedPlace | None = None,
 ) -> tuple[Ranges, Place, RaimResult]:
     """Return ranges and positions without the satellites that RAIM excludes, and its verdict on each epoch.
+
+    Of two satellites that disagree with the rest, the rest can be the faulty ones: a pair of which the robust fit of
+    the epoch keeps a range is not believed. Where a fault stays unresolved, the position is that of the ranges
+    that the robust fit keeps; its status says that a check has failed.
 
     Parameters
     ----------
@@ -48,6 +53,8 @@ def fault_free(
         Positions from these ranges.
     scale : ndarray, shape (T,)
         Noise scale of the receiver.
+    agreeing : ndarray of bool, shape (T, K)
+        Ranges that the robust fit on the line keeps.
     config : Config
         Where "raim" is not among its screens nothing is tested.
     predicted : PredictedPlace, optional
@@ -75,6 +82,8 @@ def fault_free(
         epochs = failing[unresolved]
         second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config, predicted)
         raim = _with_exclusion(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
+    if limits.mode == "chi_square":
+        raim = _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
     changed = failing[raim.excluded[failing].any(axis=1)]
     if not len(changed):
         return ranges, place, raim
@@ -93,6 +102,27 @@ def fault_free(
         constrained=patched(place.constrained, changed, solved.constrained),
     )
     return ranges, place, replace(raim, outcome=_put(raim.outcome, changed, outcome))
+
+
+def _by_robust_fit(
+    raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int
+) -> RaimResult:
+    """Return the result with the ranges that the robust fit rejects excluded where no exclusion is believed."""
+    pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
+    contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
+    unresolved = contradicted | (raim.outcome[failing] == Outcome.UNRESOLVED)
+    epochs = failing[unresolved]
+    if not len(epochs):
+        return raim
+    rejected = (ranges.weight[epochs] > 0) & ~agreeing[epochs]
+    rest = without(ranges.take(epochs), rejected)
+    rejected &= (redundancy_of(rest) >= min_redundancy)[:, None]
+    return replace(
+        raim,
+        outcome=_put(raim.outcome, epochs, np.full(len(epochs), Outcome.UNRESOLVED, dtype=np.int8)),
+        excluded=_put(raim.excluded, epochs, rejected),
+        own_error_m=_put(raim.own_error_m, epochs, np.full(rejected.shape, np.nan)),
+    )
 
 
 def _put(array: NDArray[Any], rows: Indices, values: NDArray[Any]) -> NDArray[Any]:

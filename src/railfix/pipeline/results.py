@@ -137,7 +137,7 @@ class AntennaResult(NotebookTable):
         antenna's trajectory. NaN where the status has no position.
     along_sigma_m : ndarray, shape (T,) [m]
         Standard deviation along the line: noise by the weights, the residuals of the window and those of the epoch
-        itself; satellites and atmosphere; the map error.
+        itself; satellites and atmosphere; the map error; and the distance to an open other place, by its probability.
     own_sigma_m : ndarray, shape (T,) [m]
         Single-epoch sigma: standard deviation along the line from the codes of the epoch alone, with the larger of
         the receiver's noise and the noise of these residuals, widened by Student's t where few ranges are

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, expit
 
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.constants import CLOCK_GROUP
@@ -22,6 +22,7 @@ from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
 from railfix.positioning.carrier import PhasePositions
+from railfix.positioning.constrained import constrained_position
 from railfix.positioning.intersystem_bias import tie_clocks
 from railfix.positioning.map_offset import MapOffset, beyond_threshold, map_offset
 from railfix.positioning.noise_scale import (
@@ -33,7 +34,7 @@ from railfix.positioning.noise_scale import (
     stated_scale,
 )
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
-from railfix.positioning.robust_fit import map_information, robust_fit
+from railfix.positioning.robust_fit import RobustFit, map_information, robust_fit
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
 from railfix.track.trajectory import Trajectory
@@ -109,8 +110,8 @@ def solve(
         tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = place_on_line(ranges, index, tied, config, predicted=predicted)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
-    robust, robust_sums = _robust_scale(corrected, ranges, trajectory, place, config, state)
-    ranges, place, raim = fault_free(ranges, index, place, robust, config, predicted=predicted)
+    robust, robust_sums, on_line = _robust_scale(corrected, ranges, trajectory, place, config, state)
+    ranges, place, raim = fault_free(ranges, index, place, robust, on_line.kept, config, predicted=predicted)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     off_map = _off_map(ranges, trajectory, place, constrained.arc_m, config)
     teaching = ~off_map & ~np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE])
@@ -154,6 +155,7 @@ def solve(
         arc, exact, total, variance = phase.arc_m, phase.noise_sigma_m, phase.sigma_m, scale**2
     along_sigma = np.sqrt(variance * exact**2 + (total**2 - exact**2) + nominal)
     judged = own_sigma if phase is None else along_sigma
+    along_sigma = np.sqrt(along_sigma**2 + _other_place_m2(ranges, trajectory, place, arc, config))
     if phase is not None:
         off_map = _off_map(ranges, trajectory, place, arc, config)
     solution = Solution(
@@ -209,15 +211,15 @@ def _robust_scale(
     place: Place,
     config: Config,
     state: AntennaState,
-) -> tuple[Floats, Floats]:
-    """Return the noise scale that RAIM tests with, and its new sums."""
+) -> tuple[Floats, Floats, RobustFit]:
+    """Return the noise scale that RAIM tests with, its new sums, and the robust fit on the line that it comes from."""
     arc, section = place.constrained.arc_m, np.maximum(place.constrained.section, 0)
     known = np.isfinite(arc)
     at = np.where(known[:, None], trajectory.at_arc(np.where(known, arc, 0.0)), corrected.anchor_ecef_m)
     fit = robust_fit(ranges, at, information=map_information(trajectory, section), limits=config.robust_fit)
     teaching = known & ~_off_map(ranges, trajectory, place, arc, config)
     scale, sums = robust_scale(corrected.time, fit, teaching, state.noise, limits=config.noise_scale)
-    return np.maximum(scale, _least_scale(config)), sums
+    return np.maximum(scale, _least_scale(config)), sums, fit
 
 
 def _least_scale(config: Config) -> float:
@@ -231,6 +233,23 @@ def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config:
         return np.zeros(len(model))
     share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.nan_to_num(corrected.nominal_m), 0.0)
     return np.asarray((share**2).sum(axis=1))
+
+
+def _other_place_m2(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, config: Config) -> Floats:
+    """Return the mean square distance to the best other place of ambiguous epochs, shape (T,).
+
+    The other place fits worse by the excess x, so that it is the true one with the probability ``1/(1 + exp(x/2))``
+    (normal likelihoods, neither place likelier beforehand).
+    """
+    section, square = place.section, np.zeros(len(ranges))
+    open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
+    rows = np.flatnonzero(open_ones)
+    if not len(rows):
+        return square
+    other = constrained_position(ranges.take(rows), trajectory, section.other_vertex[rows], limits=config.constrained)
+    apart = trajectory.at_arc(other.arc_m) - trajectory.at_arc(arc[rows])
+    square[rows] = np.nan_to_num((apart**2).sum(axis=1)) * expit(-section.excess[rows] / 2.0)
+    return square
 
 
 @lru_cache

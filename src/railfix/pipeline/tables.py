@@ -53,7 +53,7 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "status": "see `railfix.core.reasons.Status`",
     "chainage_m": "distance along the line from the first point of the track",
     "kilometrage_m": "the line's own marking, where the track has one",
-    "along_sigma_m": "standard deviation along the line",
+    "along_sigma_m": "standard deviation along the line; with the other place of an ambiguous epoch by its probability",
     "own_sigma_m": "single-epoch sigma: standard deviation from the codes of the epoch alone; "
     "`uncertain` above its limit",
     "latitude_deg": "antenna, WGS 84",
