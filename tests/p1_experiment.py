@@ -6,6 +6,7 @@ Run ``python tests/p1_experiment.py PART`` for the tables of docs/p1-results.md,
 short      the first two minutes of that, in seconds
 commercial 145.2 km of the scenario p1-commercial: every configuration beside P1
 others     the same on lines and places of five other seeds
+filtered   the filter along the track on the lines of "commercial", without sensors and with tachometer and inertial unit
 test-line  figures 7 and 8 and table 4
 static     two and three satellites, standing at many points of the test line
 ========== =====================================================================
@@ -77,6 +78,13 @@ WAYS: Final = (
     Way("default, ok", DEFAULT, "ok"),
     Way("strict", DEFAULT, "checked", largest_sigma_m=10.0),
     Way("strict, ok", DEFAULT, "ok", largest_sigma_m=10.0),
+)
+#: The filter along the track beside the conventional position.
+FILTERED: Final = {"preset": "default", "filter": "track"}
+FILTER_WAYS: Final = (
+    WAYS[0],
+    Way("filter", FILTERED, "filtered"),
+    Way("filter, wheel, inertial", FILTERED, "filtered", sensors=True),
 )
 _NONE: Final = (Status.TOO_FEW_SATELLITES, Status.UNOBSERVABLE, Status.NO_CONVERGENCE, Status.NO_OBSERVATION)
 #: Large errors this near in time are one line of the list [epochs].
@@ -280,15 +288,19 @@ def extent(campaign: Campaign) -> str:
     return f"{len(fronts)} runs, {km:.1f} km, {epochs} epochs of two antennas, {observed} of them observed"
 
 
-def commercial(folder: Path, runs: Sequence[int] = (0, 1, 2, 3), seed: int | None = None) -> Campaign:
+def commercial(
+    folder: Path, runs: Sequence[int] = (0, 1, 2, 3), seed: int | None = None, ways: Sequence[Way] = WAYS
+) -> Campaign:
     """The scenario p1-commercial, or its runs on another line and place."""
     curve, recipe = cn0_curve(folder), load_recipe("p1-commercial")
     campaigns = []
     for number in runs:
         other = {} if seed is None else {"seed": seed, "place_seed": seed, "line": {"generated": {"seed": seed}}}
-        scenario = recipe.scenario(number, changes=other).replaced(sensors=None)
+        scenario = recipe.scenario(number, changes=other)
+        if not any(way.sensors for way in ways):
+            scenario = scenario.replaced(sensors=None)
         name = recipe.names[number] if seed is None else f"seed-{seed}"
-        campaigns.append(ridden(Bench(scenario, name, WAYS, SYSTEMS, curve)))
+        campaigns.append(ridden(Bench(scenario, name, ways, SYSTEMS, curve)))
     return together(campaigns)
 
 
@@ -334,6 +346,37 @@ def others_report(folder: Path) -> Iterator[str]:
     yield from commercial_report(together(campaigns))
 
 
+def filtered_report(folder: Path) -> Iterator[str]:
+    """The filter along the track beside the conventional position, line by line as each is done."""
+    campaigns = []
+    for number in range(4):
+        campaigns.append(commercial(folder, (number,), ways=FILTER_WAYS))
+        yield ""
+        yield extent(campaigns[-1])
+        yield from main_table(campaigns[-1], everywhere)
+    campaign = together(campaigns)
+    yield "\nall lines"
+    yield extent(campaign)
+    yield from main_table(campaign, everywhere)
+    yield "\nways without tunnels"
+    yield from main_table(campaign, without_tunnels)
+    yield "\nbeyond the portals: epochs without observations"
+    yield from unobserved_lines(campaign)
+    for way in FILTER_WAYS[1:]:
+        yield from breaking_lines(campaign, way.name)
+
+
+def unobserved_lines(campaign: Campaign) -> Iterator[str]:
+    """Errors of the filter at epochs without observations."""
+    for (letters, way), found in campaign.found.items():
+        pairs = zip(campaign.passages, found, strict=True)
+        error = np.concatenate([f.error_m[~p.observed] for p, f in pairs])
+        size = np.abs(error[np.isfinite(error)])
+        if len(size):
+            p50, p95 = np.quantile(size, (0.5, 0.95))
+            yield f"{'+'.join(letters):7s} {way:24s}{len(size):7d} epochs: {p50:.2f} / {p95:.2f} / {size.max():.2f} m"
+
+
 def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
     """Every epoch of 10 m and more of a way, and what it is made of; of many together in time the largest."""
     for letters in SYSTEMS:
@@ -376,6 +419,8 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from commercial_report(commercial(folder))
     elif part == "short":
         yield from short_report(folder)
+    elif part == "filtered":
+        yield from filtered_report(folder)
     elif part == "others":
         yield from others_report(folder)
     elif part == "test-line":
@@ -384,7 +429,7 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from static_report()
 
 
-PARTS: Final = ("short", "commercial", "others", "test-line", "static")
+PARTS: Final = ("short", "commercial", "others", "filtered", "test-line", "static")
 
 
 def main(arguments: Sequence[str]) -> int:

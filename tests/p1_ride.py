@@ -14,14 +14,18 @@ import numpy as np
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers, Masks, Strings
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.core.settings import write_toml
+from railfix.motion.samples import SensorSamples
+from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult, EpochProcessor, State
 from railfix.ranges.cn0_curve import Cn0Samples, fit_cn0_curve, write_cn0_curve
 from railfix.run.processor import processor_of
+from railfix.run.sensors import read_sensors, until
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario import ANTENNAS, RunSettings
 from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.sensors.tables import sensor_tables
 from railfix.simulate.signals import Piece
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
@@ -40,17 +44,25 @@ class Way:
     name : str
     settings : mapping
         Of the run.
-    positions : {"conventional", "constrained", "checked", "ok"}
+    positions : {"conventional", "constrained", "checked", "ok", "filtered"}
         Which of its positions: 3-D at the nearest point of the line; on the line; of these the ones that no check
-        failed (``failed_checks = "drop"``); those of status ok alone.
+        failed (``failed_checks = "drop"``); those of status ok alone; those of the filter along the track.
     largest_sigma_m : float
         As `Config.largest_sigma_m` with failed checks dropped, put upon the results of a run with a wider limit.
+    sensors : bool
+        Whether the filter gets the tachometer and the inertial unit of the scenario.
     """
 
     name: str
     settings: Mapping[str, Any]
-    positions: Literal["conventional", "constrained", "checked", "ok"] = "constrained"
+    positions: Literal["conventional", "constrained", "checked", "ok", "filtered"] = "constrained"
     largest_sigma_m: float = np.inf
+    sensors: bool = False
+
+    @property
+    def key(self) -> str:
+        """Ways alike in it are looked at in one run."""
+        return repr((self.settings, self.sensors))
 
 
 @cache
@@ -151,17 +163,22 @@ class Bench:
             vehicle = read_vehicle(path)
         self.trajectories = {a: antenna_trajectory(track, vehicle, a) for a in ANTENNAS}
         self.ways, self.systems = ways, systems
+        self.sensors = samples_of(self.simulation) if any(way.sensors for way in ways) else SensorSamples()
         #: One processor for settings that are the same, whichever of their results is looked at.
         self.processors: dict[tuple[str, str], EpochProcessor] = {}
         for letters in systems:
             for way in ways:
                 common = {"systems": list(letters), "protection": "off", "cn0_curve": curve and str(curve)}
                 settings = {**way.settings, **common}
-                key = (letters, repr(way.settings))
+                key = (letters, way.key)
                 if key not in self.processors:
                     self.processors[key] = processor_of(
                         parse_config(settings), self.simulation.navigation, self.trajectories
                     )
+
+    def sensing(self, words: str) -> bool:
+        """Whether the ways of a key have sensors."""
+        return any(way.key == words and way.sensors for way in self.ways)
 
     def pieces(self) -> Iterator[dict[str, Piece]]:
         """Pieces of both antennas together."""
@@ -173,6 +190,16 @@ class Bench:
         return np.interp(piece.geometry.chainage_m, self.sampled, self.mapped)
 
 
+def samples_of(simulation: Simulation) -> SensorSamples:
+    """Samples of the tachometer and the inertial unit of a run."""
+    with tempfile.TemporaryDirectory() as folder:
+        tables = sensor_tables(simulation)
+        paths = {name: Path(folder) / f"{name}.parquet" for name in ("tachometer", "inertial")}
+        for name, path in paths.items():
+            tables[name].write_parquet(path)
+        return read_sensors(**paths)
+
+
 def ridden(bench: Bench) -> Campaign:
     """One run: every way of every choice of systems, both antennas."""
     states: dict[tuple[str, str], State | None] = dict.fromkeys(bench.processors)
@@ -180,7 +207,10 @@ def ridden(bench: Bench) -> Campaign:
     parts: dict[tuple[str, str, str], list[Found]] = {}
     breaking: dict[tuple[str, str], list[Breaking]] = {}
     before = 0
+    received = np.datetime64("NaT", "ns")
     for piece in bench.pieces():
+        end = max(p.observations.time[-1] for p in piece.values())
+        since, received = until(bench.sensors, received, end), end
         for antenna, one in piece.items():
             geometry = one.geometry
             truths[antenna].append(
@@ -197,13 +227,14 @@ def ridden(bench: Bench) -> Campaign:
             )
         for (letters, words), processor in bench.processors.items():
             observations = {a: p.observations for a, p in piece.items()}
-            result, states[letters, words] = processor.process(observations, states[letters, words])
+            sensors = since if bench.sensing(words) else None
+            result, states[letters, words] = processor.process(observations, states[letters, words], sensors=sensors)
             for way in bench.ways:
-                if repr(way.settings) != words:
+                if way.key != words:
                     continue
                 for index, antenna in enumerate(ANTENNAS):
                     got, truth = result.antennas[antenna], truths[antenna][-1]
-                    found = of_result(way, got, truth)
+                    found = of_result(way, got, truth, result.fusion.get(antenna))
                     parts.setdefault((letters, way.name, antenna), []).append(found)
                     large = np.flatnonzero(np.abs(found.error_m) >= LARGE_M)
                     breaking.setdefault((letters, way.name), []).extend(
@@ -221,11 +252,14 @@ def ridden(bench: Bench) -> Campaign:
     )
 
 
-def of_result(way: Way, got: AntennaResult, truth: Passage) -> Found:
+def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | None) -> Found:
     """Errors of one way out of a result."""
     conventional = way.positions == "conventional"
     chainage = got.conventional_chainage_m if conventional else got.chainage_m
     place = got.conventional_ecef_m if conventional else got.ecef_m
+    if way.positions == "filtered":
+        assert track is not None
+        chainage, place = track.chainage_m, track.ecef_m
     kept = np.ones(len(chainage), dtype=np.bool_)
     if way.positions == "checked":
         kept = ~np.isin(got.status, CHECK_FAILED)
