@@ -6,7 +6,7 @@ Run ``python tests/p1_experiment.py PART`` for the tables of docs/p1-results.md,
 short      the first two minutes of that, in seconds
 commercial 145.2 km of the scenario p1-commercial: every configuration beside P1
 others     the same on lines and places of five other seeds
-filtered   the filter along the track on the lines of "commercial", without sensors and with tachometer and inertial unit
+filtered   the filter along the track on the lines of "commercial", without sensors and with two
 test-line  figures 7 and 8 and table 4
 static     two and three satellites, standing at many points of the test line
 ========== =====================================================================

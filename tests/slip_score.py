@@ -58,7 +58,7 @@ def main() -> int:
         )
     ]
     for rule in ("p2", "map"):
-        found = find_slips(
+        found, _ = find_slips(
             t,
             speed.speed_mps,
             acceleration,

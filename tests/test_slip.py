@@ -25,7 +25,7 @@ class Motion:
         acceleration = np.gradient(self.wheel, self.time_s)
         return find_slips(
             self.time_s, self.wheel, acceleration, self.force, self.sine, limits=SlipLimits.model_validate(limits)
-        )
+        )[0]
 
 
 def motion(
@@ -102,7 +102,7 @@ def test_rolling_away_on_a_gradient_is_found_below_walking_speed(permille: float
     free = t > 6.0
     force = np.where(free, 0.0, GRAVITY_MPS2 * sine)
     wheel = np.where(t < 0.5, 0.0, np.nan)
-    found = find_slips(t, wheel, np.zeros(len(t)), force, np.full(len(t), sine))
+    found, _ = find_slips(t, wheel, np.zeros(len(t)), force, np.full(len(t), sine))
     rolling = np.flatnonzero(found.state == MotionState.ROLLING)
     assert (found.state[(t > 2.0) & (t < 6.0)] == MotionState.STANDING).all()
     assert len(rolling)

@@ -140,3 +140,6 @@ class SensorSamples:
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
+
+    def __bool__(self) -> bool:
+        return any(len(getattr(self, sensor.name)) > 0 for sensor in fields(self))

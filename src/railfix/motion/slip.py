@@ -9,13 +9,18 @@ one that no line has. Two rules:
 * ``"map"``: against the gradient of the line at the present place, with a latch: once found, a slip ends only when
   the wheel has come back to the speed carried by inertia and the pitch fits.
 
-While a slip lasts, speed and way come from the accelerometer less the gradient and its offset, which is learnt while
+While a slip lasts, speed and way come from the accelerometer less the pitch and its offset, which is learnt while
 the wheel rolls; they start `look_back_s` before the detection, for the wheel was off already then.
+
+The pitch is that of the line at the present place where it is known. With a gyro it is the integral of the pitch rate,
+which follows the line slowly and so has the swings of the body on its suspension too; without the line it follows
+the pitch by wheel and accelerometer, and the difference of the two is due to the gyro's bias (P2 2.1(3)).
 """
 
 from __future__ import annotations
 
 from collections import deque
+from copy import copy
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
@@ -77,6 +82,9 @@ class SlipLimits(Settings):
         Time constant with which the accelerometer's offset is learnt while the wheel rolls.
     standing_s : float
         Time without a pulse after which a vehicle at rest stands.
+    pitch_s, bias_s : float
+        Time constants with which the pitch by the gyro follows that of the line (or, without a line, that by wheel and
+        accelerometer), and with which the gyro's bias is learnt from their difference.
     rolling_limit, rolling_s, rolling_mps : float
         Change of the apparent pitch at standstill, its duration, and the speed carried by then, that mean rolling away.
     """
@@ -93,6 +101,8 @@ class SlipLimits(Settings):
     smoothing_s: float = Field(default=0.2, gt=0)
     offset_s: float = Field(default=60.0, gt=0)
     standing_s: float = Field(default=1.0, gt=0)
+    pitch_s: float = Field(default=20.0, gt=0)
+    bias_s: float = Field(default=200.0, gt=0)
     rolling_limit: float = Field(default=0.002, gt=0)
     rolling_s: float = Field(default=0.3, gt=0)
     rolling_mps: float = Field(default=0.05, gt=0)
@@ -111,7 +121,13 @@ class SlipResult:
     way_m : ndarray, shape (N,) [m]
         Integral of the speed from the first sample, each slip corrected from its look-back on.
     metric : ndarray, shape (N,)
-        Sine of the pitch by wheel and accelerometer less that of the line; NaN without pulses.
+        Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses.
+    smooth : ndarray, shape (N,)
+        Mean of the metric over `SlipLimits.smoothing_s`, the accelerometer's offset taken off: what is compared.
+    pitch : ndarray, shape (N,)
+        Sine of the reference pitch; NaN before it is known.
+    gyro_bias_radps : ndarray, shape (N,) [rad/s]
+        Of the pitch rate, as learnt; 0 without a gyro.
     offset_mps2 : ndarray, shape (N,) [m/s2]
         Of the accelerometer, as learnt.
     """
@@ -120,7 +136,42 @@ class SlipResult:
     speed_mps: Floats
     way_m: Floats
     metric: Floats
+    smooth: Floats
+    pitch: Floats
+    gyro_bias_radps: Floats
     offset_mps2: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipState:
+    """What one call of `find_slips` leaves to the next.
+
+    Attributes
+    ----------
+    time_s : float [s]
+        Of the last sample.
+    automaton : _Automaton
+    """
+
+    time_s: float
+    automaton: _Automaton
+
+
+def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
+    """Return the rate of the pitch from body rates, the roll in curves taken out, shape (N,) [rad/s].
+
+    The body leans with the cant, so its pitch axis sees a part of the yaw rate: ``w_y cos(phi) - w_z sin(phi)`` with
+    ``sin(phi) = (v w_z - f_y) / g``. Raw it would be wrong by 3.4 mrad/s in a curve of 400 m at 17 m/s.
+
+    Parameters
+    ----------
+    force_mps2, rate_radps : ndarray, shape (N, 3)
+        Forward, right, down (`railfix.motion.samples.InertialSamples`).
+    speed_mps : ndarray, shape (N,) [m/s]
+        Forward.
+    """
+    sine = np.clip((speed_mps * rate_radps[:, 2] - force_mps2[:, 1]) / GRAVITY_MPS2, -0.5, 0.5)
+    return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
 
 
 def find_slips(
@@ -130,8 +181,11 @@ def find_slips(
     force_mps2: Floats,
     line_sine: Floats,
     *,
+    pitch_rate: Floats | None = None,
+    since_pulse_s: Floats | None = None,
     limits: SlipLimits | None = None,
-) -> SlipResult:
+    state: SlipState | None = None,
+) -> tuple[SlipResult, SlipState | None]:
     """Return the state of the motion, its speed and way, each sample from itself and earlier ones.
 
     Parameters
@@ -143,21 +197,50 @@ def find_slips(
     force_mps2 : ndarray, shape (N,) [m/s2]
         Specific force along the vehicle.
     line_sine : ndarray, shape (N,)
-        Sine of the line's gradient at the vehicle, + up in the direction of travel; the pitch last known without a map.
+        Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known.
+    pitch_rate : ndarray, shape (N,), optional [rad/s]
+        `pitch_rate_radps`; NaN where there is none.
+    since_pulse_s : ndarray, shape (N,), optional [s]
+        Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed.
     limits : SlipLimits, optional
+    state : SlipState, optional
+        Left by the samples before.
+
+    Returns
+    -------
+    SlipResult
+    SlipState or None
+        To pass on with the next samples; None where there is no sample so far.
     """
     limits = limits or SlipLimits()
     size = len(time_s)
-    state = np.zeros(size, dtype=np.int8)
-    speed, metric, offsets = np.full(size, np.nan), np.full(size, np.nan), np.zeros(size)
-    way = np.zeros(size)
-    automaton = _Automaton(limits)
-    for k in range(size):
-        dt = float(time_s[k] - time_s[k - 1]) if k else 0.0
-        automaton.step(dt, float(wheel_mps[k]), float(wheel_mps2[k]), float(force_mps2[k]), float(line_sine[k]))
-        state[k], speed[k], metric[k] = automaton.state, automaton.speed, automaton.metric
-        way[k], offsets[k] = automaton.way, automaton.offset
-    return SlipResult(state=state, speed_mps=speed, way_m=way, metric=metric, offset_mps2=offsets)
+    if not size:
+        empty = np.empty(0)
+        return SlipResult(
+            state=np.empty(0, dtype=np.int8), speed_mps=empty, way_m=empty, metric=empty, smooth=empty, pitch=empty,
+            gyro_bias_radps=empty, offset_mps2=empty,
+        ), state  # fmt: skip
+    automaton = _Automaton(limits) if state is None else state.automaton.copied(limits)
+    steps = np.diff(time_s, prepend=time_s[0] if state is None else state.time_s).tolist()
+    rates = np.full(size, np.nan) if pitch_rate is None else pitch_rate
+    since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
+    columns = (wheel_mps, wheel_mps2, force_mps2, line_sine, rates, since)
+    rows = np.empty((size, 8))
+    for k, (dt, *values) in enumerate(zip(steps, *(column.tolist() for column in columns), strict=True)):
+        automaton.step(dt, *values)
+        rows[k] = automaton.row()
+    states, speed, way, metric, smooth, pitch, bias, offset = rows.T
+    result = SlipResult(
+        state=states.astype(np.int8),
+        speed_mps=speed,
+        way_m=way,
+        metric=metric,
+        smooth=smooth,
+        pitch=pitch,
+        gyro_bias_radps=bias,
+        offset_mps2=offset,
+    )
+    return result, SlipState(time_s=float(time_s[-1]), automaton=automaton)
 
 
 class _Automaton:
@@ -167,23 +250,45 @@ class _Automaton:
         self.limits = limits
         self.state = MotionState.INIT
         self.speed, self.way, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
-        self._smooth = 0.0
+        self.pitch, self.bias = float("nan"), 0.0
+        self._smooth, self._limit = 0.0, limits.map_limit
         self._over = self._fits = self._silent = self._carried = self._apart = self._age = 0.0
         self._rest = float("nan")
         #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
 
-    def step(self, dt: float, wheel: float, acceleration: float, force: float, sine: float) -> None:
+    def copied(self, limits: SlipLimits) -> _Automaton:
+        """The same with numbers of its own: states handed on stay as they are."""
+        other = copy(self)
+        other.limits, other._past = limits, self._past.copy()
+        return other
+
+    def row(self) -> tuple[float, ...]:
+        """Values of `SlipResult` at the last sample."""
+        return (
+            self.state, self.speed, self.way, self.metric, self._smooth, self.pitch, self.bias, self.offset,
+        )  # fmt: skip
+
+    def step(
+        self, dt: float, wheel: float, acceleration: float, force: float, sine: float, rate: float, since: float
+    ) -> None:
         limits, heard = self.limits, wheel == wheel
-        inertial = force - GRAVITY_MPS2 * sine - self.offset
         self._age += dt
         self._silent = 0.0 if heard else self._silent + dt
-        if heard and acceleration == acceleration:
-            self.metric = (force - acceleration) / GRAVITY_MPS2 - sine
+        if since == since:
+            self._silent = since
+        measured = heard and acceleration == acceleration
+        by_wheel = (force - acceleration - self.offset) / GRAVITY_MPS2 if measured else float("nan")
+        rolls = self.state == MotionState.NORMAL and self._over == 0.0
+        self._follow(dt, sine, by_wheel if rolls or self.pitch != self.pitch else float("nan"), rate)
+        reference = self.pitch
+        inertial = force - GRAVITY_MPS2 * reference - self.offset
+        self.metric = (force - acceleration) / GRAVITY_MPS2 - reference if measured else float("nan")
+        if self.metric == self.metric:
             share = min(dt / limits.smoothing_s, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
-        else:
-            self.metric = float("nan")
+        # A held pitch is that of some place behind.
+        self._limit = limits.map_limit if sine == sine or rate == rate else limits.p2_limit
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
             self._carry(dt, inertial)
             self._release(dt, wheel, heard=heard)
@@ -194,6 +299,25 @@ class _Automaton:
         if self.speed == self.speed:
             self.way += self.speed * dt
         self._past.append((self._age, self.speed, inertial))
+
+    def _follow(self, dt: float, sine: float, by_wheel: float, rate: float) -> None:
+        """The reference pitch: the line's, with the gyro what is fast; without a line that by the wheel, slowly."""
+        limits, known = self.limits, sine == sine
+        target = sine if known else by_wheel
+        if self.pitch != self.pitch:
+            self.pitch = target
+            return
+        turning = rate == rate
+        if turning:
+            self.pitch += (rate - self.bias) * dt
+        elif known:
+            self.pitch = sine
+            return
+        if target == target:
+            gap = target - self.pitch
+            self.pitch += min(dt / limits.pitch_s, 1.0) * gap
+            if turning:
+                self.bias -= gap * dt / (limits.pitch_s * limits.bias_s)
 
     def _carry(self, dt: float, inertial: float) -> None:
         self.speed += inertial * dt
@@ -210,7 +334,7 @@ class _Automaton:
                 self.state, self.speed = MotionState.NORMAL, wheel
             return
         near = max(limits.latch_mps, limits.latch_share * abs(self.speed))
-        fits = heard and abs(wheel - self.speed) < near and abs(self._smooth) < limits.map_limit
+        fits = heard and abs(wheel - self.speed) < near and abs(self._smooth) < self._limit
         self._fits = self._fits + dt if fits else 0.0
         if self._fits >= limits.latch_s:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
@@ -221,13 +345,13 @@ class _Automaton:
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")
         if limits.rule == "p2":
-            over = acceleration == acceleration and abs(self.metric + sine) > limits.p2_limit
-            value = self.metric + sine
+            value = self.metric + self.pitch
+            over = acceleration == acceleration and abs(value) > limits.p2_limit
         else:
-            over, value = abs(self._smooth) > limits.map_limit, self._smooth
+            over, value = abs(self._smooth) > self._limit, self._smooth
         self._over = self._over + dt if over else 0.0
         self.speed = wheel
-        if not over:
+        if not over and sine == sine:
             share = min(dt / limits.offset_s, 1.0)
             self.offset += share * GRAVITY_MPS2 * self._smooth
         if self._over > 0.0 and self._over >= limits.confirm_s:
@@ -261,6 +385,8 @@ class _Automaton:
             self._carried += dt
         if self.state in (MotionState.STANDING, MotionState.ROLLING):
             self._watch(dt, force)
+        elif self.state == MotionState.INIT:
+            return  # a sensor that was never heard may be dead
         elif self._silent >= limits.standing_s and not abs(self.speed) > 0.5:
             self.state, self.speed, self._rest, self._apart = MotionState.STANDING, 0.0, force, 0.0
         elif self._carried > limits.longest_carry_s:

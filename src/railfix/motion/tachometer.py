@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import TachometerPulses
@@ -175,6 +175,16 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     close = np.abs(interval[:-3] - interval[3:]) < 0.3 * outer
     doubled[2:-2] = close & (np.abs(pair / outer - 1.0) < 0.2)
     return lost, doubled
+
+
+def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
+    """Return the number of lost and doubled pulses seen up to instants, shape (N,).
+
+    A fault shows with the two pulses after it: an instant cannot know of one that is not over yet.
+    """
+    lost, doubled = tooth_faults(pulses)
+    total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[0]) < 2)) | doubled)])
+    return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
 
 
 def wheel_scale(way_gnss_m: float, way_wheel_m: float, gnss_sigma_m: float) -> tuple[float, float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -11,6 +12,7 @@ from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Masks
 from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import Reason
+from railfix.core.timescale import seconds
 from railfix.gnss.navigation import Navigation, glonass_channels
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.motion.samples import SensorSamples
@@ -19,7 +21,7 @@ from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.sensor_epochs import SensorState, sensor_epochs
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackState, track
+from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackState, TrackStatus, track
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
 _WEIGHED_BY_FILTER: Final = (
@@ -35,8 +37,30 @@ STANDSTILL_MPS: Final = 1.0 / 3.6
 #: Places beyond an end of the line by so many sigmas, or so far [m], are on its end.
 _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
+#: With sensors, epochs of so much GPS time go through the filter together [ns].
+_STRETCH_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fixed:
+    """Place by the filter at its last epoch: what the place by the wheel begins from anew every few seconds.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+    arc_m, speed_mps : float
+        NaN where the filter has not decided on a place.
+    """
+
+    time: np.datetime64
+    arc_m: float
+    speed_mps: float
+
+    def arc_at(self, time: np.datetime64) -> float:
+        """Place at a time nearby [m]."""
+        return self.arc_m + self.speed_mps * float(seconds(time - self.time))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +70,7 @@ class FilterState:
     slips: SlipState | None = None
     track: TrackState | None = None
     sensors: SensorState = field(default_factory=SensorState.empty)
+    fixed: Fixed | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +87,8 @@ class AlongTrack:
     direction : ndarray of int8, shape (T,)
         1 toward rising chainage, -1 toward falling, 0 where the speed does not tell.
     standstill : ndarray of bool, shape (T,)
+    motion : ndarray of int8, shape (T,)
+        `railfix.motion.slip.MotionState` since the epoch before, by wheel and inertial unit.
     """
 
     tracked: Tracked
@@ -73,6 +100,7 @@ class AlongTrack:
     height_m: Floats
     direction: Codes
     standstill: Masks
+    motion: Codes
 
     @property
     def time(self) -> Datetimes:
@@ -109,10 +137,8 @@ def along_track(
         Of the sensors on board since the chunk before.
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
-    sensors, kept = sensor_epochs(
-        samples, epochs.time, trajectory, state.sensors, limits=config.sensors, sources=config.filter_sources
-    )
-    tracked, after = track(epochs, Line.of(trajectory), state.track, limits=config.tracking, sensors=sensors)
+    line = Line.of(trajectory)
+    tracked, motion, after = _tracked(epochs, trajectory, line, config, replace(state, slips=slips), samples)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -128,8 +154,76 @@ def along_track(
         height_m=height,
         direction=direction.astype(np.int8),
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
+        motion=motion,
     )
-    return result, FilterState(slips=slips, track=after, sensors=kept)
+    return result, after
+
+
+def _tracked(
+    epochs: GnssEpochs,
+    trajectory: Trajectory,
+    line: Line,
+    config: Config,
+    state: FilterState,
+    samples: SensorSamples | None,
+) -> tuple[Tracked, Codes, FilterState]:
+    """Places of the filter, motion by the sensors, and the state to pass on.
+
+    With sensors the epochs are taken in stretches of `_STRETCH_NS` of GPS time, however the log is cut: the place by
+    the wheel, for the gradient there, begins each from the place of the filter.
+    """
+
+    def sine_at(arc_m: Floats) -> Floats:
+        slope = line.gradient_at(arc_m)
+        return np.asarray(slope / np.sqrt(1.0 + slope**2))
+
+    sensing = bool(samples) or bool(state.sensors.samples)
+    number = epochs.time.astype(np.int64) // _STRETCH_NS
+    edges = np.flatnonzero(np.diff(number, prepend=number[:1], append=number[-1:])) if sensing else np.empty(0, np.intp)
+    parts: list[Tracked] = []
+    motions: list[Codes] = []
+    for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
+        part = epochs if last - first == len(epochs) else _part(epochs, first, last)
+        before = _begun_anew(state, part.time) if len(part) else state.sensors
+        sensors, sensed, kept = sensor_epochs(
+            samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
+            sources=config.filter_sources,
+        )  # fmt: skip
+        samples = None
+        tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
+        state = replace(state, track=after, sensors=kept, fixed=_fixed(tracked) if len(part) else state.fixed)
+        parts.append(tracked)
+        motions.append(sensed.state)
+    return _joined(parts), np.concatenate(motions), state
+
+
+def _begun_anew(state: FilterState, time: Datetimes) -> SensorState:
+    """State of the sensors with the place of the filter, at the first epoch of a stretch."""
+    sensors, fixed = state.sensors, state.fixed
+    if fixed is None or int(time[0].astype(np.int64)) // _STRETCH_NS == int(fixed.time.astype(np.int64)) // _STRETCH_NS:
+        return sensors
+    place = fixed.arc_at(sensors.motion.time)
+    return replace(sensors, motion=replace(sensors.motion, arc_m=place))
+
+
+def _fixed(tracked: Tracked) -> Fixed:
+    decided = tracked.status[-1] in (TrackStatus.TRACKING, TrackStatus.COASTING)
+    arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
+    return Fixed(time=tracked.time[-1], arc_m=arc if decided else np.nan, speed_mps=speed)
+
+
+def _part(epochs: GnssEpochs, first: int, last: int) -> GnssEpochs:
+    """Some epochs; what belongs to channels stays whole."""
+    named = ("satellite", "clock")
+    values = {f.name: getattr(epochs, f.name) for f in fields(epochs) if f.name not in named}
+    return replace(epochs, **{name: value[first:last] for name, value in values.items()})
+
+
+def _joined(parts: list[Tracked]) -> Tracked:
+    """Places of one stretch after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    return Tracked(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Tracked)})
 
 
 def on_line_m(tracked: Tracked, trajectory: Trajectory) -> Floats:

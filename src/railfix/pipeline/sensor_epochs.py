@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Container
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -13,7 +13,9 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
-from railfix.motion.tachometer import TachometerLimits, tooth_faults, way_m, window_start
+from railfix.motion.slip import MotionState, SlipLimits
+from railfix.motion.tachometer import TachometerLimits, faults_until, way_m, window_start
+from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import SensorEpochs
 
@@ -31,6 +33,10 @@ class SensorLimits(Settings):
     Attributes
     ----------
     tachometer : TachometerLimits
+    slip : SlipLimits
+        Of the detection of slip and slide by tachometer and inertial unit together.
+    carry_sigma_mps : float
+        Of the speed that the inertial unit carries through a slip, a stop or a start.
     wheel_sigma_m : float
         Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     radar_sigma_mps, radar_step_s : float
@@ -41,6 +47,8 @@ class SensorLimits(Settings):
     """
 
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
+    slip: SlipLimits = Field(default_factory=SlipLimits)
+    carry_sigma_mps: float = Field(default=0.1, gt=0)
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     radar_sigma_mps: float = Field(default=0.1, gt=0)
     radar_step_s: float = Field(default=0.1, gt=0)
@@ -56,10 +64,12 @@ class SensorState:
     time : datetime64[ns]
         Last epoch; NaT before the first.
     samples : SensorSamples
+    motion : SensedState
     """
 
     time: np.datetime64
     samples: SensorSamples
+    motion: SensedState = field(default_factory=SensedState)
 
     @classmethod
     def empty(cls) -> SensorState:
@@ -74,9 +84,10 @@ def sensor_epochs(
     state: SensorState,
     *,
     limits: SensorLimits,
+    sine_at: Callable[[Floats], Floats] | None = None,
     sources: Container[str] = ("wheel", "radar", "force"),
-) -> tuple[SensorEpochs, SensorState]:
-    """Return ways and forces between the epochs, and the samples to keep.
+) -> tuple[SensorEpochs, SensedMotion, SensorState]:
+    """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
 
     Parameters
     ----------
@@ -88,6 +99,8 @@ def sensor_epochs(
         Tells which way the front points.
     state : SensorState
     limits : SensorLimits
+    sine_at : callable, optional
+        Sine of the gradient at arc lengths; the line is unknown without.
     sources : container of str
         Which of `wheel`, `radar` and `force` are wanted.
     """
@@ -97,20 +110,44 @@ def sensor_epochs(
     radar = _together(state.samples.radar, samples.radar)
     if not len(time):
         kept = SensorSamples(tachometer=pulses, inertial=inertial, radar=radar)
-        return SensorEpochs(), replace(state, samples=kept)
+        return SensorEpochs(), nothing_sensed(0), replace(state, samples=kept)
     first = time[0] if np.isnat(state.time) else state.time
     edges = np.concatenate([[first], time])
     facing = 1.0 if trajectory.facing == "rising" else -1.0
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     values: dict[str, Any] = {}
-    if len(pulses) and "wheel" in sources:
+    wheel, force = len(pulses) > 0 and "wheel" in sources, len(inertial) > 0 and "force" in sources
+    sensed, motion = nothing_sensed(len(time)), state.motion
+    if wheel and force and (pulses.direction != 0).any():
+        sensed, motion = sensed_motion(
+            pulses,
+            inertial,
+            edges,
+            facing,
+            sine_at or _unknown,
+            motion,
+            tachometer=limits.tachometer,
+            limits=limits.slip,
+        )
+    if wheel:
         way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
-        known = usable & (edges[:-1] >= pulses.time[0]) & ~_slow(way, span, limits) & ~_faulty(pulses, edges)
+        known = (
+            usable
+            & (edges[:-1] >= pulses.time[0])
+            & ~_slow(way, span, limits)
+            & (np.diff(faults_until(pulses, edges)) == 0)
+        )
         quantum = limits.tachometer.pulse_m / np.sqrt(6.0)
+        carried = np.isin(sensed.state, CARRIED)
+        known &= ~carried & (sensed.state != MotionState.EXPIRED)
+        rolled = np.where(known, way, np.where(carried & usable, sensed.way_m, np.nan))
+        speed_sigma = np.where(
+            carried, limits.carry_sigma_mps * (sensed.state != MotionState.STANDING), sensed.doubt_mps
+        )
         values |= {
-            "wheel_m": np.where(known, facing * way, np.nan),
-            "wheel_sigma_m": np.full(len(time), np.hypot(limits.wheel_sigma_m, quantum)),
+            "wheel_m": facing * rolled,
+            "wheel_sigma_m": np.sqrt(limits.wheel_sigma_m**2 + quantum**2 + (speed_sigma * span) ** 2),
             "wheel_sign": "unknown" if (pulses.direction == 0).all() else "measured",
         }
     if len(radar) and "radar" in sources:
@@ -118,33 +155,28 @@ def sensor_epochs(
         known = usable & (share >= _COMPLETE)
         sigma = limits.radar_sigma_mps * np.sqrt(np.maximum(span, limits.radar_step_s) * limits.radar_step_s)
         values |= {"radar_m": np.where(known, facing * mean * span, np.nan), "radar_sigma_m": sigma}
-    if len(inertial) and "force" in sources:
+    if force:
         mean, share = _mean_between(inertial.time, inertial.force_mps2[:, 0], edges)
         known = usable & (share >= _COMPLETE)
         values |= {
-            "force_mps2": np.where(known, facing * mean, np.nan),
+            "force_mps2": np.where(known, facing * (mean - sensed.swing_mps2), np.nan),
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
     kept = SensorSamples(
-        tachometer=_latest(pulses, _needed(pulses, edges[-1], limits)),
-        inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1], side="right") - 1),
+        tachometer=_latest(pulses, _needed(pulses, edges[-1] - REACH, limits)),
+        inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1] - REACH, side="right") - 1),
         radar=_latest(radar, np.searchsorted(radar.time, edges[-1], side="right") - 1),
     )
-    return SensorEpochs(**values), SensorState(time=time[-1], samples=kept)
+    return SensorEpochs(**values), sensed, SensorState(time=time[-1], samples=kept, motion=motion)
+
+
+def _unknown(arc_m: Floats) -> Floats:
+    return np.full(arc_m.shape, np.nan)
 
 
 def _slow(way: Floats, span: Floats, limits: SensorLimits) -> Masks:
     """Whether the wheel turned too slowly for a distance."""
     return np.asarray(np.abs(way) < limits.tachometer.least_speed_mps * np.maximum(span, 1e-9))
-
-
-def _faulty(pulses: TachometerPulses, edges: Datetimes) -> Masks:
-    """Whether a pulse was lost or doubled between two epochs."""
-    lost, doubled = tooth_faults(pulses)
-    total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[0]) < 2)) | doubled)])
-    # A fault shows with the two pulses after it: an epoch cannot know of one that is not over yet.
-    seen = total[np.maximum(np.searchsorted(pulses.time, edges, side="right") - 2, 0)]
-    return np.asarray(np.diff(seen) > 0)
 
 
 def _needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:

@@ -7,13 +7,16 @@ from typing import Final
 import numpy as np
 import polars as pl
 
+from railfix.motion.slip import MotionState
 from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.results import Result
+from railfix.pipeline.sensed_motion import CARRIED
 from railfix.pipeline.tables import float_column, in_time_order
 from railfix.tracking import Kind, TrackStatus
 
 #: Words of the column ``status`` of the filter along the track, and of ``direction``.
 TRACK_STATUS_TYPE: Final = pl.Enum([s.text for s in TrackStatus])
+MOTION_TYPE: Final = pl.Enum([state.name.lower() for state in MotionState])
 DIRECTION_TYPE: Final = pl.Enum(["falling", "unknown", "rising"])
 
 #: Columns of the table of the filter along the track, with their unit and meaning.
@@ -39,8 +42,12 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "protection_separation_m": "largest distance of a sub-filter without one satellite, constellation or sensor",
     "over_reading_m": "how far the train may be behind: the level, at least 2 % of the way since codes were used",
     "under_reading_m": "how far the train may be ahead; counted as the other one",
-    "sources": "measurements used with a weight of more than a half: `code`, `phase`, `doppler`, `wheel`, `radar`, "
-    "`force`, `place`",
+    "motion": "by tachometer and inertial unit together: `init` (nothing known), `standing`, `low_speed` (below the "
+    "tachometer's least), `normal` (the wheel rolls), `inertial_spin`, `inertial_slide` (the wheel is faster or slower "
+    "than the train), `rolling` (away, below the tachometer's least), `expired` (carried for too long). In `standing`, "
+    "`low_speed`, `inertial_spin`, `inertial_slide`, `rolling` the way of the wheel is not used: inertia carries",
+    "sources": "measurements used with a weight of more than a half: `code`, `phase`, `doppler`, `wheel` "
+    "(`carry` where inertia takes its place), `radar`, `force`, `place`",
     "latitude_deg": "antenna, WGS 84",
     "longitude_deg": "antenna, WGS 84",
     "height_m": "antenna, above the ellipsoid",
@@ -77,8 +84,13 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
     tracked, epochs = result.tracked, len(result)
     words = pl.Series(values=[s.text for s in TrackStatus], dtype=TRACK_STATUS_TYPE)
     directions = pl.Series(values=DIRECTION_TYPE.categories, dtype=DIRECTION_TYPE)
-    kinds = [kind.name.lower() for kind in Kind]
-    used, which = np.unique(tracked.used > 0, axis=0, return_inverse=True)
+    states = pl.Series(values=MOTION_TYPE.categories, dtype=MOTION_TYPE)
+    kinds = [*(kind.name.lower() for kind in Kind), "carry"]
+    with_wheel = tracked.used[:, Kind.WHEEL] > 0
+    carried = with_wheel & np.isin(result.motion, CARRIED)
+    has = np.column_stack([tracked.used > 0, carried])
+    has[:, Kind.WHEEL] &= ~carried
+    used, which = np.unique(has, axis=0, return_inverse=True)
     texts = pl.Series(values=["+".join(np.array(kinds)[row]) for row in used], dtype=pl.String)
     return pl.DataFrame(
         {
@@ -100,6 +112,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "protection_separation_m": float_column(tracked.separation_m),
             "over_reading_m": float_column(tracked.amount_m),
             "under_reading_m": float_column(tracked.amount_m),
+            "motion": states.gather(pl.Series(values=result.motion.astype(np.uint32))),
             "sources": texts.gather(pl.Series(values=which.reshape(-1).astype(np.uint32))),
             "latitude_deg": float_column(result.latitude_deg),
             "longitude_deg": float_column(result.longitude_deg),

@@ -1,0 +1,192 @@
+"""Motion between the epochs by wheel and inertial unit: slip, slide, standstill, carried ways, swings of the body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Codes, Datetimes, Floats, Integers
+from railfix.core.timescale import seconds
+from railfix.motion.samples import InertialSamples, TachometerPulses
+from railfix.motion.slip import GRAVITY_MPS2, MotionState, SlipLimits, SlipState, find_slips, pitch_rate_radps
+from railfix.motion.tachometer import TachometerLimits, faults_until, pulse_acceleration, pulse_speeds, way_m
+
+#: Spacing of the samples of the slip detection, at multiples of it in GPS time [ns].
+_TICK_NS: Final = 20_000_000
+#: Accelerations of the wheel and means of the inertial unit are over this [ns].
+_MEAN_NS: Final = 200_000_000
+#: A lost or doubled pulse is in the acceleration for so long [ns].
+_FAULT_NS: Final = _MEAN_NS + 150_000_000
+#: Samples before the last epoch that the next chunk needs [ns].
+REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
+#: States whose way is that of the inertial unit.
+CARRIED: Final = (
+    MotionState.STANDING, MotionState.LOW_SPEED, MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE,
+    MotionState.ROLLING,
+)  # fmt: skip
+#: The state of an interval is the one that says most.
+_RANK: Final = np.array(
+    [
+        {
+            MotionState.INIT: 0, MotionState.NORMAL: 1, MotionState.STANDING: 2, MotionState.LOW_SPEED: 3,
+            MotionState.ROLLING: 4, MotionState.INERTIAL_SPIN: 5, MotionState.INERTIAL_SLIDE: 5,
+            MotionState.EXPIRED: 6,
+        }[state]
+        for state in MotionState
+    ]
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensedMotion:
+    """Motion of T intervals between epochs; forward is that of the vehicle.
+
+    Attributes
+    ----------
+    state : ndarray of int8, shape (T,)
+        `railfix.motion.slip.MotionState`; INIT without both sensors.
+    way_m : ndarray, shape (T,) [m]
+        Forward by inertia where the state is one of `CARRIED`, NaN elsewhere.
+    doubt_mps : ndarray, shape (T,) [m/s]
+        Speed that a slip not detected yet may have had.
+    swing_mps2 : ndarray, shape (T,) [m/s2]
+        Part of the mean specific force forward that the pitching of the body makes, 0 without a gyro.
+    """
+
+    state: Codes
+    way_m: Floats
+    doubt_mps: Floats
+    swing_mps2: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensedState:
+    """What one chunk leaves to the next.
+
+    Attributes
+    ----------
+    tick : int
+        Number of the last sample since the beginning of GPS time; 0 before the first.
+    arc_m : float [m]
+        Place of the antenna then, by the wheel since the last one of the filter; NaN where it is not known.
+    slip : SlipState or None
+    """
+
+    tick: int = 0
+    arc_m: float = float("nan")
+    slip: SlipState | None = None
+
+    @property
+    def time(self) -> np.datetime64:
+        """Of the last sample."""
+        return np.datetime64(self.tick * _TICK_NS, "ns")
+
+
+def nothing_sensed(intervals: int) -> SensedMotion:
+    """Motion without a sensor."""
+    return SensedMotion(
+        state=np.zeros(intervals, dtype=np.int8),
+        way_m=np.full(intervals, np.nan),
+        doubt_mps=np.zeros(intervals),
+        swing_mps2=np.zeros(intervals),
+    )
+
+
+def sensed_motion(
+    pulses: TachometerPulses,
+    inertial: InertialSamples,
+    edges: Datetimes,
+    facing: float,
+    sine_at: Callable[[Floats], Floats],
+    state: SensedState,
+    *,
+    tachometer: TachometerLimits,
+    limits: SlipLimits,
+) -> tuple[SensedMotion, SensedState]:
+    """Return the motion between instants, and the state to pass on.
+
+    Parameters
+    ----------
+    pulses : TachometerPulses
+        With a direction.
+    inertial : InertialSamples
+        Both from `REACH` before the first instant on.
+    edges : ndarray of datetime64[ns], shape (T + 1,)
+    facing : float
+        1 where the front points to rising arc length, else -1.
+    sine_at : callable
+        Sine of the gradient in rising arc length at arc lengths.
+    state : SensedState
+    tachometer : TachometerLimits
+    limits : SlipLimits
+    """
+    ends = edges.astype("datetime64[ns]").astype(np.int64)
+    begin = state.tick or int(ends[0]) // _TICK_NS
+    ticks = np.arange(begin + 1, int(ends[-1]) // _TICK_NS + 1)
+    if not len(ticks):
+        return nothing_sensed(len(edges) - 1), state
+    when = (ticks * _TICK_NS).astype("datetime64[ns]")
+    earlier = ((ticks * _TICK_NS) - _MEAN_NS).astype("datetime64[ns]")
+    speed = pulse_speeds(pulses, when, limits=tachometer)
+    acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=tachometer), speed)
+    # a lost tooth is no slip
+    faulty = faults_until(pulses, when) > faults_until(pulses, (ticks * _TICK_NS - _FAULT_NS).astype("datetime64[ns]"))
+    acceleration = np.where(faulty, np.nan, acceleration)
+    last = np.searchsorted(pulses.time, when, side="right") - 1
+    since = np.where(last >= 0, seconds(when - pulses.time[np.maximum(last, 0)]), np.nan)
+    means = _means(inertial, earlier, when)
+    force, rates = means[:, :3], means[:, 3:]
+    turning = pitch_rate_radps(force, rates, np.nan_to_num(speed.speed_mps))
+    start = np.datetime64(begin * _TICK_NS, "ns")
+    ways = way_m(pulses, np.concatenate([[start], when]), limits=tachometer)
+    arc = state.arc_m + facing * (ways[1:] - ways[0])
+    line_sine = facing * sine_at(arc)
+    found, slip = find_slips(
+        1e-9 * _TICK_NS * (ticks - ticks[0]) + (0.0 if state.slip is None else state.slip.time_s + 1e-9 * _TICK_NS),
+        speed.speed_mps,
+        acceleration,
+        force[:, 0],
+        line_sine,
+        pitch_rate=turning,
+        since_pulse_s=since,
+        limits=limits,
+        state=state.slip,
+    )
+    swing = np.nan_to_num(GRAVITY_MPS2 * (found.pitch - line_sine))
+    lag = limits.look_back_s + limits.confirm_s + limits.smoothing_s
+    doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
+    at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
+    sensed = _by_interval(found.state, found.speed_mps, doubt, swing, at, seconds(np.diff(edges)))
+    return sensed, SensedState(tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
+
+
+def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Floats:
+    """Mean force and rate between instants, shape (N, 6)."""
+    values = np.concatenate([inertial.force_mps2, inertial.rate_radps], axis=1)
+    total = np.concatenate([np.zeros((1, 6)), np.cumsum(values, axis=0)])
+    first, last = (np.searchsorted(inertial.time, at, side="right") for at in (begin, end))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((total[last] - total[first]) / (last - first)[:, None])
+
+
+def _by_interval(
+    state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, at: Integers, span_s: Floats
+) -> SensedMotion:
+    """Samples brought together by interval: `at` is the first sample after each instant, 0 after the first."""
+    count = np.diff(at)
+    some = np.flatnonzero(count > 0)
+    result = nothing_sensed(len(count))
+    first, end = at[some], int(at[-1])
+    rank = _RANK[state[:end]]
+    # the last sample of the highest rank names the interval
+    top = rank == np.repeat(np.maximum.reduceat(rank, first), count[some])
+    named = state[np.maximum.reduceat(np.where(top, np.arange(end), -1), first)]
+    mean = np.add.reduceat(speed_mps[:end], first) / count[some]
+    result.state[some] = named
+    result.way_m[some] = np.where(np.isin(named, CARRIED), mean * span_s[some], np.nan)
+    result.doubt_mps[some] = np.maximum.reduceat(doubt_mps[:end], first)
+    result.swing_mps2[some] = np.add.reduceat(swing_mps2[:end], first) / count[some]
+    return result
