@@ -121,7 +121,7 @@ def row(
     observed = np.concatenate([p.observed[m] for p, m in zip(passages, masks, strict=True)])
     good = error[np.isfinite(error)]
     size = np.abs(good)
-    rate, base = (np.count_nonzero(np.isfinite(e)) / np.count_nonzero(observed) for e in (error, other))
+    rate, base = (np.count_nonzero(np.isfinite(e) & observed) / np.count_nonzero(observed) for e in (error, other))
     apart = np.concatenate([intervals_m(p, f, m) for p, f, m in zip(passages, found, masks, strict=True)])
     p50, p95, p99 = np.quantile(size, (0.5, 0.95, 0.99))
     return (

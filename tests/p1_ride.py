@@ -265,7 +265,8 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
         kept = ~np.isin(got.status, CHECK_FAILED)
     elif way.positions == "ok":
         kept = got.status == Status.OK
-    kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP) | conventional
+    if way.positions not in ("conventional", "filtered"):
+        kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
     error = chainage - truth.chainage_m
     away = place - truth.ecef_m
     up = truth.ecef_m / np.linalg.norm(truth.ecef_m, axis=1, keepdims=True)

@@ -25,13 +25,13 @@ from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
 from railfix.run.chunks import aligned
-from railfix.run.driver import Progress, notes_of, open_inputs
+from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
 from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import run_record
-from railfix.run.sensors import read_sensors, until
+from railfix.run.sensors import until
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
@@ -39,8 +39,14 @@ from railfix.tracking import TrackStatus
 
 #: Names of the choices with all screens and with none, and of the filter along the track.
 ALL, NONE, FILTER = "all", "none", "filter"
-#: Sensors by the input that has them.
-_SENSORS: Final[Mapping[str, FilterSource]] = {"tachometer": "wheel", "radar": "radar", "inertial": "force"}
+#: Sensors with the inputs that they need.
+_SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
+    "wheel": ("tachometer",),
+    "radar": ("radar",),
+    "force": ("inertial",),
+    "feature": ("inertial", "tachometer"),
+    "range": ("ranging",),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +140,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
     """Choices of the filter's sources by name: all that are there, all but each; codes are always used."""
-    absent = [source for name, source in _SENSORS.items() if getattr(inputs, name) is None]
+    absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {
         f"{FILTER} without {name}": tuple(other for other in there if other != name) for name in there if name != "code"
@@ -207,8 +213,11 @@ def ablate_files(
                 name: filtered.model_copy(update={"filter_sources": chosen})
                 for name, chosen in filter_choices(inputs, config.filter_sources).items()
             }
-        processors = {name: processor_of(chosen, navigation, line.trajectories) for name, chosen in settings.items()}
-        sensors = read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
+        sensors, units = sensors_of(inputs)
+        processors = {
+            name: processor_of(chosen, navigation, line.trajectories, track=line.track, units=units)
+            for name, chosen in settings.items()
+        }
         received = np.datetime64("NaT", "ns")
         states = dict.fromkeys(processors, State())
         tallies = {name: Tally(min_satellites=config.min_satellites) for name in processors}

@@ -124,6 +124,23 @@ class StationRanges:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GroundUnits:
+    """Surveyed radio stations beside the track, U of them.
+
+    Attributes
+    ----------
+    name : ndarray of str, shape (U,)
+    ecef_m : ndarray, shape (U, 3) [m]
+    """
+
+    name: Strings
+    ecef_m: Floats
+
+    def __len__(self) -> int:
+        return len(self.name)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorSamples:
     """Samples of all sensors on board received since the chunk before.
 

@@ -170,8 +170,19 @@ def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) 
     speed_mps : ndarray, shape (N,) [m/s]
         Forward.
     """
-    sine = np.clip((speed_mps * rate_radps[:, 2] - force_mps2[:, 1]) / GRAVITY_MPS2, -0.5, 0.5)
+    sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
+
+
+def heading_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
+    """Return the rate of the heading from body rates, shape (N,) [rad/s]: ``w_z cos(phi) + w_y sin(phi)``."""
+    sine = roll_sine(force_mps2, rate_radps, speed_mps)
+    return np.asarray(rate_radps[:, 2] * np.sqrt(1.0 - sine**2) + rate_radps[:, 1] * sine)
+
+
+def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
+    """Return the sine of the roll to the right, shape (N,): what the force to the right lacks of ``v w_z``."""
+    return np.clip((speed_mps * rate_radps[:, 2] - force_mps2[:, 1]) / GRAVITY_MPS2, -0.5, 0.5)
 
 
 def find_slips(

@@ -183,7 +183,7 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
     A fault shows with the two pulses after it: an instant cannot know of one that is not over yet.
     """
     lost, doubled = tooth_faults(pulses)
-    total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[0]) < 2)) | doubled)])
+    total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
     return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
 
 

@@ -18,7 +18,7 @@ from railfix.gnss.signals import carrier_frequency_hz
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
-from railfix.pipeline.sensor_epochs import SensorState, sensor_epochs
+from railfix.pipeline.sensor_epochs import SensorState, Surroundings, sensor_epochs
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackState, TrackStatus, track
@@ -50,12 +50,13 @@ class Fixed:
     Attributes
     ----------
     time : datetime64[ns]
-    arc_m, speed_mps : float
+    arc_m, sigma_m, speed_mps : float
         NaN where the filter has not decided on a place.
     """
 
     time: np.datetime64
     arc_m: float
+    sigma_m: float
     speed_mps: float
 
     def arc_at(self, time: np.datetime64) -> float:
@@ -120,6 +121,7 @@ def along_track(
     state: FilterState,
     *,
     samples: SensorSamples | None = None,
+    surroundings: Surroundings | None = None,
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna, and the state to pass on.
 
@@ -135,10 +137,14 @@ def along_track(
     state : FilterState
     samples : SensorSamples, optional
         Of the sensors on board since the chunk before.
+    surroundings : Surroundings, optional
+        Features of the line and ground units that the sensors meet.
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
     line = Line.of(trajectory)
-    tracked, motion, after = _tracked(epochs, trajectory, line, config, replace(state, slips=slips), samples)
+    tracked, motion, after = _tracked(
+        epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings
+    )
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -166,6 +172,7 @@ def _tracked(
     config: Config,
     state: FilterState,
     samples: SensorSamples | None,
+    surroundings: Surroundings | None,
 ) -> tuple[Tracked, Codes, FilterState]:
     """Places of the filter, motion by the sensors, and the state to pass on.
 
@@ -187,7 +194,7 @@ def _tracked(
         before = _begun_anew(state, part.time) if len(part) else state.sensors
         sensors, sensed, kept = sensor_epochs(
             samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
-            sources=config.filter_sources,
+            sources=config.filter_sources, surroundings=surroundings,
         )  # fmt: skip
         samples = None
         tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
@@ -200,16 +207,21 @@ def _tracked(
 def _begun_anew(state: FilterState, time: Datetimes) -> SensorState:
     """State of the sensors with the place of the filter, at the first epoch of a stretch."""
     sensors, fixed = state.sensors, state.fixed
-    if fixed is None or int(time[0].astype(np.int64)) // _STRETCH_NS == int(fixed.time.astype(np.int64)) // _STRETCH_NS:
+    if (
+        fixed is None
+        or sensors.motion.tick == 0
+        or int(time[0].astype(np.int64)) // _STRETCH_NS == int(fixed.time.astype(np.int64)) // _STRETCH_NS
+    ):
         return sensors
     place = fixed.arc_at(sensors.motion.time)
-    return replace(sensors, motion=replace(sensors.motion, arc_m=place))
+    return replace(sensors, motion=replace(sensors.motion, arc_m=place, sigma_m=fixed.sigma_m))
 
 
 def _fixed(tracked: Tracked) -> Fixed:
     decided = tracked.status[-1] in (TrackStatus.TRACKING, TrackStatus.COASTING)
     arc, speed = float(tracked.arc_m[-1]), float(tracked.speed_mps[-1])
-    return Fixed(time=tracked.time[-1], arc_m=arc if decided else np.nan, speed_mps=speed)
+    sigma = float(tracked.sigma_m[-1])
+    return Fixed(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
 
 
 def _part(epochs: GnssEpochs, first: int, last: int) -> GnssEpochs:

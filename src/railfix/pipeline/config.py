@@ -56,8 +56,10 @@ DEFAULT_SIGNALS: dict[str, tuple[str, ...]] = {
 
 
 #: Measurements that the filter along the track can use, as its column `sources` names them.
-FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force"]
-FILTER_SOURCES: Final[tuple[FilterSource, ...]] = ("code", "phase", "doppler", "wheel", "radar", "force")
+FilterSource = Literal["code", "phase", "doppler", "wheel", "radar", "force", "feature", "range"]
+FILTER_SOURCES: Final[tuple[FilterSource, ...]] = (
+    "code", "phase", "doppler", "wheel", "radar", "force", "feature", "range",
+)  # fmt: skip
 
 #: Names of the screens, in the order in which they judge.
 SCREEN_NAMES: Final = tuple(screen.name for screen in SCREENS)
@@ -183,7 +185,7 @@ class Config(ScreenSettings):
         sensors, from this and earlier epochs), into a table of its own. `railfix run` and `railfix demo` ask for it.
     filter_sources : tuple of str
         Measurements that the filter uses, where they are there: `code`, `phase` and `doppler` of the satellites, and
-        `wheel`, `radar`, `force` of the sensors on board.
+        `wheel`, `radar`, `force`, `feature` (of the line, by inertial unit and wheel), `range` of the sensors on board.
     tracking : TrackingLimits
         Noise of motion and measurements of that filter.
     sensors : SensorLimits

@@ -15,7 +15,7 @@ import numpy as np
 
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.motion.samples import SensorSamples
+from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.along_track import AlongTrack, FilterState, along_track
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
@@ -23,8 +23,10 @@ from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import ChunkSteps, PlacedRanges, PositionVerdict, Published
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
+from railfix.pipeline.feature_stage import LineFeatures
 from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
+from railfix.pipeline.sensor_epochs import Surroundings
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
@@ -40,6 +42,7 @@ from railfix.screens import (
     Verdict,
 )
 from railfix.screens.pairs import on_pairs, pair_antennas
+from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
 __all__ = ["AntennaResult", "AntennaState", "EpochProcessor", "Result", "State"]
@@ -62,6 +65,10 @@ class EpochProcessor:
         Gives the weights of the ranges in place of ``config.noise``.
     cn0_curve : Cn0Curve, optional
         Mean C/N0 over elevation, for the screen "cn0".
+    track : Track, optional
+        The line itself, for places by its changes of gradient and curvature in the filter along the track.
+    units : GroundUnits, optional
+        Surveyed stations of two-way ranges, for the filter along the track.
 
     Attributes
     ----------
@@ -85,6 +92,8 @@ class EpochProcessor:
         messages: SbasMessages | None = None,
         error_model: ErrorModel | None = None,
         cn0_curve: Cn0Curve | None = None,
+        track: Track | None = None,
+        units: GroundUnits | None = None,
     ) -> None:
         if not trajectories:
             raise ValueError("at least one antenna's trajectory is needed")
@@ -108,6 +117,8 @@ class EpochProcessor:
             spacing_known=all(t.body_chainage_m is not None for t in self.trajectories.values()),
             cn0_curve=cn0_curve,
         )
+        self._track, self._units = track, units
+        self._features: dict[str, LineFeatures] = {}
         self._has_coordinates = with_coordinates(config)
         self._lacking = self._unable()
 
@@ -217,6 +228,14 @@ class EpochProcessor:
             fusion={**state.fusion, **{name: chunks[name].filter_state for name in tracks}},
         )
         return Result(antennas=results, notes=notes, fusion=tracks), after
+
+    def surroundings(self, name: str, sensors: SensorSamples | None) -> Surroundings:
+        """Ground units, and the features of the line: made when there is an inertial unit."""
+        wanted = "feature" in self.config.filter_sources and sensors is not None and len(sensors.inertial) > 0
+        if wanted and self._track is not None and name not in self._features:
+            limits = self.config.sensors.feature
+            self._features[name] = LineFeatures.of(self._track, self.trajectories[name], limits)
+        return Surroundings(features=self._features.get(name), units=self._units)
 
     def compare(self, chunks: Mapping[str, ChunkSteps]) -> None:
         """Take the same chunk of all antennas through the screens that compare them, up to their last step.
@@ -370,6 +389,7 @@ class AntennaChunk:
                 processor.config,
                 self.filter_state,
                 samples=self._sensors,
+                surroundings=processor.surroundings(self._name, self._sensors),
             )
         return result
 

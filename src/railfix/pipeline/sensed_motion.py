@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -11,8 +11,17 @@ import numpy as np
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers
 from railfix.core.timescale import seconds
 from railfix.motion.samples import InertialSamples, TachometerPulses
-from railfix.motion.slip import GRAVITY_MPS2, MotionState, SlipLimits, SlipState, find_slips, pitch_rate_radps
+from railfix.motion.slip import (
+    GRAVITY_MPS2,
+    MotionState,
+    SlipLimits,
+    SlipState,
+    find_slips,
+    heading_rate_radps,
+    pitch_rate_radps,
+)
 from railfix.motion.tachometer import TachometerLimits, faults_until, pulse_acceleration, pulse_speeds, way_m
+from railfix.pipeline.feature_stage import RateSeries
 
 #: Spacing of the samples of the slip detection, at multiples of it in GPS time [ns].
 _TICK_NS: Final = 20_000_000
@@ -72,11 +81,14 @@ class SensedState:
         Number of the last sample since the beginning of GPS time; 0 before the first.
     arc_m : float [m]
         Place of the antenna then, by the wheel since the last one of the filter; NaN where it is not known.
+    sigma_m : float [m]
+        Standard deviation of that place of the filter.
     slip : SlipState or None
     """
 
     tick: int = 0
     arc_m: float = float("nan")
+    sigma_m: float = float("nan")
     slip: SlipState | None = None
 
     @property
@@ -105,8 +117,8 @@ def sensed_motion(
     *,
     tachometer: TachometerLimits,
     limits: SlipLimits,
-) -> tuple[SensedMotion, SensedState]:
-    """Return the motion between instants, and the state to pass on.
+) -> tuple[SensedMotion, RateSeries | None, SensedState]:
+    """Return the motion between instants, the rates of the body (None without a sample), and the state to pass on.
 
     Parameters
     ----------
@@ -124,10 +136,10 @@ def sensed_motion(
     limits : SlipLimits
     """
     ends = edges.astype("datetime64[ns]").astype(np.int64)
-    begin = state.tick or int(ends[0]) // _TICK_NS
+    begin = state.tick or max(int(ends[0]), int(inertial.time[0].astype(np.int64))) // _TICK_NS
     ticks = np.arange(begin + 1, int(ends[-1]) // _TICK_NS + 1)
     if not len(ticks):
-        return nothing_sensed(len(edges) - 1), state
+        return nothing_sensed(len(edges) - 1), None, state
     when = (ticks * _TICK_NS).astype("datetime64[ns]")
     earlier = ((ticks * _TICK_NS) - _MEAN_NS).astype("datetime64[ns]")
     speed = pulse_speeds(pulses, when, limits=tachometer)
@@ -136,16 +148,18 @@ def sensed_motion(
     faulty = faults_until(pulses, when) > faults_until(pulses, (ticks * _TICK_NS - _FAULT_NS).astype("datetime64[ns]"))
     acceleration = np.where(faulty, np.nan, acceleration)
     last = np.searchsorted(pulses.time, when, side="right") - 1
-    since = np.where(last >= 0, seconds(when - pulses.time[np.maximum(last, 0)]), np.nan)
+    since = np.full(len(when), np.nan)
+    since[last >= 0] = seconds(when[last >= 0] - pulses.time[last[last >= 0]])
     means = _means(inertial, earlier, when)
     force, rates = means[:, :3], means[:, 3:]
-    turning = pitch_rate_radps(force, rates, np.nan_to_num(speed.speed_mps))
+    known_speed = np.nan_to_num(speed.speed_mps)
+    turning = pitch_rate_radps(force, rates, known_speed)
     start = np.datetime64(begin * _TICK_NS, "ns")
     ways = way_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (ways[1:] - ways[0])
     line_sine = facing * sine_at(arc)
     found, slip = find_slips(
-        1e-9 * _TICK_NS * (ticks - ticks[0]) + (0.0 if state.slip is None else state.slip.time_s + 1e-9 * _TICK_NS),
+        np.asarray(1e-9 * _TICK_NS * ticks, dtype=np.float64),
         speed.speed_mps,
         acceleration,
         force[:, 0],
@@ -160,7 +174,17 @@ def sensed_motion(
     doubt = GRAVITY_MPS2 * lag * np.abs(found.smooth)
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
     sensed = _by_interval(found.state, found.speed_mps, doubt, swing, at, seconds(np.diff(edges)))
-    return sensed, SensedState(tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
+    step = 1e-9 * _TICK_NS
+    series = RateSeries(
+        time=when,
+        way_m=facing * (ways[1:] - ways[0]),
+        arc_m=arc,
+        turned_rad=step * heading_rate_radps(force, rates, known_speed),
+        climbed_rad=step * (turning - found.gyro_bias_radps),
+        speed_mps=facing * speed.speed_mps,
+        rolls=found.state == MotionState.NORMAL,
+    )
+    return sensed, series, replace(state, tick=int(ticks[-1]), arc_m=float(arc[-1]), slip=slip)
 
 
 def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Floats:

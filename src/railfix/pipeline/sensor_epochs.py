@@ -12,19 +12,42 @@ from pydantic import Field
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
-from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.motion.features import FeatureLimits
+from railfix.motion.samples import (
+    GroundUnits,
+    InertialSamples,
+    RadarSpeeds,
+    SensorSamples,
+    StationRanges,
+    TachometerPulses,
+)
 from railfix.motion.slip import MotionState, SlipLimits
 from railfix.motion.tachometer import TachometerLimits, faults_until, way_m, window_start
+from railfix.pipeline.feature_stage import FeatureFix, FeatureState, LineFeatures, RateSeries, ahead_m, feature_fixes
 from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedState, nothing_sensed, sensed_motion
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import SensorEpochs
+from railfix.tracking import RangeEpochs, SensorEpochs
 
 #: Longest time between epochs over which a way or a mean force is taken [s].
 _LONGEST_S: Final = 5.0
 #: Share of the samples of an interval that must be there for its mean.
 _COMPLETE: Final = 0.9
 
-Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds)
+Samples = TypeVar("Samples", TachometerPulses, InertialSamples, RadarSpeeds, StationRanges)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surroundings:
+    """What sensors are compared with.
+
+    Attributes
+    ----------
+    features : LineFeatures or None
+    units : GroundUnits or None
+    """
+
+    features: LineFeatures | None = None
+    units: GroundUnits | None = None
 
 
 class SensorLimits(Settings):
@@ -37,6 +60,18 @@ class SensorLimits(Settings):
         Of the detection of slip and slide by tachometer and inertial unit together.
     carry_sigma_mps : float
         Of the speed that the inertial unit carries through a slip, a stop or a start.
+    feature : FeatureLimits
+        Of places by changes of gradient and curvature.
+    gradient_noise, curvature_noise_1pm : float
+        Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading.
+    feature_sigma_m : float
+        Least standard deviation of such a place: the map's, and that of the body on its bogies.
+    range_sigma_m : float
+        Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
+        answering delay beside it.
+    range_ahead_m, range_right_m, range_above_m : float
+        Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
+        to the right of the antenna's path and above the antenna.
     wheel_sigma_m : float
         Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     radar_sigma_mps, radar_step_s : float
@@ -49,6 +84,14 @@ class SensorLimits(Settings):
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     slip: SlipLimits = Field(default_factory=SlipLimits)
     carry_sigma_mps: float = Field(default=0.1, gt=0)
+    feature: FeatureLimits = Field(default_factory=FeatureLimits)
+    gradient_noise: float = Field(default=1e-3, gt=0)
+    curvature_noise_1pm: float = Field(default=1e-4, gt=0)
+    feature_sigma_m: float = Field(default=0.5, gt=0)
+    range_sigma_m: float = Field(default=0.5, gt=0)
+    range_ahead_m: float = 0.0
+    range_right_m: float = 0.0
+    range_above_m: float = 0.0
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     radar_sigma_mps: float = Field(default=0.1, gt=0)
     radar_step_s: float = Field(default=0.1, gt=0)
@@ -65,11 +108,13 @@ class SensorState:
         Last epoch; NaT before the first.
     samples : SensorSamples
     motion : SensedState
+    features : FeatureState
     """
 
     time: np.datetime64
     samples: SensorSamples
     motion: SensedState = field(default_factory=SensedState)
+    features: FeatureState = field(default_factory=FeatureState)
 
     @classmethod
     def empty(cls) -> SensorState:
@@ -85,7 +130,8 @@ def sensor_epochs(
     *,
     limits: SensorLimits,
     sine_at: Callable[[Floats], Floats] | None = None,
-    sources: Container[str] = ("wheel", "radar", "force"),
+    sources: Container[str] = ("wheel", "radar", "force", "feature", "range"),
+    surroundings: Surroundings | None = None,
 ) -> tuple[SensorEpochs, SensedMotion, SensorState]:
     """Return ways and forces between the epochs, the motion that wheel and inertia agree on, and the state to keep.
 
@@ -102,14 +148,17 @@ def sensor_epochs(
     sine_at : callable, optional
         Sine of the gradient at arc lengths; the line is unknown without.
     sources : container of str
-        Which of `wheel`, `radar` and `force` are wanted.
+        Which of `wheel`, `radar`, `force`, `feature` and `range` are wanted.
+    surroundings : Surroundings, optional
+        Features of the line and ground units.
     """
     samples = samples or SensorSamples()
     pulses = _together(state.samples.tachometer, samples.tachometer)
     inertial = _together(state.samples.inertial, samples.inertial)
     radar = _together(state.samples.radar, samples.radar)
+    ranging = _together(state.samples.ranging, samples.ranging)
     if not len(time):
-        kept = SensorSamples(tachometer=pulses, inertial=inertial, radar=radar)
+        kept = SensorSamples(tachometer=pulses, inertial=inertial, radar=radar, ranging=ranging)
         return SensorEpochs(), nothing_sensed(0), replace(state, samples=kept)
     first = time[0] if np.isnat(state.time) else state.time
     edges = np.concatenate([[first], time])
@@ -117,10 +166,13 @@ def sensor_epochs(
     span = seconds(np.diff(edges))
     usable = (span > 0.0) & (span <= _LONGEST_S)
     values: dict[str, Any] = {}
-    wheel, force = len(pulses) > 0 and "wheel" in sources, len(inertial) > 0 and "force" in sources
-    sensed, motion = nothing_sensed(len(time)), state.motion
-    if wheel and force and (pulses.direction != 0).any():
-        sensed, motion = sensed_motion(
+    # what comes after the last epoch is not known yet, however the log is cut
+    heard = int(np.searchsorted(pulses.time, edges[-1], side="right"))
+    wheel = heard > 0 and "wheel" in sources
+    force = len(inertial) > 0 and bool(inertial.time[0] <= edges[-1]) and "force" in sources
+    sensed, motion, passing = nothing_sensed(len(time)), state.motion, state.features
+    if force and "wheel" in sources and (pulses.direction[:heard] != 0).all():
+        sensed, rates, motion = sensed_motion(
             pulses,
             inertial,
             edges,
@@ -130,6 +182,12 @@ def sensor_epochs(
             tachometer=limits.tachometer,
             limits=limits.slip,
         )
+        if rates is not None and surroundings is not None and surroundings.features is not None:
+            noise = (limits.gradient_noise, limits.curvature_noise_1pm)
+            fixes, passing = feature_fixes(
+                rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise, limits=limits.feature
+            )
+            values |= _places(fixes, rates, time, limits)
     if wheel:
         way = np.diff(way_m(pulses, edges, limits=limits.tachometer))
         known = (
@@ -162,12 +220,52 @@ def sensor_epochs(
             "force_mps2": np.where(known, facing * (mean - sensed.swing_mps2), np.nan),
             "force_sigma_mps2": np.full(len(time), limits.force_sigma_mps2),
         }
+    if len(ranging) and "range" in sources and surroundings is not None and surroundings.units is not None:
+        lever = np.array([
+            facing * limits.range_ahead_m - ahead_m(trajectory), facing * limits.range_right_m, limits.range_above_m
+        ])  # fmt: skip
+        values["ranges"] = _ranges(ranging, edges, surroundings.units, lever, limits)
     kept = SensorSamples(
         tachometer=_latest(pulses, _needed(pulses, edges[-1] - REACH, limits)),
         inertial=_latest(inertial, np.searchsorted(inertial.time, edges[-1] - REACH, side="right") - 1),
         radar=_latest(radar, np.searchsorted(radar.time, edges[-1], side="right") - 1),
+        ranging=_latest(ranging, np.searchsorted(ranging.time, edges[-1], side="right")),
     )
-    return SensorEpochs(**values), sensed, SensorState(time=time[-1], samples=kept, motion=motion)
+    return SensorEpochs(**values), sensed, SensorState(time=time[-1], samples=kept, motion=motion, features=passing)
+
+
+def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits: SensorLimits) -> dict[str, Floats]:
+    """Places of the antenna by the accepted features, at the first epoch after each."""
+    place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
+    at = rates.arc_at(time)
+    for fix in fixes:
+        if fix.located.verdict == "accepted":
+            epoch = int(np.searchsorted(time, rates.time[fix.tick]))
+            place[epoch] = at[epoch] + fix.correction_m
+            since = limits.feature.scale_sigma * limits.feature.half_length_m
+            sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + limits.feature_sigma_m**2)
+    return {"place_m": place, "place_sigma_m": sigma}
+
+
+def _ranges(
+    ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_m: Floats, limits: SensorLimits
+) -> RangeEpochs:
+    """Ranges by the epoch that comes after each."""
+    index = {str(name): k for k, name in enumerate(units.name)}
+    unit = np.array([index.get(str(name), -1) for name in ranging.station], dtype=np.intp)
+    epoch = np.searchsorted(edges, ranging.time, side="left") - 1
+    rows = np.flatnonzero((unit >= 0) & (epoch >= 0) & (epoch < len(edges) - 1))
+    epoch = epoch[rows]
+    slot = np.arange(len(rows)) - np.searchsorted(epoch, epoch)
+    shape = (len(edges) - 1, int(slot.max(initial=-1)) + 1)
+    values, sigmas, ages = (np.full(shape, np.nan) for _ in range(3))
+    places = np.full((*shape, 3), np.nan)
+    values[epoch, slot] = ranging.range_m[rows]
+    stated = ranging.sigma_m[rows]
+    sigmas[epoch, slot] = np.where(np.isfinite(stated), np.maximum(stated, limits.range_sigma_m), limits.range_sigma_m)
+    ages[epoch, slot] = seconds(edges[1:][epoch] - ranging.time[rows])
+    places[epoch, slot] = units.ecef_m[unit[rows]]
+    return RangeEpochs(range_m=values, sigma_m=sigmas, age_s=ages, unit_ecef_m=places, lever_m=lever_m)
 
 
 def _unknown(arc_m: Floats) -> Floats:

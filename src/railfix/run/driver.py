@@ -19,7 +19,7 @@ from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
-from railfix.motion.samples import SensorSamples
+from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, risk_of
 from railfix.pipeline.processor import EpochProcessor
@@ -40,7 +40,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
 from railfix.run.route import RouteOfLog, find_route
-from railfix.run.sensors import read_sensors
+from railfix.run.sensors import check_units, read_sensors, read_units
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
@@ -133,8 +133,8 @@ def run_files(
         folder = stack.enter_context(OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths))
         entries = inputs.entries(stack.enter_context(ThreadPoolExecutor(max_workers=1)), out)
         navigation, line, logs = open_inputs(inputs, options, config)
-        processor = processor_of(config, navigation, line.trajectories)
-        sensors = _sensors_of(inputs)
+        sensors, units = sensors_of(inputs)
+        processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
         write = options.observations == "write"
         runs: dict[str, AntennaRun | OtherProcess] = {
             name: AntennaRun(name, processor, log, sensors, observations=write)
@@ -250,12 +250,25 @@ def time_of(navigation: Navigation) -> np.datetime64 | None:
 def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunOptions) -> AntennaRun:
     """Return the run of one antenna, for a process of its own."""
     navigation, line, logs = open_inputs(inputs, options, config)
-    processor = processor_of(config, navigation, line.trajectories)
-    return AntennaRun(name, processor, logs[name], _sensors_of(inputs), observations=options.observations == "write")
+    sensors, units = sensors_of(inputs)
+    processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
+    return AntennaRun(name, processor, logs[name], sensors, observations=options.observations == "write")
 
 
-def _sensors_of(inputs: RunInputs) -> SensorSamples:
-    return read_sensors(tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar)
+def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
+    """Read the samples of the sensors on board, and the ground units that they measured ranges to.
+
+    Raises
+    ------
+    InputFileError, MismatchError
+        A table is not what it should be; ranges to a unit without a surveyed position.
+    """
+    samples = read_sensors(
+        tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging
+    )
+    units = None if inputs.ranging_units is None else read_units(inputs.ranging_units)
+    check_units(samples, units, inputs.ranging_units)
+    return samples, units
 
 
 def _position(

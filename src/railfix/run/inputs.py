@@ -100,8 +100,10 @@ class RunInputs(InputFiles):
     heights : Path or None
         Heights of a track map without.
     vehicle : Path or None
-    tachometer, inertial, radar : Path or None
+    tachometer, inertial, radar, ranging : Path or None
         Tables of the sensors on board.
+    ranging_units : Path or None
+        Surveyed positions of the ground units that `ranging` names.
     truth : Path or None
         Reference positions, for `ablate` alone.
     config : Path or None
@@ -128,6 +130,11 @@ class RunInputs(InputFiles):
     )
     inertial: Path | None = input_option("Specific forces and rates of an inertial unit: CSV or Parquet.", None)
     radar: Path | None = input_option("Speeds of a Doppler radar: CSV or Parquet with time_gpst, speed_mps.", None)
+    ranging: Path | None = input_option(
+        "Two-way ranges to ground units: CSV or Parquet with time_gpst, unit, range_m and, where it is known, sigma_m.",
+        None,
+    )
+    ranging_units: Path | None = input_option("Surveyed ground units: CSV with unit, x_m, y_m, z_m (ECEF).", None)
     config: Path | None = None
     cn0_curve: Path | None = None
     error_model: Path | None = None

@@ -6,15 +6,24 @@ from collections.abc import Mapping
 
 from railfix.core.errors import SettingsError
 from railfix.gnss.navigation import Navigation
+from railfix.motion.samples import GroundUnits
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
 from railfix.ranges.sbas import read_sbas
+from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
 
-def processor_of(config: Config, navigation: Navigation, trajectories: Mapping[str, Trajectory]) -> EpochProcessor:
+def processor_of(
+    config: Config,
+    navigation: Navigation,
+    trajectories: Mapping[str, Trajectory],
+    *,
+    track: Track | None = None,
+    units: GroundUnits | None = None,
+) -> EpochProcessor:
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
     Parameters
@@ -23,6 +32,10 @@ def processor_of(config: Config, navigation: Navigation, trajectories: Mapping[s
     navigation : Navigation
     trajectories : mapping of str to Trajectory
         By antenna.
+    track : Track, optional
+        The line itself, for places by its features.
+    units : GroundUnits, optional
+        Surveyed stations of two-way ranges.
 
     Raises
     ------
@@ -40,4 +53,6 @@ def processor_of(config: Config, navigation: Navigation, trajectories: Mapping[s
         messages=read_sbas(list(config.sbas)) if config.sbas and config.sbas != "stream" else None,
         error_model=None if config.error_model is None else read_error_model(config.error_model),
         cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
+        track=track,
+        units=units,
     )

@@ -11,8 +11,15 @@ import numpy as np
 import polars as pl
 from polars.exceptions import PolarsError
 
-from railfix.core.errors import InputFileError
-from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
+from railfix.core.errors import InputFileError, MismatchError
+from railfix.motion.samples import (
+    GroundUnits,
+    InertialSamples,
+    RadarSpeeds,
+    SensorSamples,
+    StationRanges,
+    TachometerPulses,
+)
 
 #: Columns of each table beside ``time_gpst``, as `railfix simulate` writes them; those in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -22,11 +29,17 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
         "yaw_rate_radps",
     ),
     "radar": ("speed_mps",),
+    "ranging": ("unit", "range_m", "[sigma_m]"),
+    "ranging_units": ("unit", "x_m", "y_m", "z_m"),
 }  # fmt: skip
 
 
 def read_sensors(
-    *, tachometer: Path | None = None, inertial: Path | None = None, radar: Path | None = None
+    *,
+    tachometer: Path | None = None,
+    inertial: Path | None = None,
+    radar: Path | None = None,
+    ranging: Path | None = None,
 ) -> SensorSamples:
     """Read the tables of the sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
 
@@ -56,7 +69,49 @@ def read_sensors(
         table = _table(radar, "radar")
         speed = table["speed_mps"].cast(pl.Float64).fill_null(float("nan")).to_numpy()
         values["radar"] = RadarSpeeds(time=_times(table), speed_mps=speed)
+    if ranging is not None:
+        table = _table(ranging, "ranging")
+        sigma = table["sigma_m"] if "sigma_m" in table.columns else pl.Series([None]).new_from_index(0, len(table))
+        values["ranging"] = StationRanges(
+            time=_times(table),
+            station=table["unit"].cast(pl.String).to_numpy().astype(np.str_),
+            range_m=table["range_m"].cast(pl.Float64).fill_null(float("nan")).to_numpy(),
+            sigma_m=sigma.cast(pl.Float64).fill_null(float("nan")).to_numpy(),
+        )
     return SensorSamples(**values)
+
+
+def read_units(path: Path) -> GroundUnits:
+    """Read the surveyed positions of ground units: ``unit,x_m,y_m,z_m``, ECEF of the line's frame.
+
+    Raises
+    ------
+    InputFileError
+        No such table, or a unit twice.
+    """
+    table = _columns(path, "ranging_units")
+    names = table["unit"].cast(pl.String)
+    if names.n_unique() < len(names):
+        raise InputFileError(path, f"names unit {names.filter(names.is_duplicated())[0]} twice; give each once")
+    return GroundUnits(
+        name=names.to_numpy().astype(np.str_), ecef_m=table.select("x_m", "y_m", "z_m").cast(pl.Float64).to_numpy()
+    )
+
+
+def check_units(samples: SensorSamples, units: GroundUnits | None, path: Path | None) -> None:
+    """Check that every unit with a range has been surveyed.
+
+    Raises
+    ------
+    MismatchError
+    """
+    measured = set(samples.ranging.station.tolist())
+    missing = sorted(measured - set([] if units is None else units.name.tolist()))
+    if missing:
+        where = "there is no --ranging-units" if path is None else f"{path} has no such unit"
+        raise MismatchError(
+            f"ranges name the ground unit {missing[0]}, and {where}; give the surveyed position of each"
+        )
 
 
 def until(samples: SensorSamples, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
@@ -75,6 +130,17 @@ def _times(table: pl.DataFrame) -> np.ndarray[tuple[int, ...], np.dtype[np.datet
 
 
 def _table(path: Path, kind: str) -> pl.DataFrame:
+    """A table with times that do not fall."""
+    table = _columns(path, kind)
+    if not table["time_gpst"].dtype.is_temporal():
+        raise InputFileError(path, "time_gpst is no time; expected GPS time as 2024-03-05T03:10:00.000000000")
+    falling = np.flatnonzero(np.diff(_times(table)) < np.timedelta64(0, "ns"))
+    if len(falling):
+        raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
+    return table
+
+
+def _columns(path: Path, kind: str) -> pl.DataFrame:
     try:
         if path.suffix == ".parquet":
             table = pl.read_parquet(path)
@@ -85,13 +151,9 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
     except (PolarsError, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputFileError(path, f"cannot be read as a table of the {kind} ({reason})") from error
-    needed = ("time_gpst", *(name for name in COLUMNS[kind] if not name.startswith("[")))
+    stamp = () if kind == "ranging_units" else ("time_gpst",)
+    needed = (*stamp, *(name for name in COLUMNS[kind] if not name.startswith("[")))
     missing = [name for name in needed if name not in table.columns]
     if missing:
         raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
-    if not table["time_gpst"].dtype.is_temporal():
-        raise InputFileError(path, "time_gpst is no time; expected GPS time as 2024-03-05T03:10:00.000000000")
-    falling = np.flatnonzero(np.diff(_times(table)) < np.timedelta64(0, "ns"))
-    if len(falling):
-        raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
     return table

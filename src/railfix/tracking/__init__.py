@@ -6,7 +6,7 @@ trajectory and the new state.
 
 from __future__ import annotations
 
-from railfix.tracking.epochs import GnssEpochs, SensorEpochs
+from railfix.tracking.epochs import GnssEpochs, RangeEpochs, SensorEpochs
 from railfix.tracking.filter import track
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
@@ -18,6 +18,7 @@ __all__ = [
     "GnssEpochs",
     "Kind",
     "Line",
+    "RangeEpochs",
     "SensorEpochs",
     "TrackState",
     "TrackStatus",

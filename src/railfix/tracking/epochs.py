@@ -48,6 +48,26 @@ class GnssEpochs:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RangeEpochs:
+    """Ranges to ground units since the epoch before, up to R an epoch; NaN where there is none.
+
+    Attributes
+    ----------
+    range_m, sigma_m, age_s : ndarray, shape (T, R)
+        Measured so long before the epoch.
+    unit_ecef_m : ndarray, shape (T, R, 3) [m]
+    lever_m : ndarray, shape (3,) [m]
+        From the trajectory's point to the vehicle's unit: along rising arc length, to the right, up.
+    """
+
+    range_m: Floats
+    sigma_m: Floats
+    age_s: Floats
+    unit_ecef_m: Floats
+    lever_m: Floats
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorEpochs:
     """Sensor measurements at the same epochs, shape (T,) each, NaN where there is none; None without the sensor.
 
@@ -62,7 +82,9 @@ class SensorEpochs:
     force_mps2, force_sigma_mps2 : ndarray or None [m/s2]
         Mean specific force along rising chainage since the epoch before, gravity on the gradient included.
     place_m, place_sigma_m : ndarray or None [m]
-        Arc length, by a feature of the line or ranges to ground units.
+        Arc length, by a feature of the line.
+    ranges : RangeEpochs or None
+        Two-way ranges to ground units.
     """
 
     wheel_m: Floats | None = None
@@ -74,6 +96,7 @@ class SensorEpochs:
     force_sigma_mps2: Floats | None = None
     place_m: Floats | None = None
     place_sigma_m: Floats | None = None
+    ranges: RangeEpochs | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

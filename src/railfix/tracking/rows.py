@@ -29,13 +29,15 @@ from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.core.geodesy import range_with_rotation
 from railfix.tracking.chunk import Chunk
-from railfix.tracking.epochs import SensorEpochs
+from railfix.tracking.epochs import RangeEpochs, SensorEpochs
 from railfix.tracking.line import Line
 from railfix.tracking.state import OFFSETS, SATELLITES, Unknown
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Standard gravity, enough for the share of it along a gradient [m/s2].
 _GRAVITY_MPS2: Final = 9.80665
+#: Slower than this ranges to ground units are not used [m/s].
+_STILL_MPS: Final = 0.3
 #: Slower than this a speed does not tell the direction [m/s].
 DIRECTION_MPS: Final = 0.5
 #: Shorter than this the tangent is the direction of a displacement [m].
@@ -274,6 +276,8 @@ def sensor_rows(
     place, sigma = sensors.place_m, sensors.place_sigma_m
     if place is not None and sigma is not None and np.isfinite(place[epoch]):
         listed.append(({Unknown.PLACE: 1.0}, place[epoch] - state[Unknown.PLACE], float(sigma[epoch]), Kind.PLACE))
+    if sensors.ranges is not None:
+        listed += _range_rows(sensors.ranges, epoch, line, mean)
     if not listed:
         return None
     design = np.zeros((len(mean), len(listed), mean.shape[1]))
@@ -286,3 +290,31 @@ def sensor_rows(
         variance=np.array([sigma**2 for _, _, sigma, _ in listed]),
         kind=np.array([int(kind) for _, _, _, kind in listed]),
     )
+
+
+def _range_rows(
+    ranges: RangeEpochs, epoch: int, line: Line, mean: Floats
+) -> list[tuple[dict[Unknown, Any], Floats, float, Kind]]:
+    """Ranges to ground units; none while the train stands, for the error of a standing range stays (P2 3.3)."""
+    if abs(mean[0, Unknown.SPEED]) < _STILL_MPS:
+        return []
+    listed: list[tuple[dict[Unknown, Any], Floats, float, Kind]] = []
+    for k in np.flatnonzero(np.isfinite(ranges.range_m[epoch])).tolist():
+        age = float(ranges.age_s[epoch, k])
+        place = mean[:, Unknown.PLACE] - age * mean[:, Unknown.SPEED]
+        along, right, up = ranges.lever_m.tolist()
+        point, axes = line.at(place + along)
+        across = mean[:, Unknown.MAP_RIGHT] + right
+        above = mean[:, Unknown.MAP_UP] + up
+        sight = ranges.unit_ecef_m[epoch, k] - point - across[:, None] * axes[:, 1] - above[:, None] * axes[:, 2]
+        size = np.sqrt((sight * sight).sum(axis=1))
+        slopes = -(axes @ (sight / size[:, None])[..., None])[..., 0]
+        coefficients = {
+            Unknown.PLACE: slopes[:, 0],
+            Unknown.SPEED: -age * slopes[:, 0],
+            Unknown.MAP_RIGHT: slopes[:, 1],
+            Unknown.MAP_UP: slopes[:, 2],
+        }
+        value = float(ranges.range_m[epoch, k]) - size
+        listed.append((coefficients, value, float(ranges.sigma_m[epoch, k]), Kind.PLACE))
+    return listed

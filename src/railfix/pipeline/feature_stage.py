@@ -1,0 +1,275 @@
+"""Places by changes of gradient and curvature: series of the inertial unit over the way against the line (P2 2.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks
+from railfix.core.timescale import seconds
+from railfix.motion.features import Feature, FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from railfix.track import Track
+from railfix.track.trajectory import Trajectory
+
+#: Slower than this the rates say nothing of the line [m/s].
+_SLOWEST_MPS: Final = 1.0
+#: Rates over a length are the mean of so many metres: the body's swings are shorter.
+_LEAST_POINTS: Final = 30
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineFeatures:
+    """Gradient and curvature of a line, and its features in order; arc lengths are those of the line itself.
+
+    Attributes
+    ----------
+    series : LineSeries
+    features : tuple of Feature
+    antenna_m, body_m : ndarray, shape (V,) [m]
+        Arc lengths of the antenna's trajectory, and of the body's middle on the line then: the body turns about it.
+    """
+
+    series: LineSeries
+    features: tuple[Feature, ...]
+    antenna_m: Floats
+    body_m: Floats
+
+    @classmethod
+    def of(cls, track: Track, trajectory: Trajectory, limits: FeatureLimits) -> LineFeatures:
+        """Features of a track for the body that carries an antenna."""
+        line = Trajectory.from_track(track)
+        series = line_series(line, limits=limits)
+        body = trajectory.chainage_m if trajectory.body_chainage_m is None else trajectory.body_chainage_m
+        inside = np.clip(body, line.chainage_m[0], line.chainage_m[-1])
+        return cls(
+            series=series,
+            features=tuple(map_features(series, limits=limits)),
+            antenna_m=np.asarray(trajectory.arc_m),
+            body_m=line.arc_at_chainage(inside) + body - inside,
+        )
+
+    def body_at(self, antenna_m: Floats) -> Floats:
+        """Place of the body's middle where an antenna is at an arc length of its trajectory [m]."""
+        return np.interp(antenna_m, self.antenna_m, self.body_m)
+
+
+def ahead_m(trajectory: Trajectory) -> float:
+    """Return how far an antenna is ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
+    if trajectory.body_chainage_m is None:
+        return 0.0
+    return float(np.median(trajectory.chainage_m - trajectory.body_chainage_m))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RateSeries:
+    """Rates of the body at K ticks.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (K,)
+    way_m : ndarray, shape (K,) [m]
+        Wheel's way since the tick before the first, in rising arc length.
+    arc_m : ndarray, shape (K,) [m]
+        Place of the antenna by the wheel; NaN where it is not known.
+    turned_rad, climbed_rad : ndarray, shape (K,)
+        Change of heading (+ to the right) and of pitch (+ nose up) since the tick before.
+    speed_mps : ndarray, shape (K,) [m/s]
+        In rising arc length.
+    rolls : ndarray of bool, shape (K,)
+        The wheel rolls.
+    """
+
+    time: Datetimes
+    way_m: Floats
+    arc_m: Floats
+    turned_rad: Floats
+    climbed_rad: Floats
+    speed_mps: Floats
+    rolls: Masks
+
+    def arc_at(self, time: Datetimes) -> Floats:
+        """Places at times after the first tick, on from the tick before each [m]."""
+        last = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
+        since = seconds(time - self.time[last])
+        return np.asarray(self.arc_m[last] + np.nan_to_num(self.speed_mps[last]) * since)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureState:
+    """What one chunk leaves to the next.
+
+    Attributes
+    ----------
+    way_m : float [m]
+        Way at the last tick.
+    angles : tuple of float [rad]
+        Heading and pitch there, from any beginning.
+    metre : ndarray of int64, shape (M,)
+        Whole metres of way passed without a break, in the order of travel.
+    heading_rad, pitch_rad : ndarray, shape (M,)
+        At each.
+    last : tuple of float or None
+        Place of the last accepted feature, its standard deviation, and the way there [m].
+    done_m : float [m]
+        Place up to which features have been compared; NaN before the first.
+    """
+
+    way_m: float = 0.0
+    angles: tuple[float, float] = (0.0, 0.0)
+    metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    heading_rad: Floats = field(default_factory=lambda: np.empty(0))
+    pitch_rad: Floats = field(default_factory=lambda: np.empty(0))
+    last: tuple[float, float, float] | None = None
+    done_m: float = float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureFix:
+    """Verdict on one feature.
+
+    Attributes
+    ----------
+    tick : int
+        After which of the ticks it was passed.
+    feature : Feature
+    located : Located
+    """
+
+    tick: int
+    feature: Feature
+    located: Located
+
+    @property
+    def correction_m(self) -> float:
+        """Place less that by the wheel [m]; NaN unless accepted."""
+        return self.located.arc_m - self.feature.arc_m
+
+
+def feature_fixes(
+    rates: RateSeries,
+    line: LineFeatures,
+    facing: float,
+    sigma_m: float,
+    state: FeatureState,
+    *,
+    noise: tuple[float, float],
+    limits: FeatureLimits,
+) -> tuple[list[FeatureFix], FeatureState]:
+    """Return verdicts on the features that were passed, and the state to pass on.
+
+    A feature is compared once the body's middle is `half_length_m` beyond it. Only ways without a slip and faster than
+    1 m/s count: heading and pitch are integrals, and a break begins them anew.
+
+    Parameters
+    ----------
+    rates : RateSeries
+    line : LineFeatures
+    facing : float
+        1 where the front points to rising arc length, else -1.
+    sigma_m : float [m]
+        Of the place by the wheel.
+    state : FeatureState
+    noise : tuple of float
+        Standard deviations of gradient and curvature in one metre.
+    limits : FeatureLimits
+    """
+    ways = np.concatenate([[0.0], rates.way_m]) + state.way_m
+    heading, pitch = (
+        np.concatenate([[0.0], np.cumsum(turns)]) + begin
+        for turns, begin in zip((rates.turned_rad, rates.climbed_rad), state.angles, strict=True)
+    )
+    usable = rates.rolls & (np.abs(rates.speed_mps) > _SLOWEST_MPS) & np.isfinite(heading[1:] + pitch[1:])
+    fixes: list[FeatureFix] = []
+    metre, headings, pitches = state.metre, state.heading_rad, state.pitch_rad
+    kept, last, done = int(2.5 * limits.half_length_m), state.last, state.done_m
+    breaks = np.flatnonzero(~usable)
+    # stretches of usable ticks, each closed by one that is not
+    edges = np.concatenate([[-1], breaks, [len(usable)]])
+    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        if begin >= 0:
+            metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
+        if end - begin < 2:
+            continue
+        rows = slice(begin + 1, end + 1)  # ticks begin + 1 .. end - 1, with the one before them at index begin + 1
+        way = ways[rows]
+        whole = _whole_metres(way)
+        if len(metre) and len(whole) and whole[0] != metre[-1] + np.sign(way[-1] - way[0]):
+            metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
+        rising = way if way[-1] >= way[0] else way[::-1]
+        turned, climbed = (v[rows] if way[-1] >= way[0] else v[rows][::-1] for v in (heading, pitch))
+        metre = np.concatenate([metre, whole])
+        headings = np.concatenate([headings, np.interp(whole, rising, turned)])
+        pitches = np.concatenate([pitches, np.interp(whole, rising, climbed)])
+        body = line.body_at(rates.arc_m[begin + 1 : end])
+        if not np.isfinite(body[-1]) or len(metre) < _LEAST_POINTS:
+            continue
+        sense = 1.0 if metre[-1] > metre[0] else -1.0
+        behind = body - sense * limits.half_length_m
+        passed = float(behind[-1])
+        known = done if done == done else float(behind[0])
+        for feature in line.features:
+            if not 0.0 < sense * (feature.arc_m - known) <= sense * (passed - known):
+                continue
+            tick = begin + 1 + int(np.argmax(sense * (behind - feature.arc_m) >= 0.0))
+            shift = float(body[tick - begin - 1] - ways[tick + 1])  # from ways to places of the body's middle
+            until_tick = sense * (metre - ways[tick + 1]) <= 0.0
+            located = _compared(
+                metre[until_tick], headings[until_tick], pitches[until_tick], shift, feature, line, facing, sense,
+                sigma_m, last, noise, limits,
+            )  # fmt: skip
+            if located is None:
+                continue
+            fixes.append(FeatureFix(tick=tick, feature=feature, located=located))
+            if located.verdict == "accepted":
+                last = (located.arc_m, located.sigma_m, feature.arc_m - shift)
+        # a place corrected backward passes nothing twice
+        done = passed if not sense * (passed - done) < 0.0 or abs(passed - done) > limits.half_length_m else done
+    metre, headings, pitches = metre[-kept:], headings[-kept:], pitches[-kept:]
+    angles = (float(np.nan_to_num(heading[-1])), float(np.nan_to_num(pitch[-1])))
+    return fixes, replace(
+        state, way_m=float(ways[-1]), angles=angles, metre=metre, heading_rad=headings, pitch_rad=pitches, last=last,
+        done_m=done,
+    )  # fmt: skip
+
+
+def _whole_metres(way_m: Floats) -> Integers:
+    """Whole metres between the first value and the last, in the order of travel."""
+    first, last = float(way_m[0]), float(way_m[-1])
+    if last >= first:
+        return np.arange(np.floor(first) + 1, np.floor(last) + 1).astype(np.int64)
+    return np.arange(np.ceil(first) - 1, np.ceil(last) - 1, -1).astype(np.int64)
+
+
+def _compared(
+    metre: Integers,
+    heading_rad: Floats,
+    pitch_rad: Floats,
+    shift_m: float,
+    feature: Feature,
+    line: LineFeatures,
+    facing: float,
+    sense: float,
+    sigma_m: float,
+    last: tuple[float, float, float] | None,
+    noise: tuple[float, float],
+    limits: FeatureLimits,
+) -> Located | None:
+    """Verdict on one feature; None where the way about it was not passed without a break."""
+    order = slice(None) if sense > 0 else slice(None, None, -1)
+    about = metre[order] + shift_m - feature.arc_m
+    near = np.flatnonzero(np.abs(about) <= limits.half_length_m)
+    if len(near) < 1.8 * limits.half_length_m or len(near) < 3:
+        return None
+    # In rising arc length: a vehicle that backs or faces the other way turns the signs of pitch, heading stays.
+    heading, pitch = heading_rad[order][near], facing * pitch_rad[order][near]
+    measured = LineSeries(
+        arc_m=np.asarray(about[near][1:-1], dtype=np.float64),
+        gradient=np.tan(pitch[1:-1]),
+        curvature_1pm=0.5 * (heading[2:] - heading[:-2]),
+    )
+    since = None if last is None else (last[0], last[1], feature.arc_m - shift_m - last[2])
+    return locate(
+        measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=since, limits=limits
+    )

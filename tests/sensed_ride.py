@@ -1,0 +1,128 @@
+"""A simulated ride with sensors on board through the filter, in memory: what tests and tables of the sensors share."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from railfix.core.settings import write_toml
+from railfix.core.timescale import seconds
+from railfix.gnss.observations import Observations
+from railfix.motion.samples import GroundUnits, SensorSamples
+from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.processor import State
+from railfix.run.processor import processor_of
+from railfix.run.sensors import read_sensors, read_units, until
+from railfix.simulate import Scenario, Simulation
+from railfix.simulate.run import vehicle_table
+from railfix.simulate.scenario_file import load_recipe
+from railfix.simulate.sensors.tables import sensor_tables
+from railfix.track.vehicle import antenna_trajectory, read_vehicle
+
+#: The inertial unit of `commercial-run`.
+UNIT: dict[str, Any] = {
+    "accel_bias_mps2": [0.02, -0.01, 0.03],
+    "gyro_bias_radps": [1e-5, -2e-5, 1e-5],
+    "accel_drift_sigma_mps2": 0.002,
+    "gyro_drift_sigma_radps": 1e-5,
+    "velocity_walk_mps_per_sqrt_s": 0.001,
+    "angle_walk_rad_per_sqrt_s": 5e-5,
+}
+
+
+@dataclass(frozen=True)
+class Ride:
+    """One antenna's log with the samples of the sensors and the ground truth."""
+
+    simulation: Simulation
+    observations: Observations
+    samples: SensorSamples
+    units: GroundUnits | None
+    chainage_m: np.ndarray
+    speed_mps: np.ndarray
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """Seconds since the start."""
+        return seconds(self.observations.time - self.observations.time[0])
+
+    def run(
+        self,
+        *,
+        observations: Observations | None = None,
+        samples: SensorSamples | None = None,
+        cuts: Sequence[int] = (),
+        **settings: object,
+    ) -> AlongTrack:
+        """Through the filter, in chunks that end at `cuts`."""
+        line = self.simulation.line
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "vehicle.toml"
+            write_toml(path, vehicle_table(self.simulation.scenario.vehicle))
+            trajectories = {"front": antenna_trajectory(line.track(), read_vehicle(path), "front")}
+        config = parse_config({"filter": "track", "protection": "off", **settings})
+        processor = processor_of(config, self.simulation.navigation, trajectories, track=line.track(), units=self.units)
+        whole = self.observations if observations is None else observations
+        samples = self.samples if samples is None else samples
+        state, received = State(), np.datetime64("NaT", "ns")
+        parts: list[AlongTrack] = []
+        for first, last in zip([0, *cuts], [*cuts, len(whole)], strict=True):
+            chunk = whole[first:last]
+            end = chunk.time[-1]
+            result, state = processor.process({"front": chunk}, state, sensors=until(samples, received, end))
+            received = end
+            parts.append(result.fusion["front"])
+        return joined(parts)
+
+    def error_m(self, found: AlongTrack) -> np.ndarray:
+        """Along the line."""
+        return found.chainage_m - self.chainage_m
+
+
+def joined(parts: Iterable[Any]) -> Any:
+    """Chunks of one result one after the other."""
+    parts = list(parts)
+    values = {}
+    for name, value in vars(parts[0]).items():
+        if isinstance(value, np.ndarray):
+            values[name] = np.concatenate([getattr(p, name) for p in parts])
+        elif name == "tracked":
+            values[name] = joined(getattr(p, name) for p in parts)
+    return replace(parts[0], **values)
+
+
+@cache
+def ride(text: str = "{}", name: str = "demo") -> Ride:
+    """The ride of a scenario with changes, written as a dict literal so that rides are made once."""
+    changes = eval(text, {"UNIT": UNIT})
+    return made(load_recipe(name).scenario().replaced(**changes))
+
+
+def made(scenario: Scenario) -> Ride:
+    """The ride of a scenario: its front antenna."""
+    simulation = Simulation(scenario)
+    pieces = list(simulation.pieces("front", chunk_epochs=100_000))
+    assert len(pieces) == 1
+    tables = sensor_tables(simulation)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = {n: Path(folder) / f"{n}.parquet" for n in tables if n != "wheel_slips"}
+        for n, path in paths.items():
+            tables[n].write_parquet(path)
+        units = read_units(paths.pop("ranging_units")) if "ranging_units" in paths else None
+        samples = read_sensors(**paths)
+    line, geometry = simulation.line, pieces[0].geometry
+    return Ride(
+        simulation=simulation,
+        observations=pieces[0].observations,
+        samples=samples,
+        units=units,
+        chainage_m=np.interp(geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m),
+        speed_mps=geometry.speed_mps,
+    )
