@@ -39,7 +39,10 @@ UNIT: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Ride:
-    """One antenna's log with the samples of the sensors and the ground truth."""
+    """One antenna's log with the samples of the sensors and the ground truth.
+
+    `along` is the cosine of the angle between each satellite and the track toward its end.
+    """
 
     simulation: Simulation
     observations: Observations
@@ -47,6 +50,7 @@ class Ride:
     units: GroundUnits | None
     chainage_m: np.ndarray
     speed_mps: np.ndarray
+    along: np.ndarray
 
     @property
     def time_s(self) -> np.ndarray:
@@ -80,6 +84,11 @@ class Ride:
             received = end
             parts.append(result.fusion["front"])
         return joined(parts)
+
+    def jumped(self, begin_s: float, end_s: float, metres: float) -> Observations:
+        """The observations with codes as of a place further along the line for some time."""
+        shift = np.where((self.time_s >= begin_s) & (self.time_s < end_s), metres, 0.0)
+        return replace(self.observations, code_m=self.observations.code_m - shift[:, None] * self.along)
 
     def error_m(self, found: AlongTrack) -> np.ndarray:
         """Along the line."""
@@ -125,4 +134,6 @@ def made(scenario: Scenario) -> Ride:
         units=units,
         chainage_m=np.interp(geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m),
         speed_mps=geometry.speed_mps,
+        along=np.cos(np.radians(geometry.elevation_deg))
+        * np.cos(np.radians(geometry.azimuth_deg - geometry.heading_deg[:, None])),
     )

@@ -18,10 +18,11 @@ from railfix.gnss.signals import carrier_frequency_hz
 from railfix.motion.samples import SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
+from railfix.pipeline.return_gate import ReturnState, refused_codes
 from railfix.pipeline.sensor_epochs import SensorState, Surroundings, sensor_epochs
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.track.trajectory import Trajectory
-from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackState, TrackStatus, track
+from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
 _WEIGHED_BY_FILTER: Final = (
@@ -66,12 +67,25 @@ class Fixed:
 
 @dataclass(frozen=True, kw_only=True)
 class FilterState:
-    """State of the filter along the track of one antenna after a chunk."""
+    """State of the filter along the track of one antenna after a chunk.
+
+    Attributes
+    ----------
+    slips : SlipState or None
+        Of the carrier phases.
+    track : TrackState or None
+    sensors : SensorState
+    fixed, anchor : Fixed or None
+        Place of the filter at the last epoch, and at the last one before the present stretch.
+    gate : ReturnState
+    """
 
     slips: SlipState | None = None
     track: TrackState | None = None
     sensors: SensorState = field(default_factory=SensorState.empty)
     fixed: Fixed | None = None
+    anchor: Fixed | None = None
+    gate: ReturnState = field(default_factory=ReturnState)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,6 +136,7 @@ def along_track(
     *,
     samples: SensorSamples | None = None,
     surroundings: Surroundings | None = None,
+    alone: tuple[Floats, Floats] | None = None,
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna, and the state to pass on.
 
@@ -139,11 +154,14 @@ def along_track(
         Of the sensors on board since the chunk before.
     surroundings : Surroundings, optional
         Features of the line and ground units that the sensors meet.
+    alone : tuple of ndarray, shapes (T,), optional [m]
+        Arc length and standard deviation of each epoch by itself: after an outage codes count again when it agrees with
+        the place that the sensors carried.
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
     line = Line.of(trajectory)
     tracked, motion, after = _tracked(
-        epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings
+        epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings, alone
     )
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
@@ -173,6 +191,7 @@ def _tracked(
     state: FilterState,
     samples: SensorSamples | None,
     surroundings: Surroundings | None,
+    alone: tuple[Floats, Floats] | None,
 ) -> tuple[Tracked, Codes, FilterState]:
     """Places of the filter, motion by the sensors, and the state to pass on.
 
@@ -191,12 +210,19 @@ def _tracked(
     motions: list[Codes] = []
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
         part = epochs if last - first == len(epochs) else _part(epochs, first, last)
-        before = _begun_anew(state, part.time) if len(part) else state.sensors
+        if len(part) and state.fixed is not None and _stretch(part.time[0]) != _stretch(state.fixed.time):
+            state = _begun_anew(state, state.fixed)
+        before = state.sensors
         sensors, sensed, kept = sensor_epochs(
             samples, part.time, trajectory, before, limits=config.sensors, sine_at=sine_at,
             sources=config.filter_sources, surroundings=surroundings,
         )  # fmt: skip
         samples = None
+        if sensors.ranges is not None:
+            sensors = replace(sensors, ranges=_gated_ranges(sensors.ranges, part.time, line, state, config))
+        if alone is not None and sensing and len(part):
+            part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], state, config)
+            state = replace(state, gate=gate)
         tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
         state = replace(state, track=after, sensors=kept, fixed=_fixed(tracked) if len(part) else state.fixed)
         parts.append(tracked)
@@ -204,17 +230,58 @@ def _tracked(
     return _joined(parts), np.concatenate(motions), state
 
 
-def _begun_anew(state: FilterState, time: Datetimes) -> SensorState:
-    """State of the sensors with the place of the filter, at the first epoch of a stretch."""
-    sensors, fixed = state.sensors, state.fixed
-    if (
-        fixed is None
-        or sensors.motion.tick == 0
-        or int(time[0].astype(np.int64)) // _STRETCH_NS == int(fixed.time.astype(np.int64)) // _STRETCH_NS
-    ):
-        return sensors
-    place = fixed.arc_at(sensors.motion.time)
-    return replace(sensors, motion=replace(sensors.motion, arc_m=place, sigma_m=fixed.sigma_m))
+def _gated(
+    epochs: GnssEpochs, sensors: SensorEpochs, place_m: Floats, sigma_m: Floats, state: FilterState, config: Config
+) -> tuple[GnssEpochs, ReturnState]:
+    """Epochs without the codes that an outage makes doubtful."""
+    way = np.full(len(epochs), np.nan)
+    for other in (sensors.radar_m, sensors.wheel_m):
+        if other is not None and (other is not sensors.wheel_m or sensors.wheel_sign == "measured"):
+            way = np.where(np.isfinite(other), other, way)
+    observed = np.asarray(np.isfinite(epochs.code_m).any(axis=1))
+    refused, gate = refused_codes(
+        epochs.time, observed, way, place_m, sigma_m, state.gate,
+        sigmas=config.sensors.return_sigmas, longest_s=config.sensors.return_s,
+    )  # fmt: skip
+    return (
+        replace(epochs, code_m=np.where(refused[:, None], np.nan, epochs.code_m)) if refused.any() else epochs
+    ), gate
+
+
+def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
+    """Ranges that fit the place of the filter: echoes come late, a unit surveyed wrongly fits nowhere (P2 3.3).
+
+    The place goes on at the filter's speed since the stretch began, so that the gate opens with the square of time.
+    """
+    fixed = state.anchor
+    if fixed is None:
+        return replace(ranges, range_m=np.full(ranges.range_m.shape, np.nan))
+    since = seconds(time - fixed.time)[:, None] - ranges.age_s
+    place = fixed.arc_m + fixed.speed_mps * since
+    spread = np.sqrt(fixed.sigma_m**2 + (0.5 * config.tracking.acceleration_mps2 * since**2) ** 2 + ranges.sigma_m**2)
+    along, right, up = ranges.lever_m.tolist()
+    point, axes = line.at(np.nan_to_num(place + along).ravel())
+    unit = point + right * axes[:, 1] + up * axes[:, 2]
+    size = np.linalg.norm(ranges.unit_ecef_m - unit.reshape(*place.shape, 3), axis=-1)
+    residual = ranges.range_m - size
+    echo = config.sensors.echo
+    late = np.maximum(echo.late_sigmas * spread, echo.late_m)
+    kept = (residual >= -echo.early_sigmas * spread) & (residual <= late) & np.isfinite(place)
+    return replace(ranges, range_m=np.where(kept, ranges.range_m, np.nan))
+
+
+def _stretch(time: np.datetime64) -> int:
+    return int(time.astype(np.int64)) // _STRETCH_NS
+
+
+def _begun_anew(state: FilterState, fixed: Fixed) -> FilterState:
+    """State at the beginning of a stretch: what the sensors carry begins from the place of the filter."""
+    sensors = state.sensors
+    if sensors.motion.tick:
+        motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
+        sensors = replace(sensors, motion=motion)
+    gate = replace(state.gate, place_m=fixed.arc_m, sigma_m=fixed.sigma_m, way_m=0.0)
+    return replace(state, sensors=sensors, anchor=fixed, gate=gate)
 
 
 def _fixed(tracked: Tracked) -> Fixed:

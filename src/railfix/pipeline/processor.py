@@ -390,6 +390,7 @@ class AntennaChunk:
                 self.filter_state,
                 samples=self._sensors,
                 surroundings=processor.surroundings(self._name, self._sensors),
+                alone=(result.arc_m, result.own_sigma_m),
             )
         return result
 

@@ -13,6 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.motion.features import FeatureLimits
+from railfix.motion.ranging import EchoLimits
 from railfix.motion.samples import (
     GroundUnits,
     InertialSamples,
@@ -69,9 +70,14 @@ class SensorLimits(Settings):
     range_sigma_m : float
         Of a two-way range where the device reports none: 0.19 to 0.24 m (P2 3.3), echoes and drifts of the unit's
         answering delay beside it.
+    echo : EchoLimits
+        Gate of ranges against the place of the filter.
     range_ahead_m, range_right_m, range_above_m : float
         Place of the vehicle's ranging unit: ahead of the vehicle's middle (without a vehicle file: of the antenna),
         to the right of the antenna's path and above the antenna.
+    return_sigmas, return_s : float
+        After an outage codes count again when three positions in a row lie within so many standard deviations of the
+        place that the sensors carried, or after so long.
     wheel_sigma_m : float
         Of a way between two epochs beside the pulse: creep of a braked or driven wheel.
     radar_sigma_mps, radar_step_s : float
@@ -89,9 +95,12 @@ class SensorLimits(Settings):
     curvature_noise_1pm: float = Field(default=1e-4, gt=0)
     feature_sigma_m: float = Field(default=0.5, gt=0)
     range_sigma_m: float = Field(default=0.5, gt=0)
+    echo: EchoLimits = Field(default_factory=EchoLimits)
     range_ahead_m: float = 0.0
     range_right_m: float = 0.0
     range_above_m: float = 0.0
+    return_sigmas: float = Field(default=4.0, gt=0)
+    return_s: float = Field(default=60.0, ge=0)
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     radar_sigma_mps: float = Field(default=0.1, gt=0)
     radar_step_s: float = Field(default=0.1, gt=0)

@@ -1,0 +1,101 @@
+"""Satellites that come back after an outage: codes count again once three positions agree with the coasted place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.timescale import seconds
+
+#: Without codes for so long the place is that of the sensors [s].
+_OUTAGE_S: Final = 2.0
+#: Positions that must agree before codes count again.
+_AGREEING: Final = 3
+#: Standard deviation of a way by the sensors since the beginning of a stretch, as a share.
+_WAY_SHARE: Final = 0.01
+#: Least standard deviation of a single epoch at the end of a tunnel [m]: multipath of the portal.
+_LEAST_SIGMA_M: Final = 2.0
+_NEVER: Final = np.datetime64("NaT", "ns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReturnState:
+    """What one chunk leaves to the next.
+
+    Attributes
+    ----------
+    time : datetime64[ns]
+        Last epoch whose codes counted; NaT before the first.
+    place_m, sigma_m : float [m]
+        Coasted place at the last epoch and its standard deviation; NaN where no sensor gives a way.
+    way_m : float [m]
+        Since the filter's own place.
+    returned : datetime64[ns]
+        First epoch with codes after the outage; NaT without.
+    agreeing : int
+        Positions in a row that agreed since.
+    """
+
+    time: np.datetime64 = _NEVER
+    place_m: float = float("nan")
+    sigma_m: float = float("nan")
+    way_m: float = 0.0
+    returned: np.datetime64 = _NEVER
+    agreeing: int = 0
+
+
+def refused_codes(
+    time: Datetimes,
+    observed: Masks,
+    way_m: Floats,
+    place_m: Floats,
+    sigma_m: Floats,
+    state: ReturnState,
+    *,
+    sigmas: float,
+    longest_s: float,
+) -> tuple[Masks, ReturnState]:
+    """Return the epochs whose codes do not count yet, shape (T,), and the state to pass on.
+
+    After an outage the position of each epoch by itself is compared with the place coasted on the sensors: codes count
+    again with the third in a row that lies within `sigmas` of both standard deviations together, and after `longest_s`
+    in any case. Where no sensor gives a way nothing is refused.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    observed : ndarray of bool, shape (T,)
+        Epochs with codes.
+    way_m : ndarray, shape (T,) [m]
+        By the sensors since the epoch before; NaN where there is none.
+    place_m, sigma_m : ndarray, shape (T,) [m]
+        Position of each epoch by itself; NaN where there is none.
+    state : ReturnState
+        With the place of the filter at the epoch before the first.
+    sigmas, longest_s : float
+    """
+    refused = np.zeros(len(time), dtype=np.bool_)
+    ways = state.way_m + np.cumsum(way_m)
+    coasted = state.place_m + np.cumsum(way_m)
+    spread = np.sqrt(state.sigma_m**2 + (_WAY_SHARE * ways) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
+    fits = np.abs(place_m - coasted) <= sigmas * spread
+    last, returned, agreeing = state.time, state.returned, state.agreeing
+    steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
+    if np.isnat(returned) and observed.all() and steps.max(initial=0.0) < _OUTAGE_S:
+        last, observed = time[-1] if len(time) else last, observed[:0]
+    for k in np.flatnonzero(observed).tolist():
+        out = not np.isnat(last) and (not np.isnat(returned) or float(seconds(time[k] - last)) >= _OUTAGE_S)
+        if out and np.isfinite(coasted[k]):
+            returned = time[k] if np.isnat(returned) else returned
+            agreeing = agreeing + 1 if fits[k] else 0
+            refused[k] = agreeing < _AGREEING and float(seconds(time[k] - returned)) <= longest_s
+        if not refused[k]:
+            last, returned, agreeing = time[k], _NEVER, 0
+    if not len(time):
+        return refused, state
+    return refused, replace(
+        state, time=last, place_m=float(coasted[-1]), way_m=float(ways[-1]), returned=returned, agreeing=agreeing
+    )

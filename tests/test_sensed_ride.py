@@ -1,0 +1,105 @@
+"""Sensors inside the filter along the track, on a simulated ride through a tunnel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from railfix.motion.samples import GroundUnits
+from railfix.motion.slip import MotionState
+from railfix.pipeline.train_table import antenna_train
+from railfix.tracking import Kind
+from sensed_ride import Ride, ride
+
+#: A tunnel between 61 and 68 s; the wheel slips in it.
+RIDE = """{
+    "duration_s": 84.0, "rate_hz": 2.0,
+    "sensors": {
+        "tachometer": {"jitter_s": 2e-6, "lowest_mps": 0.3, "slips": [{"start_s": 62.5, "end_s": 65.0, "ratio": 0.25}]},
+        "inertial": UNIT,
+        "ranging": {
+            "noise_sigma_m": 0.19, "multipath_sigma_m": 0.1, "echo_chance": 0.05,
+            "units": [{"name": "A", "chainage_m": 480.0}, {"name": "B", "chainage_m": 500.0, "lateral_m": -3.0}],
+        },
+    },
+}"""
+PLACE = {"range_ahead_m": 9.0, "range_above_m": -1.0}
+GNSS = ("code", "phase", "doppler")
+
+
+@pytest.fixture(scope="module")
+def case() -> Ride:
+    return ride(RIDE)
+
+
+def tunnel(case: Ride) -> np.ndarray:
+    return ~np.isfinite(case.observations.code_m).any(axis=1) & (case.time_s > 50.0)
+
+
+@pytest.mark.requirement("E5")
+def test_any_cutting_of_the_log_gives_the_same(case: Ride) -> None:
+    whole = case.run(sensors=PLACE)
+    # epoch by epoch in the tunnel, in odd pieces elsewhere
+    cuts = [1, 2, 37, 38, 95, *range(118, 142), 150]
+    cut = case.run(sensors=PLACE, cuts=cuts)
+    np.testing.assert_allclose(cut.chainage_m, whole.chainage_m, atol=1e-6)
+    np.testing.assert_array_equal(cut.motion, whole.motion)
+    np.testing.assert_array_equal(cut.tracked.used, whole.tracked.used)
+
+
+@pytest.mark.requirement("E1")
+def test_a_slip_in_a_tunnel_is_carried_by_inertia(case: Ride) -> None:
+    wheel_alone = case.run(filter_sources=(*GNSS, "wheel"))
+    both = case.run(filter_sources=(*GNSS, "wheel", "force"))
+    inside = tunnel(case)
+    slipping = (case.time_s > 63.0) & (case.time_s < 65.0)
+    assert (both.motion[slipping] == MotionState.INERTIAL_SPIN).all()
+    assert np.abs(case.error_m(wheel_alone)[inside]).max() > 2.5
+    assert np.abs(case.error_m(both)[inside]).max() < 1.0
+    table = antenna_train("front", both)
+    assert set(table["sources"].to_numpy()[slipping]) == {"force+carry"}
+    assert set(table["motion"].cast(str).to_numpy()[slipping]) == {"inertial_spin"}
+
+
+@pytest.mark.requirement("E4")
+def test_ranges_to_ground_units_place_the_train_in_the_tunnel(case: Ride) -> None:
+    found = case.run(filter_sources=(*GNSS, "range"), sensors=PLACE)
+    inside = tunnel(case)
+    ranged = inside & (found.tracked.used[:, Kind.PLACE] > 0)
+    assert ranged.sum() >= 0.8 * inside.sum()
+    error = case.error_m(found)[ranged]
+    assert np.abs(error).max() < 0.6
+    assert np.sqrt(np.mean((error / found.tracked.sigma_m[ranged]) ** 2)) < 2.0
+
+
+@pytest.mark.requirement("E4")
+def test_a_unit_surveyed_wrongly_does_not_move_the_train_while_there_are_satellites(case: Ride) -> None:
+    assert case.units is not None
+    far = case.units.ecef_m + 40.0
+    moved = Ride(**{**vars(case), "units": GroundUnits(name=case.units.name, ecef_m=far)})
+    found = moved.run(filter_sources=(*GNSS, "range"), sensors=PLACE)
+    outside = ~tunnel(case) & (case.time_s > 30.0) & (case.time_s < 61.0)
+    assert np.abs(case.error_m(found)[outside]).max() < 3.0
+
+
+@pytest.mark.requirement("E3")
+def test_a_curve_before_the_tunnel_sharpens_the_place(case: Ride) -> None:
+    without = case.run(filter_sources=(*GNSS, "wheel", "force"))
+    found = case.run(filter_sources=(*GNSS, "wheel", "force", "feature"))
+    placed = np.flatnonzero(found.tracked.used[:, Kind.PLACE])
+    assert len(placed)
+    assert found.tracked.sigma_m[placed[-1]] < without.tracked.sigma_m[placed[-1]]
+    np.testing.assert_array_less(np.abs(case.error_m(found)[placed]), 3.0 * found.tracked.sigma_m[placed])
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("metres", [50.0, -50.0, 20.0])
+def test_a_jump_of_the_satellites_at_the_portal_is_refused(case: Ride, metres: float) -> None:
+    jumped = case.jumped(68.0, 78.0, metres)
+    after = case.time_s > 61.0
+    kept = case.run(observations=jumped, filter_sources=(*GNSS, "wheel", "force"))
+    assert np.abs(case.error_m(kept)[after]).max() < 1.5
+    # the gate is what refuses it
+    open_gate = {"return_sigmas": 1e9}
+    moved = case.run(observations=jumped, filter_sources=(*GNSS, "wheel", "force"), sensors=open_gate)
+    assert np.abs(case.error_m(moved)[after]).max() > 4.0
