@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -131,6 +134,95 @@ def test_a_folder_with_other_files_is_refused(folder: Path, tmp_path: Path) -> N
     (tmp_path / "mine.txt").write_text("mine")
     with ThreadPoolExecutor(1) as executor, pytest.raises(OutputError, match="nor that of a campaign"):
         run_campaign(folder / "campaign.toml", out=tmp_path, executor=executor)
+
+
+def test_tracks_vehicles_and_sensors_may_have_fields(folder: Path, tmp_path: Path) -> None:
+    for train in "AB":
+        for name in ("line.csv", "train.toml"):
+            shutil.copy(folder / name, folder / "logs" / train / name)
+    text = CAMPAIGN.replace('"line.csv"', '"logs/{train}/line.csv"').replace(
+        '"train.toml"', '"logs/{train}/train.toml"'
+    )
+    (folder / "each.toml").write_text(f'tachometer = "logs/{{train}}/{{day}}/pulses.csv"\n{text}')
+    (folder / "logs/B/2024-03-06/pulses.csv").write_text("time_gpst,pulse\n")
+    runs = read_campaign(folder / "each.toml", tmp_path)
+    for run in runs:
+        train = folder / "logs" / run.fields["train"]
+        assert (run.inputs.track, run.inputs.vehicle) == ((train / "line.csv",), train / "train.toml")
+    assert [run.inputs.tachometer for run in runs] == [None, None, None, folder / "logs/B/2024-03-06/pulses.csv"]
+
+
+def test_a_worker_that_is_gone_is_a_failed_row(folder: Path, tmp_path: Path) -> None:
+    """A process that is killed takes its pool with it; the next command goes on."""
+
+    class Broken(ThreadPoolExecutor):
+        def submit(self, function: Callable[..., Any], /, *arguments: Any, **rest: Any) -> Future[Any]:
+            run = arguments[0]
+            if run.fields["day"] == "2024-03-06":
+                future: Future[Any] = Future()
+                future.set_exception(BrokenExecutor("a process died"))
+                return future
+            return super().submit(function, *arguments, **rest)
+
+    with Broken(1) as executor:
+        table = run_campaign(folder / "campaign.toml", out=tmp_path / "out", executor=executor)
+    assert table["status"].to_list() == ["done", "failed", "failed", "failed"]
+    assert "worker process is gone" in table["error"][1]
+    assert table["folder"][0] == "runs/train=A/day=2024-03-05"
+
+
+def test_a_scheduler_that_is_none_is_one_sentence(folder: Path, tmp_path: Path) -> None:
+    words = ["campaign", str(folder / "campaign.toml"), "--out", str(tmp_path / "out"), "--scheduler", "tpc://nowhere"]
+    result = RUNNER.invoke(app, words)
+    assert result.exit_code == 4, result.output
+    assert "no scheduler answers there" in " ".join(result.output.split())
+
+
+CLUSTER = """
+from distributed import LocalCluster
+import sys
+if __name__ == "__main__":
+    with LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None) as cluster:
+        print(cluster.scheduler_address, flush=True)
+        sys.stdin.read()
+"""
+
+
+def same_but_for_times(first: Path, second: Path) -> int:
+    """The number of runs of two campaigns that are equal; raises where one is not."""
+    folders = sorted(path.parent.relative_to(first) for path in first.rglob("run.json"))
+    assert folders == sorted(path.parent.relative_to(second) for path in second.rglob("run.json"))
+    for name in folders:
+        for table in (path.name for path in (first / name).glob("*.parquet")):
+            assert pl.read_parquet(first / name / table).equals(pl.read_parquet(second / name / table))
+        records = [json.loads((out / name / "run.json").read_text()) for out in (first, second)]
+        for record in records:
+            for key in ("wall_s", "command", "created", "started", "stages", "processing"):
+                record.pop(key, None)
+        assert records[0].keys() == records[1].keys()
+        for key in ("antennas", "positioning_rate", "ok_rate", "settings_used", "notes"):
+            assert records[0].get(key) == records[1].get(key), key
+    return len(folders)
+
+
+@pytest.mark.slow
+def test_two_workers_of_a_cluster_give_the_same_data_set(folder: Path, tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", CLUSTER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as cluster:
+        assert cluster.stdout is not None
+        address = cluster.stdout.readline().strip()
+        words = [sys.executable, "-m", "railfix", "campaign", str(folder / "campaign.toml"), "--out"]
+        done = subprocess.run(
+            [*words, str(tmp_path / "cluster"), "--scheduler", address], capture_output=True, text=True, check=False
+        )
+        cluster.communicate()
+    assert done.returncode == 0, done.stderr
+    assert "4 of 4 runs, 1 failed" in done.stderr
+    subprocess.run([*words, str(tmp_path / "here")], capture_output=True, check=True)
+    assert same_but_for_times(tmp_path / "cluster", tmp_path / "here") == 3
+    tables = [pl.read_csv(tmp_path / name / "campaign.csv").drop("wall_s") for name in ("cluster", "here")]
+    assert tables[0].equals(tables[1], null_equal=True)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ georinex = pytest.importorskip("georinex")
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning")
 
 
-@pytest.mark.parametrize("package", [railfix, railfix.core])
+@pytest.mark.parametrize("package", [railfix, railfix.core, railfix.motion, railfix.ground])
 def test_every_name_of_the_package_can_be_imported(package: object) -> None:
     names = package.__all__  # type: ignore[attr-defined]
     assert len(names) > 15

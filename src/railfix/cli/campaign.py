@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +15,7 @@ from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_files
 from railfix.cli.options import OutOption
-from railfix.core.errors import NoPositionError
+from railfix.core.errors import NoPositionError, SettingsError
 from railfix.run.campaign import run_campaign
 
 
@@ -22,6 +24,14 @@ def campaign(
     *,
     out: OutOption,
     workers: Annotated[int, typer.Option("--workers", metavar="N", min=1, help="Processes side by side.")] = 2,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Use the workers of a Dask scheduler, tcp://HOST:PORT, that see the same files (extra `cluster`).",
+        ),
+    ] = None,
 ) -> None:
     r"""Position all logs of a campaign, each into its own folder; a killed campaign is continued.
 
@@ -34,6 +44,8 @@ def campaign(
         track = ["line.csv"]
         vehicle = "car.toml"
         config = "settings.toml"
+
+    `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too.
 
     Into DIR come `runs/train=A/day=2024-03-05/` with the files of `railfix run` for each run (together one
     hive-partitioned data set), and `campaign.csv` with one row per run. A run that fails is a row with its error.
@@ -51,8 +63,8 @@ def campaign(
         typer.echo(f"{done} of {total} runs, {failed} failed, {minutes} min {seconds:02d} s left", err=True)
         sys.stderr.flush()
 
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
-        table = run_campaign(path, out=out, executor=executor, progress=progress)
+    with _executor(workers, scheduler) as (executor, lost):
+        table = run_campaign(path, out=out, executor=executor, progress=progress, lost=lost)
     failed = table.filter(status="failed")
     console = console_of_tables()
     shown = Table(*(name for name in table.columns if name != "folder"), show_edge=False)
@@ -65,3 +77,29 @@ def campaign(
     show_files(console, [out / "campaign.csv"])
     if len(failed) == len(table):
         raise NoPositionError(f"every run has failed; the first: {failed['error'][0]}")
+
+
+@contextmanager
+def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
+    """Give the executor, and the errors by which it reports that a worker process is gone.
+
+    Raises
+    ------
+    SettingsError
+        There is no such scheduler, or `distributed` is not installed.
+    """
+    if scheduler is None:
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            yield pool, (BrokenExecutor,)
+        return
+    try:
+        from distributed import Client, KilledWorker
+    except ModuleNotFoundError:
+        raise SettingsError("--scheduler needs distributed; install railfix[cluster]") from None
+    try:
+        client = Client(scheduler, timeout="10s")  # type: ignore[no-untyped-call]
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"--scheduler {scheduler}: no scheduler answers there ({error})") from None
+    with client:
+        executor: Executor = client.get_executor(pure=False)  # type: ignore[no-untyped-call]
+        yield executor, (BrokenExecutor, KilledWorker)

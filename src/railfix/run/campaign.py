@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import time as clock
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -33,28 +33,41 @@ _FIELD: Final = re.compile(r"\{(\w+)\}")
 class Campaign(Settings):
     """Files of a campaign; patterns are relative to its file and have fields in braces.
 
+    Fields that a pattern shares with `front` must agree: ``nav/{day}.nav*`` gives each run the files of its day,
+    ``{line}/track.csv`` the track of its line. Names without fields or ``*`` are files of every run.
+
     Attributes
     ----------
     front, rear : str
         Patterns of the logs: ``logs/{train}/{day}/front.obs*``. Logs with the same fields are one run; several files
         of one antenna are joined in the order of their names. `rear` may be empty.
     nav, sp3 : str
-        Patterns of navigation and precise orbit files. Fields that a pattern shares with `front` must agree:
-        ``nav/{day}.nav*`` gives each run the files of its day. `sp3` may be empty.
-    track : tuple of Path
-    vehicle, config : Path or None
+        Patterns of navigation and precise orbit files. `sp3` may be empty.
+    track : tuple of str
+        Patterns of the track's files, joined to a route in this order.
+    vehicle, tachometer, inertial, radar : str
+        Patterns, each of one file a run; may be empty.
+    config : Path or None
     options : RunOptions
-        Of every run; each is one process, unless they say otherwise.
+        Of every run.
     """
 
     front: str
     nav: str
-    track: tuple[Path, ...]
+    track: tuple[str, ...]
     rear: str = ""
     sp3: str = ""
-    vehicle: Path | None = None
+    vehicle: str = ""
+    tachometer: str = ""
+    inertial: str = ""
+    radar: str = ""
     config: Path | None = None
     options: RunOptions = RunOptions()
+
+
+#: Patterns of several files a run, and of one.
+_MANY: Final = ("front", "rear", "nav", "sp3")
+_ONE: Final = ("vehicle", "tachometer", "inertial", "radar")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,14 +120,16 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
         A setting is misspelt, or a pattern has no field or one that the logs of the front antenna lack.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
-    folder = path.parent
-    found = {name: _found(folder, getattr(campaign, name)) for name in ("front", "rear", "nav", "sp3")}
+    folder, out = path.absolute().parent, out.absolute()
+    patterns = {name: getattr(campaign, name) for name in (*_MANY, *_ONE)}
+    patterns |= {f"track {k}": pattern for k, pattern in enumerate(campaign.track)}
     fields = _FIELD.findall(campaign.front)
     if not fields:
         raise SettingsError(f"{path}: front = {campaign.front!r} has no field such as {{day}} that names a run")
-    for name in ("rear", "nav", "sp3"):
-        if other := sorted(set(_FIELD.findall(getattr(campaign, name))) - set(fields)):
+    for name, pattern in patterns.items():
+        if other := sorted(set(_FIELD.findall(pattern)) - set(fields)):
             raise SettingsError(f"{path}: {name} has the field {other[0]}, which front has not")
+    found = {name: _found(folder, pattern) for name, pattern in patterns.items()}
     keys = list(dict.fromkeys(tuple(values[name] for name in fields) for _, values in found["front"]))
     if not keys:
         raise InputFileError(path, f"no file matches front = {campaign.front!r}; check the pattern")
@@ -123,13 +138,14 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
     for key in keys:
         values = dict(zip(fields, key, strict=True))
         files = {name: tuple(_matching(found[name], values)) for name in found}
+        for name in _ONE:
+            if len(files[name]) > 1:
+                raise SettingsError(f"{path}: {name} has {len(files[name])} files for {values}; one was expected")
+        of_run: dict[str, Any] = {name: files[name] for name in _MANY}
+        of_run |= {name: next(iter(files[name]), None) for name in _ONE}
         inputs = RunInputs(
-            front=files["front"],
-            rear=files["rear"],
-            nav=files["nav"],
-            sp3=files["sp3"],
-            track=tuple(folder / track for track in campaign.track),
-            vehicle=None if campaign.vehicle is None else folder / campaign.vehicle,
+            **of_run,
+            track=tuple(file for k in range(len(campaign.track)) for file in files[f"track {k}"]),
             config=None if campaign.config is None else folder / campaign.config,
         )
         place = out.joinpath("runs", *(f"{name}={value}" for name, value in values.items()))
@@ -138,7 +154,12 @@ def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
 
 
 def run_campaign(
-    path: Path, *, out: Path, executor: Executor, progress: CampaignProgress | None = None
+    path: Path,
+    *,
+    out: Path,
+    executor: Executor,
+    progress: CampaignProgress | None = None,
+    lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
     """Position all logs of a campaign and write one row per run to ``campaign.csv``.
 
@@ -152,13 +173,17 @@ def run_campaign(
     out : Path
         Folder for the results; that of an earlier campaign is continued.
     executor : Executor
-        Of `concurrent.futures`: processes on this machine, or any other with its interface.
+        Of `concurrent.futures`: processes on this machine, or any other with its interface whose workers see the
+        same files.
     progress : CampaignProgress, optional
+    lost : tuple of type
+        Errors by which the executor reports that a worker process is gone.
 
     Returns
     -------
     polars.DataFrame
-        The fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`, `ok_rate`, `wall_s`, `folder`.
+        The fields, `status` ("done", "failed"), `error`, `epochs`, `positioning_rate`, `ok_rate`, `wall_s`, `folder`
+        (below `out`).
 
     Raises
     ------
@@ -174,7 +199,13 @@ def run_campaign(
     (out / "runs").mkdir(parents=True, exist_ok=True)
     futures = {executor.submit(position_run, run): number for number, run in enumerate(runs)}
     for count, future in enumerate(as_completed(futures), start=1):
-        results[futures[future]] = future.result()
+        number = futures[future]
+        try:
+            results[number] = future.result()
+        except lost as error:
+            gone = f"its worker process is gone ({type(error).__name__}), perhaps for lack of memory"
+            results[number] = _row(runs[number], status="failed", error=f"{gone}; run the command again")
+        results[number]["folder"] = str(runs[number].out.relative_to(out.absolute()))
         if progress is not None:
             failed = sum(row["status"] == "failed" for row in results.values())
             left = (clock.perf_counter() - began) / count * (len(runs) - count)
@@ -186,8 +217,6 @@ def run_campaign(
 
 def position_run(run: CampaignRun) -> dict[str, Any]:
     """Position one run, unless its results are there, and return its row."""
-    row: dict[str, Any] = {**run.fields, "status": "done", "error": None, "epochs": None, "positioning_rate": None}
-    row |= {"ok_rate": None, "wall_s": None, "folder": str(run.out)}
     try:
         check_folder(run.out, overwrite="replace")
         if not run.done:
@@ -195,15 +224,26 @@ def position_run(run: CampaignRun) -> dict[str, Any]:
             run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:
-        return row | {"status": "failed", "error": " ".join(str(error).split())}
-    row["epochs"] = sum(antenna["epochs"] for antenna in record["antennas"].values())
-    return row | {name: record[name] for name in ("positioning_rate", "ok_rate", "wall_s")}
+        return _row(run, status="failed", error=" ".join(str(error).split()))
+    epochs = sum(antenna["epochs"] for antenna in record["antennas"].values())
+    return _row(run, epochs=epochs, **{name: record[name] for name in ("positioning_rate", "ok_rate", "wall_s")})
+
+
+def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
+    """Return the row of a run."""
+    absent = dict.fromkeys(("error", "epochs", "positioning_rate", "ok_rate", "wall_s"))
+    return {**run.fields, "status": "done", **absent, **values}
 
 
 def _found(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
-    """Return the files that match a pattern, in order of their names, with the values of its fields."""
+    """Return the files that match a pattern, in order of their names, with the values of its fields.
+
+    A name without fields or ``*`` is that file, whether it is there or not: the run says what is wrong with it.
+    """
     if not pattern:
         return []
+    if not _FIELD.search(pattern) and "*" not in pattern:
+        return [(folder / pattern, {})]
     escaped = "".join(_regex(part) for part in re.split(r"(\{\w+\}|\*)", pattern))
     expression = re.compile(escaped)
     found = []

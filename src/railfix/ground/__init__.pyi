@@ -1,0 +1,53 @@
+# The names of `railfix.ground`, imported at their first use (lazy-loader).
+
+from .authority import Authority
+from .centre import CentreLimits, TrainRecord, TrainState, report_received, time_passed
+from .interlocking import (
+    Interlocking,
+    InterlockingLimits,
+    PointState,
+    TrainInterval,
+    extended,
+    released,
+    route_requested,
+)
+from .layout import Layout, LoopStation
+from .monitor import MonitorLimits, MonitorState, advance, release
+from .on_board import OnBoard, OnBoardLimits
+from .reference_curve import ReferenceCurve
+from .station_fixes import StationFixes, station_fixes
+from .supervision import Supervision
+from .triangle import TriangleLimits, TriangleResult, Verdict, compare_triangle, limits_for_false_stops
+
+__all__ = [
+    "Authority",
+    "CentreLimits",
+    "Interlocking",
+    "InterlockingLimits",
+    "Layout",
+    "LoopStation",
+    "MonitorLimits",
+    "MonitorState",
+    "OnBoard",
+    "OnBoardLimits",
+    "PointState",
+    "ReferenceCurve",
+    "StationFixes",
+    "Supervision",
+    "TrainInterval",
+    "TrainRecord",
+    "TrainState",
+    "TriangleLimits",
+    "TriangleResult",
+    "Verdict",
+    "advance",
+    "compare_triangle",
+    "extended",
+    "limits_for_false_stops",
+    "release",
+    "released",
+    "report_received",
+    "route_requested",
+    "station_fixes",
+    "time_passed",
+]

@@ -1,0 +1,60 @@
+# The names of `railfix.motion`, imported at their first use (lazy-loader).
+
+from .features import Feature, FeatureLimits, LineSeries, Located, line_series, locate, map_features
+from .ranging import (
+    EchoLimits,
+    EchoResult,
+    along_m,
+    along_sigma_m,
+    radar_speed_mps,
+    reject_echoes,
+    two_way_range_m,
+)
+from .samples import InertialSamples, RadarSpeeds, SensorSamples, StationRanges, TachometerPulses
+from .slip import MotionState, SlipLimits, SlipResult, find_slips
+from .tachometer import (
+    PulseSpeeds,
+    SpeedCheck,
+    TachometerLimits,
+    check_speeds,
+    pulse_acceleration,
+    pulse_speeds,
+    tooth_faults,
+    way_m,
+    wheel_scale,
+)
+
+__all__ = [
+    "EchoLimits",
+    "EchoResult",
+    "Feature",
+    "FeatureLimits",
+    "InertialSamples",
+    "LineSeries",
+    "Located",
+    "MotionState",
+    "PulseSpeeds",
+    "RadarSpeeds",
+    "SensorSamples",
+    "SlipLimits",
+    "SlipResult",
+    "SpeedCheck",
+    "StationRanges",
+    "TachometerLimits",
+    "TachometerPulses",
+    "along_m",
+    "along_sigma_m",
+    "check_speeds",
+    "find_slips",
+    "line_series",
+    "locate",
+    "map_features",
+    "pulse_acceleration",
+    "pulse_speeds",
+    "radar_speed_mps",
+    "reject_echoes",
+    "tooth_faults",
+    "two_way_range_m",
+    "way_m",
+    "wheel_scale",
+]
