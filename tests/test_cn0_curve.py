@@ -236,6 +236,20 @@ def test_command_on_the_demonstration(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["curve.png", "curve.toml"]
 
 
+@pytest.mark.requirement("B1")
+@pytest.mark.parametrize(("receiver", "said"), [("SIMULATED", False), ("ANOTHER 9", True)])
+def test_a_run_says_that_the_curve_is_of_another_receiver(tmp_path: Path, receiver: str, said: bool) -> None:
+    curve, out = tmp_path / "curve.toml", tmp_path / "run"
+    code, printed = call(DEMO / "front.crx.gz", "--nav", DEMO / "nav.rnx.gz", "--out", curve, "--bin", 10)
+    assert code == 0, printed
+    curve.write_text(curve.read_text().replace("SIMULATED", receiver))
+    words = ["run", "--front", DEMO / "front.crx.gz", "--nav", DEMO / "nav.rnx.gz", "--track", DEMO / "track.csv"]
+    words += ["--cn0-curve", curve, "--end", "2024-03-05T03:10:03", "--filter", "off", "--out", out]
+    result = runner.invoke(app, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    assert ("front: C/N0 curve was made with receiver 'ANOTHER 9'" in result.output) is said
+
+
 def test_command_says_what_is_wrong(tmp_path: Path) -> None:
     good = [DEMO / "front.crx.gz", "--nav", DEMO / "nav.rnx.gz", "--out", tmp_path / "c.toml"]
     for more, exit_code, named in (

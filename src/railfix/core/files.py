@@ -262,11 +262,6 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
     return content
 
 
-def toml_string(text: str) -> str:
-    """Quote a text for TOML: as a JSON string, with the control character that only TOML escapes."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
 def write_whole(path: FilePath, text: str, *, what: str = "file") -> None:
     """Write a text file under a temporary name, then rename it: a failed write leaves no file.
 

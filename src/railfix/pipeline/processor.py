@@ -221,7 +221,8 @@ class EpochProcessor:
         """
         results = {name: chunk.finished() for name, chunk in chunks.items()}
         tracks = {name: chunk.tracked for name, chunk in chunks.items() if chunk.tracked is not None}
-        notes = (*(state.received or self.received).notes, *self._lacking)
+        of_chunks = [note for chunk in chunks.values() for note in chunk.notes]
+        notes = (*(state.received or self.received).notes, *self._lacking, *of_chunks)
         after = replace(
             state,
             antennas={**state.antennas, **{name: chunk.state for name, chunk in chunks.items()}},
@@ -329,6 +330,8 @@ class AntennaChunk:
         Likewise.
     tracked : AlongTrack or None
         By the filter along the track, where it is on.
+    notes : tuple of str
+        On a C/N0 curve of another antenna or receiver.
     """
 
     def __init__(
@@ -343,6 +346,8 @@ class AntennaChunk:
     ) -> None:
         self.state, self.filter_state = state, filter_state
         self.tracked: AlongTrack | None = None
+        curve = processor._setup.cn0_curve if "cn0" in processor.config.screens else None
+        self.notes = () if curve is None else tuple(f"{name}: {n}" for n in curve.notes_for(observations.header))
         self._processor, self._name, self._received, self._sensors = processor, name, received, sensors
         self._ranges, self.state = processor._screened(name, observations, received, state)
         self._solution: Solution | None = None
