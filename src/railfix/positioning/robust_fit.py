@@ -8,7 +8,7 @@ noise level is assumed, so that the noise of a receiver can be learnt from what 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -17,7 +17,8 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
+from railfix.kernels import compiled_by
+from railfix.positioning.normal_equations import Ranges, inverse_3x3, reduced_equations
 from railfix.track.trajectory import Trajectory
 
 #: Median of the absolute value of a standard normal variable.
@@ -100,30 +101,82 @@ def robust_fit(
     if not used.shape[1]:
         nothing = np.zeros(len(ranges), dtype=np.int64)
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
-    unknowns, prior = (3, 0.0) if information is None else (1, information)
-    freedom = ranges.n_used - ranges.n_clocks - unknowns
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    root, misfit = np.sqrt(ranges.weight), ranges.code_m - distance
-    sizes = np.array([group.stop - group.start for group in ranges.groups], dtype=np.intp)
-    middle = np.minimum(ranges.n_used // 2, used.shape[1] - 1)[:, None]
-    correction = np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN
+    freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
+    ties, none = ranges.ties, np.empty((0, len(ranges.groups)))
+    kept, wsse, solved = reweighted(
+        np.ascontiguousarray(ranges.sat_ecef_m),
+        np.ascontiguousarray(ranges.code_m),
+        np.ascontiguousarray(ranges.weight),
+        np.ascontiguousarray(place_ecef_m),
+        ranges.starts,
+        none if ties is None else np.ascontiguousarray(ties.offset_m),
+        none if ties is None else np.ascontiguousarray(ties.sigma_m),
+        np.empty((0, 3, 3)) if information is None else np.ascontiguousarray(information),
+        np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN,
+        limits.keep,
+        limits.reject,
+        limits.iterations,
+    )
+    left = np.asarray(np.count_nonzero(kept, axis=1) - (ranges.n_used - freedom), dtype=np.int64)
+    some = (left > 0) & solved
+    return RobustFit(
+        kept=kept, variance=np.where(some, wsse / np.maximum(left, 1), np.nan), freedom=np.where(some, left, 0)
+    )
+
+
+@compiled_by("ranges")
+def reweighted(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    place_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    information: Floats,
+    correction: Floats,
+    keep: float,
+    reject: float,
+    iterations: int,
+) -> tuple[Masks, Floats, Masks]:
+    """Reweight ranges by their residuals; arrays in C order, up to `sigma_m` as `reduced_equations` takes them.
+
+    Parameters
+    ----------
+    information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
+    correction : ndarray, shape (T,)
+        Scale of the residuals over their median.
+    keep, reject : float
+    iterations : int
+
+    Returns
+    -------
+    kept : ndarray of bool, shape (T, M)
+    wsse : ndarray, shape (T,)
+        Weighted sum of the squared residuals of the kept ranges.
+    solved : ndarray of bool, shape (T,)
+        False where the last step was not determined.
+    """
+    used, prior = weight > 0, information if len(information) == len(weight) else 0.0
+    n_used = np.count_nonzero(used, axis=1)
+    distance, los = range_with_rotation(sat_ecef_m, place_ecef_m[:, None, :])
+    root, misfit = np.sqrt(weight), code_m - distance
+    sizes = np.diff(np.append(starts, weight.shape[1]))
+    middle = np.minimum(n_used // 2, used.shape[1] - 1)[:, None]
     factor = used.astype(np.float64)
-    for _ in range(limits.iterations):
-        equations = normal_equations(replace(ranges, weight=ranges.weight * factor), place_ecef_m)
-        step = np.einsum("tij,tj->ti", inverse_3x3(equations.matrix + prior), equations.vector)
-        clock = equations.clock_m - np.matmul(step[:, None, :], equations.clock_slope)[:, 0]
+    for _ in range(iterations):
+        system, means, _, seen = reduced_equations(
+            sat_ecef_m, code_m, weight * factor, place_ecef_m, starts, offset_m, sigma_m
+        )
+        step = np.einsum("tij,tj->ti", inverse_3x3(system[:, :3, :3] + prior), system[:, :3, 3])
+        clock = np.where(seen, means[:, 3], np.nan) - np.matmul(step[:, None, :], means[:, :3])[:, 0]
         residual = misfit + np.einsum("tmi,ti->tm", los, step) - np.repeat(clock, sizes, axis=1)
         whitened = root * np.abs(np.nan_to_num(residual))
         spread = np.sort(np.where(used, whitened, np.inf), axis=1)
         median = np.take_along_axis(spread, middle, axis=1)[:, 0]
         scale = np.maximum(np.where(np.isfinite(median), median, 0.0) * correction, _LEAST_SCALE)
         size = whitened / scale[:, None]
-        decline = ((limits.reject - size) / (limits.reject - limits.keep)) ** 2 * limits.keep / np.maximum(size, 1e-9)
-        factor = np.where(used & (size < limits.reject), np.where(size <= limits.keep, 1.0, decline), 0.0)
-    kept = used & (size < limits.reject)
-    left = np.asarray(np.count_nonzero(kept, axis=1) - (ranges.n_used - freedom), dtype=np.int64)
-    wsse = np.where(kept, whitened**2, 0.0).sum(axis=1)
-    some = (left > 0) & np.isfinite(step).all(axis=1)
-    return RobustFit(
-        kept=kept, variance=np.where(some, wsse / np.maximum(left, 1), np.nan), freedom=np.where(some, left, 0)
-    )
+        decline = ((reject - size) / (reject - keep)) ** 2 * keep / np.maximum(size, 1e-9)
+        factor = np.where(used & (size < reject), np.where(size <= keep, 1.0, decline), 0.0)
+    kept = used & (size < reject)
+    return kept, np.where(kept, whitened**2, 0.0).sum(axis=1), np.isfinite(step).all(axis=1)
