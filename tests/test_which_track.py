@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +10,16 @@ import pytest
 from scipy.stats import binom
 from typer.testing import CliRunner
 
+from network_made import made_network
 from railfix.cli import app
-from railfix.core.errors import MismatchError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config
-from railfix.positioning.which_track import StandstillErrors, StandstillFix, track_posterior
-from railfix.run.which_track import BaseStation, StandstillCodes, decide_track, standstill_codes
+from railfix.positioning.which_track import StandstillErrors, StandstillFix, TrackPosterior, track_posterior
+from railfix.run.standstill import BaseStation, StandstillCodes, standstill_codes
+from railfix.run.track_prior import prior_of_interlocking, prior_of_last_place, write_last_place
+from railfix.run.which_track import decide_track
 from yard_made import RISKS, SPACING_M, decided, made_tracks, to_geojson
 
 pytestmark = pytest.mark.requirement("E6")
@@ -104,6 +108,41 @@ def test_wrong_decisions_of_2000_yards_are_within_the_risk(common_m: float) -> N
         assert wrong <= binom.ppf(0.999, given, risk)
 
 
+def test_phases_decide_more_and_never_wrongly() -> None:
+    """The same yards with and without phases, at a risk that codes seldom reach."""
+    looks, risk = (60.0,), 1e-3
+    share = {}
+    for method in ("model", "phase"):
+        rows = [
+            decided(k, errors=StandstillErrors(), common_sigma_m=0.05, method=method, looks=looks) for k in range(24)
+        ]
+        given = [(a[risk][0], own) for a, own in rows if risk in a]
+        assert sum(name != own for name, own in given) <= binom.ppf(0.999, len(given), risk)
+        share[method] = len(given)
+    assert share["phase"] > share["model"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("half_cycle", [False, True])
+def test_wrong_decisions_with_phases_are_within_the_risk(half_cycle: bool) -> None:
+    """Also where a satellite's phase is half a cycle off: such phases follow no model and count for nothing."""
+    rows = [
+        decided(
+            k,
+            errors=StandstillErrors(),
+            common_sigma_m=0.05,
+            method="phase",
+            looks=(60.0, 300.0),
+            half_cycle=half_cycle,
+        )
+        for k in range(500)
+    ]
+    for risk in RISKS:
+        given = [(a[risk][0], own) for a, own in rows if risk in a]
+        assert len(given) > 300
+        assert sum(name != own for name, own in given) <= binom.ppf(0.999, len(given), risk)
+
+
 def test_samples_counted_as_independent_decide_wrongly() -> None:
     """The naive method is over its risk by far on the same yards."""
     rows = [decided(k, errors=StandstillErrors(), common_sigma_m=1.0, method="naive") for k in range(30)]
@@ -142,7 +181,11 @@ def roof(recordings: Path) -> dict[str, StandstillCodes]:
 
 def _from(codes: StandstillCodes, first: int, epochs: int) -> StandstillCodes:
     rows = slice(first, first + epochs)
-    return StandstillCodes(**{**vars(codes), "time": codes.time[rows], "residual_m": codes.residual_m[rows]})
+    phases = codes.phases
+    if phases is not None:
+        parts = {name: getattr(phases, name)[rows] for name in ("difference_m", "lost", "toward", "elevation_deg")}
+        phases = replace(phases, **parts)
+    return replace(codes, time=codes.time[rows], residual_m=codes.residual_m[rows], phases=phases)
 
 
 @pytest.mark.parametrize(("kind", "decisions"), [("base", 0.9), ("alone", 0.0)])
@@ -160,6 +203,42 @@ def test_roof_with_invented_yards_is_never_on_a_wrong_track(
             answers.append((result.track, f"T{own + 1}"))
     assert not [a for a in answers if a[0] not in ("undecided", a[1])]
     assert np.mean([a == b for a, b in answers]) >= decisions
+
+
+def test_phases_of_the_roof_decide_at_a_millionth(roof: dict[str, StandstillCodes]) -> None:
+    """Within a minute and at every azimuth, where codes beside the same base station leave tracks undecided."""
+    answers: dict[bool, list[str]] = {True: [], False: []}
+    for azimuth in range(0, 180, 30):
+        yard = made_tracks(5, azimuth, np.zeros(2), 2)
+        for with_phases, names in answers.items():
+            codes = _from(roof["base"], 0, 61)
+            codes = codes if with_phases else replace(codes, phases=None)
+            names.append(decide_track(yard, [codes], arms_m=(0.0,), errors=StandstillErrors(), risk=1e-6).track)
+    assert answers[True] == ["T3"] * 6
+    assert answers[False].count("undecided") > 1
+    assert set(answers[False]) <= {"T3", "undecided"}
+
+
+def test_phases_of_the_roof_are_whole_wavelengths_at_its_place(roof: dict[str, StandstillCodes]) -> None:
+    phases = roof["base"].phases
+    assert phases is not None
+    mean = phases.mean(slice(0, 61), StandstillErrors())
+    cycles = mean.difference_m / mean.wavelength_m
+    assert len(cycles) > 20
+    assert np.abs(cycles - np.round(cycles)).max() < 0.06
+
+
+def test_a_slip_ends_the_part_of_a_satellite_that_is_used(roof: dict[str, StandstillCodes]) -> None:
+    phases = roof["base"].phases
+    assert phases is not None
+    whole = phases.mean(slice(0, 61), StandstillErrors())
+    slipped = phases.difference_m.copy()
+    slipped[25:, 3] += 5 * phases.wavelength_m[3]
+    again = replace(phases, difference_m=slipped).mean(slice(0, 61), StandstillErrors())
+    change = (again.difference_m - whole.difference_m) / whole.wavelength_m
+    # the longer part is that after the slip: five wavelengths more, the mean is not between
+    assert sorted(np.round(np.abs(change)).tolist())[-1] == 5.0
+    assert np.abs(change - np.round(change)).max() < 0.02
 
 
 def test_roof_between_tracks_of_a_map_that_lacks_its_own_is_on_none(roof: dict[str, StandstillCodes]) -> None:
@@ -187,3 +266,75 @@ def test_a_moving_train_is_an_error(recordings: Path) -> None:
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     with pytest.raises(MismatchError, match="standstill"):
         standstill_codes(read_observations(folder / "SEPT265G.21O"), read_navigation(folder / "SEPT2650.21P"), Config())
+
+
+# --- what is known beforehand ------------------------------------------------
+
+
+def _last(folder: Path, **shares: float) -> Path:
+    path = folder / "last.json"
+    names = tuple(shares)
+    posterior = TrackPosterior(
+        names=names, probability=np.array([*shares.values()]), with_rising=np.zeros(len(names) - 1), fits=True
+    )
+    write_last_place(posterior, np.datetime64("2024-01-01"), path)
+    return path
+
+
+def test_a_train_that_has_not_moved_is_where_it_was_but_for_a_missed_move(tmp_path: Path) -> None:
+    net = made_network(10.0)
+    path = _last(tmp_path, **{"01": 0.98, "02": 0.015, "none": 0.005})
+    prior = prior_of_last_place(path, net, moved_m=0.4, missed_move=1e-2, unmapped=0.05)
+    count = len(net.names)
+    assert prior.weights["01"] == pytest.approx(0.99 * 0.98 + 0.01 * 0.995 / count)
+    assert prior.weights["1a"] == pytest.approx(0.01 * 0.995 / count)
+    assert prior.unmapped == pytest.approx(0.99 * 0.005 + 0.01 * 0.05)
+    assert sum(prior.weights.values()) == pytest.approx(0.995)
+
+
+def test_a_train_that_has_moved_is_on_a_track_within_reach(tmp_path: Path) -> None:
+    """From 01, which is 1120 m long, 100 m lead to 0a and 0b only, and by turning there to 02; 600 m to 1a, too."""
+    net = made_network(10.0)
+    path = _last(tmp_path, **{"01": 1.0, "none": 0.0})
+    near = prior_of_last_place(path, net, moved_m=100.0, missed_move=1e-3, unmapped=0.05)
+    likely = {name for name, weight in near.weights.items() if weight > 0.01}
+    assert likely == {"01", "02", "0a", "0b"}
+    far = prior_of_last_place(path, net, moved_m=600.0, missed_move=1e-3, unmapped=0.05)
+    assert {name for name, weight in far.weights.items() if weight > 0.01} == likely | {"1a"}
+
+
+def test_last_places_that_cannot_be_used_are_one_sentence(tmp_path: Path) -> None:
+    net = made_network(10.0)
+    known = {"moved_m": 0.0, "missed_move": 1e-3, "unmapped": 0.05}
+    with pytest.raises(InputFileError, match="track 'x' is not in the map"):
+        prior_of_last_place(_last(tmp_path, **{"x": 0.9, "none": 0.1}), net, **known)
+    with pytest.raises(InputFileError, match="do not add up to 1"):
+        prior_of_last_place(_last(tmp_path, **{"01": 0.9, "none": 0.3}), net, **known)
+    (tmp_path / "last.json").write_text('{"probability": {"01": "much"}}')
+    with pytest.raises(InputFileError, match="--save-last writes it"):
+        prior_of_last_place(tmp_path / "last.json", net, **known)
+    for text in ("01", "01=-1", "01=0", "01=nan"):
+        with pytest.raises(SettingsError, match=r"NAME=WEIGHT|all weights are 0"):
+            prior_of_interlocking(text, net)
+    with pytest.raises(SettingsError, match="no track 'y'"):
+        prior_of_interlocking("y=1", net)
+
+
+def test_last_place_decides_what_codes_alone_cannot(recordings: Path, tmp_path: Path) -> None:
+    """Switched off beside a base station, switched on again without one."""
+    folder = recordings / "dual" / "mosaic_x2_99cm"
+    latitude, longitude, _ = (float(v) for v in (folder / "rover_position.txt").read_text().split())
+    yard = to_geojson(made_tracks(4, 30.0, np.zeros(2), 1), latitude, longitude)
+    (tmp_path / "yard.geojson").write_text(yard)
+    place = ",".join((folder / "base_position.txt").read_text().split())
+    words = ["which-track", "--front", str(folder / "rover.obs"), "--nav", str(folder / "base.nav")]
+    words += ["--map", str(tmp_path / "yard.geojson"), "--crs", "EPSG:4326"]
+    beside = ["--base", str(folder / "base.obs"), "--base-place", place, "--save-last", str(tmp_path / "last.json")]
+    alone = CliRunner().invoke(app, words)
+    assert alone.output.startswith("track: undecided"), alone.output
+    first = CliRunner().invoke(app, [*words, *beside])
+    assert first.output.startswith("track: T2"), first.output
+    again = CliRunner().invoke(app, [*words, "--last", str(tmp_path / "last.json"), "--moved", "0"])
+    assert again.output.startswith("track: T2"), again.output
+    half = CliRunner().invoke(app, [*words, "--last", str(tmp_path / "last.json")])
+    assert half.exit_code == 4

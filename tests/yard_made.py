@@ -9,9 +9,11 @@ import json
 import sys
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.positioning.standstill_phase import CodePlace, MeanPhases
 from railfix.positioning.which_track import (
     StandstillErrors,
     StandstillFix,
@@ -55,14 +57,55 @@ def to_geojson(tracks: list[YardTrack], latitude: float, longitude: float) -> st
     return json.dumps({"type": "FeatureCollection", "features": features})
 
 
+def made_phases(
+    rng: np.random.Generator,
+    bearing: np.ndarray,
+    elevation: np.ndarray,
+    system: np.ndarray,
+    place_m: np.ndarray,
+    errors: StandstillErrors,
+    *,
+    half_cycle: bool = False,
+) -> MeanPhases:
+    """Double differences of an antenna at a place (east, north, up), with the phase errors of `StandstillErrors`."""
+    azimuth, up = np.radians(bearing), np.radians(elevation)
+    toward = np.stack([np.cos(up) * np.sin(azimuth), np.cos(up) * np.cos(azimuth), np.sin(up)], axis=-1)
+    sigma = errors.phase_sigma_m(elevation, distance_m=0.0)
+    single = -toward @ place_m + rng.normal(0.0, sigma) + 0.190293673 * rng.integers(-30, 30, len(elevation))
+    if half_cycle:
+        single[int(np.argmin(elevation))] += 0.190293673 / 2.0
+    values, away, blocks = [], [], []
+    for letter in np.unique(system):
+        columns = np.flatnonzero(system == letter)
+        reference = columns[np.argmax(elevation[columns])]
+        own = columns[columns != reference]
+        values.append(single[own] - single[reference])
+        away.append(-(toward[own] - toward[reference]))
+        blocks.append(np.diag(sigma[own] ** 2) + sigma[reference] ** 2)
+    return MeanPhases(
+        difference_m=np.concatenate(values),
+        away=np.concatenate(away),
+        wavelength_m=np.full(sum(map(len, values)), 0.190293673),
+        covariance_m2=block_diag(*blocks),
+    )
+
+
 def decided(
-    seed: int, *, errors: StandstillErrors, common_sigma_m: float, method: str = "model", unmapped: bool | None = None
+    seed: int,
+    *,
+    errors: StandstillErrors,
+    common_sigma_m: float,
+    method: str = "model",
+    unmapped: bool | None = None,
+    looks: tuple[float, ...] = LOOKS_S,
+    half_cycle: bool = False,
 ) -> tuple[dict[float, tuple[str, float]], str]:
     """First decision at each risk, with its time, and the true track of one simulated yard.
 
     A track is missing in the map with the prior's probability, or as `unmapped` states.
 
-    `method` "naive" counts the 1 Hz samples as independent.
+    `method` "naive" counts the 1 Hz samples as independent; "phase" has carrier phases, too, with `half_cycle` a
+    satellite of each antenna half a cycle off.
     """
     rng = np.random.default_rng(seed)
     count = int(rng.integers(2, 13))
@@ -78,7 +121,7 @@ def decided(
     missing = bool(rng.random() < errors.unmapped_prior) if unmapped is None else unmapped
     tracks = [track for k, track in enumerate(yard) if not (missing and k == own)]
     common = rng.normal(0.0, common_sigma_m, satellites)
-    seconds = int(LOOKS_S[-1])
+    seconds = int(looks[-1])
     keep = np.exp(-1.0 / errors.correlation_s)
     arms = (10.0, -10.0)
     heading = np.array([np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth))])
@@ -94,16 +137,24 @@ def decided(
             common + bias + np.cumsum(noise, axis=0) / np.arange(1, seconds + 1)[:, None] * errors.code_noise_m / sines
         )
     answers: dict[float, tuple[str, float]] = {}
-    for look in LOOKS_S:
+    mounting = (
+        rng.normal(0.0, errors.antenna_sigma_m, (len(arms), 2)) if method == "phase" else np.zeros((len(arms), 2))
+    )
+    moved = [facing * arm * heading + error for arm, error in zip(arms, mounting, strict=True)]
+    phases = [
+        made_phases(rng, bearing, elevation, system, np.append(place, 0.0), errors, half_cycle=half_cycle)
+        for place in (moved if method == "phase" else [])
+    ]
+    for look in looks:
         fixes = []
-        for code, arm in zip(codes, arms, strict=True):
+        for code, shift in zip(codes, moved, strict=True):
             fix = standstill_fix(
                 bearing, elevation, system, code[int(look) - 1], seconds=look,
                 common_m=np.full(satellites, common_sigma_m), errors=errors,
             )  # fmt: skip
             assert fix is not None
-            place = fix.east_north_m + facing * arm * heading
-            shrink = 1.0 if method == "model" else 1.0 / look
+            assert fix.place is not None
+            place, shrink = fix.east_north_m + shift, 1.0 / look if method == "naive" else 1.0
             fixes.append(
                 StandstillFix(
                     east_north_m=place,
@@ -111,10 +162,13 @@ def decided(
                     common_m2=fix.common_m2 * shrink,
                     misfit=fix.misfit,
                     freedom=fix.freedom,
+                    place=CodePlace(
+                        place_m=fix.place.place_m + np.append(shift, 0.0), covariance_m2=fix.place.covariance_m2
+                    ),
                 )
             )
-        used = errors if method == "model" else errors.replaced(map_sigma_m=0.0)
-        posterior = track_posterior(tracks, fixes, arms_m=arms, errors=used)
+        used = errors.replaced(map_sigma_m=0.0) if method == "naive" else errors
+        posterior = track_posterior(tracks, fixes, arms_m=arms, errors=used, phases=phases)
         for risk in RISKS:
             name = posterior.decision(risk=risk)
             if name and risk not in answers:
@@ -128,6 +182,7 @@ def main() -> None:
     for title, common, method in (
         ("base station", 0.05, "model"),
         ("no base station", 1.0, "model"),
+        ("base station, carrier phases", 0.05, "phase"),
         ("1 Hz samples as independent, no base station", 1.0, "naive"),
     ):
         rows = [decided(k, errors=errors, common_sigma_m=common, method=method) for k in range(yards)]

@@ -13,6 +13,7 @@ from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.run.output import check_output_file
+from railfix.run.track_prior import write_last_place
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files
 
 
@@ -25,21 +26,26 @@ def which_track(
     out: Annotated[
         Path | None, typer.Option(metavar="PICTURE", help="Picture of the probabilities over time (.png or .svg).")
     ] = None,
+    save_last: Annotated[
+        Path | None,
+        typer.Option("--save-last", metavar="FILE.json", help="Probabilities of tracks, for --last at the next start."),
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Decide on which track a train at rest stands, or report that it is undecided.
 
     Each track of the map within 60 m is a hypothesis, and so is a track that the map does not have (`none`). The
-    codes of each satellite have a constant error at rest, so waiting helps less than independent samples would. The
-    decision is taken when the probability of all other hypotheses together is below `--risk`; else all
-    probabilities are printed.
+    codes of each satellite have a constant error at rest, so waiting helps less than independent samples would; with
+    a base station carrier phases count, too. The decision is taken when the probability of all other hypotheses
+    together is below `--risk`; else all probabilities are printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
     Exit codes as `railfix --help` says; 5 where the train moves or no track is near.
     """
-    if out is not None:
-        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
+    for target in (out, save_last):
+        if target is not None:
+            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
     settings, _ = settings_of(choices)
     decision = which_track_files(inputs, options, settings)
     console = console_of_tables()
@@ -55,6 +61,9 @@ def which_track(
         table.add_row(last.names[k], f"{last.probability[k]:.6f}", "" if np.isnan(share) else f"{share:.4f}")
     console.print(table)
     show_notes(console, decision.notes)
+    if save_last is not None:
+        write_last_place(last, decision.end, save_last)
+        console.print(f"last place: {save_last}", markup=False, soft_wrap=True)
     if out is not None:
         from railfix.report.plots.which_track import plot_track_decision
 

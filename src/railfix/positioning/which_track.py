@@ -1,9 +1,10 @@
-"""Which of several tracks a train stands on, from codes at rest (P1 2.5).
+"""Which of several tracks a train stands on, from codes and carrier phases at rest (P1 2.5).
 
 Hypotheses are a track and the way the train faces, and *none*: a track that the map does not have, parallel to the
 nearest at any distance that keeps clear of the others. At rest multipath does not average out: each satellite's code
 has a constant bias, so the covariance of the mean does not fall with the number of epochs, and satellite, orbit and
-atmosphere errors are common to both antennas. The posterior probability of a hypothesis is its prior times the
+atmosphere errors are common to both antennas. Beside a base station the carrier phases count, too
+(`railfix.positioning.standstill_phase`). The posterior probability of a hypothesis is its prior times the
 likelihood integrated over the place along the track. A decision is taken when all others together have less than the
 risk allowed; whatever the time at which that happens, its probability of being wrong is that risk, as far as the error
 model holds (a posterior probability is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472, for the sequential
@@ -13,7 +14,7 @@ test).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,6 +23,12 @@ from scipy.special import chdtrc, logsumexp
 
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.settings import Settings, option
+from railfix.positioning.standstill_phase import (
+    CodePlace,
+    MeanPhases,
+    phase_log_likelihood,
+    uniform_log_likelihood,
+)
 
 #: Steps of the integrals along and across the track [m].
 _ALONG_M: Final = 0.25
@@ -31,6 +38,12 @@ _CLEARANCE_M: Final = 3.0
 #: Part of a track about the train that is integrated over, either side [m].
 _REACH_M: Final = 40.0
 _LEAST_ELEVATION_DEG: Final = 10.0
+#: What the atmosphere leaves of the difference of phases at two places: share of their distance.
+_PHASE_SHARE: Final = 1e-6
+#: Hypotheses with codes this much less likely (logarithm) than the best are not looked at with phases.
+_UNLIKELY: Final = 25.0
+#: Standard deviations of the place along the track, and of the height, that phases are searched with [m].
+_ANY_PLACE_M: Final = 50.0
 #: Probability of a larger misfit of the mean codes below which the error model is not believed.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
@@ -46,6 +59,12 @@ class StandstillErrors(Settings):
     code_noise_m : float [m]
         Part that varies, correlated over `correlation_s`, likewise.
     correlation_s : float [s]
+    phase_bias_m : float [m]
+        Constant part of a satellite's carrier phase at the zenith, likewise.
+    phase_fault_prior : float
+        Probability that the phases of a standstill follow no model, by a slip or half a cycle that was not seen.
+    antenna_sigma_m : float [m]
+        Error of each antenna's place on the train, along and across: spacing, sway, lean.
     map_sigma_m : float [m]
         Error across the track that all tracks of a yard have in common, lean of the antenna on canted track included.
     unmapped_prior : float
@@ -56,6 +75,9 @@ class StandstillErrors(Settings):
     code_bias_m: float = option("Constant code error of a satellite at the zenith.", 0.6, metavar="M", gt=0)
     code_noise_m: float = option("Varying code error of a satellite at the zenith.", 0.5, metavar="M", gt=0)
     correlation_s: float = option("Time over which the varying part persists.", 60.0, metavar="S", gt=0)
+    phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
+    phase_fault_prior: float = Field(default=1e-3, gt=0, lt=1)
+    antenna_sigma_m: float = Field(default=0.05, gt=0)
     map_sigma_m: float = option("Error of the map across the track, common to its tracks.", 0.3, metavar="M", ge=0)
     unmapped_prior: float = option("Prior probability of a track not in the map.", 0.05, metavar="P", gt=0, lt=1)
     unmapped_width_m: float = Field(default=60.0, gt=0)
@@ -63,6 +85,10 @@ class StandstillErrors(Settings):
     def bias_m(self, elevation_deg: Floats) -> Floats:
         """Standard deviation of the constant code error [m]."""
         return np.asarray(self.code_bias_m / _sine(elevation_deg))
+
+    def phase_sigma_m(self, elevation_deg: Floats, *, distance_m: float) -> Floats:
+        """Standard deviation of the difference of two receivers' phases [m], atmosphere at a distance included."""
+        return np.asarray(np.hypot(np.sqrt(2.0) * self.phase_bias_m, _PHASE_SHARE * distance_m) / _sine(elevation_deg))
 
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
         """Standard deviation of the mean of the varying code error over a time [m].
@@ -93,6 +119,8 @@ class StandstillFix:
     misfit : float
         Weighted sum of squares of the residuals.
     freedom : int
+    place : CodePlace or None
+        With the height, for phases; None where there are none.
     """
 
     east_north_m: Floats
@@ -100,6 +128,7 @@ class StandstillFix:
     common_m2: Floats
     misfit: float
     freedom: int
+    place: CodePlace | None = None
 
     @property
     def fits(self) -> bool:
@@ -164,6 +193,7 @@ def standstill_fix(
         common_m2=(plan * common_m**2) @ plan.T,
         misfit=float(weight @ left**2),
         freedom=freedom,
+        place=CodePlace(place_m=estimate[:3], covariance_m2=(gain[:3] / weight) @ gain[:3].T),
     )
 
 
@@ -208,6 +238,7 @@ def track_posterior(
     arms_m: Sequence[float],
     errors: StandstillErrors,
     prior: Mapping[str, float] | None = None,
+    phases: Sequence[MeanPhases] = (),
 ) -> TrackPosterior:
     """Probability of each track, and of none, that a train at rest stands on it.
 
@@ -221,6 +252,8 @@ def track_posterior(
     errors : StandstillErrors
     prior : mapping of str to float, optional
         Weights of the mapped tracks by name, from the last place or the interlocking; those not named have none.
+    phases : sequence of MeanPhases
+        Of each antenna, beside a base station; empty without.
 
     Returns
     -------
@@ -232,33 +265,84 @@ def track_posterior(
     if not weights.sum() > 0.0:
         raise ValueError("the prior names none of the tracks")
     weights = weights / weights.sum() * (1.0 - errors.unmapped_prior)
-    evidence = np.full((len(tracks), 2), -np.inf)
-    for k, track in enumerate(tracks):
-        for j, facing in enumerate((1.0, -1.0)):
-            evidence[k, j] = _log_evidence(track.points_m, places, covariance, arms_m, facing, np.zeros(1))
     nearest = int(np.argmin([_distance(track.points_m, fixes[0].east_north_m) for track in tracks]))
     half = errors.unmapped_width_m / 2.0
     shifts = np.arange(-half, half + _ACROSS_M / 2.0, _ACROSS_M)
     width = len(shifts)
     shifts = shifts[_clear(shifts, tracks, nearest, fixes[0].east_north_m)]
-    free = [
-        _log_evidence(tracks[nearest].points_m, places, covariance, arms_m, facing, shifts) - np.log(width)
-        for facing in (1.0, -1.0)
+    # hypotheses: each track, and shifts of the nearest one; each with both ways to face
+    lines = [*((track, np.zeros(1)) for track in tracks), (tracks[nearest], shifts)]
+    found = [
+        [_places(track.points_m, places, covariance, arms_m, facing, across) for facing in (1.0, -1.0)]
+        for track, across in lines
     ]
+    if phases:
+        found = _with_phases(found, fixes, phases, errors)
     with np.errstate(divide="ignore"):
-        logs = np.concatenate([(np.log(weights)[:, None] + evidence).ravel(), np.log(errors.unmapped_prior) + free])
+        log_prior = np.log([*weights, errors.unmapped_prior / width])
+    logs = np.array(
+        [[logsumexp(item.log_evidence) if len(item.log_evidence) else -np.inf for item in row] for row in found]
+    )
+    logs += log_prior[:, None]
     total = logsumexp(logs)
     if not np.isfinite(total):
         shares = np.zeros((len(tracks) + 1, 2))
         shares[-1] = 0.5
     else:
-        shares = np.exp(logs - total).reshape(-1, 2)
+        shares = np.exp(logs - total)
     return TrackPosterior(
         names=(*(track.name for track in tracks), NONE),
         probability=shares.sum(axis=1),
         with_rising=shares[:-1, 0],
         fits=all(fix.fits for fix in fixes),
     )
+
+
+def _with_phases(
+    found: list[list[_Places]], fixes: Sequence[StandstillFix], phases: Sequence[MeanPhases], errors: StandstillErrors
+) -> list[list[_Places]]:
+    """Evidence with that of the phases."""
+    codes = [fix.place for fix in fixes if fix.place is not None]
+    heights = np.array([code.place_m[2] for code in codes])
+    best = max(item.log_evidence.max(initial=-np.inf) for row in found for item in row)
+    lowest = uniform_log_likelihood(phases, fault_prior=errors.phase_fault_prior)
+    result = []
+    for row in found:
+        updated: list[_Places] = []
+        for k, item in enumerate(row):
+            evidence = item.log_evidence + lowest
+            likely = item.log_evidence > best - _UNLIKELY
+            if k == 1 and len(codes) == 1:
+                # one antenna does not tell the facing
+                evidence = updated[0].log_evidence
+            elif likely.any():
+                count = int(likely.sum())
+                expected = np.dstack([item.expected_m[likely], np.broadcast_to(heights, (count, len(codes)))])
+                evidence[likely] = item.log_evidence[likely] + phase_log_likelihood(
+                    expected.reshape(count, -1),
+                    _spread(item.heading, errors),
+                    codes,
+                    phases,
+                    fault_prior=errors.phase_fault_prior,
+                )
+            updated.append(replace(item, log_evidence=evidence))
+        result.append(updated)
+    return result
+
+
+def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
+    """Covariance of the antennas' places, shape (3 A, 3 A): along and map common to them, height and mounting not.
+
+    Parameters
+    ----------
+    heading : ndarray, shape (A, 2)
+    """
+    count = len(heading)
+    along = np.column_stack([heading, np.zeros(count)])
+    right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
+    common = _ANY_PLACE_M**2 * np.outer(along, along) + errors.map_sigma_m**2 * np.outer(right, right)
+    own = errors.antenna_sigma_m**2 * np.eye(3) + _ANY_PLACE_M**2 * np.diag([0.0, 0.0, 1.0])
+    return np.asarray(common + np.kron(np.eye(count), own))
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
@@ -300,10 +384,29 @@ def _distances(points_m: Floats, places_m: Floats) -> Floats:
     return np.asarray(np.linalg.norm(offset - share[..., None] * step, axis=-1).min(axis=1))
 
 
-def _log_evidence(
+@dataclass(frozen=True, kw_only=True)
+class _Places:
+    """Hypotheses of a track, U shifts across it.
+
+    Attributes
+    ----------
+    log_evidence : ndarray, shape (U,)
+        Likelihood integrated over the place along the track.
+    expected_m : ndarray, shape (U, A, 2)
+        Most likely places of the antennas.
+    heading : ndarray, shape (A, 2)
+        Unit vectors along the track there.
+    """
+
+    log_evidence: Floats
+    expected_m: Floats
+    heading: Floats
+
+
+def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
-) -> float:
-    """Logarithm of the likelihood integrated over the place along a track, and summed over shifts across it."""
+) -> _Places:
+    """Likelihood of places of the antennas on a track and at shifts across it; no shift off the ends of the track."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)
@@ -311,9 +414,10 @@ def _log_evidence(
     at = np.arange(centre - _REACH_M, centre + _REACH_M, _ALONG_M)
     at = at[(at > 0.0) & (at < way[-1])]
     if not len(at) or not len(shifts_m):
-        return -np.inf
+        none = np.zeros((0, len(arms_m), 2))
+        return _Places(log_evidence=np.zeros(0), expected_m=none, heading=np.zeros((len(arms_m), 2)))
     inverse = np.linalg.inv(covariance)
-    expected = []
+    expected, headings = [], []
     for arm in arms_m:
         place = np.clip(at + facing * arm, 0.0, way[-1])
         segment = np.clip(np.searchsorted(way, place, side="right") - 1, 0, len(way) - 2)
@@ -321,6 +425,15 @@ def _log_evidence(
         point = points_m[segment] + heading * (place - way[segment])[:, None]
         right = np.stack([heading[:, 1], -heading[:, 0]], axis=-1)
         expected.append(point[:, None] + right[:, None] * shifts_m[None, :, None])
+        headings.append(heading)
     left = places_m - np.concatenate(expected, axis=-1)
     exponent = -0.5 * np.einsum("nui,ij,nuj->nu", left, inverse, left)
-    return float(logsumexp(exponent) - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1] + np.log(_ALONG_M))
+    likeliest = np.argmax(exponent, axis=0)
+    chosen = np.stack(expected, axis=2)[likeliest, np.arange(len(shifts_m))]
+    return _Places(
+        log_evidence=logsumexp(exponent, axis=0)
+        - 0.5 * np.linalg.slogdet(2.0 * np.pi * covariance)[1]
+        + np.log(_ALONG_M),
+        expected_m=chosen,
+        heading=np.stack(headings, axis=1)[likeliest[len(shifts_m) // 2]],
+    )

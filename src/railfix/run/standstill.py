@@ -1,0 +1,290 @@
+"""Codes and carrier phases of an antenna at rest, with those of a base station subtracted where there is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.constants import CLOCK_GROUP, SPEED_OF_LIGHT
+from railfix.core.errors import MismatchError
+from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.gnss.navigation import Navigation
+from railfix.gnss.observations import Observations
+from railfix.pipeline.channels import ChannelBook
+from railfix.pipeline.config import Config
+from railfix.pipeline.locate import AntennaRanges, antenna_ranges, locate
+from railfix.pipeline.received import known_from_start
+from railfix.positioning.standstill_phase import MeanPhases
+from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
+
+#: Satellites in fewer than this share of the epochs are left out, so that the mean is over the same ones.
+_SHARE: Final = 0.9
+#: Residual standard deviation of satellite and atmosphere errors beside a base station [m]; it is at most 10 km away.
+_BESIDE_BASE_M: Final = 0.05
+#: Largest difference of mean places of the first and the last third of the log [m].
+_AT_REST_M: Final = 8.0
+#: Change of a double difference from epoch to epoch that is a slip [wavelengths].
+_SLIP: Final = 0.25
+#: Share of the epochs over which a double difference must be unbroken.
+_UNBROKEN: Final = 0.5
+#: Bit of the loss-of-lock indicator: a slip since the epoch before; and that half a cycle is unknown.
+_LOST, _HALF_CYCLE = 1, 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandstillCodes:
+    """Codes of one antenna at rest, minus those computed for an origin: T epochs, K satellites.
+
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    residual_m : ndarray, shape (T, K)
+        Receiver clock of each constellation removed.
+    system : ndarray of str, shape (K,)
+    azimuth_deg, elevation_deg, common_m : ndarray, shape (K,)
+        `common_m`: standard deviation of satellite and atmosphere errors.
+    receivers : int
+        2 where a base station's codes are subtracted.
+    origin_ecef_m : ndarray, shape (3,)
+    phases : StandstillPhases or None
+        None without a base station.
+    """
+
+    time: Datetimes
+    residual_m: Floats
+    system: Strings
+    azimuth_deg: Floats
+    elevation_deg: Floats
+    common_m: Floats
+    receivers: int
+    origin_ecef_m: Floats
+    phases: StandstillPhases | None = None
+
+    def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
+        """Mean place over some epochs."""
+        seconds = float((self.time[epochs][-1] - self.time[epochs][0]) / np.timedelta64(1, "s"))
+        return standstill_fix(
+            self.azimuth_deg,
+            self.elevation_deg,
+            self.system,
+            np.nanmean(self.residual_m[epochs], axis=0),
+            seconds=seconds,
+            common_m=self.common_m,
+            errors=errors,
+            receivers=self.receivers,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseStation:
+    """Observations of a base station and its place, ECEF [m]."""
+
+    observations: Observations
+    ecef_m: Floats
+
+
+def standstill_codes(
+    obs: Observations,
+    navigation: Navigation,
+    config: Config,
+    *,
+    base: BaseStation | None = None,
+    origin_ecef_m: Floats | None = None,
+) -> StandstillCodes:
+    """Codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.
+
+    Raises
+    ------
+    MismatchError
+        The antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
+    """
+    received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
+    seen = antenna_ranges(obs, received, config, book)
+    places = locate(obs, received, config, book).ecef_m
+    places = places[np.isfinite(places[:, 0])]
+    if len(places) < 2:
+        raise MismatchError("the log has no positions; are the navigation files of its day?")
+    third = max(1, len(places) // 3)
+    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(places[0]))
+    change = np.median(places[-third:], axis=0) - np.median(places[:third], axis=0)
+    moved = float(np.hypot(*(enu_axes(latitude, longitude)[:2] @ change)))
+    if moved > _AT_REST_M:
+        raise MismatchError(f"the antenna moves by {moved:.0f} m in the log; give --start and --end of a standstill")
+    origin = np.median(places, axis=0) if origin_ecef_m is None else origin_ecef_m
+    time, residual, names = obs.time, _residual(seen, origin), seen.channels.satellite
+    columns, phases = np.arange(len(names)), None
+    nominal = config.nominal.sigma_m(np.nanmedian(seen.elevation_deg, axis=0))
+    if base is not None:
+        other = antenna_ranges(base.observations, received, config, book)
+        mine, its = _common_epochs(obs, base.observations)
+        columns, opposite = _common_channels(seen, other)
+        time = obs.time[mine]
+        residual = residual[mine][:, columns] - _residual(other, base.ecef_m)[its][:, opposite]
+        phases = _phases((obs, seen, origin, mine, columns), (base.observations, other, base.ecef_m, its, opposite))
+        nominal = np.full(len(names), _BESIDE_BASE_M)
+    kept = np.isfinite(residual).mean(axis=0) >= _SHARE
+    if not kept.any():
+        raise MismatchError("no satellite is observed over the whole log")
+    system = np.array([CLOCK_GROUP[str(name)[0]] for name in names[columns[kept]]])
+    residual = residual[:, kept]
+    for letter in np.unique(system):
+        rows = system == letter
+        residual[:, rows] -= np.nanmean(residual[:, rows], axis=1, keepdims=True)
+    elevation, azimuth = seen.elevation_deg[:, columns[kept]], seen.azimuth_deg[:, columns[kept]]
+    turn = np.radians(azimuth)
+    return StandstillCodes(
+        time=time,
+        residual_m=residual,
+        system=system,
+        azimuth_deg=np.degrees(np.arctan2(np.nanmean(np.sin(turn), axis=0), np.nanmean(np.cos(turn), axis=0))),
+        elevation_deg=np.nanmean(elevation, axis=0),
+        common_m=nominal[columns[kept]],
+        receivers=1 if base is None else 2,
+        origin_ecef_m=origin,
+        phases=phases,
+    )
+
+
+def _residual(seen: AntennaRanges, origin_ecef_m: Floats) -> Floats:
+    """Observed minus computed codes at a place, the Earth's rotation in transit included; NaN where unused."""
+    ranges = seen.ranges
+    computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
+    return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)
+
+
+def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Indices]:
+    """Epochs of two logs with the same time tags, to a tenth of a second."""
+    step = np.timedelta64(100, "ms")
+    stamps = [np.round((t - obs.time[0]) / step).astype(np.int64) for t in (obs.time, other.time)]
+    _, mine, its = np.intersect1d(*stamps, return_indices=True)
+    if not len(mine):
+        raise MismatchError("log and base station have no epoch in common")
+    return mine, its
+
+
+def _common_channels(seen: AntennaRanges, other: AntennaRanges) -> tuple[Indices, Indices]:
+    """Channels of two receivers with the same satellites and signals."""
+    names = [list(zip(s.channels.satellite.tolist(), s.channels.signal.tolist(), strict=True)) for s in (seen, other)]
+    shared = [name for name in names[0] if name in names[1]]
+    if not shared:
+        raise MismatchError("log and base station have no signal of a satellite in common")
+    mine, its = (np.array([of.index(name) for name in shared], dtype=np.intp) for of in names)
+    return mine, its
+
+
+@dataclass(frozen=True, kw_only=True)
+class StandstillPhases:
+    """Carrier phases of an antenna at rest less those of a base station, T epochs, M satellites.
+
+    Attributes
+    ----------
+    difference_m : ndarray, shape (T, M)
+        Less those computed for the origin; NaN where one of the receivers has none.
+    lost : ndarray of bool, shape (T, M)
+        Whether one of them reports a slip since the epoch before.
+    toward : ndarray, shape (T, M, 3)
+        Unit vectors to the satellites, east, north, up.
+    elevation_deg : ndarray, shape (T, M)
+    wavelength_m : ndarray, shape (M,)
+    group : ndarray of str, shape (M,)
+        Satellites on one clock and signal.
+    distance_m : float
+        From the base station.
+    """
+
+    difference_m: Floats
+    lost: Masks
+    toward: Floats
+    elevation_deg: Floats
+    wavelength_m: Floats
+    group: Strings
+    distance_m: float
+
+    def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
+        """Mean double differences over some epochs, of each satellite over its longest unbroken part."""
+        difference, lost, toward = self.difference_m[epochs], self.lost[epochs], self.toward[epochs]
+        least = _UNBROKEN * len(difference)
+        elevation = np.where(np.isfinite(difference), self.elevation_deg[epochs], 0.0).sum(axis=0)
+        elevation /= np.maximum(np.isfinite(difference).sum(axis=0), 1)
+        values, away, wavelengths, blocks = [], [], [], []
+        for group in np.unique(self.group):
+            columns = np.flatnonzero((self.group == group) & (np.isfinite(difference).sum(axis=0) >= least))
+            if len(columns) < 2:
+                continue
+            reference = int(columns[np.argmax(elevation[columns])])
+            own = [k for k in columns.tolist() if k != reference]
+            kept = []
+            for k in own:
+                double = difference[:, k] - difference[:, reference]
+                part = _longest_part(double, lost[:, k] | lost[:, reference], _SLIP * float(self.wavelength_m[k]))
+                if part.stop - part.start < least:
+                    continue
+                kept.append(k)
+                values.append(float(double[part].mean()))
+                away.append(-(toward[part, k] - toward[part, reference]).mean(axis=0))
+                wavelengths.append(float(self.wavelength_m[k]))
+            variance = errors.phase_sigma_m(elevation, distance_m=self.distance_m) ** 2
+            blocks.append(np.diag(variance[kept]) + variance[reference])
+        return MeanPhases(
+            difference_m=np.array(values),
+            away=np.reshape(away, (len(values), 3)),
+            wavelength_m=np.array(wavelengths),
+            covariance_m2=block_diag(*blocks) if values else np.zeros((0, 0)),
+        )
+
+
+def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
+    """The longest run of epochs with values and without a slip."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        return slice(0, 0)
+    gap = (np.diff(known) > 1) | (np.abs(np.diff(values[known])) > slip) | lost[known[1:]]
+    bounds = np.concatenate([[0], np.flatnonzero(gap) + 1, [len(known)]])
+    longest = int(np.argmax(np.diff(bounds)))
+    return slice(int(known[bounds[longest]]), int(known[bounds[longest + 1] - 1]) + 1)
+
+
+#: Log, corrected ranges, place, and the epochs and channels to take of it.
+_Side = tuple[Observations, AntennaRanges, Floats, Indices, Indices]
+
+
+def _phases(train: _Side, base: _Side) -> StandstillPhases:
+    """Single differences of the phases; GLONASS, whose wavelengths differ, is left out."""
+    sides, lost = [], []
+    for obs, seen, place, epochs, columns in (train, base):
+        channel = seen.channels.columns[columns]
+        wavelength = SPEED_OF_LIGHT / seen.channels.frequency_hz[columns]
+        rows = np.ix_(epochs, columns)
+        # orbit, clock and troposphere as of the codes; the ionosphere, of opposite sign, is the same at both ends
+        corrections = seen.ranges.code_m[rows] - obs.code_m[np.ix_(epochs, channel)]
+        lock = obs.loss_of_lock[np.ix_(epochs, channel)]
+        phase = obs.phase_cycles[np.ix_(epochs, channel)] * wavelength + corrections
+        computed, _ = range_with_rotation(seen.ranges.sat_ecef_m[rows], place)
+        usable = (seen.ranges.weight[rows] > 0.0) & (lock & _HALF_CYCLE == 0)
+        sides.append(np.where(usable, phase - computed, np.nan))
+        lost.append((lock & _LOST > 0) | obs.break_before[epochs][:, None])
+    _, seen, origin, epochs, columns = train
+    latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(origin))
+    line = seen.ranges.sat_ecef_m[np.ix_(epochs, columns)] - origin
+    toward = line @ enu_axes(latitude, longitude).T
+    satellite = seen.channels.satellite[columns]
+    kept = np.array([not str(name).startswith("R") for name in satellite], dtype=np.bool_)
+    group = np.array(
+        [
+            CLOCK_GROUP[str(name)[0]] + str(signal)
+            for name, signal in zip(satellite, seen.channels.signal[columns], strict=True)
+        ]
+    )
+    return StandstillPhases(
+        difference_m=(sides[0] - sides[1])[:, kept],
+        lost=(lost[0] | lost[1])[:, kept],
+        toward=(toward / np.linalg.norm(toward, axis=-1, keepdims=True))[:, kept],
+        elevation_deg=seen.elevation_deg[np.ix_(epochs, columns)][:, kept],
+        wavelength_m=(SPEED_OF_LIGHT / seen.channels.frequency_hz[columns])[kept],
+        group=group[kept],
+        distance_m=float(np.linalg.norm(origin - base[2])),
+    )
