@@ -88,6 +88,11 @@ def test_rooms_do_not_import_each_other_in_a_circle() -> None:
     assert rest == {}, "these rooms import each other"
 
 
+#: Compiled functions that call each other stay in one file: numba compiles anew when a file changes, not what it calls.
+ONE_FILE = "src/railfix/kernels/tracking.py"
+
+
 def test_files_stay_small() -> None:
     large = {str(p.relative_to(ROOT)): n for p in _sources() if (n := len(p.read_text().splitlines())) > 450}
+    large.pop(ONE_FILE)
     assert large == {}, "is there a second room in these files?"

@@ -71,6 +71,8 @@ class FilterState:
 
     Attributes
     ----------
+    line : Line or None
+        The trajectory as the filter sees it, made once.
     slips : SlipState or None
         Of the carrier phases.
     track : TrackState or None
@@ -80,6 +82,7 @@ class FilterState:
     gate : ReturnState
     """
 
+    line: Line | None = None
     slips: SlipState | None = None
     track: TrackState | None = None
     sensors: SensorState = field(default_factory=SensorState.empty)
@@ -159,7 +162,7 @@ def along_track(
         the place that the sensors carried.
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
-    line = Line.of(trajectory)
+    line = Line.of(trajectory) if state.line is None else state.line
     tracked, motion, after = _tracked(
         epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings, alone
     )
@@ -180,7 +183,7 @@ def along_track(
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
         motion=motion,
     )
-    return result, after
+    return result, replace(after, line=line)
 
 
 def _tracked(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from importlib import import_module
 from typing import Final
 
 import numpy as np
 
+from railfix import kernels
 from railfix.core.arrays import Floats
 from railfix.tracking.bank import levelled
 from railfix.tracking.chunk import Chunk, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
+from railfix.tracking.compiled import Compiled
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.hypotheses import most_probable, on_the_line, surviving, with_map_error
 from railfix.tracking.limits import TrackingLimits
@@ -20,6 +23,10 @@ from railfix.tracking.misfit import code_shift, learn_map
 from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, write_place, write_rows
 from railfix.tracking.robust import (
+    DOUBTFUL,
+    FREEDOM,
+    MOVED_M,
+    RELINEARISED,
     applied,
     better_mode,
     first_weights,
@@ -31,14 +38,6 @@ from railfix.tracking.rows import DIRECTION_MPS, Rows, rows_of, sensor_rows
 from railfix.tracking.search import seek
 from railfix.tracking.state import SATELLITES, Bank, TrackState, Unknown, begun_anew
 
-#: Mean weight of codes, or of phases and Dopplers, under which another start of the reweighting is tried.
-_DOUBTFUL: Final = 0.7
-#: Variances of place and speed added for that start [m2, m2/s2].
-_FREEDOM: Final = np.array([30.0**2, 10.0**2])
-#: The equations are made again when a place has moved by more than this [m]: 26 000 km away a range bends by 2 cm
-#: over 1 km, the line by 1 m over 20 m in its sharpest curves.
-_MOVED_M: Final = 2.0
-_RELINEARISED: Final = 4
 _PLACES: Final = [Unknown.PLACE, Unknown.BEFORE]
 
 
@@ -74,8 +73,16 @@ def track(
     if len(epochs):
         chunk = prepared(epochs, state, limits)
         anew = np.asarray(chunk.fresh.any(axis=1))
-        for epoch in range(len(epochs)):
-            _step(chunk, epoch, line, state, limits, sensors, result, bool(anew[epoch]))
+        fast = None
+        if kernels.CHOSEN == "numba" and limits.level == "off":
+            fast = Compiled(import_module("railfix.kernels.tracking"), chunk, line, sensors, limits, result)
+        epoch = 0
+        while epoch < len(epochs):
+            done = epoch if fast is None else fast.advance(state, epoch)
+            if done == epoch:
+                _step(chunk, epoch, line, state, limits, sensors, result, bool(anew[epoch]))
+                done += 1
+            epoch = done
         leave(chunk, epochs, state, limits)
     return result, state
 
@@ -147,14 +154,14 @@ def _measure(
     weight = first_weights(rows, prior, degrees)
     shift = code_shift(rows, prior, weight, most_probable(state.log_probability))
     update = robust_update(rows, prior, weight, degrees=degrees, passes=passes)
-    doubtful = min(_least(update.weight[:, part]) for part in (rows.codes, rows.motion)) < _DOUBTFUL
+    doubtful = min(_least(update.weight[:, part]) for part in (rows.codes, rows.motion)) < DOUBTFUL
     if doubtful:
-        update = better_mode(rows, prior, update, _FREEDOM, degrees=degrees, passes=passes)
+        update = better_mode(rows, prior, update, FREEDOM, degrees=degrees, passes=passes)
     after = applied(mean, covariance, prior, update)
     settled, point = rows, mean[:, _PLACES]
-    for _ in range(_RELINEARISED):
+    for _ in range(RELINEARISED):
         places = after[0][:, _PLACES]
-        if np.abs(places[:, 0] - point[:, 0]).max() < _MOVED_M:
+        if np.abs(places[:, 0] - point[:, 0]).max() < MOVED_M:
             break
         point = places
         sensed = sensor_rows(sensors, epoch, line, mean, dt, state.direction)

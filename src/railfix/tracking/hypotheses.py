@@ -27,7 +27,7 @@ WHEEL_PRIOR: Final = 0.02
 FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
 #: How much more probable another place must be to be gone by: near-equal ones would take turns.
-_SWITCH: Final = 3.0
+SWITCH: Final = 3.0
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
@@ -217,9 +217,9 @@ def on_the_line(mean: Floats, covariance: Floats, line: Line, limits: TrackingLi
 
 
 def most_probable(log_probability: Floats) -> int:
-    """The hypothesis to go by: that of before, the first, unless another is `_SWITCH` times as probable."""
+    """The hypothesis to go by: that of before, the first, unless another is `SWITCH` times as probable."""
     best = int(np.argmax(log_probability))
-    return best if log_probability[best] > log_probability[0] + np.log(_SWITCH) else 0
+    return best if log_probability[best] > log_probability[0] + np.log(SWITCH) else 0
 
 
 def surviving(

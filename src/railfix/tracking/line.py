@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -74,7 +75,18 @@ class Line:
         axes = axes / np.sqrt((axes * axes).sum(axis=-1, keepdims=True))
         return self.ecef_m[index] + along[:, None] * self.segment[index], axes
 
+    @cached_property
+    def middle_m(self) -> Floats:
+        """Arc lengths of the middles of the segments, shape (V - 1,) [m]."""
+        return 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
+
+    @cached_property
+    def written(self) -> dict[str, Floats | float]:
+        """Everything by its name, arrays as writable copies, row by row."""
+        names = ("arc_m", "ecef_m", "axes", "segment", "middle_m", "gradient")
+        arrays = {name: np.array(getattr(self, name), order="C") for name in names}
+        return {**arrays, "sigma_plan_m": float(self.sigma_plan_m), "sigma_height_m": float(self.sigma_height_m)}
+
     def gradient_at(self, arc_m: Floats) -> Floats:
         """Climb over horizontal length, between the middles of segments, shape (H,)."""
-        middle = 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
-        return np.interp(arc_m, middle, self.gradient)
+        return np.interp(arc_m, self.middle_m, self.gradient)

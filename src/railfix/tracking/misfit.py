@@ -20,12 +20,12 @@ from railfix.tracking.rows import Rows
 from railfix.tracking.state import TrackState, Unknown
 
 #: Fewer codes of an epoch do not tell a shift from clocks.
-_CODES: Final = 4
+CODES: Final = 4
 #: A single epoch counts with at most so many standard deviations.
-_CLIPPED: Final = 3.0
+CLIPPED: Final = 3.0
 #: Time constant of learning [s], and the largest logarithm: beyond 1.6 m in the square root of a metre nothing changes.
-_LEARNT_S: Final = 5.0
-_LARGEST: Final = 8.0
+LEARNT_S: Final = 5.0
+LARGEST: Final = 8.0
 
 
 def code_shift(rows: Rows, prior: Prior, weight: Floats, best: int) -> float:
@@ -43,7 +43,7 @@ def code_shift(rows: Rows, prior: Prior, weight: Floats, best: int) -> float:
         Hypothesis.
     """
     codes = rows.codes
-    if codes.stop < _CODES:
+    if codes.stop < CODES:
         return 0.0
     design = prior.design[best, codes]
     noise = rows.variance[codes] / np.minimum(weight[best, codes], 1.0)
@@ -52,7 +52,7 @@ def code_shift(rows: Rows, prior: Prior, weight: Floats, best: int) -> float:
     along = rows.design[best, codes] @ rows.combine[best, :, Unknown.PLACE]
     solved = np.linalg.solve(spread, np.stack([rows.value[best, codes], along], axis=1))
     score, information = along @ solved
-    return float(np.clip(score / np.sqrt(information), -_CLIPPED, _CLIPPED)) if information > 0.0 else 0.0
+    return float(np.clip(score / np.sqrt(information), -CLIPPED, CLIPPED)) if information > 0.0 else 0.0
 
 
 def learn_map(state: TrackState, shift: float, dt: float, limits: TrackingLimits) -> None:
@@ -65,5 +65,5 @@ def learn_map(state: TrackState, shift: float, dt: float, limits: TrackingLimits
     beyond = abs(mean) / (np.sqrt(variance) * limits.map_misfit_sigmas)
     scale = state.map_log_scale * np.exp(-dt / limits.map_misfit_kept_s)
     if beyond > 1.0:
-        scale += 2.0 * np.log(beyond) * dt / _LEARNT_S
-    state.map_log_scale = float(min(scale, _LARGEST))
+        scale += 2.0 * np.log(beyond) * dt / LEARNT_S
+    state.map_log_scale = float(min(scale, LARGEST))

@@ -20,7 +20,7 @@ WHEEL_WALK: Final = 5e-4
 FORCE_WALK_MPS2: Final = 1e-3
 RADAR_WALK: Final = 2e-4
 #: Least variance of a step of the place [m2], keeps matrices regular.
-_LEAST_STEP_M2: Final = 1e-6
+LEAST_STEP_M2: Final = 1e-6
 
 
 def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
@@ -47,7 +47,7 @@ def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Flo
     return step, density * noise
 
 
-_singer = lru_cache(maxsize=64)(singer_step)
+singer = lru_cache(maxsize=64)(singer_step)
 
 
 def predicted(
@@ -58,7 +58,7 @@ def predicted(
     The clones `Unknown.BEFORE` and `Unknown.SPEED_BEFORE` take place and speed, what begins anew at an epoch gets its
     prior. `map_scale` is the factor on `TrackingLimits.map_scale_m`.
     """
-    step, noise = _singer(dt, limits.acceleration_mps2, limits.acceleration_s)
+    step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
     speed = np.abs(mean[:, Unknown.SPEED])
     travel = speed * dt
     map_kept = np.exp(-travel / limits.map_absolute_m)
@@ -78,7 +78,7 @@ def predicted(
     lasting = limits.doppler_error_mps + limits.doppler_error_share * speed
     walk = limits.clock_walk_mps**2
     added = np.zeros(mean.shape)
-    added[:, Unknown.PLACE] = added[:, Unknown.SPEED] = _LEAST_STEP_M2
+    added[:, Unknown.PLACE] = added[:, Unknown.SPEED] = LEAST_STEP_M2
     added[:, Unknown.DRIFT] = walk * dt
     added[:, Unknown.PHASE_CLOCK] = walk * dt**3 / 3.0 + 1e-6
     added[:, Unknown.MAP_RIGHT] = line.sigma_plan_m**2 * (1.0 - map_kept**2)
@@ -91,7 +91,7 @@ def predicted(
     added[:, OFFSETS:SATELLITES] = limits.offset_walk_m**2 * dt
     added[:, SATELLITES:] = (1.0 - code_kept**2)[:, None]
     length = (limits.map_scale_m * map_scale) ** 2 * travel + limits.phase_walk_m**2 * dt
-    place = spread[:, Unknown.PLACE, Unknown.PLACE] + noise[0, 0] + _LEAST_STEP_M2
+    place = spread[:, Unknown.PLACE, Unknown.PLACE] + noise[0, 0] + LEAST_STEP_M2
     added[:, FRESH] = _fresh_variances(after, place, length, line, travel, limits)
     added[:, Unknown.PLACE] += length
     diagonal = np.arange(mean.shape[1])

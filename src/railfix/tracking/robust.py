@@ -14,6 +14,15 @@ from railfix.tracking.state import Unknown
 #: Share of a sensor's variance that no weight takes away: two sensors of the same combination keep it regular.
 SENSOR_FLOOR: Final = 1e-6
 
+#: Mean weight of codes, or of phases and Dopplers, under which another start of the reweighting is tried.
+DOUBTFUL: Final = 0.7
+#: Variances of place and speed added for that start [m2, m2/s2].
+FREEDOM: Final = np.array([30.0**2, 10.0**2])
+#: The equations are made again when a place has moved by more than this [m]: 26 000 km away a range bends by 2 cm
+#: over 1 km, the line by 1 m over 20 m in its sharpest curves.
+MOVED_M: Final = 2.0
+RELINEARISED: Final = 4
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:

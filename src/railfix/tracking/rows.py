@@ -35,13 +35,13 @@ from railfix.tracking.state import OFFSETS, SATELLITES, Unknown
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Standard gravity, enough for the share of it along a gradient [m/s2].
-_GRAVITY_MPS2: Final = 9.80665
+GRAVITY_MPS2: Final = 9.80665
 #: Slower than this ranges to ground units are not used [m/s].
 _STILL_MPS: Final = 0.3
 #: Slower than this a speed does not tell the direction [m/s].
 DIRECTION_MPS: Final = 0.5
 #: Shorter than this the tangent is the direction of a displacement [m].
-_CHORD_M: Final = 0.5
+CHORD_M: Final = 0.5
 
 
 class Kind(IntEnum):
@@ -194,8 +194,8 @@ def rows_of(
         chord = ecef - before
         length = np.sqrt((chord * chord).sum(axis=1))
         sign = np.where(point[:, 0] >= point[:, 1], 1.0, -1.0)
-        straight = np.where(length > _CHORD_M, sign / np.maximum(length, _CHORD_M), 0.0)[:, None] * chord
-        along = np.where((length > _CHORD_M)[:, None], straight, axes[:, 0])
+        straight = np.where(length > CHORD_M, sign / np.maximum(length, CHORD_M), 0.0)[:, None] * chord
+        along = np.where((length > CHORD_M)[:, None], straight, axes[:, 0])
         gradient = -(sight[:, phase] @ along[:, :, None])[..., 0]
         design[:, part, way] = gradient
         design[:, part, way + 1] = 1.0
@@ -268,7 +268,7 @@ def sensor_rows(
     force, sigma = sensors.force_mps2, sensors.force_sigma_mps2
     if force is not None and sigma is not None and np.isfinite(force[epoch]):
         slope = line.gradient_at(0.5 * (state[Unknown.PLACE] + state[Unknown.BEFORE]))
-        gravity = _GRAVITY_MPS2 * slope / np.sqrt(1.0 + slope**2)
+        gravity = GRAVITY_MPS2 * slope / np.sqrt(1.0 + slope**2)
         gained = (state[Unknown.SPEED] - state[Unknown.SPEED_BEFORE]) / dt
         value = force[epoch] - gained - gravity - state[Unknown.FORCE_OFFSET]
         coefficients = {Unknown.SPEED: 1.0 / dt, Unknown.SPEED_BEFORE: -1.0 / dt, Unknown.FORCE_OFFSET: 1.0}
