@@ -68,7 +68,8 @@ class RateSeries:
 
     Attributes
     ----------
-    time : ndarray of datetime64[ns], shape (K,)
+    time, known : ndarray of datetime64[ns], shape (K,)
+        At which they hold, and when they were known.
     way_m : ndarray, shape (K,) [m]
         Wheel's way since the tick before the first, in rising arc length.
     arc_m : ndarray, shape (K,) [m]
@@ -82,6 +83,7 @@ class RateSeries:
     """
 
     time: Datetimes
+    known: Datetimes
     way_m: Floats
     arc_m: Floats
     turned_rad: Floats

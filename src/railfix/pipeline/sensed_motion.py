@@ -175,10 +175,14 @@ def sensed_motion(
     at = np.searchsorted(ticks * _TICK_NS, ends, side="right")
     sensed = _by_interval(found.state, found.speed_mps, doubt, swing, at, seconds(np.diff(edges)))
     step = 1e-9 * _TICK_NS
+    # mean rates are those of the middle of their time
+    middle = (ticks * _TICK_NS - _MEAN_NS // 2).astype("datetime64[ns]")
+    passed = way_m(pulses, np.concatenate([[start - np.timedelta64(_MEAN_NS // 2, "ns")], middle]), limits=tachometer)
     series = RateSeries(
-        time=when,
-        way_m=facing * (ways[1:] - ways[0]),
-        arc_m=arc,
+        time=middle,
+        known=when,
+        way_m=facing * (passed[1:] - passed[0]),
+        arc_m=state.arc_m + facing * (passed[1:] - ways[0]),
         turned_rad=step * heading_rate_radps(force, rates, known_speed),
         climbed_rad=step * (turning - found.gyro_bias_radps),
         speed_mps=facing * speed.speed_mps,

@@ -65,6 +65,9 @@ class SensorLimits(Settings):
         Of places by changes of gradient and curvature.
     gradient_noise, curvature_noise_1pm : float
         Standard deviations in one metre of way: swings of the body of 1 mrad, and of its heading.
+    map_length_m : float
+        Length over which the errors of the map change (as `TrackingLimits.map_correlation_m`): a map of 0.3 m places no
+        feature better than some metres, one of 0.05 m to half a metre.
     feature_sigma_m : float
         Least standard deviation of such a place: the map's, and that of the body on its bogies.
     range_sigma_m : float
@@ -93,6 +96,7 @@ class SensorLimits(Settings):
     feature: FeatureLimits = Field(default_factory=FeatureLimits)
     gradient_noise: float = Field(default=1e-3, gt=0)
     curvature_noise_1pm: float = Field(default=1e-4, gt=0)
+    map_length_m: float = Field(default=50.0, gt=0)
     feature_sigma_m: float = Field(default=0.5, gt=0)
     range_sigma_m: float = Field(default=0.5, gt=0)
     echo: EchoLimits = Field(default_factory=EchoLimits)
@@ -192,7 +196,7 @@ def sensor_epochs(
             limits=limits.slip,
         )
         if rates is not None and surroundings is not None and surroundings.features is not None:
-            noise = (limits.gradient_noise, limits.curvature_noise_1pm)
+            noise = _with_map(limits, trajectory)
             fixes, passing = feature_fixes(
                 rates, surroundings.features, facing, motion.sigma_m, passing, noise=noise, limits=limits.feature
             )
@@ -243,13 +247,25 @@ def sensor_epochs(
     return SensorEpochs(**values), sensed, SensorState(time=time[-1], samples=kept, motion=motion, features=passing)
 
 
+def _with_map(limits: SensorLimits, trajectory: Trajectory) -> tuple[float, float]:
+    """Noise of gradient and curvature in one metre, the errors of the map in it.
+
+    A map off by sigma across the track over a length L has curvatures off by ``sqrt(3) sigma / L^2`` for about L: as
+    white noise in one metre times ``sqrt(L)``. Its gradients are off by ``sigma / L`` likewise.
+    """
+    length = limits.map_length_m
+    gradient = trajectory.sigma_height_m / np.sqrt(length)
+    curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / length**1.5
+    return float(np.hypot(limits.gradient_noise, gradient)), float(np.hypot(limits.curvature_noise_1pm, curvature))
+
+
 def _places(fixes: list[FeatureFix], rates: RateSeries, time: Datetimes, limits: SensorLimits) -> dict[str, Floats]:
     """Places of the antenna by the accepted features, at the first epoch after each."""
     place, sigma = np.full(len(time), np.nan), np.full(len(time), np.nan)
     at = rates.arc_at(time)
     for fix in fixes:
         if fix.located.verdict == "accepted":
-            epoch = int(np.searchsorted(time, rates.time[fix.tick]))
+            epoch = int(np.searchsorted(time, rates.known[fix.tick]))
             place[epoch] = at[epoch] + fix.correction_m
             since = limits.feature.scale_sigma * limits.feature.half_length_m
             sigma[epoch] = np.sqrt(fix.located.sigma_m**2 + since**2 + limits.feature_sigma_m**2)
