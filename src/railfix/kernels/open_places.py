@@ -89,8 +89,8 @@ def risk_off_tangent(
                     x = (c_xx * sx + c_xy * sy + c_xz * sz) * inverse
                     y = (c_xy * sx + c_yy * sy + c_yz * sz) * inverse
                     z = (c_xz * sx + c_yz * sy + c_zz * sz) * inverse
-                    gap = max(clear_m[t] - math.sqrt(x * x + y * y + z * z), 0.0)
-                    excess = gap * gap / ((c_xx + c_yy + c_zz) * inverse) - max(x * sx + y * sy + z * sz, 0.0)
+                    gap = max(clear_m[t] - math.sqrt(x * x + y * y), 0.0)
+                    excess = gap * gap / ((c_xx + c_yy) * inverse) - max(x * sx + y * sy + z * sz, 0.0)
                     if excess > 1400.0:
                         tail = 0.0
                     elif excess > 0.0:

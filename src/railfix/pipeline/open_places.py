@@ -149,9 +149,14 @@ def places_beyond_the_level(
         block = rows[first : first + size]
         parts, design, none = _whitened(model.take(block), index, np.maximum(scale[block], 1.0))
         prior = np.where(parts.used, risk.prior(systems)[parts.channel], 0.0)
-        clear_m = np.maximum(level_m[block], _off_tangent_m(index, arc_m[block]))
         bound = risk_off_tangent(
-            parts.projector, parts.residual, design, prior, none.slope[:, 0], none.matrix[:, 0], clear_m
+            parts.projector,
+            parts.residual,
+            design,
+            prior,
+            none.slope[:, 0],
+            none.matrix[:, 0],
+            _off_tangent_m(index, arc_m[block]),
         )
         near = np.flatnonzero(bound > risk.risk_per_sample)
         for some in np.array_split(near, 1 + 9 * len(near) // size) if len(near) else ():
@@ -166,7 +171,7 @@ def places_beyond_the_level(
 def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
     """Return a distance within which no part of the line lies off the tangent, at positions on it, shape (T,) [m].
 
-    The same for all positions on a section; at most `_CLEAR_M`.
+    Along and across, without the height. The same for all positions on a section; at most `_CLEAR_M`.
     """
     line = index.trajectory
     section = line.segment_at(arc_m)[0]
@@ -180,7 +185,7 @@ def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
         row = np.repeat(np.arange(len(new)), count)
         other = (vertex < len(line.length_m)) & (vertex != new[row])
         row, vertex = row[other], vertex[other]
-        own, tangent = line.length_m[new[row]], line.tangent[new[row]]
+        own, tangent, across = line.length_m[new[row]], line.tangent[new[row]], line.across[new[row]]
         along, distance, off = [], [], np.zeros(len(row), dtype=bool)
         for end in (vertex, vertex + 1):
             away = line.ecef_m[end] - line.ecef_m[new[row]]
@@ -188,8 +193,8 @@ def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
             # Of all places on the section, the one abeam or nearest sees the end furthest off the tangent.
             least = np.maximum(np.maximum(ahead - own, -ahead), 0.0)
             beside = np.linalg.norm(away - ahead[:, None] * tangent, axis=1)
-            distance.append(np.hypot(least, beside))
-            off |= (least < _ALONG * distance[-1]) & (beside > _ON_TANGENT_M)
+            distance.append(np.hypot(least, np.einsum("pi,pi->p", away, across)))
+            off |= (least < _ALONG * np.hypot(least, beside)) & (beside > _ON_TANGENT_M)
             along.append(ahead)
         # A section that passes by has ends in both directions, and a middle off the tangent.
         passing = np.minimum(np.maximum(*along), own) - np.maximum(np.minimum(*along), 0.0) > _ON_TANGENT_M
@@ -212,8 +217,8 @@ def risk_off_tangent(
 ) -> Floats:
     """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
 
-    At a distance D from the position a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
-    least, c its lowest place, C the inverse of its matrix and s its slope.
+    At a distance D along and across a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
+    least: c its lowest place and C the inverse of its matrix, both along and across, and s its slope.
 
     Parameters
     ----------
@@ -283,8 +288,8 @@ def _bounded(
         (c_xy * s + c_yy * t + c_yz * u) * inverse,
         (c_xz * s + c_yz * t + c_zz * u) * inverse,
     )
-    gap = np.maximum(clear_m[:, None] - np.sqrt(x * x + y * y + z * z), 0.0)
-    spread = np.where(regular, (c_xx + c_yy + c_zz) * inverse, np.inf)
+    gap = np.maximum(clear_m[:, None] - np.sqrt(x * x + y * y), 0.0)
+    spread = np.where(regular, (c_xx + c_yy) * inverse, np.inf)
     excess = gap * gap / spread - np.maximum(x * s + y * t + z * u, 0.0)
     tail = np.where(excess > 0.0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
     return np.asarray((prior * tail).sum(axis=1))
