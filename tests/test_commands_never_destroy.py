@@ -182,6 +182,8 @@ def _killed_after(words: list[str], seconds: float, number: signal.Signals, fold
 def _check_kills(desk: Desk, command: str, kills: int, number: signal.Signals, seed: int) -> None:
     words = [word.format(desk=desk.folder, out="out") for word in command.split()]
     out = desk.folder / "out"
+    made = ("out",) if command.startswith("report") else ()  # its folder has to be there
+    out.parent.joinpath(*made).mkdir(exist_ok=True)
     began = time.perf_counter()
     assert _killed_after(words, 100.0, number, desk.folder) == 0
     whole_s = time.perf_counter() - began
@@ -191,24 +193,29 @@ def _check_kills(desk: Desk, command: str, kills: int, number: signal.Signals, s
     shutil.rmtree(out)
     random = Random(seed)
     for _ in range(kills):
+        out.parent.joinpath(*made).mkdir(exist_ok=True)
         code = _killed_after(words, random.uniform(0.1, 1.1) * whole_s, number, desk.folder)
         assert code in (0, -number, 128 + number)
         result = RUNNER.invoke(app, [word.format(desk=desk.folder, out=out) for word in command.split()])
         # the killed process had finished its work, or the next one does it
-        assert result.exit_code == 0 or (result.exit_code == 8 and "not empty" in result.output), result.output
+        finished = "not empty" in result.output or "exists already" in " ".join(result.output.split())
+        assert result.exit_code == 0 or (result.exit_code == 8 and finished), result.output
         assert sorted(path.name for path in out.iterdir()) == expected
         if (out / "run.json").exists():
             assert json.loads((out / "run.json").read_text())["positioning_rate"] > 0.9
+        for page in out.glob("*.html"):
+            assert page.read_text().rstrip().endswith("</html>")
         shutil.rmtree(out)
 
 
 KILLED: Final = {
     "run": f"run {_LOG} --observations --out {{out}}",
     "simulate": "simulate {desk}/scenario.toml --out {out}",
+    "report": "report {desk}/results --reference {desk}/truth.csv --out {out}/report.html",
 }
 
 
-@pytest.mark.parametrize("name", KILLED)
+@pytest.mark.parametrize("name", ["run", "simulate"])
 def test_the_next_run_works_after_a_kill(desk: Desk, name: str) -> None:
     _check_kills(desk, KILLED[name], 3, signal.SIGKILL, seed=1)
 
