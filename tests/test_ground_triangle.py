@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from railfix.cli.ground import app
+from railfix.core.geodesy import geodetic_from_ecef
+from railfix.gnss.observations import Observations
 from railfix.ground.monitor import MonitorLimits, MonitorState, Order, advance, release
 from railfix.ground.monitor_log import monitor_log
-from railfix.ground.simulated_triangle import PLAN_M, simulated_fixes
+from railfix.ground.simulated_triangle import PLAN_M, TIME, points_ecef_m, simulated_fixes
 from railfix.ground.station_fixes import station_fixes
+from railfix.ground.station_streams import StationStreams
 from railfix.ground.triangle import (
     SIDES,
     STOPPING,
@@ -262,6 +267,87 @@ def test_a_satellite_clock_step_in_the_logs(triangle_logs: tuple[list[Path], Pat
     done = CliRunner().invoke(app, ["monitor", *map(str, broken), *options])
     assert "suspend satellite positioning: satellites_or_jamming" in done.output, done.output
     assert done.output.index("suspend") < done.output.index("stop:")
+
+
+def test_streams_are_judged_as_their_logs_are(triangle_logs: tuple[list[Path], Path], tmp_path: Path) -> None:
+    """The same verdicts and errors as from the logs; a clock step in the streams stops the trains at once."""
+    logs, nav = triangle_logs
+    observations = [read_observations(path) for path in logs]
+    points = [
+        ",".join(f"{float(value):.9f}" for value in geodetic_from_ecef(log.header.approximate_ecef_m))
+        for log in observations
+    ]
+    places = [word for point in points for word in ("--point", point)]
+    words = [*map(str, logs), "--nav", str(nav), *places]
+    for name, more in (("logs", []), ("live", ["--live"])):
+        done = CliRunner().invoke(app, ["monitor", *words, *more, "--out", str(tmp_path / name)])
+        assert done.exit_code == 0, done.output
+        assert "no stop" in done.output
+    once, live = (pl.read_csv(tmp_path / name / "monitor.csv") for name in ("logs", "live"))
+    assert live["time_gpst"].to_list() == once["time_gpst"].to_list()
+    assert live["verdict"].to_list() == once["verdict"].to_list() == ["healthy"] * 60
+    for name in ("error_0_m", "side_01_m"):
+        assert np.abs((live[name] - once[name]).to_numpy()).max() < 1e-6
+    strength = np.nan_to_num(observations[0].cn0_dbhz.mean(axis=0)) * (observations[0].signal == "1C")
+    satellite = observations[0].satellite[np.argsort(strength)[-3]]
+    for k, log in enumerate(observations):
+        code = log.code_m.copy()
+        code[30:, log.satellite == satellite] += 400.0
+        write_observations(replace(log, code_m=code), tmp_path / f"{k}.rnx")
+    words = [*(str(tmp_path / f"{k}.rnx") for k in range(3)), "--nav", str(nav), *places, "--live"]
+    done = CliRunner().invoke(app, ["monitor", *words, "--out", str(tmp_path / "step")])
+    tag = np.datetime_as_string(once["time_gpst"].str.to_datetime(time_unit="ns").to_numpy()[30], unit="s")
+    assert f"{tag} suspend satellite positioning: satellites_or_jamming" in done.output, done.output
+
+
+def test_streams_of_which_nothing_comes_stop_the_trains(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        source = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        words = ["monitor", source, source, source, "--live", "--late", "0.5", "--for", "2", "--out", str(tmp_path)]
+        done = CliRunner().invoke(app, [*words, *("--point", "35.7,139.7,100") * 3])
+    assert done.exit_code == 0, done.output
+    assert done.output.count("suspend satellite positioning: monitor_lost") == 1
+
+
+def test_a_receiver_without_satellites_gives_no_fix_and_all_three_are_jamming() -> None:
+    """Epochs without any satellite come on: monitor lost; where the C/N0 of all three has fallen: jamming."""
+    logs = [full_sky(k) for k in range(3)]
+    stations = StationStreams(points_ecef_m())
+    for second in range(20):
+        for k, log in enumerate(logs):
+            fixes = stations.push(k, log[second : second + 1])
+    assert fixes is not None
+    assert not fixes.cn0_fallen.any()
+    for second in range(20, 23):
+        for k, log in enumerate(logs):
+            epoch = log[second : second + 1]
+            fixes = stations.push(k, replace(epoch, code_m=epoch.code_m * np.nan, cn0_dbhz=epoch.cn0_dbhz * np.nan))
+    assert fixes is not None
+    assert fixes.cn0_fallen.all()
+    assert np.isnan(fixes.fixes_m).all()
+    triangle = compare_triangle(PLAN_M, fixes.fixes_m, limits=LIMITS, cn0_fallen=fixes.cn0_fallen)
+    assert triangle.verdict[0] == Verdict.JAMMING
+    # one receiver alone is behind: nothing comes out, and the older epochs are dropped when it is back
+    for second in range(23, 26):
+        for k in (0, 1):
+            assert stations.push(k, logs[k][second : second + 1]) is None
+    for k in range(3):
+        fixes = stations.push(k, logs[k][26:27])
+    assert fixes is not None
+    assert stations.counts["incomplete"] == 3
+
+
+def full_sky(receiver: int) -> Observations:
+    """Thirty epochs of one receiver with C/N0; without records there are no fixes."""
+    satellite = np.array([f"G{k:02d}" for k in range(1, 9)])
+    shape = (30, len(satellite))
+    empty = np.full(shape, np.nan)
+    return Observations(
+        time=TIME + np.arange(30) * np.timedelta64(1, "s") + np.timedelta64(receiver, "ms"),
+        satellite=satellite, signal=np.full(len(satellite), "1C"), code_m=np.full(shape, 2.2e7), phase_cycles=empty,
+        doppler_hz=empty, cn0_dbhz=np.full(shape, 45.0), loss_of_lock=np.zeros(shape, dtype=np.uint8),
+        break_before=np.zeros(30, dtype=bool),
+    )  # fmt: skip
 
 
 def test_two_stations_of_a_recording_as_monitors(recordings: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -15,6 +17,10 @@ from railfix.cli.console import console_of_tables, show_files
 from railfix.cli.options import OverwriteOption
 from railfix.core.errors import MismatchError, OutputError, SettingsError
 from railfix.run.output import check_output_file
+
+if TYPE_CHECKING:
+    from railfix.ground.monitor import MonitorLimits, Order
+    from railfix.ground.triangle import TriangleLimits
 
 app = typer.Typer(
     cls=Commands,
@@ -38,12 +44,19 @@ def ground() -> None:
 @app.command("monitor", cls=Command)
 def monitor(
     logs: Annotated[
-        list[Path], typer.Argument(metavar="OBS OBS OBS", help="RINEX observation files of the three receivers.")
+        list[str],
+        typer.Argument(
+            metavar="OBS OBS OBS",
+            help="RINEX observation files of the three receivers; with --live their streams, as of `railfix live`.",
+        ),
     ],
     *,
     nav: Annotated[
-        list[Path], typer.Option("--nav", metavar="FILE", help="RINEX navigation file; repeat it for several.")
-    ],
+        list[Path] | None,
+        typer.Option(
+            "--nav", metavar="FILE", help="RINEX navigation file; repeat it for several. Streams may bring their own."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for monitor.csv and triangle.png.")],
     point: Annotated[
         list[str] | None,
@@ -55,6 +68,10 @@ def monitor(
     radius: Annotated[float, typer.Option(metavar="M", help="Radius of the circle of allowable error.")] = 12.0,
     side: Annotated[float, typer.Option(metavar="M", help="Largest deviation of the vector between two fixes.")] = 6.0,
     late: Annotated[float, typer.Option(metavar="S", help="Time after which three fixes are late.")] = 3.0,
+    live: Annotated[bool, typer.Option("--live", help="Judge streams as they arrive, once a second.")] = False,
+    for_seconds: Annotated[
+        float | None, typer.Option("--for", metavar="S", min=0.0, help="With --live: end after this time.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Judge satellite positioning by three receivers at known points.
@@ -63,6 +80,10 @@ def monitor(
     fixes with those between the points. The first cause that stops the trains is latched and printed.
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
+
+    With --live the logs are streams, judged as they arrive until they end; monitor.csv grows with them.
+
+    Example: `railfix ground monitor --live tcp://10.0.0.1:2101 tcp://10.0.0.2:2101 tcp://10.0.0.3:2101 --point ...`
 
     Exit codes as `railfix --help` says; 5 where the logs have no satellite or no epoch in common.
     """
@@ -81,19 +102,25 @@ def monitor(
     files = [out / "monitor.csv", out / "triangle.png"]
     for path in files:
         if path.parent.exists():
-            check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=[*logs, *nav])
+            inputs = [*(Path(log) for log in logs), *(nav or [])]
+            check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=inputs)
+    if point is not None and len(point) != 3:
+        raise SettingsError(f"--point was given {len(point)} times; give it once for each receiver")
+    if live:
+        _monitor_live(logs, point, nav, files[0], limits=limits, times=times, for_s=for_seconds)
+        return
+    if not nav:
+        raise SettingsError("--nav is missing: logs need navigation files")
     observations = [read_observations(path) for path in logs]
     if point:
         from railfix.cli.cn0_curve import place_of
 
-        if len(point) != 3:
-            raise SettingsError(f"--point was given {len(point)} times; give it once for each receiver")
         points = np.stack([place_of(text, "--point") for text in point])
     else:
         points = np.stack([log.header.approximate_ecef_m for log in observations])
-        for path, known in zip(logs, points, strict=True):
+        for log, known in zip(logs, points, strict=True):
             if not np.isfinite(known).all():
-                raise MismatchError(f"{path}: the header has no position; give the known points with --point")
+                raise MismatchError(f"{log}: the header has no position; give the known points with --point")
     fixes = station_fixes(observations, points, read_navigation(nav))
     result = monitor_log(fixes, limits=limits, times=times)
     try:
@@ -113,6 +140,83 @@ def monitor(
     if not result.orders:
         console.print("no stop")
     show_files(console, files)
+
+
+def _monitor_live(
+    sources: list[str],
+    point: list[str] | None,
+    nav: list[Path] | None,
+    path: Path,
+    *,
+    limits: TriangleLimits,
+    times: MonitorLimits,
+    for_s: float | None,
+) -> None:
+    """Judge streams until they end, or for a time; rows go to a file and orders are printed as they come."""
+    import asyncio
+    import time
+
+    from railfix.cli.cn0_curve import place_of
+    from railfix.ground.monitor_log import LiveMonitor
+    from railfix.ground.station_streams import stream_fixes
+    from railfix.ground.triangle import Verdict
+    from railfix.io import read_navigation
+    from railfix.live.sources import check_source, is_file
+
+    if point is None:
+        raise SettingsError("--point is missing: streams name no known points; give it once for each receiver")
+    for source in sources:
+        check_source(source)
+    points = np.stack([place_of(text, "--point") for text in point])
+    navigation = read_navigation(nav) if nav else None
+    monitor, counts, console = LiveMonitor(limits=limits, times=times), Counter[str](), console_of_tables()
+    recorded = all(is_file(source) for source in sources)
+
+    def show(orders: tuple[Order, ...], when: str) -> None:
+        for order in orders:
+            cause = "" if monitor.state.cause is None else f": {monitor.state.cause.name.lower()}"
+            named = "" if monitor.state.receiver < 0 else f", receiver {monitor.state.receiver}"
+            console.print(f"{when} {order.value}{cause}{named}", soft_wrap=True)
+
+    async def work() -> None:
+        async for fixes in stream_fixes(sources, points, navigation=navigation):
+            # recorded streams have the clock of their tags
+            tag_s = float(fixes.time[0].astype(np.int64)) / 1e9
+            judged, orders = monitor.judge(fixes, tag_s if recorded else time.monotonic())
+            judged.table().write_csv(file, include_header=not counts)
+            file.flush()
+            counts[Verdict(int(judged.triangle.verdict[0])).name.lower()] += 1
+            show(orders, np.datetime_as_string(fixes.time[0], unit="s"))
+
+    async def watch() -> None:
+        while not recorded:
+            await asyncio.sleep(0.5)
+            show(monitor.silent(time.monotonic()), "nothing for too long:")
+
+    async def session() -> None:
+        tasks = [asyncio.create_task(work()), asyncio.create_task(watch())]
+        done, _ = await asyncio.wait(tasks[:1], timeout=for_s)
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for task in done:
+            task.result()
+
+    if not recorded:
+        monitor.state = replace(monitor.state, complete_s=time.monotonic())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as file:
+            asyncio.run(session())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror})") from None
+    table = Table("verdict", "epochs")
+    for name, count in sorted(counts.items()):
+        table.add_row(name, str(count))
+    console.print(table)
+    if not monitor.state.stopped:
+        console.print("no stop")
+    show_files(console, [path])
 
 
 @app.command("keys", cls=Command)

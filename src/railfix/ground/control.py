@@ -190,6 +190,8 @@ class ControlCentre:
         if self.monitor is None:
             return
         verdict, receiver = self._verdict or (None, -1)
+        if verdict is None and now - self.monitor.complete_s <= self.times.late_s:
+            return  # not late yet
         self._verdict, self._judged = None, verdict
         self.monitor, orders = advance(self.monitor, now, verdict, receiver=receiver, limits=self.times)
         for order in orders:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +59,7 @@ def monitor_log(
         The sides of the triangle are too short for the limits.
     """
     limits, times = limits or TriangleLimits(), times or MonitorLimits()
-    try:
-        triangle = compare_triangle(fixes.points_m, fixes.fixes_m, limits=limits, cn0_fallen=fixes.cn0_fallen)
-    except ValueError as error:
-        raise SettingsError(str(error)) from None
+    triangle = _compared(fixes, limits)
     seconds = (fixes.time - fixes.time[0]) / np.timedelta64(1, "s")
     state, orders = MonitorState(stopped=False), []
     for k, now in enumerate(seconds.tolist()):
@@ -106,3 +103,46 @@ def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> N
         axes.legend(loc="upper left", ncols=5, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
+
+
+@dataclass(kw_only=True)
+class LiveMonitor:
+    """Monitor of fixes as they arrive, one epoch at a time.
+
+    Attributes
+    ----------
+    limits : TriangleLimits
+    times : MonitorLimits
+    state : MonitorState
+    """
+
+    limits: TriangleLimits
+    times: MonitorLimits
+    state: MonitorState = field(default_factory=lambda: MonitorState(stopped=False))
+
+    def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
+        """Take one epoch; return it judged, and the orders to be sent.
+
+        Raises
+        ------
+        SettingsError
+            The sides of the triangle are too short for the limits.
+        """
+        triangle = _compared(fixes, self.limits)
+        verdict, receiver = Verdict(int(triangle.verdict[0])), int(triangle.receiver[0])
+        self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)
+        return MonitoredLog(fixes=fixes, triangle=triangle, orders=()), orders
+
+    def silent(self, now_s: float) -> tuple[Order, ...]:
+        """Take that nothing has come since the last epoch; return the orders to be sent where it is late."""
+        if now_s - self.state.complete_s <= self.times.late_s:
+            return ()
+        self.state, orders = advance(self.state, now_s, None, limits=self.times)
+        return orders
+
+
+def _compared(fixes: StationFixes, limits: TriangleLimits) -> TriangleResult:
+    try:
+        return compare_triangle(fixes.points_m, fixes.fixes_m, limits=limits, cn0_fallen=fixes.cn0_fallen)
+    except ValueError as error:
+        raise SettingsError(str(error)) from None

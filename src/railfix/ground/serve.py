@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.arrays import Floats
+from railfix.core.errors import InputFileError, RailfixError, SettingsError
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import Settings, load_settings
 from railfix.ground.centre import CentreLimits
 from railfix.ground.control import ControlCentre, orders_of
@@ -25,9 +27,12 @@ from railfix.ground.link_quality import LinkName
 from railfix.ground.links import BEARERS, CentreLinks
 from railfix.ground.monitor import MonitorLimits
 from railfix.ground.reference_curve import ReferenceCurve
+from railfix.ground.station_streams import stream_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.triangle import TriangleLimits, Verdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
+from railfix.io import read_navigation
 
 #: Period of the centre's work [s].
 STEP_S = 1.0
@@ -47,6 +52,7 @@ def parse_address(text: object) -> tuple[str, int]:
     return host, int(port)
 
 
+Place = tuple[float, float, float]
 Address = Annotated[tuple[str, int], BeforeValidator(parse_address)]
 
 
@@ -75,6 +81,30 @@ class TrainPlace(Settings):
     bound_m: float = Field(default=10.0, ge=0)
 
 
+class TriangleInputs(Settings):
+    """Reference triangle on live streams.
+
+    Attributes
+    ----------
+    sources : tuple of str, length 3
+        As of ``railfix live``.
+    points : tuple of (float, float, float), length 3 [deg, deg, m]
+        Latitude, longitude and height of the known points.
+    nav : tuple of Path
+        Navigation known from the start; records from the streams are added.
+    limits : TriangleLimits
+    """
+
+    sources: tuple[str, str, str]
+    points: tuple[Place, Place, Place]
+    nav: tuple[Path, ...] = ()
+    limits: TriangleLimits = TriangleLimits()
+
+    def points_ecef_m(self) -> Floats:
+        """Known points, shape (3, 3) [m]."""
+        return ecef_from_geodetic(*np.array(self.points).T)
+
+
 class CentreFile(Settings):
     """File of a centre; paths are relative to it.
 
@@ -95,6 +125,8 @@ class CentreFile(Settings):
         Of the reference run curve, for simulated running.
     points_s : float [s]
         Time in which the simulated points move: there is no interface to real ones.
+    triangle : TriangleInputs or None
+        Judges satellite positioning; the first start is then a stop, to be released by hand. Without it nothing does.
     centre, interlocking, monitor : settings
         `CentreLimits`, `InterlockingLimits`, `MonitorLimits`.
     """
@@ -107,6 +139,7 @@ class CentreFile(Settings):
     routes: Literal["automatic", "by hand"] = "automatic"
     speed_mps: float = Field(default=20.0, gt=0)
     points_s: float = Field(default=5.0, ge=0)
+    triangle: TriangleInputs | None = None
     centre: CentreLimits = CentreLimits()
     interlocking: InterlockingLimits = InterlockingLimits()
     monitor: MonitorLimits = MonitorLimits()
@@ -240,7 +273,7 @@ async def run_centre(
         control = ControlCentre.restored(
             supervision,
             store,
-            judged=False,
+            judged=settings.triangle is not None,
             curves=settings.curves(),
             send=links.send,
             clock=time.monotonic,
@@ -274,10 +307,11 @@ async def run_centre(
         try:
             work = asyncio.create_task(_work(control, field_points))
             ending = asyncio.create_task(end.wait())
+            judging = asyncio.create_task(_judge(control, settings, path))
             await asyncio.wait([work, ending], timeout=for_s, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
                 work.result()
-            for task in (work, ending):
+            for task in (work, ending, judging):
                 task.cancel()
                 with contextlib.suppress(asyncio.CancelledError):
                     await task
@@ -303,6 +337,23 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
         control.step()
         due = max(due + STEP_S, loop.time())
         await asyncio.sleep(due - loop.time())
+
+
+async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> None:
+    """Judge satellite positioning by the streams of the triangle; where they end, its lateness stops the trains."""
+    if (triangle := settings.triangle) is None:
+        return
+    try:
+        navigation = read_navigation([path.parent / name for name in triangle.nav]) if triangle.nav else None
+        points = triangle.points_ecef_m()
+        async for fixes in stream_fixes(triangle.sources, points, navigation=navigation):
+            result = compare_triangle(
+                fixes.points_m, fixes.fixes_m, limits=triangle.limits, cn0_fallen=fixes.cn0_fallen
+            )
+            control.judge(Verdict(int(result.verdict[0])), int(result.receiver[0]))
+        control.log("triangle: every stream has ended")
+    except (RailfixError, ValueError) as error:
+        control.log(f"triangle: {' '.join(str(error).split())}")
 
 
 def _check_line(control: ControlCentre, path: Path) -> None:

@@ -81,7 +81,7 @@ def station_fixes(
     common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
     if not common:
         raise MismatchError("the logs have no satellite on the same signal in common; the same signals are needed")
-    epochs = [_rounded(log.time) for log in logs]
+    epochs = [rounded(log.time) for log in logs]
     if not len(reduce(np.intersect1d, epochs)):
         raise MismatchError("the logs have no epoch in common; logs of the same time are needed")
     time = reduce(np.union1d, epochs)
@@ -129,8 +129,7 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
     points_ecef_m : ndarray, shape (N, 3) [m]
     cn0_fallen : ndarray of bool, shape (T, N)
     """
-    latitude, longitude, _ = geodetic_from_ecef(points_ecef_m[0])
-    plane = enu_axes(latitude, longitude)[:2]
+    plane = _plane(points_ecef_m)
     fixes = [
         single_point(item, np.broadcast_to(point, (len(time), 3))).ecef_m
         for item, point in zip(ranges, points_ecef_m, strict=True)
@@ -144,7 +143,25 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
     )
 
 
-def _rounded(time: Datetimes) -> Datetimes:
+def no_fixes(time: Datetimes, points_ecef_m: Floats) -> StationFixes:
+    """Return epochs without a fix of any receiver."""
+    shape = (len(time), len(points_ecef_m))
+    return StationFixes(
+        time=time,
+        points_m=(points_ecef_m - points_ecef_m[0]) @ _plane(points_ecef_m).T,
+        fixes_m=np.full((*shape, 2), np.nan),
+        n_satellites=np.zeros(len(time), dtype=np.int64),
+        cn0_fallen=np.zeros(shape, dtype=bool),
+    )
+
+
+def _plane(points_ecef_m: Floats) -> Floats:
+    """Return east and north at the first point, shape (2, 3)."""
+    latitude, longitude, _ = geodetic_from_ecef(points_ecef_m[0])
+    return enu_axes(latitude, longitude)[:2]
+
+
+def rounded(time: Datetimes) -> Datetimes:
     """Return tags rounded to `SAME_EPOCH`, shape (T,)."""
     step = SAME_EPOCH.astype("timedelta64[ns]").astype(np.int64)
     rounded = (time.astype("datetime64[ns]").astype(np.int64) + step // 2) // step * step
