@@ -14,11 +14,13 @@ from typer.testing import CliRunner
 from network_made import made_network, made_run, segment, to_degrees
 from railfix.cli.map import app
 from railfix.core.errors import MismatchError, SettingsError
+from railfix.report.network_page import write_network_page
 from railfix.track import read_track
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
 from railfix.track.network_match import match, read_plan_positions, route_of
 from railfix.track.network_read import links_of_ends, read_network
+from report_page import Page, browser, fetched, opened
 
 pytestmark = pytest.mark.requirement("A10")
 INFRABEL = {"latitude_deg": "latitude", "longitude_deg": "longitude", "time_gpst": "timestamp"}
@@ -190,19 +192,51 @@ def test_infrabel_runs_lie_on_tracks_where_the_positions_are_fixed(
     assert not left_out
 
 
+def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:
+    net = made_network(10.0)
+    x = np.linspace(0.0, 440.0, 23)
+    net = replace(net, tracks=(*net.tracks, segment("far <b>", *to_degrees(-2.0 - x[::-1], 0.0 * x))))
+    log, on = made_run(net, [0, 2, 3], rng=np.random.default_rng(1), sigma_m=0.8)
+    page = tmp_path / "network.html"
+    write_network_page(net, check_network(net), page, run=(log, match(net, log)))
+    text = page.read_text()
+    assert fetched(text) == []
+    assert "default-src &#39;none&#39;" in text or "default-src 'none'" in text
+    assert "0a and far &lt;b&gt; end 2.00 m apart" in text
+    assert f"{len(on):,} positions, 100.0 % on a track" in text
+    row = text[text.index('<th scope="row">02</th>') :].split("</tr>")[0]
+    assert ["1,120" in row, ">0a<" in row, ">0b<" in row, f"{(on == 2).sum()}<" in row] == [True] * 4
+    if browser() is not None:
+        shown = Page(opened(page))
+        assert shown.text.get("railfix-errors", "") == ""
+        assert len(shown.figures) == 1
+
+
+def test_plan_of_a_large_network_is_thinned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    net = made_network(100.0)
+    write_network_page(net, check_network(net), tmp_path / "whole.html")
+    monkeypatch.setattr("railfix.report.network_page._DRAWN", 500)
+    write_network_page(net, check_network(net), tmp_path / "thin.html")
+    sizes = [(tmp_path / name).stat().st_size for name in ("whole.html", "thin.html")]
+    assert sizes[1] < sizes[0] - 20_000
+    assert "th point of a track and its ends are drawn" in (tmp_path / "thin.html").read_text()
+
+
 def test_route_and_match_commands(recordings: Path, tmp_path: Path) -> None:
     folder = recordings / "rail" / "infrabel"
     log = folder / "log_28876_L36-B.csv"
     columns = [word for ours, theirs in INFRABEL.items() for word in ("--column", f"{ours}={theirs}")]
     out = tmp_path / "matched.csv"
     words = ["match", str(folder / "network_airport.geojson"), "--log", str(log), "--out", str(out), *columns]
-    result = CliRunner().invoke(app, [*words, "--picture", str(tmp_path / "run.png")])
+    pages = ["--picture", str(tmp_path / "run.png"), "--page", str(tmp_path / "run.html")]
+    result = CliRunner().invoke(app, [*words, *pages])
     assert result.exit_code == 0, result.output
     with out.open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1132
     assert {row["track"] for row in rows} >= {"88_L_3842", "88_L_9748"}
     assert (tmp_path / "run.png").stat().st_size > 10_000
+    assert "1,132 positions" in (tmp_path / "run.html").read_text()
     profile = tmp_path / "profile.csv"
     profile.write_text("chainage_m,height_m\n0,90\n20000,110\n")
     line = tmp_path / "line.csv"

@@ -35,6 +35,9 @@ Columns = Annotated[
 ]
 
 
+Page = Annotated[
+    Path | None, typer.Option(metavar="FILE.html", help="Page to look at: plan to zoom, switches, faults, tables.")
+]
 SameFrame = Annotated[
     bool,
     typer.Option(
@@ -70,6 +73,7 @@ def network(
     reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "height_sigma")],
     tolerance: Tolerance = TOLERANCE_M,
     out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
+    page: Page = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Check a network of tracks and print its faults.
@@ -81,8 +85,9 @@ def network(
 
     Exit codes as `railfix --help` says; 6 where the network has gaps, kinks, or connections that do not meet.
     """
-    if out is not None:
-        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=maps)
+    for target in (out, page):
+        if target is not None:
+            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=maps)
     tracks = _network(maps, reading, tolerance)
     quality = check_network(tracks)
     console = console_of_tables()
@@ -103,6 +108,11 @@ def network(
 
         plot_network(tracks, out, quality=quality)
         console.print(f"picture: {out}", markup=False, soft_wrap=True)
+    if page is not None:
+        from railfix.report.network_page import write_network_page
+
+        write_network_page(tracks, quality, page)
+        console.print(f"page: {page}", markup=False, soft_wrap=True)
     faults = [f for f in quality.findings if f.kind in ("gap", "joint", "kink")]
     if faults:
         raise MapQualityError(f"the network has {len(faults)} fault(s), the first: {faults[0].sentence}")
@@ -213,6 +223,7 @@ def match_command(
     log: Annotated[Path, typer.Option(metavar="LOG", help="Positions: .pos, NMEA, GPX, or CSV with named columns.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="Positions on the network to write.")],
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
+    page: Page = None,
     sigma: Annotated[
         float | None,
         typer.Option(metavar="M", help="Sigma of the distance from the track, map included; else that of LOG, or 2 m."),
@@ -233,8 +244,9 @@ def match_command(
     """
     if sigma is not None and not sigma > 0.0:
         raise SettingsError("--sigma must be positive")
-    for target in [out] if picture is None else [out, picture]:
-        check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log])
+    for target in (out, picture, page):
+        if target is not None:
+            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log])
     net = _network(maps, reading, tolerance)
     positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
     matched = match(net, positions, sigma_m=sigma)
@@ -251,6 +263,11 @@ def match_command(
 
         plot_network(net, picture, run=(positions, matched))
         console.print(f"picture: {picture}", markup=False, soft_wrap=True)
+    if page is not None:
+        from railfix.report.network_page import write_network_page
+
+        write_network_page(net, check_network(net), page, run=(positions, matched))
+        console.print(f"page: {page}", markup=False, soft_wrap=True)
     console.print(f"positions: {out}", markup=False, soft_wrap=True)
 
 

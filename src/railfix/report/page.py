@@ -178,6 +178,32 @@ def report_page(
     )
 
 
+def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block]) -> str:
+    """HTML of a page of charts and tables under them.
+
+    Parameters
+    ----------
+    title : str
+    charts : sequence of Chart
+    tables : sequence of Block
+    """
+    numbers = count()
+    return (
+        _environment()
+        .get_template("charts.html.j2")
+        .render(
+            title=title,
+            created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            version=__version__,
+            policy=_POLICY,
+            style=_resource("page.css"),
+            scripts=(_resource("errors.js"), _resource("page.js")),
+            charts=_Part(title="", figures=[_figure(chart, numbers) for chart in charts]),
+            tables=tables,
+        )
+    )
+
+
 def _environment() -> Environment:
     return Environment(
         loader=PackageLoader("railfix.report"),
