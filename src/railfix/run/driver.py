@@ -40,6 +40,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
 from railfix.run.route import RouteOfLog, find_route
+from railfix.run.sensor_checks import sensor_notes
 from railfix.run.sensors import check_units, read_sensors, read_units
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
@@ -153,6 +154,7 @@ def run_files(
         notes = (
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
             *_notes_of_levels(config, tally, found_levels),
+            *(_notes_of_sensors(folder, sensors, config) if tracks and sensors else ()),
         )
         level_basis = "protection" if basis_of(config) == "measured" else "indicative protection"
         wall = clock.perf_counter() - began
@@ -253,6 +255,12 @@ def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunO
     sensors, units = sensors_of(inputs)
     processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
     return AntennaRun(name, processor, logs[name], sensors, observations=options.observations == "write")
+
+
+def _notes_of_sensors(folder: OutputFolder, sensors: SensorSamples, config: Config) -> tuple[str, ...]:
+    """Return notes on sensors that contradict the speeds of the first antenna."""
+    rows = folder.scan("train.parquet").select("time_gpst", "antenna", "speed_mps", "sources").collect()
+    return sensor_notes(sensors, rows.filter(antenna=rows["antenna"][0]), config.sensors.tachometer)
 
 
 def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
