@@ -213,7 +213,7 @@ def truth_of(folder: Path, name: str) -> Path:
 
 def recording_of(folder: Path, name: str) -> Recording:
     past = read_record(folder / name)
-    navigation, line, logs = open_inputs(past.inputs, past.options)
+    navigation, line, logs = open_inputs(past.inputs, past.options, past.config)
     (antenna,) = logs
     reference = read_reference(truth_of(folder, name), (antenna,))[antenna]
     return Recording(
