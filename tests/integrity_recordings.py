@@ -275,9 +275,9 @@ def judged(
         which = channel[np.argmax(used[row[of]][:, channel], axis=1)]
         by_range[row[of], which] = found.samples.error_m[of]
     share, misfit = _moved(one, result, used, place)
-    scale = np.ones(len(result)) if file is not None else np.maximum(result.noise_scale, least_scale)
+    scale = result.noise_scale if file is not None else np.maximum(result.noise_scale, least_scale)
     bias = np.zeros(used.shape) if file is None else _bias(file, result, one)
-    sigma = scale[:, None] * result.sigma_m[:, result.columns]
+    sigma = np.fmax(scale[:, None] * result.sigma_m[:, result.columns], result.bound_sigma_m[:, result.columns])
     observed = np.isfinite(place[:, 0]) & np.any((result.reason & 1) == 0, axis=1)
     if since is not None:
         observed &= result.time >= since

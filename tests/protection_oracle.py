@@ -38,11 +38,13 @@ class Level:
 class Resolved:
     """One epoch solved with all satellites and without any of them, by least squares of what is left."""
 
-    def __init__(self, case: raim_oracle.Problem, scale: float) -> None:
+    def __init__(self, case: raim_oracle.Problem, scale: float, least_sigma_m: np.ndarray | None = None) -> None:
         self.case, self.rows = case, len(case.observed)
         noise = np.full(self.rows, scale)  # ranges and ties
         n = len(case.channels)
         noise[n : n + 2] = 1.0  # the map: across and up
+        if least_sigma_m is not None:
+            noise[:n] = np.maximum(noise[:n], least_sigma_m[case.channels] / case.sigma_m)
         self.noise = noise
         self.all = self.without(())
 

@@ -87,10 +87,35 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
     assert without is not None
     assert three is not None
     assert six is not None
+    assert np.array_equal(level(3.0).chainage_m, FAULTY.chainage_m)
     added = three.level.fault_free_m - without.level.fault_free_m
     assert (added > 1.0).all()
     np.testing.assert_allclose(six.level.fault_free_m - without.level.fault_free_m, 2.0 * added, rtol=1e-9)
     assert (three.level.level_m > without.level.level_m + 0.9 * added).all()
+
+
+@pytest.mark.requirement("C2")
+def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
+    """A model below the receiver's own noise changes nothing; above it the level grows, whatever the weights."""
+    config = parse_config({**BASE, "error_model": "named.toml"})
+
+    def level(sigma_m: float) -> np.ndarray:
+        model = error_model(0.0)
+        wide = replace(model.after, bound_sigma_m=np.full(model.after.bound_sigma_m.shape, sigma_m))
+        processor = EpochProcessor(
+            config,
+            {"front": clean_trajectories()["front"]},
+            navigation=clean_navigation(),
+            error_model=replace(model, after=wide),
+        )
+        protection = processor.process({"front": FRONT})[0].antennas["front"].protection
+        assert protection is not None
+        return protection.level.fault_free_m
+
+    least, small, two, twenty, forty = (level(sigma) for sigma in (1e-4, 1e-3, 2.0, 20.0, 40.0))
+    np.testing.assert_allclose(small, least, rtol=1e-9)
+    assert (two > least).all()
+    np.testing.assert_allclose(forty / twenty, 2.0, rtol=0.03)
 
 
 @pytest.mark.requirement("B4")

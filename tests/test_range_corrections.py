@@ -273,7 +273,7 @@ def test_a_model_of_local_errors_is_widened_by_the_nominal_errors_and_another_is
         result = processor.process(observations)[0].antennas["front"]
         used = result.reason == 0
         nominal = NominalErrors().sigma_m(result.elevation_deg)
-        assert result.sigma_m[used] == pytest.approx(np.sqrt(9.0 + extra * nominal[used] ** 2))
+        assert result.bound_sigma_m[used] == pytest.approx(np.sqrt(9.0 + extra * nominal[used] ** 2))
 
 
 def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
@@ -314,7 +314,7 @@ def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:
     np.testing.assert_array_equal(results[0].chainage_m, results[1].chainage_m)
     for result in results:
         used = result.reason == 0
-        assert result.sigma_m[used] == pytest.approx(3.0)
+        assert result.bound_sigma_m[used] == pytest.approx(3.0)
 
 
 def test_phases_have_the_weight_of_their_elevation(monkeypatch: pytest.MonkeyPatch) -> None:

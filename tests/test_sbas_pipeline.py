@@ -167,10 +167,13 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     index = processor._index["front"]
     place = place_on_line(ranges, index, point, config)
     scale = np.ones(len(ranges))
-    ranges, place, raim = fault_free(ranges, index, place, scale, config.model_copy(update={"screens": ()}))
+    ranges, place, raim = fault_free(
+        ranges, index, place, scale, ranges.weight > 0, config.model_copy(update={"screens": ()})
+    )
     section = np.maximum(place.constrained.section, 0)
     model_on_line = constrained_model(ranges, index.trajectory, place.constrained.arc_m, section=section)
-    offset = cast("MapOffset", SimpleNamespace(beyond_m=(np.zeros(len(ranges)), np.zeros(len(ranges)))))
+    nothing = (np.zeros(len(ranges)), np.zeros(len(ranges)))
+    offset = cast("MapOffset", SimpleNamespace(beyond_m=nothing, seen=None))
 
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
         return protection_levels(one, model_on_line, offset, raim, scale, settings).level.level_m

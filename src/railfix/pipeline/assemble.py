@@ -68,6 +68,7 @@ def antenna_result(
         azimuth_deg=on_all_channels(corrected.azimuth_deg),
         cn0_dbhz=obs.cn0_dbhz,
         sigma_m=on_all_channels(corrected.sigma_m),
+        bound_sigma_m=on_all_channels(corrected.bound_sigma_m),
         corrected_code_m=on_all_channels(corrected.corrected_code_m),
         residual_m=on_all_channels(np.where(corrected.reason == 0, constrained.residual_m, np.nan)),
         satellites=corrected.satellites,

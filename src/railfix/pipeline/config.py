@@ -157,9 +157,9 @@ class Config(ScreenSettings):
     sbas_limits : SbasLimits
         Time-outs, use of message type 0, treatment of missing degradation data.
     error_model : path or None
-        Errors by direction and C/N0 (``railfix error-model``): their overbounds replace `noise` as weights, and are
-        the basis of the protection level. Without it the level is based on `noise` times the scale estimated
-        so far, which bounds no tails.
+        Errors by direction and C/N0 (``railfix error-model``): in the protection level the sigma of no range falls
+        below their overbounds. Weights, screens and RAIM stay those of `noise`. Without it the level is based on
+        `noise` times the scale estimated so far, which bounds no tails.
     nominal : NominalErrors
         Satellite and atmospheric errors, added to a model of local errors where SBAS does not give them.
     protection : {"on", "off"}

@@ -53,8 +53,8 @@ class CorrectedRanges:
     corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
     nominal_m : ndarray, shape (T, K) [m]
         Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`.
-    bias_m : ndarray, shape (T, K) [m]
-        Largest nominal bias of each range by the error model; 0 without one.
+    bound_sigma_m, bias_m : ndarray, shape (T, K) [m]
+        Overbounding sigma and largest nominal bias of each range by the error model; 0 without one.
     reason : ndarray of int64, shape (T, K)
         `reasons.Reason` bits so far, 0 = usable.
     screens : mapping of str to Screened
@@ -77,6 +77,7 @@ class CorrectedRanges:
     corrected_code_m: Floats
     sigma_m: Floats
     nominal_m: Floats
+    bound_sigma_m: Floats
     bias_m: Floats
     reason: Bits
     screens: Mapping[str, Screened] = field(default_factory=dict)
@@ -167,7 +168,7 @@ def correct_ranges(
     index : SearchIndex
         Of the antenna's trajectory.
     error_model : ErrorModel, optional
-        Gives the weights in place of ``config.noise``.
+        Gives the least sigmas of the protection level; the weights are those of ``config.noise``.
 
     Returns
     -------
@@ -212,12 +213,13 @@ def correct_ranges(
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
         reason = np.where(observed, reason | delays.reason, reason)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
-    local, bias = _local_errors(seen, cn0, index, config, error_model)
     nominal = config.nominal.sigma_m(seen.elevation_deg) if sbas is None else delays.sigma_m
-    if error_model is not None and error_model.covers == "local" and sbas is None:
-        local = np.hypot(local, nominal)
-    sigma = np.hypot(local, delays.sigma_m)
-    uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma))
+    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
+    bound, bias = np.zeros(code.shape), np.zeros(code.shape)
+    if error_model is not None:
+        bound, bias = _by_error_model(error_model, seen, cn0, index)
+        bound = np.hypot(bound, nominal) if error_model.covers == "local" or sbas is not None else bound
+    uncorrected = (reason == 0) & ~(np.isfinite(clean) & np.isfinite(sigma) & np.isfinite(bound))
     return CorrectedRanges(
         observations=obs,
         channels=channels,
@@ -233,17 +235,14 @@ def correct_ranges(
         corrected_code_m=clean,
         sigma_m=sigma,
         nominal_m=nominal,
+        bound_sigma_m=bound,
         bias_m=bias,
         reason=np.where(uncorrected, int(Reason.NO_CORRECTION), reason),
     )
 
 
-def _local_errors(
-    seen: SeenFrom, cn0: Floats, index: SearchIndex, config: Config, model: ErrorModel | None
-) -> tuple[Floats, Floats]:
-    """Return sigma and bias of the ranges by the error model, or by the noise settings: shapes (T, K) [m]."""
-    if model is None:
-        return code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), np.zeros(cn0.shape)
+def _by_error_model(model: ErrorModel, seen: SeenFrom, cn0: Floats, index: SearchIndex) -> tuple[Floats, Floats]:
+    """Return overbounding sigma and bias of the ranges by the error model: shapes (T, K) [m]."""
     arc, _ = index.trajectory.nearest(seen.receiver_ecef_m)
     turned = seen.azimuth_deg - index.trajectory.body_azimuth_deg(arc)[:, None]
     sigma, bias = model.at(seen.elevation_deg, turned, cn0)

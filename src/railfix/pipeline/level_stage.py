@@ -66,6 +66,11 @@ def risk_of(config: Config) -> RiskBudget:
     return config.risk.replaced(satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
 
 
+def level_scale(scale: Floats, config: Config) -> Floats:
+    """Return the noise scale of the levels, shape (T,): 1 at least, unless an error model states the least sigmas."""
+    return np.maximum(scale, 1.0) if config.error_model is None or config.sbas else scale
+
+
 def protection_levels(
     corrected: CorrectedRanges,
     model: LinearModel,
@@ -86,7 +91,8 @@ def protection_levels(
         of a wrong map.
     raim : RaimResult
     scale : ndarray, shape (T,)
-        The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, also for an error model.
+        The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, and with an error model
+        the sigma of no range falls below the model's.
     config : Config
 
     Returns
@@ -99,7 +105,8 @@ def protection_levels(
         replace(model, covariance_m2=covariance),
         [name[0] for name in corrected.satellite.tolist()],
         risk=risk_of(config),
-        scale=np.maximum(scale, 1.0),
+        scale=level_scale(scale, config),
+        least_sigma_m=None if config.error_model is None else corrected.bound_sigma_m,
         bias_m=None if config.error_model is None else corrected.bias_m,
         map_bias_m=np.stack(offset.beyond_m, axis=1),
         map_seen=offset.seen,

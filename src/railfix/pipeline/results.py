@@ -158,6 +158,8 @@ class AntennaResult(NotebookTable):
         `reasons.Reason` bits, 0 = used.
     elevation_deg, azimuth_deg, cn0_dbhz, sigma_m, corrected_code_m, residual_m : ndarray, shape (T, M)
         NaN where unknown; residuals of the position on the line.
+    bound_sigma_m : ndarray, shape (T, M) [m]
+        Least sigma of each range in the level, by the error model; 0 without one.
     satellites : SatelliteStates
         Of the channels in `columns`.
     columns : ndarray of int, shape (K,)
@@ -208,6 +210,7 @@ class AntennaResult(NotebookTable):
     azimuth_deg: Floats
     cn0_dbhz: Floats
     sigma_m: Floats
+    bound_sigma_m: Floats
     corrected_code_m: Floats
     residual_m: Floats
     satellites: SatelliteStates

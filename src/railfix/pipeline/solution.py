@@ -133,12 +133,19 @@ def solve(
     if config.protection == "on" and config.carrier != "float":
         level = protection_levels(corrected, model, offset, raim, scale, config)
         systems = [name[0] for name in corrected.satellite.tolist()]
+        bounding, bounding_scale = model, scale
+        if config.error_model is not None:
+            sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
+            weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
+            section = np.maximum(constrained.section, 0)
+            bounding = constrained_model(replace(ranges, weight=weight), trajectory, constrained.arc_m, section=section)
+            bounding_scale = np.ones(len(ranges))
         open_elsewhere = places_beyond_the_level(
             index,
             constrained.arc_m,
-            model,
+            bounding,
             level.level.level_m,
-            scale,
+            bounding_scale,
             systems,
             risk_of(config),
             np.flatnonzero(place.section.excess > config.section.threshold),
@@ -223,13 +230,13 @@ def _robust_scale(
 
 
 def _least_scale(config: Config) -> float:
-    """Return the least noise scale: an error model and SBAS state overbounds, which quiet residuals do not shrink."""
-    return 1.0 if config.error_model is not None or config.sbas else 0.0
+    """Return the least noise scale: SBAS states overbounds, which quiet residuals do not shrink."""
+    return 1.0 if config.sbas else 0.0
 
 
 def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config: Config) -> Floats:
     """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
-    if config.error_model is not None or config.sbas:
+    if config.sbas:
         return np.zeros(len(model))
     share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.nan_to_num(corrected.nominal_m), 0.0)
     return np.asarray((share**2).sum(axis=1))

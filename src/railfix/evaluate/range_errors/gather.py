@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Datetimes, Strings
+from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
@@ -157,12 +157,19 @@ def range_errors(
             cn0_dbhz=result.cn0_dbhz[:, columns][epoch, channel],
             block=time_block[epoch] * 1_000_000 + numbers[channel],
             used=used[epoch, channel],
-            sigma_m=(result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None])[epoch, channel],
+            sigma_m=_level_sigma_m(result)[epoch, channel],
         ),
         time=result.time[epoch],
         satellite=satellite[channel],
         epochs=int(np.isfinite(place[:, 0]).sum()),
     )
+
+
+def _level_sigma_m(result: AntennaResult) -> Floats:
+    """Standard deviation of each range in the protection level of the run, shape (T, K) [m]."""
+    columns = result.columns
+    stated = result.sigma_m[:, columns] * np.maximum(result.noise_scale, 1.0)[:, None]
+    return np.asarray(np.fmax(stated, result.bound_sigma_m[:, columns]))
 
 
 def joined(parts: list[ErrorSamples]) -> ErrorSamples:

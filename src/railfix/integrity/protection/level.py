@@ -35,6 +35,7 @@ from railfix.integrity.protection.risk import (
     pair_sum,
 )
 from railfix.integrity.protection.separation import (
+    AllInView,
     Separations,
     all_in_view,
     without_constellation,
@@ -160,6 +161,7 @@ def along_track_level(
     *,
     risk: RiskBudget | None = None,
     scale: ArrayLike = 1.0,
+    least_sigma_m: ArrayLike | None = None,
     bias_m: ArrayLike | None = None,
     map_bias_m: ArrayLike | None = None,
     map_seen: tuple[Floats, Floats] | None = None,
@@ -176,6 +178,8 @@ def along_track_level(
     risk : RiskBudget, optional
     scale : array_like, shape (T,) or ()
         Noise scale: multiplies the sigmas of the ranges, not the map error.
+    least_sigma_m : array_like, shape (T, M) or (M,) [m], optional
+        Least standard deviation of each range, as an overbound gives it; none: that of its weight times the scale.
     bias_m : array_like, shape (T, M) or (M,) [m], optional
         Largest nominal bias of each range, as a paired overbound gives it; none: 0.
     map_bias_m : array_like, shape (T, 2) or (2,) [m], optional
@@ -207,15 +211,16 @@ def along_track_level(
         raise ValueError("the noise scale must be positive")
     out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
     bias = None if bias_m is None else np.broadcast_to(np.asarray(bias_m, dtype=np.float64), (epochs, channels))
+    least = None if least_sigma_m is None else np.broadcast_to(np.asarray(least_sigma_m, float), (epochs, channels))
     offset = None if map_bias_m is None else np.broadcast_to(np.asarray(map_bias_m, dtype=np.float64), (epochs, 2))
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     plan = _plan(model, systems, risk, out, wrong_map=map_seen is not None)
     result = _empty(epochs, plan)
     for block in _blocks(model, np.flatnonzero(located)):
-        some = None if bias is None else bias[block]
-        moved = None if offset is None else offset[block]
+        part = model.take(block)
+        some, moved, low = (None if v is None else v[block] for v in (bias, offset, least))
         seen = None if map_seen is None else (map_seen[0][block], map_seen[1][block])
-        _level_of_block(result, block, model.take(block), plan, scale[block], some, moved, seen)
+        _level_of_block(result, block, part, plan, all_in_view(part, scale[block], some, moved, low), seen)
     return result
 
 
@@ -304,13 +309,10 @@ def _level_of_block(
     rows: Indices,
     model: LinearModel,
     plan: _Plan,
-    scale: Floats,
-    bias: Floats | None,
-    map_bias: Floats | None,
+    full: AllInView,
     map_seen: tuple[Floats, Floats] | None,
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
-    full = all_in_view(model, scale, bias, map_bias)
     sigma = full.sigma_m
     k_fault_free, k_false_alarm = one_sided_k(plan.fault_free[rows] / 2.0), plan.k_false_alarm[rows]
     fault_free = k_fault_free * sigma + full.bias_m
@@ -318,7 +320,7 @@ def _level_of_block(
 
     single_separations, single_prior = [without_one(full)], [prior]
     for c, (_, members) in enumerate(plan.groups):
-        single_separations.append(without_constellation(model, members, full, bias))
+        single_separations.append(without_constellation(model, members, full))
         single_prior.append(plan.group_prior[rows, c : c + 1])
     wrong_map = None
     if map_seen is not None and plan.map_prior > 0.0:

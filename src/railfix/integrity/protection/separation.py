@@ -39,12 +39,23 @@ class AllInView:
     variance_m2: Floats  # (T,) of the weights, scale 1
     scale: Floats  # (T,)
     range_bias: Floats | None  # (T, n) largest nominal bias of each range, over its sigma
+    beyond: (
+        Floats | None
+    )  # (T, n) variance of each range beyond that of its weight and the scale, over that of its weight
     map_bias: Floats  # (T, 2) offset of the map across and up, over the sigma of the map error
 
     @property
     def sigma_m(self) -> Floats:
         """Standard deviation, shape (T,)."""
-        return np.sqrt(scaled(self.variance_m2, self.map_m, self.scale))
+        variance = scaled(self.variance_m2, self.map_m, self.scale)
+        if self.beyond is not None:
+            variance = variance + (self.gain_m**2 * self.beyond).sum(axis=1)
+        return np.sqrt(variance)
+
+    @property
+    def by_range(self) -> bool:
+        """Whether the gains of single ranges are needed."""
+        return self.range_bias is not None or self.beyond is not None
 
     @property
     def bias_m(self) -> Floats:
@@ -73,7 +84,11 @@ def scaled(variance_m2: Floats, map_m: Floats, scale: Floats) -> Floats:
 
 
 def all_in_view(
-    model: LinearModel, scale: Floats, bias_m: Floats | None, map_bias_m: Floats | None = None
+    model: LinearModel,
+    scale: Floats,
+    bias_m: Floats | None,
+    map_bias_m: Floats | None = None,
+    least_sigma_m: Floats | None = None,
 ) -> AllInView:
     """The parts that every subset asks for.
 
@@ -84,6 +99,8 @@ def all_in_view(
     scale : ndarray, shape (T,)
     bias_m : ndarray, shape (T, M) [m], or None
     map_bias_m : ndarray, shape (T, 2) [m], or None
+    least_sigma_m : ndarray, shape (T, M) [m], or None
+        Least standard deviation of each range; none: that of its weight times the scale.
     """
     parts = compact(model)
     root = np.sqrt(np.einsum("ii->i", model.prior))[1:]
@@ -92,6 +109,10 @@ def all_in_view(
     if bias_m is not None:
         range_bias = np.take_along_axis(np.abs(bias_m) * model.root_weight, parts.channel, axis=1)
         range_bias = np.where(parts.used, range_bias, 0.0)
+    beyond = None
+    if least_sigma_m is not None:
+        least = np.take_along_axis(np.where(model.used, least_sigma_m * model.root_weight, 0.0), parts.channel, axis=1)
+        beyond = np.where(parts.used, np.maximum(least**2 - scale[:, None] ** 2, 0.0), 0.0)
     return AllInView(
         channel=parts.channel,
         used=parts.used,
@@ -103,6 +124,7 @@ def all_in_view(
         variance_m2=model.covariance_m2[:, 0, 0],
         scale=scale,
         range_bias=range_bias,
+        beyond=beyond,
         map_bias=np.zeros((len(model), 2)) if map_bias_m is None else map_bias_m * root,
     )
 
@@ -113,11 +135,8 @@ def without_one(full: AllInView) -> Separations:
     checked = share > LEAST_REDUNDANCY
     weight = np.where(checked, gain / np.where(checked, share, 1.0), 0.0)
     blind = ~checked & (np.abs(gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
-    bias = np.zeros(gain.shape)
-    if full.range_bias is not None:
-        left = gain[:, None, :] - weight[:, :, None] * full.projector
-        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
-    return _separations(full, weight * gain, weight[..., None] * full.map_gain_m, -weight * full.residual, bias, blind)
+    left = gain[:, None, :] - weight[:, :, None] * full.projector if full.by_range else None
+    return _separations(full, weight * gain, weight[..., None] * full.map_gain_m, -weight * full.residual, left, blind)
 
 
 def without_two(full: AllInView, first: Indices, second: Indices) -> Separations:
@@ -151,12 +170,11 @@ def without_two(full: AllInView, first: Indices, second: Indices) -> Separations
         weight_1[t, k], weight_2[t, k] = x * shown, y * shown
     moved = -(weight_1 * full.residual[:, first] + weight_2 * full.residual[:, second])
     response = weight_1[..., None] * full.map_gain_m[:, first] + weight_2[..., None] * full.map_gain_m[:, second]
-    bias = np.zeros(gain_1.shape)
-    if full.range_bias is not None:
+    left = None
+    if full.by_range:
         left = gain[:, None, :] - weight_1[..., None] * full.projector[:, first]
         left -= weight_2[..., None] * full.projector[:, second]
-        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
-    return _separations(full, weight_1 * gain_1 + weight_2 * gain_2, response, moved, bias, blind)
+    return _separations(full, weight_1 * gain_1 + weight_2 * gain_2, response, moved, left, blind)
 
 
 def without_three(full: AllInView, members: Indices) -> Separations:
@@ -199,21 +217,20 @@ def without_three(full: AllInView, members: Indices) -> Separations:
         blind[t, at] = hidden > _NO_EFFECT * np.sqrt(full.variance_m2[t])
         solved = np.where(shown, share / np.where(shown, values, 1.0), 0.0)
         weights[:, t, at] = np.einsum("sij,sj->is", vectors, solved)
-    square, moved, bias = np.zeros(gain_1.shape), np.zeros(gain_1.shape), np.zeros(gain_1.shape)
+    square, moved, left = np.zeros(gain_1.shape), np.zeros(gain_1.shape), None
     response = np.zeros((*gain_1.shape, 2))
     for place, weight in zip((i, j, k), weights, strict=True):
         square += weight * gain[:, place]
         moved -= weight * full.residual[:, place]
         response += weight[..., None] * full.map_gain_m[:, place]
-    if full.range_bias is not None:
+    if full.by_range:
         left = np.repeat(gain[:, None, :], len(members), axis=1)
         for place, weight in zip((i, j, k), weights, strict=True):
             left -= weight[..., None] * full.projector[:, place]
-        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
-    return _separations(full, np.maximum(square, 0.0), response, moved, bias, blind)
+    return _separations(full, np.maximum(square, 0.0), response, moved, left, blind)
 
 
-def without_constellation(model: LinearModel, members: Masks, full: AllInView, bias_m: Floats | None) -> Separations:
+def without_constellation(model: LinearModel, members: Masks, full: AllInView) -> Separations:
     """A whole constellation left out, K = 1: the information of the rest, inverted (3 x 3).
 
     Its channels share a clock. With ``S' = I - R K R^T`` of the clocks alone, r the 1/sigma of the members
@@ -225,9 +242,8 @@ def without_constellation(model: LinearModel, members: Masks, full: AllInView, b
     model : LinearModel
         T epochs.
     members : ndarray of bool, shape (M,)
-    all_of : Whole
+    full : AllInView
         Of this model.
-    bias_m : ndarray, shape (T, M) [m], or None
     """
     clock = int(model.clock[members][0])
     root = np.where(members, model.root_weight, 0.0)
@@ -249,18 +265,18 @@ def without_constellation(model: LinearModel, members: Masks, full: AllInView, b
     ask -= (more * (root * own).sum(axis=1))[:, None] * pull
     moved = (row * ask).sum(axis=1) - model.step_m[:, 0]
     prior = np.sqrt(np.einsum("ii->i", model.prior))[1:]
-    bias = np.zeros(len(model))
-    if bias_m is not None:
+    kept = None
+    if full.by_range:
         between = model.clock_covariance_m2[:, clock][:, model.clock] * model.root_weight
         response = np.matmul(model.design, row[..., None])[..., 0]
         response += ((1.0 + more * mass) * (row * pull).sum(axis=1))[:, None] * between
-        bias = (np.abs(np.where(members, 0.0, response)) * np.abs(bias_m) * model.root_weight).sum(axis=1)
+        kept = np.take_along_axis(np.where(members, 0.0, response), full.channel, axis=1)[:, None]
     return _separations(
         full,
         (row[:, 0] - covariance[:, 0, 0])[:, None],
         (-row[:, 1:] * prior - full.map_m)[:, None],
         moved[:, None],
-        bias[:, None],
+        kept,
         blind[:, None],
     )
 
@@ -355,32 +371,34 @@ def without_constellation_and_one(full: AllInView, members: Masks) -> Separation
     share = np.einsum("tii->ti", left_projector)
     checked = share > LEAST_REDUNDANCY
     weight = np.where(checked, left_gain / np.where(checked, share, 1.0), 0.0)
-    bias = np.zeros(gain.shape)
-    if full.range_bias is not None:
-        left = left_gain[:, None, :] - weight[:, :, None] * left_projector
-        bias = np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
+    left = left_gain[:, None, :] - weight[:, :, None] * left_projector if full.by_range else None
     alone = ~checked & (np.abs(left_gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
     return _separations(
         full,
         np.maximum(square[:, None] + weight * left_gain, 0.0),
         response[:, None] + weight[..., None] * left_map,
         moved[:, None] - weight * left_residual,
-        bias,
+        left,
         (alone | blind[:, None]) & rest,
     )
 
 
 def _separations(
-    full: AllInView, square: Floats, response: Floats, moved: Floats, bias: Floats, blind: Masks
+    full: AllInView, square: Floats, response: Floats, moved: Floats, left: Floats | None, blind: Masks
 ) -> Separations:
-    """From the variance of the distance (T, K), and its response to the map error (T, K, 2)."""
-    apart = np.sqrt(scaled(square, response, full.scale))
+    """From variance of the distance (T, K), response to the map error (T, K, 2), gains of what is left (T, K, n)."""
     whole_response = full.map_m[:, None] + response
+    apart = scaled(square, response, full.scale)
     total = scaled(full.variance_m2[:, None] + square, whole_response, full.scale)
-    of_map = np.abs((whole_response * full.map_bias[:, None]).sum(axis=2))
+    bias = np.abs((whole_response * full.map_bias[:, None]).sum(axis=2))
+    if left is not None and full.range_bias is not None:
+        bias = bias + np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
+    if left is not None and full.beyond is not None:
+        apart = apart + np.einsum("tki,ti->tk", (left - full.gain_m[:, None]) ** 2, full.beyond)
+        total = total + np.einsum("tki,ti->tk", left**2, full.beyond)
     return Separations(
         sigma_m=np.where(blind, np.inf, np.sqrt(total)),
-        separation_sigma_m=np.where(blind, np.inf, apart),
+        separation_sigma_m=np.where(blind, np.inf, np.sqrt(apart)),
         moved_m=np.where(blind, 0.0, moved),
-        bias_m=np.where(blind, 0.0, bias + of_map),
+        bias_m=np.where(blind, 0.0, bias),
     )
