@@ -82,7 +82,7 @@ def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
 
 def _demo(config: Config, part: slice = slice(0, 600)) -> tuple[EpochProcessor, Observations, AntennaReference]:
     inputs = demo_inputs()
-    navigation, line, logs = open_inputs(inputs, RunOptions())
+    navigation, line, logs = open_inputs(inputs, RunOptions(), Config())
     processor = processor_of(config, navigation, line.trajectories)
     reference = read_reference(demo_files()["truth"], ("front", "rear"))["front"]
     return processor, next(logs["front"].parts())[part], reference
@@ -319,5 +319,5 @@ def test_a_model_says_under_which_conditions_it_holds(done_run: Path, tmp_path: 
 
 
 def _nothing() -> tuple[Navigation, dict[str, Trajectory]]:
-    navigation, line, _ = open_inputs(demo_inputs(), RunOptions())
+    navigation, line, _ = open_inputs(demo_inputs(), RunOptions(), Config())
     return navigation, line.trajectories
