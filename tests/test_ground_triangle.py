@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+import static_monitors
 from railfix.cli.ground import app
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.observations import Observations
@@ -359,3 +360,16 @@ def test_two_stations_of_a_recording_as_monitors(recordings: Path) -> None:
     error = np.hypot(*np.moveaxis(fixes.fixes_m - fixes.points_m, -1, 0))
     assert (error[fixes.n_satellites >= 6] < LIMITS.radius_m).all()
     assert np.isfinite(error).all(axis=1).mean() > 0.9
+
+
+@pytest.mark.slow
+def test_static_recordings_under_open_sky_give_no_false_alarm(recordings: Path) -> None:
+    """One receiver at a time against its circle; an attenuated antenna at its cold start is another matter."""
+    found = static_monitors.recordings(recordings)
+    for name, (_, offset, _) in found.items():
+        error = np.hypot(*offset.T)
+        assert np.isfinite(error).mean() > 0.97, name
+        if "attenuation" not in name:
+            assert np.nanmax(error) < LIMITS.radius_m, name
+    attenuated = np.hypot(*found["u-blox, 16 dB attenuation, cold start"][1].T)
+    assert np.nanmedian(attenuated) < 5.0
