@@ -107,18 +107,20 @@ def test_a_serial_line(log: bytes, tags: list[np.datetime64]) -> None:
         for part in in_fragments(log, 1):
             os.write(ours, part)
             time.sleep(0.005)
-        time.sleep(0.1)
-        os.close(ours)
+        until = time.monotonic() + 20
+        while len(outputs) < EPOCHS and time.monotonic() < until:
+            time.sleep(0.02)
+        os.close(ours)  # what was not yet read is lost with it
 
     logger, handler = logging.getLogger("railfix.live"), Opened()
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
+    outputs: list[LiveOutput] = []
     writer = threading.Thread(target=write)
     writer.start()
     seen: list[np.datetime64] = []
 
     async def run() -> None:
-        outputs: list[LiveOutput] = []
         try:
             await run_session(
                 engine(), {"front": f"serial:{name}?baud=115200"}, [], speed=None, hooks=Hooks(observe=outputs.append)

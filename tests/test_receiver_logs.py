@@ -344,7 +344,8 @@ def test_sbas_messages_of_a_receiver(recordings: Path, tmp_path: Path) -> None:
     read = read_sbas(log)
     kept = np.delete(np.arange(200), [17, 90])
     assert read.rejected["parity"] == 2
-    assert read.time.tolist() == known.time[kept].tolist()
+    # An epoch comes too early to use the message after it: it counts from 1 ns later on.
+    assert read.time.tolist() == (known.time[kept] + np.timedelta64(1, "ns")).tolist()
     assert read.prn.tolist() == known.prn[kept].tolist()
     assert read.type.tolist() == known.type[kept].tolist()
     assert np.array_equal(read.bits[:, :28], known.bits[kept, :28])

@@ -142,6 +142,7 @@ class SessionLog:
         """Write what is left; lines that the file lacks are told on the screen."""
         for handler in self._handlers:
             self._logger.removeHandler(handler)
+        self._logger.propagate = True
         if self._written is not None and self._file is not None:
             self._written.close()
             self._file.close()

@@ -147,8 +147,10 @@ async def run_session(
         _save(engine, states, hooks)
         raise
     finally:
-        for pump in pumps:
-            pump.cancel()
+        while pending := [pump for pump in pumps if not pump.done()]:
+            for pump in pending:
+                pump.cancel()
+            await asyncio.wait(pending, timeout=1.0)
         gc.enable()
         gc.unfreeze()
     return metrics

@@ -7,15 +7,18 @@ import base64
 import io
 import sys
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
+
+Item = TypeVar("Item")
 
 _BLOCK = 4096
 _FORMS = (
@@ -25,6 +28,8 @@ _FORMS = (
 _CONNECT_S = 10.0
 #: Longest wait for a byte of a serial line in one call [s].
 _SERIAL_S = 0.05
+#: Wait for what has come already [s].
+_ONCE_MORE_S = 0.02
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
 
@@ -135,11 +140,25 @@ async def _file(path: str) -> AsyncIterator[bytes]:
             await asyncio.sleep(0)
 
 
+async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
+    """What a call waits for, or TimeoutError.
+
+    It is asked once more at the end: what came while this program itself was busy counts. (`asyncio.wait_for` may lose
+    a cancellation that comes at the same moment.)
+    """
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            return await call()
+    async with asyncio.timeout(_ONCE_MORE_S):
+        return await call()
+
+
 async def _tcp(source: str, request: bytes, silence_s: float) -> AsyncIterator[bytes]:
     """Empty bytes once connected, then what arrives."""
     parts = urlsplit(source)
     try:
-        reader, writer = await asyncio.wait_for(asyncio.open_connection(parts.hostname, parts.port), _CONNECT_S)
+        async with asyncio.timeout(_CONNECT_S):
+            reader, writer = await asyncio.open_connection(parts.hostname, parts.port)
     except (OSError, TimeoutError) as error:
         raise InputFileError(hidden(source), f"cannot be connected to ({error or 'no answer'})") from None
     try:
@@ -147,7 +166,7 @@ async def _tcp(source: str, request: bytes, silence_s: float) -> AsyncIterator[b
             writer.write(request)
             await writer.drain()
         yield b""
-        while data := await asyncio.wait_for(reader.read(_BLOCK), silence_s):
+        while data := await _within(silence_s, lambda: reader.read(_BLOCK)):
             yield data
     except TimeoutError:
         raise InputFileError(hidden(source), f"has sent nothing for {silence_s:g} s") from None
@@ -276,7 +295,7 @@ async def _serial(source: str, silence_s: float) -> AsyncIterator[bytes]:
     thread.start()
     try:
         yield b""
-        while isinstance(item := await asyncio.wait_for(arrived.get(), silence_s), bytes):
+        while isinstance(item := await _within(silence_s, arrived.get), bytes):
             yield item
         raise InputFileError(source, f"the line broke ({item})")
     except TimeoutError:

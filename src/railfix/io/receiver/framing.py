@@ -133,7 +133,7 @@ def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
         frame_start=frame[accepted],
         consumed=consumed,
         skipped_bytes=consumed - inside,
-        bad_checksums=_outside(frame[~valid], frame[accepted], frame_end[accepted]),
+        bad_checksums=_outside(frame[~valid & (frame < consumed)], frame[accepted], frame_end[accepted]),
     )
 
 

@@ -1,0 +1,113 @@
+"""Times between the messages of a live session in real time, and their age, at 10 Hz with two antennas.
+
+The demonstration's logs go as UBX through two TCP connections at their own pace to `railfix live` in a process of its
+own, over and over with later tags; the messages come back as datagrams::
+
+    python tests/benchmarks/bench_messages.py [--seconds 600] [--filter track|off] [--channels 1|2]
+
+Prints percentiles of the time between two messages and how many were missing or too much, for each quarter as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import railfix
+from railfix.gnss.observations import Observations
+from railfix.io.train_message import MessageStatus, decode
+from railfix.simulate.demo_data import demo_files
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from ubx_made import rawx
+
+PERIOD_S = 0.1
+
+
+async def served(log: Observations, began: float, until: float, ready: asyncio.Queue[int]) -> None:
+    """Serve a log epoch by epoch; each one goes out when it is due, tags rising from lap to lap."""
+
+    async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        k = 0
+        with contextlib.suppress(ConnectionError):
+            while time.monotonic() < until:
+                await asyncio.sleep(max(0.0, began + PERIOD_S * k - time.monotonic()))
+                lap, epoch = divmod(k, len(log))
+                shift = np.timedelta64(round(lap * len(log) * PERIOD_S * 1e9), "ns")
+                writer.write(rawx(replace(log[epoch : epoch + 1], time=log.time[epoch : epoch + 1] + shift), 0))
+                await writer.drain()
+                k += 1
+        writer.close()
+
+    server = await asyncio.start_server(answer, "127.0.0.1", 0)
+    await ready.put(server.sockets[0].getsockname()[1])
+    await asyncio.sleep(max(0.0, until - time.monotonic()) + 1.0)
+    server.close()
+
+
+async def both(began: float, until: float, ports: list[int], started: threading.Event) -> None:
+    files, ready = demo_files(), asyncio.Queue[int]()
+    tasks = []
+    for name in ("front", "rear"):
+        log = railfix.read_observations(files[name])
+        seen = np.isfinite(log.code_m).sum(axis=1) > 0
+        tasks.append(asyncio.create_task(served(log[: int(np.argmin(seen)) or len(log)], began, until, ready)))
+        ports.append(await ready.get())
+    started.set()
+    await asyncio.gather(*tasks)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--filter", choices=("track", "off"), default="track")
+    parser.add_argument("--channels", choices=("1", "2"), default="1")
+    options = parser.parse_args()
+    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    receiver.bind(("127.0.0.1", 0))
+    receiver.settimeout(20.0)
+    began = time.monotonic() + 8.0  # after the program has started
+    until, ports, started = began + options.seconds, list[int](), threading.Event()
+    threading.Thread(target=lambda: asyncio.run(both(began, until, ports, started)), daemon=True).start()
+    started.wait(30)
+    files = demo_files()
+    words = [sys.executable, "-m", "railfix", "live", "--nav", str(files["nav"])]
+    words += ["--track", str(files["track"]), "--vehicle", str(files["vehicle"])]
+    words += ["--front", f"tcp://127.0.0.1:{ports[0]}", "--rear", f"tcp://127.0.0.1:{ports[1]}"]
+    words += ["--filter", options.filter, "--channels", options.channels]
+    words += ["--send", f"cbor@udp://127.0.0.1:{receiver.getsockname()[1]}"]
+    process = subprocess.Popen(words, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+    arrived, messages = [], []
+    while time.monotonic() < until:
+        messages.append(decode(receiver.recv(4000)))
+        arrived.append(time.monotonic())
+    process.terminate()
+    process.wait(20)
+    at = np.array(arrived)
+    within = (at > began + 5.0) & (at < until - 1.0)  # the first epochs fill caches
+    between = np.diff(at[within]) * 1e3
+    kinds = [message.status for message, used in zip(messages, within, strict=True) if used]
+    silent = sum(kind is MessageStatus.NO_INPUT for kind in kinds)
+    sequence = np.array([message.sequence for message, used in zip(messages, within, strict=True) if used])
+    print(f"{len(between) + 1} messages in {at[within][-1] - at[within][0]:.1f} s, {silent} of them without input,")
+    print(f"{int(np.sum(np.diff(sequence) - 1))} missing; filter {options.filter}, {options.channels} channel(s)")
+    quantiles = (0.1, 1, 50, 99, 99.9)
+    for name, part in [("all", between), *((f"quarter {k + 1}", q) for k, q in enumerate(np.array_split(between, 4)))]:
+        values = "  ".join(f"p{q:g} {np.percentile(part, q):6.1f}" for q in quantiles)
+        inside = np.mean(np.abs(part - PERIOD_S * 1e3) <= 10.0)
+        print(f"{name:10s} {values}  max {part.max():6.1f} ms; within 100 +- 10 ms: {100 * inside:.2f} %")
+
+
+if __name__ == "__main__":
+    main()

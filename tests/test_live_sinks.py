@@ -1,0 +1,479 @@
+"""Targets of live messages end to end: MQTT broker, slow and broken readers, forms; what a person sees of a session."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+import os
+import pty
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from typer.testing import CliRunner
+
+import railfix
+from railfix.cli import app
+from railfix.core.errors import OutputError, SettingsError
+from railfix.io.train_message import MessageStatus, TrainMessage, decode, from_json
+from railfix.live.console import SessionLog
+from railfix.live.engine import LiveOutput
+from railfix.live.forms import etcs_form
+from railfix.live.outlets import Outlet
+from railfix.live.settings import LiveSettings
+from railfix.live.sinks import open_sink
+from railfix.simulate.demo_data import demo_files
+from ubx_made import log_of
+
+pytestmark = pytest.mark.requirement("A8")
+RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
+
+
+def output(sequence: int, **values: Any) -> LiveOutput:
+    message = TrainMessage(train=1, sequence=sequence, time_ns=1, sent_ns=1, line=1, **values)
+    return LiveOutput(message=message, result=None)
+
+
+# --- outlets ------------------------------------------------------------------
+
+
+def test_a_slow_reader_delays_nothing_and_loses_what_does_not_fit() -> None:
+    """A pipe that nobody reads: 5000 messages are handed over in a moment, the rest is counted."""
+    release, taken = threading.Event(), list[int]()
+
+    def stuck(item: int) -> None:
+        release.wait(20)
+        taken.append(item)
+
+    outlet = Outlet("slow", stuck, waiting=100)
+    began = time.perf_counter()
+    for k in range(5000):
+        outlet.send(k)
+    assert time.perf_counter() - began < 0.5
+    assert outlet.dropped >= 5000 - 102
+    release.set()
+    outlet.close()
+    assert len(taken) + outlet.dropped == 5000
+    assert taken == sorted(taken)
+
+
+def test_a_replay_waits_and_loses_nothing() -> None:
+    taken = list[int]()
+
+    def slow(item: int) -> None:
+        time.sleep(0.001)
+        taken.append(item)
+
+    outlet = Outlet("slow", slow, waiting=3, full="wait")
+    for k in range(50):
+        outlet.send(k)
+    outlet.close()
+    assert taken == list(range(50))
+
+
+def test_a_target_that_refuses_is_counted_and_a_defect_is_raised() -> None:
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    outlet = Outlet("disk", full, waiting=10)
+    for k in range(5):
+        outlet.send(k)
+    outlet.close()
+    assert (outlet.failed, outlet.failure) == (5, "cannot be written (No space left on device)")
+    strict = Outlet("disk", full, waiting=10, full="wait")
+    strict.send(1)
+    with pytest.raises(OutputError, match="disk: cannot be written"):
+        strict.close()
+
+    def defect(_: int) -> None:
+        raise ZeroDivisionError
+
+    broken = Outlet("defect", defect, waiting=10)
+    broken.send(1)
+    broken.close()
+    with pytest.raises(ZeroDivisionError):
+        broken.send(2)
+
+
+def test_a_disk_that_is_full_does_not_stop_the_other_sinks(tmp_path: Path) -> None:
+    """/dev/full refuses every byte; the file beside it has all messages."""
+    if not Path("/dev/full").exists():
+        pytest.skip("there is no /dev/full here")
+
+    async def run() -> Any:
+        full = await open_sink("json@/dev/full", overwrite="replace")
+        file = await open_sink(f"json@{tmp_path / 'messages'}")
+        for k in range(20):
+            for sink in (full, file):
+                sink.send(output(k))
+        full.close()
+        file.close()
+        return full
+
+    full = asyncio.run(run())
+    assert full.failed == 20
+    assert "No space left" in full.failure
+    assert [from_json(line).sequence for line in (tmp_path / "messages").read_text().splitlines()] == list(range(20))
+
+
+def test_readers_of_a_server_and_datagrams() -> None:
+    """Everybody who connects gets the messages from then on; datagrams carry no length."""
+
+    async def run() -> tuple[list[TrainMessage], list[TrainMessage]]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+            receiver.bind(("127.0.0.1", 0))
+            receiver.settimeout(5)
+            port = free_port()
+            server = await open_sink(f"json@tcp-server://127.0.0.1:{port}")
+            udp = await open_sink(f"cbor@udp://127.0.0.1:{receiver.getsockname()[1]}")
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            await asyncio.sleep(0.05)
+            for k in range(3):
+                server.send(output(k))
+                udp.send(output(k))
+            lines = [await asyncio.wait_for(reader.readline(), 5) for _ in range(3)]
+            udp.close()
+            datagrams = [receiver.recv(2000) for _ in range(3)]
+            writer.close()
+            server.close()
+        return [from_json(line.decode()) for line in lines], [decode(data) for data in datagrams]
+
+    over_tcp, over_udp = asyncio.run(run())
+    assert over_tcp == over_udp == [output(k).message for k in range(3)]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+# --- MQTT ---------------------------------------------------------------------
+
+
+def started_broker(folder: Path, port: int, *, password: bool) -> subprocess.Popen[bytes]:
+    program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+    if program is None:
+        pytest.skip("no MQTT broker: mosquitto (Debian package of that name) is not installed")
+    lines = [f"listener {port} 127.0.0.1", "persistence false"]
+    if password:
+        words = ["mosquitto_passwd", "-b", "-c", str(folder / "passwords"), "train", "p:s"]
+        subprocess.run(words, check=True, timeout=20, capture_output=True)
+        (folder / "passwords").chmod(0o644)
+        lines += ["allow_anonymous false", f"password_file {folder / 'passwords'}", "user root"]
+    else:
+        lines.append("allow_anonymous true")
+    (folder / "broker.conf").write_text("\n".join(lines) + "\n")
+    process = subprocess.Popen(
+        [program, "-c", str(folder / "broker.conf")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    until = time.monotonic() + 10
+    while time.monotonic() < until:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return process
+        time.sleep(0.05)
+    raise AssertionError("the broker does not listen")
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[int]:
+    port = free_port()
+    process = started_broker(tmp_path, port, password=False)
+    yield port
+    process.terminate()
+    process.wait(10)
+
+
+@pytest.fixture
+def subscribed(broker: int) -> Iterator[tuple[int, list[bytes]]]:
+    paho = pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed")
+    enums = pytest.importorskip("paho.mqtt.enums", reason="paho-mqtt is not installed")
+    got: list[bytes] = []
+    ready = threading.Event()
+    client = paho.Client(enums.CallbackAPIVersion.VERSION2)
+    client.on_message = lambda _client, _data, message: got.append(message.payload)
+    client.on_subscribe = lambda *_: ready.set()
+    client.on_connect = lambda *_: client.subscribe("railway/train 7", qos=1)
+    client.connect("127.0.0.1", broker)
+    client.loop_start()
+    assert ready.wait(10)
+    yield broker, got
+    client.disconnect()
+    client.loop_stop()
+
+
+@pytest.mark.parametrize("form", ["json", "cbor"])
+def test_mqtt(subscribed: tuple[int, list[bytes]], form: str) -> None:
+    """Every message arrives under its topic, in order."""
+    port, got = subscribed
+
+    async def run() -> None:
+        sink = await open_sink(f"{form}@mqtt://127.0.0.1:{port}/railway/train 7")
+        await asyncio.sleep(0.2)
+        for k in range(50):
+            sink.send(output(k))
+        await asyncio.to_thread(sink.close)
+        assert (sink.dropped, sink.failed) == (0, 0)
+
+    asyncio.run(run())
+    until = time.monotonic() + 10
+    while len(got) < 50 and time.monotonic() < until:
+        time.sleep(0.02)
+    messages = [from_json(data.decode()) if form == "json" else decode(data) for data in got]
+    assert [message.sequence for message in messages] == list(range(50))
+
+
+def test_mqtt_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
+    """Messages in between are counted as refused; the connection is opened again."""
+    pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed")
+    port = free_port()
+    process = started_broker(tmp_path, port, password=False)
+
+    async def run() -> None:
+        nonlocal process
+        sink = await open_sink(f"json@mqtt://127.0.0.1:{port}/x")
+        await until(lambda: delivered(sink, 1) == 0)
+        process.terminate()
+        process.wait(10)
+        await until(lambda: delivered(sink, 2) > 0)
+        assert sink.failure.startswith("cannot be written (the broker is not connected")
+        process = started_broker(tmp_path, port, password=False)
+        await until(lambda: delivered(sink, 3) == 0)
+        await asyncio.to_thread(sink.close)
+
+    def delivered(sink: Any, number: int) -> int:
+        """How many more were refused after one message."""
+        before = sink.failed
+        sink.send(output(number))
+        time.sleep(0.1)
+        return int(sink.failed - before)
+
+    async def until(reached: Any) -> None:
+        end = time.monotonic() + 15
+        while not await asyncio.to_thread(reached):
+            assert time.monotonic() < end
+            await asyncio.sleep(0.1)
+
+    try:
+        asyncio.run(run())
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def test_mqtt_without_a_broker() -> None:
+    pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed")
+    with pytest.raises(OutputError, match="cannot be connected to"):
+        asyncio.run(open_sink(f"json@mqtt://127.0.0.1:{free_port()}/x"))
+
+
+# --- forms --------------------------------------------------------------------
+
+
+def test_position_reports_of_etcs() -> None:
+    """Against the reference of the settings; nothing without a position or with a doubt that it cannot say."""
+    form = etcs_form(LiveSettings(reference=77, reference_m=12_000.0))
+    placed = {"chainage_cm": 1_234_567, "over_cm": 812, "under_cm": 655, "status": MessageStatus.POSITION}
+    report = json.loads(form(output(1, **placed)))
+    assert (report["NID_PACKET"], report["NID_LRBG"], report["D_LRBG"], report["Q_SCALE"]) == (0, 77, 346, 1)
+    far = json.loads(form(output(1, **{**placed, "chainage_cm": 11_200_000})))
+    assert (far["D_LRBG"], far["Q_SCALE"], far["L_DOUBTOVER"]) == (10_000, 2, 1)
+    assert form(output(1)) == b""
+    assert form(output(1, **{**placed, "over_cm": 40_000_000})) == b""
+
+
+def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:
+    words = ["live", "--front", str(demo_files()["front"]), "--track", str(demo_files()["track"])]
+    done = RUNNER.invoke(app, [*words, "--send", "etcs@-", "--live", "reference_m=400000"])
+    assert done.exit_code == 4
+    assert "name a reference nearer" in " ".join(done.output.split())
+    with pytest.raises(SettingsError, match="FORM@TARGET"):
+        asyncio.run(open_sink(f"packet0@{tmp_path}/x"))
+
+
+def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) -> None:
+    """Chainage, sigma, speed, level, amounts and status of every live message against `train` of `railfix run`."""
+    files = demo_files()
+    parts = {name: tmp_path / f"{name}.rnx" for name in ("front", "rear")}
+    for name, path in parts.items():
+        railfix.write_observations(railfix.read_observations(files[name])[:120], path)
+    common = ["--front", str(parts["front"]), "--rear", str(parts["rear"]), "--track", str(files["track"])]
+    common += ["--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
+    common += ["--set", "tracking.level=on", "--reference", "centre"]
+    send = [f"json@{tmp_path / 'messages'}", f"train@{tmp_path / 'train'}", f"positions@{tmp_path / 'positions'}"]
+    words = [word for text in send for word in ("--send", text)]
+    done = RUNNER.invoke(app, ["live", *common, "--live", "no_input=skip", *words])
+    assert done.exit_code == 0, done.output
+    assert RUNNER.invoke(app, ["run", *common, "--out", str(tmp_path / "run")]).exit_code == 0
+    batch = {name: pl.read_parquet(tmp_path / "run" / f"{name}.parquet") for name in ("train", "positions")}
+    for name, table in batch.items():
+        rows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
+        found = {(row["time_gpst"], row["antenna"]): row for row in rows}
+        assert len(found) == len(rows) > 200
+        compared = 0
+        times = table["time_gpst"].dt.strftime("%Y-%m-%dT%H:%M:%S%.9f").to_list()
+        for time_gpst, row in zip(times, table.iter_rows(named=True), strict=True):
+            live = found.get((time_gpst, row["antenna"]))
+            if live is None:  # epochs without a single code, which receivers do not send
+                assert not math.isfinite(row["chainage_m"])
+                continue
+            for column, value in row.items():
+                if column == "time_gpst":
+                    continue
+                if isinstance(value, float):
+                    theirs = math.nan if live[column] is None else float(live[column])
+                    same = theirs == value or (math.isnan(theirs) and math.isnan(value))
+                    assert same or abs(theirs - value) < 1e-9, (column, value, theirs)
+                    compared += math.isfinite(value)
+                else:
+                    assert live[column] == value, column
+        assert compared > 2_000
+    rows = {
+        (time, row["antenna"]): row
+        for time, row in zip(
+            batch["train"]["time_gpst"].to_numpy().tolist(), batch["train"].iter_rows(named=True), strict=True
+        )
+    }
+    epoch = np.datetime64("1980-01-06", "ns").astype(np.int64)
+    checked = 0
+    for line in (tmp_path / "messages").read_text().splitlines():
+        message = from_json(line)
+        candidates = [rows.get((message.time_ns + int(epoch), antenna)) for antenna in ("front", "rear")]
+        mine = [row for row in candidates if row is not None and of_message(row, message)]
+        if message.chainage_cm is None:
+            assert all(row is None or not math.isfinite(row["chainage_m"]) for row in candidates)
+            continue
+        assert mine, message
+        assert (message.status is MessageStatus.COASTING) == (mine[0]["status"] == "coasting")
+        assert message.status is not MessageStatus.POSITION or mine[0]["status"] == "tracking"
+        checked += 1
+    assert checked > 100
+
+
+def up_cm(value: float) -> int:
+    return math.ceil(value * 100.0 - 1e-9)
+
+
+def of_message(row: dict[str, Any], message: TrainMessage) -> bool:
+    """Whether a message says what a row of the filter says, rounded: bounds up, 1 cm more for that of the place."""
+    if not math.isfinite(row["chainage_m"]):
+        return False
+    level = row["protection_level_m"]
+    bounds = (None, None)
+    if math.isfinite(row["over_reading_m"]):
+        bounds = (up_cm(row["over_reading_m"] + 0.01), up_cm(level))
+    said = (message.over_cm, message.protection_level_cm)
+    return (
+        message.chainage_cm == round(row["chainage_m"] * 100.0)
+        and message.sigma_cm == up_cm(row["along_sigma_m"])
+        and message.speed_cmps == round(row["speed_mps"] * 100.0)
+        and (said == bounds or bounds == (None, None))
+        and message.direction == {"falling": -1, "unknown": 0, "rising": 1}[row["direction"]]
+        and message.standstill == row["standstill"]
+    )
+
+
+# --- what a person sees -------------------------------------------------------
+
+
+def test_the_log_rotates(tmp_path: Path) -> None:
+    log = SessionLog(tmp_path / "log", LiveSettings(log_bytes=1000, log_files=2))
+    for k in range(100):
+        log.say(f"sentence number {k}")
+    log.close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["log", "log.1", "log.2"]
+    assert all(path.stat().st_size <= 1000 for path in tmp_path.iterdir())
+    assert "sentence number 99" in (tmp_path / "log").read_text()
+    logger = logging.getLogger("railfix.live")
+    assert not [handler for handler in logger.handlers if type(handler).__module__.startswith("railfix")]
+    assert logger.propagate
+    with pytest.raises(OutputError, match="cannot be opened as a log file"):
+        SessionLog(tmp_path / "nowhere" / "log", LiveSettings())
+
+
+def program(*words: str) -> list[str]:
+    return [sys.executable, "-m", "railfix", "live", *words]
+
+
+def test_hangup_metrics_and_the_end_by_a_signal(tmp_path: Path) -> None:
+    """SIGHUP reloads nothing and says so, in the log and in the metrics; SIGTERM ends with the state written."""
+    log = tmp_path / "log.ubx"
+    log.write_bytes(log_of(railfix.read_observations(demo_files()["front"])[:400]))
+    files, port = demo_files(), free_port()
+    words = ["--front", str(log), "--track", str(files["track"]), "--nav", str(files["nav"]), "--speed", "1"]
+    words += ["--send", f"json@{tmp_path / 'messages'}", "--log", str(tmp_path / "log"), "--state", str(tmp_path / "s")]
+    process = subprocess.Popen(
+        program(*words, "--metrics", f"127.0.0.1:{port}"), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    try:
+        until = time.monotonic() + 60
+        while time.monotonic() < until and not (tmp_path / "messages").exists():
+            time.sleep(0.1)
+        while time.monotonic() < until and (tmp_path / "messages").read_text().count("\n") < 10:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGHUP)
+        text = ""
+        while time.monotonic() < until and "railfix_hangups_total 1" not in text:
+            text = asked(port)
+        assert "railfix_hangups_total 1" in text
+        assert "railfix_between_messages_seconds" in text
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    assert process.returncode == 0, said
+    assert "SIGHUP: nothing is reloaded" in (tmp_path / "log").read_text()
+    assert "messages" in said
+    assert (tmp_path / "s").stat().st_size > 1000
+
+
+def asked(port: int) -> str:
+    with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+        connection.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+        data = b""
+        while part := connection.recv(65_536):
+            data += part
+    return data.decode()
+
+
+def test_a_status_line_on_a_terminal_alone(tmp_path: Path) -> None:
+    """On a terminal the status is renewed in place; into a file not a word of it goes."""
+    log = tmp_path / "log.ubx"
+    log.write_bytes(log_of(railfix.read_observations(demo_files()["front"])[:20]))
+    files = demo_files()
+    words = ["--front", str(log), "--track", str(files["track"]), "--nav", str(files["nav"]), "--speed", "10"]
+    words += ["--send", f"json@{tmp_path / 'messages'}", "--overwrite"]
+    ours, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "150"}
+    process = subprocess.Popen(program(*words), stdout=subprocess.DEVNULL, stderr=theirs, env=environment)
+    os.close(theirs)
+    seen = b""
+    while True:
+        try:
+            part = os.read(ours, 4096)
+        except OSError:  # the other end is closed
+            break
+        if not part:
+            break
+        seen += part
+    os.close(ours)
+    assert process.wait(60) == 0
+    text = seen.decode(errors="replace")
+    assert "GPST" in text
+    assert "satellites" in text
+    plain = subprocess.run(program(*words), capture_output=True, text=True, timeout=60, check=True)
+    assert "satellites" not in plain.stderr
+    assert "messages" in plain.stderr
