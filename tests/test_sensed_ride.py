@@ -130,3 +130,15 @@ def test_wrong_units_tags_and_diameters_are_told(case: Ride) -> None:
     pulses = case.samples.tachometer
     shifted = replace(pulses, time=pulses.time - np.timedelta64(1, "s"))
     assert "1.0 s early" in " ".join(sensor_notes(replace(case.samples, tachometer=shifted), train, limits))
+
+
+@pytest.mark.requirement("E5")
+def test_the_innovation_of_each_sensor_stands_in_the_table(case: Ride) -> None:
+    found = case.run(sensors=PLACE)
+    table = antenna_train("front", found)
+    for kind, column in ((Kind.WHEEL, "innovation_wheel_m"), (Kind.FORCE, "innovation_force_mps2")):
+        known = np.isfinite(table[column].fill_null(float("nan")).to_numpy())
+        assert known[found.tracked.used[:, kind] > 0].all()
+        assert known.sum() > 100
+    ranged = table["innovation_place_m"].fill_null(float("nan")).to_numpy()[tunnel(case)]
+    assert np.nanmedian(np.abs(ranged)) < 1.0

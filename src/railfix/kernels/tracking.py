@@ -185,6 +185,7 @@ class Answers(NamedTuple):
     map_scale: Floats
     used: Integers
     innovation: Floats
+    sensed: Floats
     weight: Floats
 
 
@@ -1226,6 +1227,7 @@ def advance(
             answers.used[t, kind] += weight[best, i] > 0.5
         for j in range(ns):
             answers.used[t, 3 + sensors[j]] += weight[best, gnss + j] > 0.5
+            answers.sensed[t, sensors[j]] = innovation[best, gnss + j]
 
         _finish(
             t, best, nc > 0, True, dt, numbers, active, memory, answers, new_mean, new_covariance, work, ranked,

@@ -60,6 +60,10 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "force_offset_mps2": "offset of the accelerometer, as estimated",
     "map_scale": "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
     "pseudoranges keep moving against the map",
+    "innovation_wheel_m": "way of the wheel since the epoch before less the predicted one",
+    "innovation_radar_m": "the same of the radar",
+    "innovation_force_mps2": "mean specific force forward less the predicted one",
+    "innovation_place_m": "place by a feature of the line, or range to a ground unit, less the predicted one",
 }
 
 
@@ -123,5 +127,9 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "wheel_scale": float_column(tracked.wheel_scale),
             "force_offset_mps2": float_column(tracked.force_offset_mps2),
             "map_scale": float_column(tracked.map_scale),
+            **{
+                f"innovation_{kind.name.lower()}_{unit}": float_column(tracked.sensed[:, kind - 3])
+                for kind, unit in ((Kind.WHEEL, "m"), (Kind.RADAR, "m"), (Kind.FORCE, "mps2"), (Kind.PLACE, "m"))
+            },
         }
     )

@@ -70,6 +70,8 @@ class Tracked:
         Measurements of each kind with a weight of more than a half.
     innovation : ndarray, shape (T, 3, K)
         Before the update, of codes, phases and Dopplers.
+    sensed : ndarray, shape (T, len(Kind) - 3)
+        The same of the sensors, in the order of `Kind`; of several ranges the last.
     weight : ndarray, shape (T, 3, K)
     """
 
@@ -94,6 +96,7 @@ class Tracked:
     amount_m: Floats
     used: Integers
     innovation: Floats
+    sensed: Floats
     weight: Floats
 
     def __len__(self) -> int:
@@ -114,6 +117,7 @@ class Tracked:
             hypotheses=np.zeros(size, dtype=np.int64),
             used=np.zeros((size, len(Kind)), dtype=np.int64),
             innovation=np.full((size, 3, channels), np.nan),
+            sensed=np.full((size, len(Kind) - 3), np.nan),
             weight=np.full((size, 3, channels), np.nan),
             **{name: np.full(size, np.nan) for name in names},
         )
@@ -124,6 +128,7 @@ def write_rows(result: Tracked, epoch: int, rows: Rows, innovation: Floats, weig
     end = rows.bounds[2]
     result.innovation[epoch, rows.kind[:end], rows.column[:end]] = innovation[:end]
     result.weight[epoch, rows.kind[:end], rows.column[:end]] = weight[:end]
+    result.sensed[epoch, rows.kind[end:] - 3] = innovation[end:]
     result.used[epoch] = np.bincount(rows.kind[weight > 0.5], minlength=len(Kind))
     result.code_weight[epoch] = mean_weight(weight[None], rows.codes)[0]
     result.motion_weight[epoch] = mean_weight(weight[None], rows.motion)[0]
