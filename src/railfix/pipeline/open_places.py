@@ -38,6 +38,8 @@ _ON_TANGENT_M: Final = 1e-3
 _NEGLIGIBLE: Final = 0.01
 #: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
 _BLOCK_SIZE: Final = 300_000
+#: Numbers that a block of epochs by channels squared holds.
+_BOUND_SIZE: Final = 100_000
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def places_beyond_the_level(
     if not len(rows):
         return result
     channels = int(np.count_nonzero(model.used[rows], axis=1).max())
-    size = max(1, _BLOCK_SIZE // channels**2)
+    size = max(1, _BOUND_SIZE // channels**2)
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
         parts, design, none = _whitened(model.take(block), index, np.maximum(scale[block], 1.0))
