@@ -31,6 +31,8 @@ class TrackReading(Settings):
         Plate that moves such coordinates to the time of the log; see `railfix.track.frames.track_at`.
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
         See `railfix.track.vehicle.antenna_trajectory`.
+    cache : {"use", "skip"}
+        See `railfix.run.prepared`.
     """
 
     crs: str | None = option("CRS of the track where its file does not name one.", None, metavar="EPSG")
@@ -52,6 +54,9 @@ class TrackReading(Settings):
     )
     plate: str | None = option("Plate that moves such coordinates to the time of the log.", None, metavar="NAME")
     reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
+    cache: Literal["use", "skip"] = option(
+        "Prepare the line anew: neither read nor write the cache folder.", "use", name="--no-cache"
+    )
 
 
 class LogReading(Settings):

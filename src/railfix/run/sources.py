@@ -17,6 +17,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
 from railfix.run.inputs import Antenna
 from railfix.run.options import TrackReading
+from railfix.run.prepared import PreparedLines, key_of, track_key
 from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
@@ -47,6 +48,8 @@ class Line:
     from_file : bool
         Whether the track is that of its files as they are: no route of a network, no heights of a second source, and
         not moved to another frame.
+    preparing : tuple of str
+        Notes on the cache of prepared lines.
     """
 
     track: Track
@@ -55,12 +58,13 @@ class Line:
     frame: FrameShift | None = None
     route: RouteOfLog | None = None
     from_file: bool = True
+    preparing: tuple[str, ...] = ()
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes on the map, the vehicle and the trajectories, each once."""
         notes = [note for trajectory in self.trajectories.values() for note in trajectory.notes]
-        notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ())]
+        notes += [*self.track.provenance.notes, *(self.frame.notes if self.frame else ()), *self.preparing]
         return tuple(dict.fromkeys([*(self.route.notes if self.route else ()), *notes]))
 
     @property
@@ -109,6 +113,36 @@ def open_line(
     InputFileError, SettingsError, MismatchError
         A file is not what it should be, or track and vehicle do not fit.
     """
+    prepared = PreparedLines(use=reading.cache == "use")
+    key = key_of("line", *track, heights, reading.crs, reading.height_datum, reading.geoid, reading.height_sigma)
+    centreline, route = prepared.track(key), None
+    if centreline is None:
+        centreline, route = _read_line(track, reading, heights=heights, find=find)
+        if route is None:
+            prepared.keep_track(key, centreline)
+    shift, moved = None, centreline
+    if at is not None:
+        moved, shift = track_at(centreline, at, epoch=reading.map_epoch, plate=reading.plate)
+    paths = _paths(moved, vehicle, antennas, reading, prepared)
+    return Line(
+        track=moved,
+        vehicle=paths[0],
+        trajectories=paths[1],
+        frame=shift,
+        route=route,
+        from_file=route is None and heights is None and moved is centreline,
+        preparing=tuple(prepared.notes),
+    )
+
+
+def _read_line(
+    track: tuple[Path, ...],
+    reading: TrackReading,
+    *,
+    heights: Path | None,
+    find: Callable[[Network], RouteOfLog] | None,
+) -> tuple[Track, RouteOfLog | None]:
+    """Read the track, and find the route in a network."""
     segments = _segments(track, reading)
     route = None
     if len(track) == 1 and len(segments) > 1 and not is_route(segments):
@@ -127,18 +161,7 @@ def open_line(
         height_datum=reading.height_datum,
         sigma_height_m=reading.height_sigma,
     )
-    shift, moved = None, centreline
-    if at is not None:
-        moved, shift = track_at(centreline, at, epoch=reading.map_epoch, plate=reading.plate)
-    paths = _paths(moved, vehicle, antennas, reading)
-    return Line(
-        track=moved,
-        vehicle=paths[0],
-        trajectories=paths[1],
-        frame=shift,
-        route=route,
-        from_file=route is None and heights is None and moved is centreline,
-    )
+    return centreline, route
 
 
 def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
@@ -152,7 +175,11 @@ def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
 
 
 def _paths(
-    track: Track, vehicle: Path | None, antennas: tuple[Antenna, ...], reading: TrackReading
+    track: Track,
+    vehicle: Path | None,
+    antennas: tuple[Antenna, ...],
+    reading: TrackReading,
+    prepared: PreparedLines,
 ) -> tuple[Vehicle | None, dict[str, Trajectory]]:
     """The vehicle, and the path of each antenna."""
     if vehicle is None:
@@ -162,7 +189,16 @@ def _paths(
             )
         return None, dict.fromkeys(antennas, Trajectory.from_track(track))
     body = read_vehicle(vehicle)
-    return body, {n: antenna_trajectory(track, body, n, reference=reading.reference) for n in antennas}
+    of_track = track_key(track)
+    paths: dict[str, Trajectory] = {}
+    for name in antennas:
+        key = key_of("path", of_track, body.model_dump_json(), name, reading.reference)
+        path = prepared.path(key)
+        if path is None:
+            path = antenna_trajectory(track, body, name, reference=reading.reference)
+            prepared.keep_path(key, path)
+        paths[name] = path
+    return body, paths
 
 
 @dataclass(kw_only=True)

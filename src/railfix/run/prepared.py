@@ -1,0 +1,159 @@
+"""Prepared lines kept on disk: the track as it was read, and the paths of the antennas on it.
+
+Reading a line of 2000 km and computing the paths of two antennas takes seconds, and gives the same for the same files,
+settings and version of railfix: long ones are kept in the user's cache folder, which can be deleted at any time. It is
+that of the platform (``~/.cache/railfix`` on Linux), or the one that `VARIABLE` names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railfix import __version__
+from railfix.core.arrays import read_only
+from railfix.core.errors import OutputError
+from railfix.core.files import staged_file
+from railfix.track import Track
+from railfix.track.track import Provenance
+from railfix.track.trajectory import Trajectory
+
+#: Environment variable with the cache folder.
+VARIABLE: Final = "RAILFIX_CACHE_DIR"
+#: Lines with fewer points are prepared sooner than looked up.
+LEAST_POINTS: Final = 20_000
+#: Entries that are kept, the last written ones.
+MOST_ENTRIES: Final = 16
+#: Computed from the points of a trajectory, and kept with them.
+_DERIVED: Final = ("up", "across")
+#: What reading a damaged file can raise.
+_DAMAGE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
+
+
+def cache_folder() -> Path:
+    """Return the folder of prepared lines."""
+    import platformdirs
+
+    return Path(os.environ.get(VARIABLE) or platformdirs.user_cache_path("railfix", appauthor=False))
+
+
+class PreparedLines:
+    """Prepared lines of one command.
+
+    Parameters
+    ----------
+    use : bool
+        False: nothing is found, nothing is kept.
+
+    Attributes
+    ----------
+    notes : list of str
+        What was damaged and could not be written, one sentence each.
+    """
+
+    def __init__(self, *, use: bool = True) -> None:
+        self.notes: list[str] = []
+        self._folder = cache_folder() if use else None
+
+    def track(self, key: str) -> Track | None:
+        """Return the track that was kept under a key; None where there is none."""
+        found = self._load(key)
+        if found is None:
+            return None
+        plain, arrays = found
+        provenance: dict[str, Any] = plain.pop("provenance")
+        provenance |= {name: tuple(provenance[name]) for name in ("files", "notes")}
+        values: dict[str, Any] = {**plain, **arrays, "sections": tuple(plain["sections"])}
+        return Track(**values, provenance=Provenance(**provenance))
+
+    def keep_track(self, key: str, track: Track) -> None:
+        """Keep a track."""
+        if len(track) >= LEAST_POINTS:
+            plain, arrays = _parts(track)
+            self._keep(key, {**plain, "provenance": asdict(track.provenance)}, arrays)
+
+    def path(self, key: str) -> Trajectory | None:
+        """Return the trajectory that was kept under a key; None where there is none."""
+        found = self._load(key)
+        if found is None:
+            return None
+        plain, arrays = found
+        derived = {name: arrays.pop(name) for name in _DERIVED}
+        values: dict[str, Any] = {**plain, **arrays, "notes": tuple(plain["notes"])}
+        trajectory = Trajectory(**values)
+        vars(trajectory).update({name: read_only(array) for name, array in derived.items()})
+        return trajectory
+
+    def keep_path(self, key: str, path: Trajectory) -> None:
+        """Keep a trajectory."""
+        if len(path) >= LEAST_POINTS:
+            plain, arrays = _parts(path)
+            self._keep(key, plain, arrays | {name: getattr(path, name) for name in _DERIVED})
+
+    def _load(self, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]] | None:
+        if self._folder is None:
+            return None
+        file = self._folder / f"{key}.npz"
+        try:
+            with file.open("rb") as handle, np.load(handle, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            plain: dict[str, Any] = json.loads(arrays.pop("plain").tobytes())
+        except FileNotFoundError:
+            return None
+        except _DAMAGE as error:
+            self.notes.append(f"{file}: damaged, the line was prepared again ({type(error).__name__}: {error})")
+            return None
+        return plain, arrays
+
+    def _keep(self, key: str, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+        if self._folder is None:
+            return
+        file = self._folder / f"{key}.npz"
+        text = np.frombuffer(json.dumps(plain).encode(), dtype=np.uint8)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with staged_file(file, what="prepared line") as temporary, temporary.open("wb") as handle:
+                np.savez(handle, plain=text, **arrays)  # type: ignore[arg-type]  # its stub has allow_pickle
+            entries = sorted(self._folder.glob("*.npz"), key=lambda entry: entry.stat().st_mtime)
+            for old in entries[:-MOST_ENTRIES]:
+                old.unlink(missing_ok=True)
+        except (OSError, OutputError) as error:
+            reason = error.strerror or str(error) if isinstance(error, OSError) else str(error)
+            self.notes.append(f"{self._folder}: the prepared line could not be kept ({reason}); set {VARIABLE}")
+
+
+def key_of(kind: str, *parts: object) -> str:
+    """Return the key of what is made of `parts`: files by their content, arrays, and anything else as text."""
+    digest = hashlib.sha256(f"{kind} {__version__}".encode())
+    for part in parts:
+        if isinstance(part, Path):
+            with suppress(OSError), part.open("rb") as file:  # a missing file is reported where it is read
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        elif isinstance(part, np.ndarray):
+            digest.update(hashlib.sha256(np.ascontiguousarray(part).tobytes()).digest())
+        digest.update(f"{part if not isinstance(part, np.ndarray) else part.shape}\0".encode())
+    return digest.hexdigest()
+
+
+def track_key(track: Track) -> str:
+    """Return the key of a track as it is in memory."""
+    plain, arrays = _parts(track)
+    return key_of("track", json.dumps(plain), *arrays.values(), repr(track.provenance))
+
+
+def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Return the plain fields and the arrays, provenance left out."""
+    values = {item.name: getattr(value, item.name) for item in fields(value) if item.name != "provenance"}
+    arrays = {name: array for name, array in values.items() if isinstance(array, np.ndarray)}
+    return {name: v for name, v in values.items() if name not in arrays}, arrays
