@@ -14,7 +14,7 @@ from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.integrity.raim import Outcome
-from railfix.pipeline import fault_exclusion, solution
+from railfix.pipeline import fault_exclusion, level_stage, solution
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
@@ -92,6 +92,36 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
     assert (added > 1.0).all()
     np.testing.assert_allclose(six.level.fault_free_m - without.level.fault_free_m, 2.0 * added, rtol=1e-9)
     assert (three.level.level_m > without.level.level_m + 0.9 * added).all()
+
+
+@pytest.mark.requirement("C2")
+def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Left and right of the track by the directions to the satellites, up to the elevation of the setting."""
+    caught, original = [], level_stage.along_track_level
+
+    def spied(*arguments: Any, **options: Any) -> Any:
+        caught.append(options["sides"])
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(level_stage, "along_track_level", spied)
+    result = front_alone(FRONT, BASE)
+    (sides,) = caught
+    line, columns = clean_trajectories()["front"], result.columns
+    section = result.constrained.section
+    sight = result.satellites.position_ecef_m - line.at_arc(result.constrained.arc_m)[:, None]
+    level = np.cross(
+        line.ecef_m[section] / np.linalg.norm(line.ecef_m[section], axis=1)[:, None], line.tangent[section]
+    )
+    right = -np.einsum("tki,ti->tk", sight, level) > 0
+    low = result.elevation_deg[:, columns] < 45.0
+    used = result.reason[:, columns] == 0
+    assert (low & used).any()
+    assert np.array_equal((sides[:, 1] & used), low & right & used)
+    assert np.array_equal((sides[:, 0] & used), low & ~right & used)
+    assert result.protection is not None
+    more = front_alone(FRONT, BASE | {"risk": {"side_prior": 1e-7}}).protection
+    assert more is not None
+    assert (more.level.level_m > result.protection.level.level_m).all()
 
 
 @pytest.mark.requirement("C2")

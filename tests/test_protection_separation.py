@@ -17,6 +17,7 @@ from railfix.integrity.protection.separation import (
     Separations,
     all_in_view,
     without_constellation,
+    without_group,
     without_map,
     without_one,
     without_two,
@@ -88,9 +89,12 @@ def test_every_subset_equals_solving_without_it(seed, system, scale, fault, leas
     twos = without_two(all_of, first, second)
     for k, pair in enumerate(combinations(range(n), 2)):
         compare(twos, k, pair, solved, bias)
+    for group in ((0, 2), (1, 2, 3), tuple(range(0, n, 2))):
+        compare(without_group(all_of, np.isin(np.arange(n), group)[None]), 0, group, solved, bias)
     for letter in set(systems):
         members = np.array([s == letter for s in systems])
         got = without_constellation(model, members, all_of)
+        compare(without_group(all_of, members[None]), 0, tuple(np.flatnonzero(members).tolist()), solved, bias)
         compare(got, 0, tuple(np.flatnonzero(members).tolist()), solved, bias)
 
 

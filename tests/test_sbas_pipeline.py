@@ -176,7 +176,7 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     offset = cast("MapOffset", SimpleNamespace(beyond_m=nothing, seen=None))
 
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
-        return protection_levels(one, model_on_line, offset, raim, scale, settings).level.level_m
+        return protection_levels(one, model_on_line, offset, raim, scale, np.zeros(len(scale)), settings).level.level_m
 
     has = np.isfinite(levels(scale, config))
     assert has.any()

@@ -55,6 +55,7 @@ def level_facts(config: Config) -> dict[str, Any]:
         "satellite_prior": dict(risk.satellite_prior),
         "local_prior": risk.local_prior,
         "map_prior": risk.map_prior,
+        "side_prior": risk.side_prior,
         "false_alarm": risk.false_alarm,
     }
 
@@ -77,6 +78,7 @@ def protection_levels(
     offset: MapOffset,
     raim: RaimResult,
     scale: Floats,
+    heading_deg: Floats,
     config: Config,
 ) -> ProtectionResult:
     """Return the protection levels of the positions of a chunk.
@@ -93,6 +95,8 @@ def protection_levels(
     scale : ndarray, shape (T,)
         The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, and with an error model
         the sigma of no range falls below the model's.
+    heading_deg : ndarray, shape (T,)
+        Azimuth of the track.
     config : Config
 
     Returns
@@ -110,10 +114,18 @@ def protection_levels(
         bias_m=None if config.error_model is None else corrected.bias_m,
         map_bias_m=np.stack(offset.beyond_m, axis=1),
         map_seen=offset.seen,
+        sides=_sides(corrected, heading_deg, config.risk.side_elevation_deg),
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
+
+
+def _sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float) -> Masks:
+    """Return the low satellites left and right of the track, shape (T, 2, K)."""
+    right = np.sin(np.radians(corrected.azimuth_deg - heading_deg[:, None])) > 0
+    low = corrected.elevation_deg < elevation_deg
+    return np.stack([low & ~right, low & right], axis=1)
 
 
 def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:

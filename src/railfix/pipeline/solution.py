@@ -131,7 +131,8 @@ def solve(
     corrected = corrected.rejected(raim.excluded, Reason.FAULT_EXCLUDED)
     level, open_elsewhere = None, np.zeros(len(ranges), dtype=bool)
     if config.protection == "on" and config.carrier != "float":
-        level = protection_levels(corrected, model, offset, raim, scale, config)
+        heading = trajectory.heading_deg[np.maximum(constrained.section, 0)]
+        level = protection_levels(corrected, model, offset, raim, scale, heading, config)
         systems = [name[0] for name in corrected.satellite.tolist()]
         bounding, bounding_scale = model, scale
         if config.error_model is not None:

@@ -25,21 +25,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks, Strings
-from railfix.integrity.protection.risk import (
-    MOST_EXCLUDED,
-    RiskBudget,
-    more_than_three,
-    more_than_two,
-    one_sided_k,
-    pair_sum,
-)
+from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
+from railfix.integrity.protection.allocation import Allocation, allocate
+from railfix.integrity.protection.risk import RiskBudget, one_sided_k, pair_sum
 from railfix.integrity.protection.separation import (
     AllInView,
     Separations,
     all_in_view,
     without_constellation,
     without_constellation_and_one,
+    without_group,
     without_map,
     without_one,
     without_three,
@@ -127,23 +122,6 @@ class ProtectionLevel:
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """Allocation of the risk, T epochs."""
-
-    prior: Floats  # (T, M), 0 where not used
-    groups: tuple[tuple[str, Masks], ...]  # constellations with a prior of their own: letter, members (M,)
-    group_prior: Floats  # (T, C), 0 where absent
-    beyond: Floats
-    fault_free: Floats  # risk of each part
-    one: Floats
-    two: Floats
-    pairs: Masks  # two faults are likelier than their share
-    triples: Masks  # three faults are likelier than what may stay unchecked
-    k_false_alarm: Floats
-    map_prior: float  # of a wrong map; 0: no hypothesis
-
-
-@dataclass(frozen=True)
 class _Part:
     """One part of the level: T epochs."""
 
@@ -165,6 +143,7 @@ def along_track_level(
     bias_m: ArrayLike | None = None,
     map_bias_m: ArrayLike | None = None,
     map_seen: tuple[Floats, Floats] | None = None,
+    sides: Masks | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
     """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension, up to two satellites).
@@ -187,6 +166,8 @@ def along_track_level(
     map_seen : tuple of ndarray, shapes (T, 2) [m] and (T, 2, 2) [1/m^2], optional
         Place of the antenna across and above the line without the map, and its inverse covariance (0: unknown). With it
         a wrong map, alone and with each faulty satellite, is a hypothesis of prior `RiskBudget.map_prior`.
+    sides : ndarray of bool, shape (T, S, M), optional
+        Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
         Satellites that fault detection left out at this epoch (not: what the screens rejected before).
 
@@ -214,62 +195,20 @@ def along_track_level(
     least = None if least_sigma_m is None else np.broadcast_to(np.asarray(least_sigma_m, float), (epochs, channels))
     offset = None if map_bias_m is None else np.broadcast_to(np.asarray(map_bias_m, dtype=np.float64), (epochs, 2))
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
-    plan = _plan(model, systems, risk, out, wrong_map=map_seen is not None)
+    together = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
+    plan = allocate(model, systems, risk, out, together, wrong_map=map_seen is not None)
     result = _empty(epochs, plan)
     for block in _blocks(model, np.flatnonzero(located)):
         part = model.take(block)
         some, moved, low = (None if v is None else v[block] for v in (bias, offset, least))
         seen = None if map_seen is None else (map_seen[0][block], map_seen[1][block])
-        _level_of_block(result, block, part, plan, all_in_view(part, scale[block], some, moved, low), seen)
+        _level_of_block(
+            result, block, part, plan, all_in_view(part, scale[block], some, moved, low), seen, together[block]
+        )
     return result
 
 
-def _plan(model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers, *, wrong_map: bool) -> _Plan:
-    """Divide the risk of each epoch."""
-    prior = model.used * risk.prior(systems)
-    # Excluded satellites count among those that may be faulty, with the largest prior.
-    everyone = np.concatenate(
-        [prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max(initial=0.0)], axis=1
-    )
-    letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
-    groups = tuple((s, np.array([t == s for t in systems])) for s in letters)
-    group_prior = np.zeros((len(model), len(groups)))
-    together = np.zeros(len(model))
-    for c, (letter, members) in enumerate(groups):
-        group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
-        # A constellation and two satellites of others: not checked.
-        together += group_prior[:, c] * pair_sum(prior * ~members)
-    three = more_than_two(everyone)
-    triples = three > risk.unchecked_share * risk.risk_per_sample
-    map_prior = risk.map_prior if wrong_map else 0.0
-    # A wrong map with a constellation, or with two satellites.
-    together += map_prior * (group_prior.sum(axis=1) + pair_sum(everyone))
-    beyond = np.where(triples, more_than_three(everyone), three) + together + pair_sum(group_prior)
-    n = np.count_nonzero(model.used, axis=1)
-    left = risk.sample_risk(n, out, beyond)
-    # With triples every part gives up a quarter to them.
-    left = np.where(triples, 0.75, 1.0) * left
-    two = risk.two_fault_share * left
-    pairs = (pair_sum(prior) > two) | triples
-    tests = n + np.where(pairs, n * (n - 1) // 2, 0) + np.count_nonzero(group_prior, axis=1)
-    tests = tests + n * np.count_nonzero(group_prior, axis=1)
-    tests = tests + np.where(triples, n * (n - 1) * (n - 2) // 6, 0)
-    return _Plan(
-        prior=prior,
-        groups=groups,
-        group_prior=group_prior,
-        beyond=beyond,
-        fault_free=risk.fault_free_share * left,
-        one=risk.one_fault_share * left,
-        two=two,
-        pairs=pairs,
-        triples=triples,
-        k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1))),
-        map_prior=map_prior,
-    )
-
-
-def _empty(epochs: int, plan: _Plan) -> ProtectionLevel:
+def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
     """A result without positions."""
 
     def nan() -> Floats:
@@ -308,9 +247,10 @@ def _level_of_block(
     result: ProtectionLevel,
     rows: Indices,
     model: LinearModel,
-    plan: _Plan,
+    plan: Allocation,
     full: AllInView,
     map_seen: tuple[Floats, Floats] | None,
+    sides: Masks,
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
     sigma = full.sigma_m
@@ -322,6 +262,10 @@ def _level_of_block(
     for c, (_, members) in enumerate(plan.groups):
         single_separations.append(without_constellation(model, members, full))
         single_prior.append(plan.group_prior[rows, c : c + 1])
+    for c in range(sides.shape[1] if plan.side_prior.any() else 0):
+        of_side = np.take_along_axis(sides[:, c], full.channel, axis=1) & full.used
+        single_separations.append(without_group(full, of_side))
+        single_prior.append(plan.side_prior[rows, c : c + 1])
     wrong_map = None
     if map_seen is not None and plan.map_prior > 0.0:
         wrong_map = without_map(full, model, *map_seen)
@@ -379,8 +323,8 @@ def _level_of_block(
     at = np.arange(len(rows))
     has_single = (single_fault.worst >= 0) & (single_fault.worst < n)
     result.worst_one[rows] = np.where(has_single, full.channel[at, np.where(has_single, single_fault.worst, 0)], -1)
-    # The last two are a wrong map, and none.
-    letters = np.array([*(letter for letter, _ in plan.groups), "", ""])
+    # The last are the sides, a wrong map, and none.
+    letters = np.array([*(letter for letter, _ in plan.groups), *[""] * (sides.shape[1] + 2)])
     result.worst_constellation[rows] = letters[np.where(single_fault.worst >= n, single_fault.worst - n, -1)]
     if n > 1:
         has_pair = (double_fault.worst >= 0) & (double_fault.worst < len(first)) & bool(pairs.any())

@@ -92,6 +92,13 @@ class RiskBudget(Settings):
     map_prior : float
         Probability that the map at a place is wrong by more than its stated error: the next track, heights without
         the geoid, another reference frame. An assumption; 0: no such hypothesis.
+    side_prior : float
+        Probability that one reflection makes the low satellites of one side of the track faulty together. Two faults at
+        a time are on recordings ten times as frequent as independence gives: ten times the product of two local
+        priors for ten pairs. An assumption; 0: no such hypothesis. Beyond 2e-7 a side together with any
+        other fault, which is not checked, leaves no level.
+    side_elevation_deg : float
+        Elevation up to which satellites count as low: of a wall as high as it is away.
     priors : {"assumed", "measured"}
         Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are
         called indicative in every output: they carry no risk an hour.
@@ -111,6 +118,8 @@ class RiskBudget(Settings):
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
+    side_prior: float = Field(default=1e-8, ge=0, lt=1)
+    side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
     priors: Literal["assumed", "measured"] = "assumed"
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 

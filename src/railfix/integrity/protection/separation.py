@@ -338,12 +338,61 @@ def without_map(
     return alone, with_one
 
 
+@dataclass(frozen=True)
+class _Group:
+    """A group of channels left out, T epochs."""
+
+    across: Floats  # (T, n, n) of the rest onto the group
+    pull: Floats  # (T, n) of the residuals of the group on the position
+    square: Floats  # (T,) variance of the distance
+    moved: Floats  # (T,)
+    response: Floats  # (T, 2) of the distance to the map error
+    blind: Masks  # (T,)
+
+
+def _group(full: AllInView, members: Masks) -> _Group:
+    """``S_JJ^+`` of a group of channels, and what leaving it out does.
+
+    Where S_JJ is singular (a clock of the group alone), the direction that no residual shows must move nothing.
+    """
+    mask, projector, gain = members.astype(np.float64), full.projector, full.gain_m
+    values, vectors = np.linalg.eigh(projector * mask[:, :, None] * mask[:, None, :])
+    some = values > LEAST_REDUNDANCY
+    inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
+    inverse *= mask[:, :, None] * mask[:, None, :]
+    hidden = np.einsum("tij,ti->tj", vectors * mask[:, :, None], gain * mask) * ~some
+    pull = np.einsum("tij,tj->ti", inverse, gain)
+    return _Group(
+        across=projector @ inverse,
+        pull=pull,
+        square=(pull * gain).sum(axis=1),
+        moved=-(pull * full.residual).sum(axis=1),
+        response=np.einsum("ti,tij->tj", pull, full.map_gain_m),
+        blind=np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(full.variance_m2),
+    )
+
+
+def without_group(full: AllInView, members: Masks) -> Separations:
+    """Any group of channels left out whole, K = 1.
+
+    Parameters
+    ----------
+    full : AllInView
+    members : ndarray of bool, shape (T, n)
+        Places of the group in the compact arrays; some epochs may have none.
+    """
+    group = _group(full, members)
+    left = (full.gain_m - np.einsum("tij,tj->ti", group.across, full.gain_m))[:, None] if full.by_range else None
+    return _separations(
+        full, group.square[:, None], group.response[:, None], group.moved[:, None], left, group.blind[:, None]
+    )
+
+
 def without_constellation_and_one(full: AllInView, members: Masks) -> Separations:
     """A whole constellation left out with each channel of the others, K = n.
 
     What leaving out the constellation J makes of the projector, the residuals and the gains of the rest,
-    ``S - S_.J S_JJ^+ S_J.`` and the like, is what `without_one` needs of it. Where the clock is theirs alone, S_JJ
-    is singular in a direction that moves nothing.
+    ``S - S_.J S_JJ^+ S_J.`` and the like, is what `without_one` needs of it.
 
     Parameters
     ----------
@@ -351,19 +400,9 @@ def without_constellation_and_one(full: AllInView, members: Masks) -> Separation
     members : ndarray of bool, shape (T, n)
         Places of the constellation in the compact arrays; some epochs may have none.
     """
-    mask, rest = members.astype(np.float64), full.used & ~members
+    group = _group(full, members)
+    rest, across = full.used & ~members, group.across
     projector, gain = full.projector, full.gain_m
-    values, vectors = np.linalg.eigh(projector * mask[:, :, None] * mask[:, None, :])
-    some = values > LEAST_REDUNDANCY
-    inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
-    inverse *= mask[:, :, None] * mask[:, None, :]
-    hidden = np.einsum("tij,ti->tj", vectors * mask[:, :, None], gain * mask) * ~some
-    blind = np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(full.variance_m2)
-    across = projector @ inverse  # (T, n, n): of the rest onto the constellation
-    pull = np.einsum("tij,tj->ti", inverse, gain)
-    square = (pull * gain).sum(axis=1)
-    moved = -(pull * full.residual).sum(axis=1)
-    response = np.einsum("ti,tij->tj", pull, full.map_gain_m)
     left_gain = rest * (gain - np.einsum("tij,tj->ti", across, gain))
     left_residual = rest * (full.residual - np.einsum("tij,tj->ti", across, full.residual))
     left_map = rest[..., None] * (full.map_gain_m - across @ full.map_gain_m)
@@ -375,11 +414,11 @@ def without_constellation_and_one(full: AllInView, members: Masks) -> Separation
     alone = ~checked & (np.abs(left_gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
     return _separations(
         full,
-        np.maximum(square[:, None] + weight * left_gain, 0.0),
-        response[:, None] + weight[..., None] * left_map,
-        moved[:, None] - weight * left_residual,
+        np.maximum(group.square[:, None] + weight * left_gain, 0.0),
+        group.response[:, None] + weight[..., None] * left_map,
+        group.moved[:, None] - weight * left_residual,
         left,
-        (alone | blind[:, None]) & rest,
+        (alone | group.blind[:, None]) & rest,
     )
 
 

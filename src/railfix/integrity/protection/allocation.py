@@ -1,0 +1,103 @@
+"""Allocation of the risk of each epoch to the hypotheses of its level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Integers, Masks
+from railfix.integrity.protection.risk import (
+    MOST_EXCLUDED,
+    RiskBudget,
+    more_than_three,
+    more_than_two,
+    one_sided_k,
+    pair_sum,
+)
+from railfix.integrity.raim import LinearModel
+
+
+@dataclass(frozen=True)
+class Allocation:
+    """Allocation of the risk, T epochs."""
+
+    prior: Floats  # (T, M), 0 where not used
+    groups: tuple[tuple[str, Masks], ...]  # constellations with a prior of their own: letter, members (M,)
+    group_prior: Floats  # (T, C), 0 where absent
+    beyond: Floats
+    fault_free: Floats  # risk of each part
+    one: Floats
+    two: Floats
+    pairs: Masks  # two faults are likelier than their share
+    triples: Masks  # three faults are likelier than what may stay unchecked
+    k_false_alarm: Floats
+    map_prior: float  # of a wrong map; 0: no hypothesis
+    side_prior: Floats  # (T, S), of sets of satellites that fail together; 0 where fewer than two
+
+
+def allocate(
+    model: LinearModel, systems: Sequence[str], risk: RiskBudget, out: Integers, sides: Masks, *, wrong_map: bool
+) -> Allocation:
+    """Divide the risk of each epoch.
+
+    Parameters
+    ----------
+    model : LinearModel
+        T epochs, M channels.
+    systems : sequence of str, length M
+    risk : RiskBudget
+    out : ndarray of int, shape (T,)
+        Satellites excluded.
+    sides : ndarray of bool, shape (T, S, M)
+        Sets of satellites that fail together.
+    wrong_map : bool
+        Whether a wrong map is a hypothesis.
+    """
+    prior = model.used * risk.prior(systems)
+    # Excluded satellites count among those that may be faulty, with the largest prior.
+    everyone = np.concatenate(
+        [prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max(initial=0.0)], axis=1
+    )
+    letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
+    groups = tuple((s, np.array([t == s for t in systems])) for s in letters)
+    group_prior = np.zeros((len(model), len(groups)))
+    together = np.zeros(len(model))
+    for c, (letter, members) in enumerate(groups):
+        group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
+        # A constellation and two satellites of others: not checked.
+        together += group_prior[:, c] * pair_sum(prior * ~members)
+    three = more_than_two(everyone)
+    triples = three > risk.unchecked_share * risk.risk_per_sample
+    map_prior = risk.map_prior if wrong_map else 0.0
+    # A wrong map with a constellation, or with two satellites.
+    together += map_prior * (group_prior.sum(axis=1) + pair_sum(everyone))
+    side_prior = np.where(np.count_nonzero(sides & model.used[:, None], axis=2) > 1, risk.side_prior, 0.0)
+    # A side with any other fault: not checked.
+    together += side_prior.sum(axis=1) * (everyone.sum(axis=1) + map_prior) + pair_sum(side_prior)
+    beyond = np.where(triples, more_than_three(everyone), three) + together + pair_sum(group_prior)
+    n = np.count_nonzero(model.used, axis=1)
+    left = risk.sample_risk(n, out, beyond)
+    # With triples every part gives up a quarter to them.
+    left = np.where(triples, 0.75, 1.0) * left
+    two = risk.two_fault_share * left
+    pairs = (pair_sum(prior) > two) | triples
+    tests = n + np.where(pairs, n * (n - 1) // 2, 0) + np.count_nonzero(group_prior, axis=1)
+    tests = tests + np.count_nonzero(side_prior, axis=1)
+    tests = tests + n * np.count_nonzero(group_prior, axis=1)
+    tests = tests + np.where(triples, n * (n - 1) * (n - 2) // 6, 0)
+    return Allocation(
+        prior=prior,
+        groups=groups,
+        group_prior=group_prior,
+        beyond=beyond,
+        fault_free=risk.fault_free_share * left,
+        one=risk.one_fault_share * left,
+        two=two,
+        pairs=pairs,
+        triples=triples,
+        k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1))),
+        map_prior=map_prior,
+        side_prior=side_prior,
+    )
