@@ -18,6 +18,7 @@ from railfix.track.network import Link, Network
 from railfix.track.network_match import PlanLog, match
 from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, Segment
 from railfix.track.track import UNNAMED, Track
+from railfix.track.trajectory import Trajectory
 
 #: A unit of 2 km: the main track to a switch, two parallel tracks 3.6 m apart over 1 km, the main track again.
 UNIT_M = 2000.0
@@ -108,31 +109,37 @@ def made_run(
     return log, on
 
 
-def write_station(
-    path: Path, track: Track, *, crs: str = "EPSG:4326", loop_m: tuple[float, float], aside_m: float
+def write_stations(
+    path: Path, track: Track, *, crs: str = "EPSG:4326", loops_m: list[tuple[float, float]], aside_m: float
 ) -> None:
-    """A GeoPackage of a line with a loop beside it: tracks "west", "main", "loop" and "east", 3-D."""
+    """A GeoPackage of a line with loops beside it: tracks "line 0", "main 0", "loop 0", "line 1", ..., 3-D."""
     import pyogrio
     import shapely
 
-    from railfix.track.trajectory import Trajectory
-
     line = Trajectory.from_track(track)
-    places = np.unique(np.concatenate([track.chainage_m, loop_m]))
-    ramp = np.clip(np.minimum(places - loop_m[0], loop_m[1] - places) / _RAMP_M, 0.0, 1.0)
-    shift = aside_m * (3.0 * ramp**2 - 2.0 * ramp**3)
+    bounds = [b for loop in loops_m for b in loop]
+    places = np.unique(np.concatenate([track.chainage_m, bounds]))
     points = line.at_arc(places)
-    aside = points + shift[:, None] * line.across[line.segment_at(places)[0]]
-    first, last = np.searchsorted(places, loop_m)
+    right = line.across[line.segment_at(places)[0]]
     to_map = Transformer.from_crs("EPSG:4979", CRS(crs).to_3d(), always_xy=True)
+    parts: dict[str, np.ndarray] = {}
+    start = 0
+    for k, loop in enumerate(loops_m):
+        first, last = np.searchsorted(places, loop)
+        ramp = np.clip(np.minimum(places - loop[0], loop[1] - places) / _RAMP_M, 0.0, 1.0)
+        aside = points + (aside_m * (3.0 * ramp**2 - 2.0 * ramp**3))[:, None] * right
+        parts[f"line {k}"] = points[start : first + 1]
+        parts[f"main {k}"], parts[f"loop {k}"] = points[first : last + 1], aside[first : last + 1]
+        start = last
+    parts[f"line {len(loops_m)}"] = points[start:]
     shapes = []
-    for own in (points[: first + 1], points[first : last + 1], aside[first : last + 1], points[last:]):
+    for own in parts.values():
         latitude, longitude, height = geodetic_from_ecef(own)
         shapes.append(shapely.LineString(np.stack(to_map.transform(longitude, latitude, height), axis=-1)))
     pyogrio.raw.write(
         path,
         np.array([shapely.to_wkb(shape) for shape in shapes]),
-        [np.array(["west", "main", "loop", "east"], dtype=object)],
+        [np.array([*parts], dtype=object)],
         ["name"],
         geometry_type="LineString Z",
         crs=crs,

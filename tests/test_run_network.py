@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from typer.testing import CliRunner
 
-from network_made import made_network, made_run, write_station
+from network_made import made_network, made_run, write_stations
+from railfix.cli import app
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.evaluate import evaluate_run
@@ -35,7 +37,7 @@ def _demo_on(folder: Path, *, aside_m: float, crs: str = "EPSG:4326") -> RunInpu
     """The demo log on its own line, which has a loop beside it, as a GeoPackage."""
     inputs = demo_inputs()
     path = folder / "station.gpkg"
-    write_station(path, read_track(inputs.track), crs=crs, loop_m=LOOP_M, aside_m=aside_m)
+    write_stations(path, read_track(inputs.track), crs=crs, loops_m=[LOOP_M], aside_m=aside_m)
     return inputs.replaced(track=(path,), rear=(), vehicle=None)
 
 
@@ -50,13 +52,13 @@ def test_route_is_found_and_the_loop_keeps_its_probability(near: tuple[RunInputs
     _, summary = near
     record = json.loads(summary.files["run.json"].read_text())
     route = record["line"]["route"]
-    assert route["tracks"] == ["west", "main", "east"]
-    assert [a["track"] for a in route["alternatives"]] == ["loop"]
+    assert route["tracks"] == ["line 0", "main 0", "line 1"]
+    assert [a["track"] for a in route["alternatives"]] == ["loop 0"]
     assert 0.05 < route["alternatives"][0]["largest_probability"] < 0.5
     assert route["least_probability"] == pytest.approx(1.0 - route["alternatives"][0]["largest_probability"], abs=0.02)
     notes = " ".join(summary.notes)
-    assert "route found from the log: west, main, east" in notes
-    assert "may be on loop instead of main" in notes
+    assert "route found from the log: line 0, main 0, line 1" in notes
+    assert "may be on loop 0 instead of main 0" in notes
 
 
 def test_rows_name_their_track_and_the_probabilities_of_those_near(near: tuple[RunInputs, RunSummary]) -> None:
@@ -64,7 +66,7 @@ def test_rows_name_their_track_and_the_probabilities_of_those_near(near: tuple[R
     rows = pl.read_parquet(summary.files["positions.parquet"])
     placed = rows.filter(pl.col("chainage_m").is_not_null())
     assert rows.filter(pl.col("chainage_m").is_null())["track"].null_count() == len(rows) - len(placed)
-    for name, low, high in (("west", 0.0, LOOP_M[0]), ("main", *LOOP_M), ("east", LOOP_M[1], 1e4)):
+    for name, low, high in (("line 0", 0.0, LOOP_M[0]), ("main 0", *LOOP_M), ("line 1", LOOP_M[1], 1e4)):
         own = placed.filter(pl.col("track") == name)
         assert len(own) > 20
         assert own["chainage_m"].is_between(low - 0.01, high + 0.01).all()
@@ -75,7 +77,7 @@ def test_rows_name_their_track_and_the_probabilities_of_those_near(near: tuple[R
     sums = near_.group_by("time_gpst", "antenna").agg(pl.col("probability").sum())
     assert len(sums) == len(placed)
     assert (sums["probability"] - 1.0).abs().max() < 2e-3  # type: ignore[operator]
-    loop = near_.filter(pl.col("track") == "loop")
+    loop = near_.filter(pl.col("track") == "loop 0")
     assert not loop["on_route"].any()
     assert loop["offset_m"].median() == pytest.approx(4.5, abs=0.3)
     train = pl.read_parquet(summary.files["train.parquet"])
@@ -116,7 +118,7 @@ def test_a_map_in_another_frame_is_moved_also_in_a_network(tmp_path: Path) -> No
     assert shift is not None
     assert 0.1 < np.hypot(shift.east_m, shift.north_m) < 0.6
     assert frames["jgd2011"].route is not None
-    assert frames["jgd2011"].route.names == ["west", "main", "east"]
+    assert frames["jgd2011"].route.names == ["line 0", "main 0", "line 1"]
     assert not frames["jgd2011"].from_file
     # the line stands where the satellites have it, the route's positions where the map has it
     moved = frames["jgd2011"].track.ecef_m - frames["wgs84"].track.ecef_m
@@ -195,3 +197,38 @@ def test_positions_are_matched_in_the_frame_of_the_map() -> None:
     with pytest.raises(MismatchError, match=r"has no times.*--same-frame"):
         timeless.in_frame_of(net)
     assert timeless.in_frame_of(made)[1].method == "used as it is"
+
+
+@pytest.mark.slow
+def test_from_the_geopackage_of_an_operator_and_a_log_of_an_hour_to_positions_with_track_names(tmp_path: Path) -> None:
+    """The commands of docs/how-to.md, on an hour of a simulated train between stations with loops."""
+
+    def run(*words: str) -> str:
+        done = CliRunner().invoke(app, [str(word) for word in words])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    made, out, net = tmp_path / "made", tmp_path / "results", tmp_path / "tracks.gpkg"
+    settings = ("rate_hz=1", "line.length_m=36000", "run.cruise_mps=25")
+    run("simulate", "demo", "--seconds", "3600", *(w for s in settings for w in ("--set", s)), "--out", made, "--plain")
+    track = read_track(made / "track.csv")
+    loops = [(float(at), at + 900.0) for at in np.arange(2000.0, track.chainage_m[-1] - 1500.0, 6000.0)]
+    write_stations(net, track, crs="EPSG:6668", loops_m=loops, aside_m=4.5)
+    assert "separate part" in run(
+        "map", "network", net, "--height-datum", "ellipsoidal", "--page", tmp_path / "net.html"
+    )
+    log = ("--front", made / "front.rnx", "--nav", made / "nav.rnx", "--height-datum", "ellipsoidal")
+    text = run("run", *log, "--track", net, "--out", out)
+    assert "route found from the log: line 0, main 0, line 1" in text
+    rows = pl.read_csv(out / "train.csv").filter(pl.col("track").is_not_null())
+    truth = pl.read_csv(made / "truth.csv").filter(pl.col("antenna") == "front").select("time_gpst", "chainage_m")
+    both = rows.join(truth, on="time_gpst", suffix="_true")
+    assert len(both) > 3000
+    bounds = np.array([b for loop in loops for b in loop])
+    number = np.searchsorted(bounds, both["chainage_m_true"].to_numpy())
+    names = np.array([name for k in range(len(loops)) for name in (f"line {k}", f"main {k}")] + [f"line {len(loops)}"])
+    right = names[number] == both["track"].to_numpy()
+    assert right.mean() > 0.99
+    near = pl.read_csv(out / "tracks.csv")
+    assert set(near["track"]) >= {f"loop {k}" for k in range(2)}
+    run("report", out, "--out", tmp_path / "report.html")
