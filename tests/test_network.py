@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from network_made import made_network, made_run, segment, to_degrees
+from network_recordings import shares
 from railfix.cli.map import app
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.report.network_page import write_network_page
@@ -190,6 +191,18 @@ def test_infrabel_runs_lie_on_tracks_where_the_positions_are_fixed(
     tracks, left_out = route_of(infrabel, matched)
     assert 4 <= len(tracks) <= 12
     assert not left_out
+
+
+def test_infrabel_positions_are_on_the_track_that_is_known_of_them(infrabel: Network, recordings: Path) -> None:
+    """Also with errors of 2 m. On the last log fixed positions lie metres from the map: no track is known."""
+    folder = recordings / "rail" / "infrabel"
+    names = ("28554_L36-A_to_L36C-A", "29304_L36-B_to_L36N-B")
+    first, last = (shares(infrabel, folder / f"log_{name}.csv", seeds=2) for name in names)
+    assert first.known > 200
+    assert first.right == 1.0
+    assert first.right_with_errors > 0.95
+    assert last.known < 10
+    assert last.fixed_m > 1.5
 
 
 def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Floats, Indices, Integers
+from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import MismatchError
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.gnss.navigation import Navigation
@@ -128,6 +128,10 @@ class RouteOfLog:
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
 
     @cached_property
+    def _names(self) -> Strings:
+        return np.array([*self.network.names, None], dtype=object)
+
+    @cached_property
     def _on_route(self) -> Floats:
         return np.isin(self.matched.candidates.track, self.tracks).astype(np.float64)
 
@@ -225,7 +229,7 @@ class RouteOfLog:
         along, _ = self.network.place_on(number, latitude, longitude)
         epoch = self._nearest_epoch(table["time_gpst"].to_numpy())
         share = np.where(known, self.probability[epoch], np.nan)
-        names = np.array([*self.network.names, None], dtype=object)
+        names = self._names
         positions = table.with_columns(
             pl.Series("track", names[number].tolist(), dtype=pl.String),
             pl.Series("track_chainage_m", along, nan_to_null=True),

@@ -240,49 +240,46 @@ class _Transitions:
         self._network = network
         self._track, self._place = candidates.track, candidates.chainage_m
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        self._ways: dict[tuple[int, int], dict[int, float]] = {}
-        same = (self._track[1:, None, :] == self._track[:-1, :, None]) & (self._track[:-1, :, None] >= 0)
-        #: Cost to stay, shape (n - 1, m, m); other passages are computed where both ends have one.
-        self._same = same
+        #: Ways from an end of a track to the ends of others, and how far they were looked for.
+        self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
+        self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
+        to_end = np.fmin(self._place, self._rest)
+        #: Whether an end of the track is within reach, before and after each passage, shapes (n - 1, m).
+        self._leaves = to_end[:-1] <= self._reach[:, None]
+        self._enters = to_end[1:] <= self._reach[:, None]
 
     def __call__(self, k: int) -> Floats:
         """Costs from epoch k to k + 1, shape (m + 1, m + 1)."""
         before, after = self._track[k], self._track[k + 1]
         m = len(before)
+        same = (before[:, None] == after) & (before[:, None] >= 0)
         cost = np.full((m + 1, m + 1), _LEAVE_COST)
         cost[m, m] = 0.0
-        cost[:m, :m] = np.where(self._same[k], 0.0, _JUMP_COST)
-        for i in np.flatnonzero(before >= 0):
-            for j in np.flatnonzero((after >= 0) & ~self._same[k, i]):
-                if self._connected(k, int(i), int(j)):
-                    cost[i, j] = 0.0
+        cost[:m, :m] = np.where(same, 0.0, _JUMP_COST)
+        for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
+            if self._connected(k, i, j):
+                cost[i, j] = 0.0
         return cost
 
     def _connected(self, k: int, i: int, j: int) -> bool:
         """Whether a train can have run from one place to the other in the distance between two positions."""
-        a, b = int(self._track[k, i]), int(self._track[k + 1, j])
-        place, target = float(self._place[k, i]), float(self._place[k + 1, j])
-        length, reach = self._network.length_m, float(self._reach[k])
-        for end in (0, 1):
-            rest = place if end == 0 else float(length[a]) - place
+        a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
+        for end, rest in enumerate((float(self._place[k, i]), float(self._rest[k, i]))):
             if rest > reach:
                 continue
-            ways = self._from(a, end)
-            for entry in (0, 1):
-                into = target if entry == 0 else float(length[b]) - target
+            ways = self._from(a, end, reach)
+            for entry, into in enumerate((float(self._place[k + 1, j]), float(self._rest[k + 1, j]))):
                 if rest + ways.get(4 * b + 2 * entry, np.inf) + into <= reach:
                     return True
         return False
 
-    def _from(self, track: int, end: int) -> dict[int, float]:
-        if (track, end) not in self._ways:
-            node = 4 * track + 2 * end + 1
-            reach = float(self._reach.max(initial=0.0))
-            inside = node in self._network.graph
-            self._ways[track, end] = (
-                dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach)) if inside else {}
-            )
-        return self._ways[track, end]
+    def _from(self, track: int, end: int, reach_m: float) -> dict[int, float]:
+        searched, ways = self._ways.get((track, end), (-1.0, {}))
+        node = 4 * track + 2 * end + 1
+        if searched < reach_m and node in self._network.graph:
+            ways = dict(nx.single_source_dijkstra_path_length(self._network.graph, node, cutoff=reach_m))
+            self._ways[track, end] = (reach_m, ways)
+        return ways
 
 
 def _decode(cost: Floats, moves: _Transitions) -> tuple[Indices, Floats]:
