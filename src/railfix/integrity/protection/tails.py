@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from scipy.special import ndtr
 
-from railfix.core.arrays import Codes, Floats
+from railfix.core.arrays import Codes, Floats, Indices
+from railfix.kernels import compiled_by
 
 #: Evaluations of the sum in a round; epochs that have not come close after it go on.
 _STEPS: Final = 4
@@ -53,14 +54,35 @@ def least_level(above_m: Floats, kinds: list[Tails], allowed: Floats) -> tuple[F
     spender : ndarray of int8, shape (T,)
         The kind that uses up most of the risk at that level.
     """
+    bounds = np.cumsum([0, *(kind.weight.shape[1] for kind in kinds)])
+    offset = np.concatenate([kind.offset_m for kind in kinds], axis=1)
+    inverse = 1.0 / np.concatenate([kind.sigma_m for kind in kinds], axis=1)
+    weight = np.concatenate([kind.weight for kind in kinds], axis=1)
+    return lowered(np.ascontiguousarray(above_m), offset, inverse, weight, bounds, np.ascontiguousarray(allowed))
+
+
+@compiled_by("level")
+def lowered(
+    above_m: Floats, offset_m: Floats, inverse: Floats, weight: Floats, bounds: Indices, allowed: Floats
+) -> tuple[Floats, Codes]:
+    """Lower levels as `least_level` does; arrays in C order.
+
+    Parameters
+    ----------
+    above_m, allowed : ndarray, shape (T,)
+    offset_m, inverse, weight : ndarray, shape (T, K)
+        Of all tails; `inverse` is 1/sigma [1/m].
+    bounds : ndarray of int
+        First tail of each kind, and K.
+    """
     level, spender = above_m.copy(), np.zeros(len(above_m), dtype=np.int8)
     rows = np.flatnonzero(np.isfinite(above_m) & (allowed > 0))
     here, below = above_m[rows], np.zeros(len(rows))
     for _ in range(_ROUNDS):
         if not len(rows):
             break
-        some = [Tails(offset_m=k.offset_m[rows], sigma_m=k.sigma_m[rows], weight=k.weight[rows]) for k in kinds]
-        found = _descend(level[rows], spender[rows], below, here, some, allowed[rows])
+        tails = offset_m[rows], inverse[rows], weight[rows]
+        found = _descend(level[rows], spender[rows], below, here, *tails, bounds, allowed[rows])
         level[rows], spender[rows], below, here = found
         going = np.abs(here - level[rows]) > _CLOSE * level[rows]
         rows, below, here = rows[going], below[going], here[going]
@@ -68,16 +90,20 @@ def least_level(above_m: Floats, kinds: list[Tails], allowed: Floats) -> tuple[F
 
 
 def _descend(
-    level: Floats, spender: Codes, below: Floats, here: Floats, kinds: list[Tails], limit: Floats
+    level: Floats,
+    spender: Codes,
+    below: Floats,
+    here: Floats,
+    offset: Floats,
+    inverse: Floats,
+    weight: Floats,
+    bounds: Indices,
+    limit: Floats,
 ) -> tuple[Floats, Codes, Floats, Floats]:
     """A round of steps: the lowest level within the risk, its spender, the highest beyond it, and where to go on."""
-    offset = np.concatenate([kind.offset_m for kind in kinds], axis=1)
-    inverse = 1.0 / np.concatenate([kind.sigma_m for kind in kinds], axis=1)
-    weight = np.concatenate([kind.weight for kind in kinds], axis=1)
     density_weight = weight * inverse / _ROOT_TWO_PI
-    bounds = np.cumsum([0, *(kind.weight.shape[1] for kind in kinds)])
     aim = limit * (1.0 - _AIM)
-    parts = np.empty((len(level), len(kinds)))
+    parts = np.empty((len(level), len(bounds) - 1))
     for _ in range(_STEPS):
         z = (offset - here[:, None]) * inverse
         tail = ndtr(z)
