@@ -21,6 +21,7 @@ from railfix.ranges.error_model import (
     ErrorSamples,
     condition_differences,
     fault_rate,
+    faulty_stretches,
     fit_bins,
     gaussian_overbound,
     read_error_model,
@@ -41,6 +42,7 @@ def samples_of(error: np.ndarray, elevation: float, azimuth: float, cn0: float, 
         block=block + np.arange(n) // 10,
         used=np.ones(n, dtype=bool),
         sigma_m=np.full(n, 2.0),
+        chainage_m=np.full(n, np.nan),
     )
 
 
@@ -142,6 +144,7 @@ def made_model() -> ErrorModel:
         block=np.arange(n) // 5,
         used=rng.random(n) < 0.7,
         sigma_m=np.full(n, 2.0),
+        chainage_m=np.full(n, np.nan),
     )
     fit = ErrorModelFit()
     return ErrorModel(
@@ -271,6 +274,22 @@ def test_the_summary_pools_mean_and_variance_over_the_bins() -> None:
     assert rows["C/N0 0-60"] == ("40", "+0.00", "2.50", "2.5-4.0", "0", "-", "-", "-")
     assert rows["elevation 45-90"][:4] == ("10", "-3.00", "1.00", "2.5-2.5")
     assert "all round" in rows
+
+
+def test_stretches_with_more_faults_than_the_line_are_marked() -> None:
+    """Each hundredth block is faulty by chance; in 400 to 600 m half of them, and at 900 m one of few."""
+    rng = np.random.default_rng(3)
+    n = 20_000
+    chainage = rng.uniform(0.0, 2000.0, n)
+    bad = rng.random(n) < np.where((chainage >= 400.0) & (chainage < 600.0), 0.5, 0.01)
+    samples = replace(samples_of(np.where(bad, 30.0, 1.0), 30.0, 10.0, 40.0), block=np.arange(n), chainage_m=chainage)
+    assert faulty_stretches(samples) == ((400.0, 600.0),)
+    assert faulty_stretches(replace(samples, used=~bad)) == ()
+    assert faulty_stretches(replace(samples, chainage_m=np.full(n, np.nan))) == ()
+    # The same errors in one block of time are one fault.
+    assert faulty_stretches(replace(samples, block=np.zeros(n, dtype=np.int64))) == ()
+    few = replace(samples_of(np.full(3, 30.0), 30.0, 10.0, 40.0), chainage_m=np.full(3, 2950.0))
+    assert faulty_stretches(joined(samples, few)) == ((400.0, 600.0),)
 
 
 def test_the_rate_of_faults_is_counted_by_blocks() -> None:

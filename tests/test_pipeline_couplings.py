@@ -13,6 +13,7 @@ from pipeline_cases import clean_navigation, clean_observations, clean_trajector
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
 from railfix.gnss.signals import carrier_frequency_hz
+from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
 from railfix.pipeline import fault_exclusion, level_stage, solution
 from railfix.pipeline.config import parse_config
@@ -122,6 +123,25 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
     more = front_alone(FRONT, BASE | {"risk": {"side_prior": 1e-7}}).protection
     assert more is not None
     assert (more.level.level_m > result.protection.level.level_m).all()
+
+
+@pytest.mark.requirement("C2")
+def test_no_level_reaches_into_a_stretch_without_one() -> None:
+    """Positions whose level touches the stretch have none; the verdict is unavailable, positions stay."""
+    middle = float(np.median(FAULTY.chainage_m))
+    assert FAULTY.protection is not None
+    before = FAULTY.protection.level.level_m
+    found = front_alone(FRONT, BASE | {"no_level_m": [[middle, middle + 5.0]]})
+    assert found.protection is not None
+    touched = (FAULTY.chainage_m + before > middle) & (FAULTY.chainage_m - before < middle + 5.0)
+    assert touched.any()
+    assert np.array_equal(np.isinf(found.protection.level.level_m), touched)
+    assert (found.protection.level.cause[touched] == Cause.UNBOUNDED).all()
+    assert (found.protection.status[touched] == LevelStatus.UNAVAILABLE).all()
+    assert np.array_equal(found.chainage_m, FAULTY.chainage_m)
+    far = front_alone(FRONT, BASE | {"no_level_m": [[middle + 1e4, middle + 2e4]]}).protection
+    assert far is not None
+    assert np.array_equal(far.level.level_m, before)
 
 
 @pytest.mark.requirement("C2")

@@ -96,6 +96,7 @@ def made_error_model(path: Path) -> Path:
         block=np.arange(n, dtype=np.int64),
         used=np.ones(n, dtype=np.bool_),
         sigma_m=np.ones(n),
+        chainage_m=np.full(n, np.nan),
     )
     fit = ErrorModelFit()
     of_all = fit_bins(samples, samples.used, fit)

@@ -14,7 +14,15 @@ from railfix.cli.console import console_of_tables
 from railfix.cli.options import OverwriteOption
 from railfix.core.errors import SettingsError
 from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
-from railfix.ranges.error_model import ErrorBins, ErrorModel, ErrorModelFit, summary, write_error_model
+from railfix.ranges.error_model import (
+    ErrorBins,
+    ErrorModel,
+    ErrorModelFit,
+    ErrorSamples,
+    faulty_stretches,
+    summary,
+    write_error_model,
+)
 from railfix.run.output import check_output_file
 
 
@@ -63,8 +71,8 @@ def error_model(
     atmospheric errors of those days: it is wider, and valid for such days.
 
     The file has bias, standard deviation and a Gaussian overbound for every bin of elevation, azimuth from the
-    car's front and C/N0, before the screens and after. `railfix run --error-model MODEL.toml` weights
-    the ranges and derives the protection level by it.
+    car's front and C/N0, before the screens and after. `railfix run --error-model MODEL.toml` derives
+    the protection level from it.
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
@@ -86,7 +94,7 @@ def error_model(
     ]
     model, samples = error_model_from_runs(inputs, fit=fit)
     write_error_model(model, out)
-    _print_model(model, len(samples.error_m))
+    _print_model(model, samples)
     typer.echo(f"wrote {out}")
 
 
@@ -94,11 +102,12 @@ def _edges(text: str) -> tuple[float, ...]:
     return tuple(float(part) for part in text.split(","))
 
 
-def _print_model(model: ErrorModel, samples: int) -> None:
+def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     console = console_of_tables()
     base = model.source.base or "none: errors of satellites and atmosphere are in the model"
     console.print(
-        f"{samples:,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres",
+        f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; "
+        "in metres",
         markup=False,
     )
     table = Table(show_edge=False, pad_edge=False)
@@ -118,3 +127,10 @@ def _print_model(model: ErrorModel, samples: int) -> None:
             markup=False,
             soft_wrap=True,
         )
+        if stretches := ", ".join(f"[{start:g}, {end:g}]" for start, end in faulty_stretches(samples)):
+            console.print(
+                f"local faults are more frequent than on the line at chainages [m] {stretches}; no level there: "
+                f"--set 'no_level_m=[{stretches}]'",
+                markup=False,
+                soft_wrap=True,
+            )

@@ -35,6 +35,7 @@ def antenna_result(
     latitude, longitude, height = geodetic_from_ecef(ecef)
     nearest, offset = trajectory.nearest(point.ecef_m)
     reason = reason_of_all_channels(corrected)
+    chainage = trajectory.chainage_at(arc)
     protection = solution.protection
 
     def on_all_channels(values: Floats) -> Floats:
@@ -47,7 +48,7 @@ def antenna_result(
         satellite=obs.satellite,
         signal=obs.signal,
         status=solution.status,
-        chainage_m=trajectory.chainage_at(arc),
+        chainage_m=chainage,
         kilometrage_m=trajectory.kilometrage_at(arc),
         arc_m=arc,
         along_sigma_m=np.where(has, solution.along_sigma_m, np.nan),
@@ -79,7 +80,7 @@ def antenna_result(
         constrained=constrained,
         phase=solution.phase,
         raim=replace(solution.raim, protection_level_m=np.where(has, solution.raim.protection_level_m, np.nan)),
-        protection=None if protection is None else judged(protection, solution.status, has, config),
+        protection=None if protection is None else judged(protection, solution.status, has, chainage, config),
         map_offset=solution.map_offset,
         clocks=corrected.clocks,
         clock_offset_m=solution.ties.offset_m,

@@ -168,6 +168,9 @@ class Config(ScreenSettings):
         Integrity risk per hour, its shares, and the fault probabilities that the level assumes.
     alarm_limit_m : float
         Largest protection level of an available position. P4 takes a car length, 20 m.
+    no_level_m : tuple of (float, float) [m]
+        Stretches of the line, chainages from and to, where local faults cannot be bounded: no level there
+        (``railfix error-model`` prints those of its runs).
     raim_protection : {"on", "off"}
         Whether positions also get P4's level: the largest slope times the largest undetected bias.
     noise, elevation, cn0, doppler, antenna_pair, raim, antenna_spacing
@@ -221,6 +224,7 @@ class Config(ScreenSettings):
     protection: Literal["on", "off"] = "on"
     risk: RiskBudget = RiskBudget()
     alarm_limit_m: float = Field(default=20.0, gt=0)
+    no_level_m: tuple[tuple[float, float], ...] = ()
     raim_protection: Literal["on", "off"] = "off"
     carrier: Literal["off", "smoothed", "float"] = "off"
     phase_sigma_m: float = Field(default=0.01, gt=0)

@@ -9,7 +9,14 @@ import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.reasons import CHECK_FAILED, Status
-from railfix.integrity.protection import LevelStatus, ProtectionLevel, RiskBudget, along_track_level, availability
+from railfix.integrity.protection import (
+    Cause,
+    LevelStatus,
+    ProtectionLevel,
+    RiskBudget,
+    along_track_level,
+    availability,
+)
 from railfix.integrity.raim import LinearModel, Outcome
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -128,7 +135,9 @@ def _sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float
     return np.stack([low & ~right, low & right], axis=1)
 
 
-def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Config) -> ProtectionResult:
+def judged(
+    protection: ProtectionResult, status: Codes, has: Masks, chainage_m: Floats, config: Config
+) -> ProtectionResult:
     """Return the levels with the verdicts on the positions applied.
 
     A level holds at the place where the ranges were linearised. Where another place explains them as well, it
@@ -141,12 +150,18 @@ def judged(protection: ProtectionResult, status: Codes, has: Masks, config: Conf
         `reasons.Status`.
     has : ndarray of bool, shape (T,)
         Epochs that keep their coordinates; the others lose the level, too.
+    chainage_m : ndarray, shape (T,) [m]
+        Positions; where the level reaches a stretch of `Config.no_level_m` it is infinite.
     config : Config
     """
     values = {}
     for item in fields(ProtectionLevel):
         value = getattr(protection.level, item.name)
         values[item.name] = np.where(has, value, np.nan) if value.dtype == np.float64 else value
+    for start, end in config.no_level_m:
+        near = (chainage_m + values["level_m"] > start) & (chainage_m - values["level_m"] < end)
+        values["level_m"] = np.where(near, np.inf, values["level_m"])
+        values["cause"] = np.where(near, int(Cause.UNBOUNDED), values["cause"]).astype(np.int8)
     level = ProtectionLevel(**values)
     verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     alarming = np.isin(status, [*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET])

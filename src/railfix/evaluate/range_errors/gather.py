@@ -158,6 +158,7 @@ def range_errors(
             block=time_block[epoch] * 1_000_000 + numbers[channel],
             used=used[epoch, channel],
             sigma_m=_level_sigma_m(result)[epoch, channel],
+            chainage_m=trajectory.chainage_at(trajectory.nearest(place[epoch])[0]),
         ),
         time=result.time[epoch],
         satellite=satellite[channel],

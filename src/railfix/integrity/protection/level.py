@@ -68,6 +68,8 @@ class Cause(IntEnum):
     NO_POSITION = 5
     #: Faults of three satellites.
     THREE_FAULTS = 6
+    #: Infinite: local faults cannot be bounded at this place of the line.
+    UNBOUNDED = 7
 
 
 @dataclass(frozen=True, kw_only=True)

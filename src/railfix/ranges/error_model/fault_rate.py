@@ -1,4 +1,4 @@
-"""Rate of local faults on a line: ranges beyond a bound in sigmas of the protection level, with confidence."""
+"""Local faults on a line: ranges beyond a bound in sigmas of the protection level; their rate and places."""
 
 from __future__ import annotations
 
@@ -41,6 +41,47 @@ def fault_rate(samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: 
         prior=count / ranges if ranges else 0.0,
         upper=min(1.0, part * upper),
         together=_together(every, bad),
+    )
+
+
+def faulty_stretches(
+    samples: ErrorSamples, *, length_m: float = 100.0, beyond_sigma: float = 5.0, confidence: float = 0.95
+) -> tuple[tuple[float, float], ...]:
+    """Stretches of the line where local faults are more frequent than on the whole line.
+
+    A stretch is one whose share of faulty blocks is, at the lower end of its interval (Clopper and Pearson), above the
+    share of the line at the upper end of its own. Where that holds, no prior of the line bounds the local faults:
+    there the settings leave the train without a level (`Config.no_level_m`).
+
+    Parameters
+    ----------
+    samples : ErrorSamples
+    length_m : float [m]
+    beyond_sigma, confidence : float
+        As `fault_rate`; one-sided.
+
+    Returns
+    -------
+    tuple of (float, float) [m]
+        Chainages from and to; neighbouring stretches are joined.
+    """
+    used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
+    faulty = used & (np.abs(samples.error_m) > beyond_sigma * samples.sigma_m)
+    if not faulty.any():
+        return ()
+    part = np.floor(samples.chainage_m[used] / length_m).astype(np.int64)
+    pairs, number = np.unique(np.stack([part, samples.block[used]], axis=1), axis=0, return_inverse=True)
+    bad = np.zeros(len(pairs), dtype=bool)
+    bad[number.ravel()[faulty[used]]] = True
+    places, of = np.unique(pairs[:, 0], return_inverse=True)
+    blocks, hits = np.bincount(of), np.bincount(of, weights=bad)
+    upper = betaincinv(bad.sum() + 1, max(len(bad) - bad.sum(), 1), confidence)
+    lower = np.where(hits > 0, betaincinv(np.maximum(hits, 1), blocks - hits + 1, 1.0 - confidence), 0.0)
+    marked = places[lower > upper]
+    edges = np.flatnonzero(np.diff(marked, prepend=marked[:1] - 2, append=marked[-1:] + 2) > 1)
+    return tuple(
+        (float(marked[first] * length_m), float((marked[end - 1] + 1) * length_m))
+        for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
     )
 
 

@@ -46,6 +46,8 @@ class ErrorSamples:
         Samples that passed every screen.
     sigma_m : ndarray, shape (n,) [m]
         Standard deviation that the protection level of the run gave the range.
+    chainage_m : ndarray, shape (n,) [m]
+        Place of the train; NaN where unknown.
     """
 
     error_m: Floats
@@ -55,6 +57,7 @@ class ErrorSamples:
     block: Integers
     used: Masks
     sigma_m: Floats
+    chainage_m: Floats
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
