@@ -14,6 +14,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from statistics import median
@@ -51,11 +52,27 @@ def long_run(folder: Path, epochs: int) -> tuple[Path, Path]:
     return whole, folder / "truth.csv"
 
 
+def anonymous_mb() -> float:
+    """Resident memory of this process that is not pages of files [MB]."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon"))
+
+
 def write(run: Path, truth: Path, page: Path) -> None:
-    """Write the page; print the time [s] and the largest resident memory of this process [MB]."""
-    began = time.perf_counter()
+    """Write the page; print the time [s], the largest resident memory and its part that is not pages of files [MB]."""
+    began, own, done = time.perf_counter(), [0.0], threading.Event()
+
+    def watch() -> None:
+        while not done.wait(0.02):
+            own[0] = max(own[0], anonymous_mb())
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
     write_report([run], page, references=[truth])
-    print(time.perf_counter() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    took = time.perf_counter() - began
+    done.set()
+    watcher.join()
+    print(took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, own[0])
 
 
 def main() -> None:
@@ -71,11 +88,12 @@ def main() -> None:
         run, truth = long_run(Path(place), arguments.epochs)
         page = (arguments.keep or Path(place)) / "report.html"
         program = [sys.executable, __file__, "--write", str(run), str(truth), str(page)]
-        took, peak = subprocess.run(program, capture_output=True, text=True, check=True).stdout.split()
+        took, peak, own = subprocess.run(program, capture_output=True, text=True, check=True).stdout.split()
         rows = {name: pl.scan_parquet(run / f"{name}.parquet").select(pl.len()).collect().item() for name in
                 ("positions", "observations")}  # fmt: skip
         print(f"{rows['positions']:,} rows of positions, {rows['observations']:,} of observations")
-        print(f"written in {float(took):.1f} s with {float(peak):.0f} MB of memory, {page.stat().st_size / 1e6:.2f} MB")
+        memory = f"{float(peak):.0f} MB of memory ({float(own):.0f} without pages of files)"
+        print(f"written in {float(took):.1f} s with {memory}, {page.stat().st_size / 1e6:.2f} MB")
         if browser() is not None:
             paper = Path(place) / "report.pdf"
             run_browser(page, f"--print-to-pdf={paper}")

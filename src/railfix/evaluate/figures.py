@@ -126,7 +126,7 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
         "status": pl.col("status"),
     }
     inside = epochs.filter("in_reference").select(*KEYS, *_USED)
-    ranked = inside.with_columns(rank.cast(pl.Int64).alias(f"{name}_rank") for name, rank in ranks.items())
+    ranked = inside.with_columns(rank.cast(pl.Int32).alias(f"{name}_rank") for name, rank in ranks.items())
     return ranked.with_columns(
         pl.col(KEYS).cast(WORDS),
         *(expression.cast(pl.String).cast(WORDS).alias(f"{name}_group") for name, expression in names.items()),

@@ -223,9 +223,11 @@ def _read_table(path: Path, name: str, needed: Sequence[str]) -> tuple[Path, pl.
         raise InputFileError(file, f"has no column {missing[0]}; expected the {name} of railfix run")
     if not len(rows):
         raise InputFileError(file, "has no rows; there is nothing to evaluate")
-    if len(rows.select(_KEYS).unique()) < len(rows):
-        raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
-    return file, rows if rows["time_gpst"].is_sorted() else rows.sort("time_gpst", maintain_order=True)
+    rows = rows if rows["time_gpst"].is_sorted() else rows.sort("time_gpst", maintain_order=True)
+    for (antenna,) in rows.select("antenna").unique().iter_rows():
+        if (np.diff(rows.filter(antenna=antenna)["time_gpst"].to_numpy()) == np.timedelta64(0)).any():
+            raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
+    return file, rows
 
 
 def _table(file: Path) -> pl.DataFrame:

@@ -99,17 +99,30 @@ class RunScreen:
     antenna, name : str
         ``front``, ``doppler``.
     picture : ScreenPicture
-    time : ndarray of datetime64[ns], shape (T,)
-        Of each row of the picture: an epoch, or an observation.
-    chainage_m : ndarray, shape (T,) [m]
-        Of the position at that time; NaN without one.
+        A row an epoch, or an observation.
+    epoch : ndarray of int, shape (T,) or None
+        Epoch of each row; None where the rows are the epochs.
+    epoch_time : ndarray of datetime64[ns], shape (E,)
+    epoch_chainage_m : ndarray, shape (E,) [m]
+        Of the position; NaN without one.
     """
 
     antenna: str
     name: str
     picture: ScreenPicture
-    time: Datetimes
-    chainage_m: Floats
+    epoch: Indices | None
+    epoch_time: Datetimes
+    epoch_chainage_m: Floats
+
+    @property
+    def time(self) -> Datetimes:
+        """Time of each row of the picture, shape (T,)."""
+        return self.epoch_time if self.epoch is None else self.epoch_time[self.epoch]
+
+    @property
+    def chainage_m(self) -> Floats:
+        """Chainage of each row of the picture, shape (T,) [m]."""
+        return self.epoch_chainage_m if self.epoch is None else self.epoch_chainage_m[self.epoch]
 
 
 def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
@@ -131,12 +144,18 @@ def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFra
         mine = positions.filter(pl.col("antenna") == antenna)
         seen = observations.filter(pl.col("antenna") == antenna)
         time, chainage = mine["time_gpst"].to_numpy(), floats(mine, "chainage_m")
-        epoch = np.searchsorted(time, seen.select("time_gpst").collect()["time_gpst"].to_numpy())
+        epoch = np.searchsorted(time, seen.select("time_gpst").collect()["time_gpst"].to_numpy()).astype(np.int32)
         rows = _Rows(positions=mine, observations=seen, epoch=epoch)
         for name, picture in _pictures(antenna, rows, config):
             if np.isfinite(picture.metric).any():
-                at = epoch if len(picture.metric) == len(epoch) else np.arange(len(time))
-                yield RunScreen(antenna=antenna, name=name, picture=picture, time=time[at], chainage_m=chainage[at])
+                yield RunScreen(
+                    antenna=antenna,
+                    name=name,
+                    picture=picture,
+                    epoch=epoch if len(picture.metric) == len(epoch) else None,
+                    epoch_time=time,
+                    epoch_chainage_m=chainage,
+                )
 
 
 def _pictures(antenna: str, rows: _Rows, config: Config) -> Iterator[tuple[str, ScreenPicture]]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.files import staged_file
 from railfix.core.timescale import seconds
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 #: Colours distinguishable with colour blindness (Okabe and Ito).
 _MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#2f86b8"
 _COLUMNS: Final = 4
+#: Rows of a picture that are looked at together.
+_BLOCK: Final = 100_000
 
 
 def draw_screen(
@@ -92,27 +95,35 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
-    where = np.broadcast_to(x[:, None], picture.metric.shape)
     layers: list[Layer] = []
     shown = total = 0
-    for mask, colour, label in ((~picture.reject, _KEPT, "passed"), (picture.reject, _REJECTED, "rejected")):
-        along, metric = where[mask], picture.metric[mask]
+    for reject, colour, label in ((False, _KEPT, "passed"), (True, _REJECTED, "rejected")):
+        parts = []
+        for along, metric, rejects, _ in _blocks(picture, x):
+            mask = rejects == reject
+            along, metric = along[mask], metric[mask]
+            total += int(np.count_nonzero(np.isfinite(along + metric)))
+            rows = spread(along, metric)
+            parts.append((along[rows], metric[rows]))
+        along, metric = _joined(parts)
         rows = spread(along, metric)
-        shown, total = shown + len(rows), total + int(np.count_nonzero(np.isfinite(along + metric)))
+        shown += len(rows)
         layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
-    limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
-    finite = np.isfinite(limit)
-    same = not finite.any() or bool(limit[finite].min() == limit[finite].max())
-    at, least = _tightest(where[finite], limit[finite])
+    limits = [_tightest(*(values[np.isfinite(limit)] for values in (along, limit))) for along, _, _, limit in
+              _blocks(picture, x)]  # fmt: skip
+    at, least = _tightest(*_joined(limits))
+    edges = [(float(np.nanmin(limit)), float(np.nanmax(limit))) for _, _, _, limit in _blocks(picture, x)
+             if np.isfinite(limit).any()]  # fmt: skip
+    finite = bool(edges)
+    same = not finite or min(low for low, _ in edges) == max(high for _, high in edges)
     rows = extremes(at, least)
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
         label = "limit" if sign > 0 else ""
         layers.append(Line(label=label, colour=_FLOOR, x=at[rows], y=sign * least[rows], width=1.0))
     scale: dict[str, Any] = {}
-    values = np.abs(picture.metric[np.isfinite(picture.metric)])
-    if finite.any() and picture.sides != "below" and len(values):
+    if finite and picture.sides != "below" and judged:
         top = 6.0 * float(np.median(least)) if len(least) else 0.0
-        if top > 0.0 and values.max() > top:
+        if top > 0.0 and max(float(np.nanmax(picture.metric)), -float(np.nanmin(picture.metric))) > top:
             scale = {"y_scale": "symlog", "y_linear": nice_step(top / 2.0)}
     return Chart(
         name=name,
@@ -125,6 +136,23 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
         width="half",
         **scale,
     )
+
+
+def _blocks(picture: ScreenPicture, x: Floats) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
+    """Give x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
+    limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
+    for first in range(0, len(x), _BLOCK):
+        rows = slice(first, first + _BLOCK)
+        metric = picture.metric[rows]
+        where = np.broadcast_to(x[rows, None], metric.shape)
+        yield where.ravel(), metric.ravel(), picture.reject[rows].ravel(), limit[rows].ravel()
+
+
+def _joined(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Pairs of arrays end to end."""
+    if not parts:
+        return np.empty(0), np.empty(0)
+    return np.concatenate([x for x, _ in parts]), np.concatenate([y for _, y in parts])
 
 
 def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
