@@ -135,6 +135,18 @@ class OutputFolder:
 
         return pl.scan_parquet(self._pieces[name])
 
+    def by_antenna(self, name: str, columns: Sequence[str], *, where: pl.Expr | None = None) -> dict[str, pl.DataFrame]:
+        """Return some columns of what was appended so far, by antenna; read piece by piece, as all rows may be many."""
+        import polars as pl
+
+        parts: dict[str, list[pl.DataFrame]] = {}
+        for piece in self._pieces[name]:
+            rows = pl.read_parquet(piece, columns=["antenna", *columns])
+            some = rows if where is None else rows.filter(where)
+            for key, part in some.partition_by("antenna", as_dict=True, include_key=False).items():
+                parts.setdefault(str(key[0]), []).append(part)
+        return {antenna: pl.concat(parts[antenna]) for antenna in sorted(parts)}
+
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write one JSON file; NaN and infinities, which JSON lacks, are written as words."""
         with _writing(self.path / name):

@@ -58,58 +58,39 @@ def levels(folder: OutputFolder) -> dict[str, Levels]:
     """Protection levels by antenna, from the rows written so far; empty where they are off."""
     level, status = pl.col("protection_level_m"), pl.col("protection_status").cast(pl.String)
     finite = level.filter(level.is_finite())
-    table = (
-        folder.scan("positions.parquet")
-        .filter(status.is_not_null())
-        .group_by("antenna")
-        .agg(
-            p50_m=finite.quantile(0.5),
-            p95_m=finite.quantile(0.95),
-            **{word: (status == word).sum() for word in ("available", "unavailable", "alarm")},
-            without_budget=(pl.col("protection_cause").cast(pl.String) == "budget").sum(),
-        )
-        .sort("antenna")
-        .collect()
-    )
-    return {row.pop("antenna"): Levels(**row) for row in table.iter_rows(named=True)}
+    figures = {
+        "p50_m": finite.quantile(0.5),
+        "p95_m": finite.quantile(0.95),
+        **{word: (status == word).sum() for word in ("available", "unavailable", "alarm")},
+        "without_budget": (pl.col("protection_cause").cast(pl.String) == "budget").sum(),
+    }
+    columns = ("protection_level_m", "protection_status", "protection_cause")
+    tables = folder.by_antenna("positions.parquet", columns, where=pl.col("protection_status").is_not_null())
+    return {name: Levels(**table.select(**figures).row(0, named=True)) for name, table in tables.items()}
 
 
 def along_sigma(folder: OutputFolder) -> dict[str, AlongSigma]:
     """Percentiles by antenna, from the rows written so far."""
     sigma = pl.col("along_sigma_m")
-    table = (
-        folder.scan("positions.parquet")
-        .filter(sigma.is_not_null())
-        .group_by("antenna")
-        .agg(p50=sigma.quantile(0.5), p95=sigma.quantile(0.95), max=sigma.max())
-        .sort("antenna")
-        .collect()
-    )
-    return {
-        row["antenna"]: AlongSigma(p50_m=row["p50"], p95_m=row["p95"], max_m=row["max"])
-        for row in table.iter_rows(named=True)
-    }
+    figures = {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()}
+    tables = folder.by_antenna("positions.parquet", ("along_sigma_m",), where=sigma.is_not_null())
+    return {name: AlongSigma(**table.select(**figures).row(0, named=True)) for name, table in tables.items()}
 
 
 def filtered(folder: OutputFolder) -> dict[str, Filtered]:
     """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written so far."""
     sigma, status = pl.col("along_sigma_m"), pl.col("status").cast(pl.String)
-    table = (
-        folder.scan("train.parquet")
-        .group_by("antenna")
-        .agg(
-            p50=sigma.quantile(0.5),
-            p95=sigma.quantile(0.95),
-            max=sigma.max(),
-            **{word.text: (status == word.text).sum() for word in TrackStatus},
-        )
-        .sort("antenna")
-        .collect()
-    )
+    figures = {
+        "p50": sigma.quantile(0.5),
+        "p95": sigma.quantile(0.95),
+        "max": sigma.max(),
+        **{word.text: (status == word.text).sum() for word in TrackStatus},
+    }
     found = {}
-    for row in table.iter_rows(named=True):
+    for name, table in folder.by_antenna("train.parquet", ("along_sigma_m", "status")).items():
+        row = table.select(**figures).row(0, named=True)
         along = AlongSigma(p50_m=row["p50"], p95_m=row["p95"], max_m=row["max"]) if row["max"] is not None else None
-        found[row["antenna"]] = Filtered(status={s.text: row[s.text] for s in TrackStatus}, along_sigma_m=along)
+        found[name] = Filtered(status={s.text: row[s.text] for s in TrackStatus}, along_sigma_m=along)
     return found
 
 
