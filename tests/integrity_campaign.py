@@ -3,7 +3,8 @@
 ``python tests/integrity_campaign.py FOLDER [--runs 48] [--jobs 2]`` simulates runs over lines, places and skies
 that all differ (the shipped scenario ``p1-commercial`` under other seeds), half of which make an error model
 that the other half is judged by, and the other way round. Each run is kept in FOLDER, so that a broken
-campaign goes on where it was. ``--summary`` prints the tables of what is there.
+campaign goes on where it was. ``--summary`` prints the tables of what is there; ``--model FILE`` judges the same
+runs by a model of another generator, such as one of the recordings (``tests/integrity_recordings.py`` writes them).
 """
 
 from __future__ import annotations
@@ -24,8 +25,7 @@ from railfix.core.reasons import Status
 from railfix.core.settings import write_toml
 from railfix.evaluate.range_errors import range_errors
 from railfix.evaluate.range_errors.gather import joined
-from railfix.integrity.protection import Cause
-from railfix.integrity.protection import Status as LevelStatus
+from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.stanford import Region, stanford
 from railfix.io.reference_log import AntennaReference
 from railfix.pipeline.config import parse_config
@@ -50,6 +50,8 @@ ANTENNAS = ("front", "rear")
 ALARM_LIMITS_M = (10.0, 20.0, 40.0)
 #: Bins of the models: finer in C/N0 than by default, there are millions of samples.
 BINS = ErrorBins(cn0_dbhz=(0.0, 30.0, 35.0, 37.5, 40.0, 42.5, 45.0, 47.5, 50.0, 60.0))
+#: Kinds of levels by the model that they rest on; those of any other model are "other".
+NAMES = {None: "plain", "model-even": "judged", "model-odd": "judged"}
 #: Settings of both halves.
 SETTINGS: dict[str, Any] = {"elevation": {"mask_deg": 15.0}}
 
@@ -155,7 +157,7 @@ def model_of(runs: list[int], folder: Path, name: str) -> Path:
 
 def judge(run: int, model: Path | None, folder: Path) -> None:
     """Errors and levels of a run, weighted by a model of other runs."""
-    out = folder / f"{'plain' if model is None else 'judged'}-{run:03d}.npz"
+    out = folder / f"{NAMES.get(model and model.stem, 'other')}-{run:03d}.npz"
     if out.exists():
         return
     played = Played.of(scenario_of(run))
@@ -278,8 +280,16 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=48)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--summary", action="store_true")
+    parser.add_argument("--model", type=Path, help="judge the runs of FOLDER by this model, of another generator")
     options = parser.parse_args()
     began = clock.perf_counter()
+    if options.model is not None:
+        with ProcessPoolExecutor(max_workers=options.jobs) as pool:
+            runs = range(options.runs)
+            list(pool.map(judge, runs, [options.model] * options.runs, [options.folder] * options.runs))
+        print("\n".join(summary(table(options.folder, "other"))))
+        print(f"{clock.perf_counter() - began:.0f} s")
+        return
     if not options.summary:
         campaign(options.folder, options.runs, options.jobs)
     print("\n".join(summary(table(options.folder, "judged"))))
