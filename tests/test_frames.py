@@ -12,7 +12,7 @@ from pyproj import Transformer
 from typer.testing import CliRunner
 
 from railfix.cli import app
-from railfix.core.errors import MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track import Track, read_track
 from railfix.track.frames import WORKING_FRAME, decimal_year, frame_degrees, kind_of_frame, track_at
@@ -91,6 +91,52 @@ def test_japan_moves_with_its_plate_and_says_so() -> None:
     _, shift = track_at(track, np.datetime64("2026-07-01"))
     assert 0.2 < np.hypot(shift.east_m, shift.north_m) < 0.6
     assert "left out" in shift.notes[0]
+
+
+def _semidynamic(path: Path, *, slope: float = 0.0) -> Path:
+    """A parameter file about Tokyo: 0.01 and 0.02 seconds of arc, 0.1 m; the first grows by `slope` each 5 km north."""
+    mesh = pytest.importorskip("jgdtrans").mesh
+    lines = ["made by a test"] * 15 + ["MeshCode dB(sec)  dL(sec) dH(m)"]
+    for row in range(4):
+        for column in range(4):
+            cell = mesh.MeshCell.from_pos(35.63 + row / 24.0, 139.71 + column / 16.0, mesh_unit=5)
+            code = cell.south_west.to_meshcode()
+            lines.append(f"{code:08d} {0.01 + slope * row:9.5f} {0.02:9.5f} {0.1:9.5f}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_japan_moves_by_a_semidynamic_correction_where_its_file_is_given(tmp_path: Path) -> None:
+    track = line_at([(35.68, 139.76, 60.0), (35.69, 139.77, 60.0)], "EPSG:6667")
+    time = np.datetime64("2026-07-01")
+    moved, shift = track_at(track, time, parameters=_semidynamic(tmp_path / "s.par"))
+    assert moved.latitude_deg - track.latitude_deg == pytest.approx(0.01 / 3600.0, abs=1e-9)
+    assert moved.longitude_deg - track.longitude_deg == pytest.approx(0.02 / 3600.0, abs=1e-9)
+    assert (shift.east_m, shift.north_m, shift.up_m) == pytest.approx((0.503, 0.308, 0.1), abs=2e-3)
+    assert "its epoch is not named" in shift.notes[0]
+    later, named = track_at(track, time, parameters=tmp_path / "s.par", epoch=2024.5)
+    step = np.linalg.norm(later.ecef_m - moved.ecef_m, axis=1)
+    assert 0.03 < step[0] < 0.07  # two years of the Eurasian plate in the ITRF
+    assert "since its epoch 2024.5" in named.method
+    # taken by cells of 0.001 degrees: within millimetres of each point's own
+    sloped, _ = track_at(track, time, parameters=_semidynamic(tmp_path / "slope.par", slope=0.001))
+    correction = pytest.importorskip("jgdtrans").loads((tmp_path / "slope.par").read_text(), format="SemiDynaEXE")
+    own = [correction.forward_corr(*p).latitude for p in zip(track.latitude_deg, track.longitude_deg, strict=True)]
+    assert (sloped.latitude_deg - track.latitude_deg - own) * 111e3 == pytest.approx(0.0, abs=2e-3)
+
+
+def test_semidynamic_files_that_cannot_be_used_are_one_sentence(tmp_path: Path) -> None:
+    tokyo = line_at([(35.68, 139.76, 60.0), (35.69, 139.76, 60.0)], "EPSG:6667")
+    osaka = line_at([(34.68, 135.76, 60.0), (34.69, 135.76, 60.0)], "EPSG:6667")
+    europe = line_at([(50.85, 4.35, 100.0), (50.86, 4.35, 100.0)], "EPSG:4937")
+    time, path = np.datetime64("2026-07-01"), _semidynamic(tmp_path / "s.par")
+    with pytest.raises(InputFileError, match="no parameters for a part of the map"):
+        track_at(osaka, time, parameters=path)
+    with pytest.raises(SettingsError, match="are for JGD2011"):
+        track_at(europe, time, parameters=path)
+    (tmp_path / "text.par").write_text("no parameters\n" * 20)
+    with pytest.raises(InputFileError, match="no parameter file of semi-dynamic correction"):
+        track_at(tokyo, time, parameters=tmp_path / "text.par")
 
 
 def test_a_map_without_a_frame_names_its_doubt(tmp_path: Path) -> None:

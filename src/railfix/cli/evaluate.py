@@ -62,7 +62,7 @@ def evaluate(
             help="Environment by chainage (from_m,to_m,environment), where the reference has none.",
         ),
     ] = None,
-    files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "height_sigma")],
+    files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     label: Annotated[
         list[str] | None,
         typer.Option(

@@ -56,7 +56,7 @@ def check(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
     ] = None,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "height_sigma")],
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     max_gap: Annotated[
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
@@ -118,7 +118,7 @@ def features(
     out: Annotated[
         Path | None, typer.Option(metavar="CSV", help="File for the features; printed alone without it.")
     ] = None,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "height_sigma")],
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     overwrite: OverwriteOption = False,
 ) -> None:
     """List the features of a line: the places where its gradient or its curvature changes.

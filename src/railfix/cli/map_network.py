@@ -70,7 +70,7 @@ def _network(maps: list[Path], reading: TrackReading, tolerance: float) -> Netwo
 def network(
     maps: Maps,
     *,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "height_sigma")],
+    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     tolerance: Tolerance = TOLERANCE_M,
     out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
     page: Page = None,
@@ -196,7 +196,7 @@ def _positions(
     log = read_plan_positions(path, columns=columns_of(column))
     if same_frame:
         return log, []
-    moved, shift = log.in_frame_of(net, epoch=reading.map_epoch, plate=reading.plate)
+    moved, shift = log.in_frame_of(net, **reading.motion)
     size = float(np.hypot(shift.east_m, shift.north_m))
     note = (
         f"map: {shift.frame} moved by {size:.2f} m (east {shift.east_m:+.2f}, north {shift.north_m:+.2f}) to "

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Final, Literal, Self
+from pathlib import Path
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -29,6 +30,8 @@ class TrackReading(Settings):
         Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).
     plate : str or None
         Plate that moves such coordinates to the time of the log; see `railfix.track.frames.track_at`.
+    jgd_parameters : Path or None
+        Semi-dynamic correction of a track in JGD2011.
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
         See `railfix.track.vehicle.antenna_trajectory`.
     cache : {"use", "skip"}
@@ -53,7 +56,18 @@ class TrackReading(Settings):
         lt=2100.0,
     )
     plate: str | None = option("Plate that moves such coordinates to the time of the log.", None, metavar="NAME")
+    jgd_parameters: Path | None = option(
+        "Semi-dynamic correction parameters (.par) that move a map in JGD2011 to their epoch; --map-epoch names it.",
+        None,
+        metavar="FILE",
+    )
     reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
+
+    @property
+    def motion(self) -> dict[str, Any]:
+        """What moves the track to the frame of the satellites: keywords of `railfix.track.frames.points_at`."""
+        return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
+
     cache: Literal["use", "skip"] = option(
         "Prepare the line anew: neither read nor write the cache folder.", "use", name="--no-cache"
     )

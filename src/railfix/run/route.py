@@ -221,9 +221,7 @@ class RouteOfLog:
         known = np.isfinite(chainage) & np.isfinite(ecef[:, 0])
         if known.any():
             reading = self.reading
-            place, _ = in_map_frame(
-                ecef[known], self.network.frame, self.time, epoch=reading.map_epoch, plate=reading.plate
-            )
+            place, _ = in_map_frame(ecef[known], self.network.frame, self.time, **reading.motion)
             latitude[known], longitude[known], _ = geodetic_from_ecef(place)
         number = np.where(known, self._section(line, chainage), -1)
         along, _ = self.network.place_on(number, latitude, longitude)
@@ -324,7 +322,7 @@ def find_route(
         longitude_deg=longitude,
         sigma_m=np.sqrt((sigma[:, :2] ** 2).mean(axis=1)),
     )
-    positions, _ = positions.in_frame_of(network, epoch=reading.map_epoch, plate=reading.plate)
+    positions, _ = positions.in_frame_of(network, **reading.motion)
     matched = match(network, positions)
     tracks, left_out = route_of(network, matched)
     if not tracks:

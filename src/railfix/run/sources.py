@@ -122,7 +122,7 @@ def open_line(
             prepared.keep_track(key, centreline)
     shift, moved = None, centreline
     if at is not None:
-        moved, shift = track_at(centreline, at, epoch=reading.map_epoch, plate=reading.plate)
+        moved, shift = track_at(centreline, at, **reading.motion)
     paths = _paths(moved, vehicle, antennas, reading, prepared)
     return Line(
         track=moved,

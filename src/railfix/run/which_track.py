@@ -243,7 +243,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     origin, notes = codes[0].origin_ecef_m, list(network.notes)
     if options.same_frame == "no":
         place, shift = in_map_frame(
-            origin[None], network.frame, codes[0].time[0], epoch=reading.map_epoch, plate=reading.plate,
+            origin[None], network.frame, codes[0].time[0], **reading.motion,
             named=network.named,
         )  # fmt: skip
         origin, size = place[0], float(np.hypot(shift.east_m, shift.north_m))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from os import PathLike
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -20,7 +21,8 @@ from pyproj.exceptions import CRSError, ProjError
 from pyproj.transformer import TransformerGroup
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.errors import MismatchError, SettingsError
+from railfix.core.errors import InputFileError, MismatchError, SettingsError
+from railfix.core.files import read_text
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.track.track import UNNAMED, Track
 
@@ -201,7 +203,12 @@ def older_datum_note(crs: str | None) -> tuple[str, ...]:
 
 
 def track_at(
-    track: Track, time: np.datetime64, *, epoch: float | None = None, plate: str | None = None
+    track: Track,
+    time: np.datetime64,
+    *,
+    epoch: float | None = None,
+    plate: str | None = None,
+    parameters: str | PathLike[str] | None = None,
 ) -> tuple[Track, FrameShift]:
     """The track in the frame of the satellites at a time.
 
@@ -209,7 +216,7 @@ def track_at(
     ----------
     track : Track
         Coordinates in the frame that `Provenance.frame` names.
-    time, epoch, plate
+    time, epoch, plate, parameters
         As for `points_at`.
 
     Returns
@@ -224,8 +231,8 @@ def track_at(
         The plate is unknown, or `epoch` or `plate` is given for a frame that does not need it.
     """
     provenance = track.provenance
-    named = provenance.crs != UNNAMED
-    moved, shift = points_at(track.ecef_m, provenance.frame, time, epoch=epoch, plate=plate, named=named)
+    how: dict[str, Any] = {"epoch": epoch, "plate": plate, "parameters": parameters}
+    moved, shift = points_at(track.ecef_m, provenance.frame, time, named=provenance.crs != UNNAMED, **how)
     if moved is track.ecef_m:
         return track, shift
     latitude, longitude, height = geodetic_from_ecef(moved)
@@ -240,6 +247,7 @@ def points_at(
     *,
     epoch: float | None = None,
     plate: str | None = None,
+    parameters: str | PathLike[str] | None = None,
     named: bool = True,
 ) -> tuple[Floats, FrameShift]:
     """Points of a map in the frame of the satellites at a time.
@@ -255,6 +263,9 @@ def points_at(
         Epoch of the map's coordinates, where its frame is an ITRF.
     plate : str, optional
         Plate that moves coordinates of an ITRF from `epoch` to `time`: one of `PLATES`.
+    parameters : path, optional
+        Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
+        deformation included; `epoch` is that of the file then, from which on the plate moves them.
     named : bool
         Whether the map names its frame; else the size of the doubt is noted.
 
@@ -277,11 +288,15 @@ def points_at(
     held = _HELD.get(frame.name.split(" (")[0])
     if (epoch is not None or plate is not None) and not (kind == "dynamic" or held):
         raise SettingsError(f"the map's frame is {frame.name}, which takes no epoch and no plate of its own")
+    if parameters is not None and not frame.name.startswith("JGD2011"):
+        raise SettingsError(f"the map's frame is {frame.name}; semi-dynamic parameters are for JGD2011")
     middle = ecef_m[len(ecef_m) // 2]
     if kind in ("wgs84", "older datum"):
         notes = () if named else _doubt(middle, time)
         return ecef_m, FrameShift(frame=frame.name, used=used, method="used as it is", notes=notes)
-    if held is not None:
+    if parameters is not None:
+        moved, method, notes = _by_parameters(ecef_m, parameters, year, epoch, plate or "EURA")
+    elif held is not None:
         moved_by, since, rest = held
         plate, epoch = plate or moved_by, epoch or since
         moved, method = _by_plate(ecef_m, plate, year - epoch), f"motion of the plate {plate} since {epoch:g}; {rest}"
@@ -309,6 +324,7 @@ def in_map_frame(
     *,
     epoch: float | None = None,
     plate: str | None = None,
+    parameters: str | PathLike[str] | None = None,
     named: bool = True,
 ) -> tuple[Floats, FrameShift]:
     """Positions from satellites in the frame of a map: the shift of `points_at` taken off.
@@ -319,13 +335,13 @@ def in_map_frame(
     ----------
     ecef_m : ndarray, shape (n, 3) [m]
         NaN where there is no position.
-    crs, time, epoch, plate, named
+    crs, time, epoch, plate, parameters, named
         As for `points_at`.
     """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")
-    moved, shift = points_at(ecef_m[known], crs, time, epoch=epoch, plate=plate, named=named)
+    moved, shift = points_at(ecef_m[known], crs, time, epoch=epoch, plate=plate, parameters=parameters, named=named)
     back = ecef_m.copy()
     back[known] = 2.0 * ecef_m[known] - moved
     return back, shift
@@ -350,6 +366,36 @@ def _from_dynamic(
         note = f"map: {name} at {epoch:g} is not moved to {year:.2f}, for no plate is named (1 to 8 cm a year)"
         return moved, f"{name} at {epoch:g}, not moved", (note,)
     return _by_plate(moved, plate, year - epoch), f"{name} at {epoch:g}, motion of the plate {plate}", ()
+
+
+def _by_parameters(
+    ecef_m: Floats, path: str | PathLike[str], year: float, epoch: float | None, plate: str
+) -> tuple[Floats, str, tuple[str, ...]]:
+    """Coordinates of JGD2011 moved by a semi-dynamic correction, and with the plate from its epoch on, where named.
+
+    The correction changes by millimetres over 100 m, so it is taken once in each cell of a thousandth of a degree.
+    """
+    try:
+        import jgdtrans
+    except ImportError:
+        raise InputFileError(path, "semi-dynamic correction needs jgdtrans: pip install 'railfix[maps]'") from None
+    try:
+        correction = jgdtrans.loads(read_text(path), format="SemiDynaEXE")
+    except jgdtrans.ParseParFileError as error:
+        raise InputFileError(path, f"is no parameter file of semi-dynamic correction ({error})") from None
+    latitude, longitude, height = geodetic_from_ecef(ecef_m)
+    cells, which = np.unique(np.round(np.stack([latitude, longitude], axis=-1), 3), axis=0, return_inverse=True)
+    try:
+        values = [correction.forward_corr(*cell) for cell in cells.tolist()]
+    except jgdtrans.ParameterNotFoundError:
+        raise InputFileError(path, "has no parameters for a part of the map; is it the file of its region?") from None
+    moves = np.array([(v.latitude, v.longitude, v.altitude) for v in values])[which.ravel()]
+    moved = ecef_from_geodetic(latitude + moves[:, 0], longitude + moves[:, 1], height + moves[:, 2])
+    method = f"semi-dynamic correction {path}"
+    if epoch is None:
+        return moved, method, (f"map: JGD2011 moved by the {method}; its epoch is not named (--map-epoch)",)
+    method += f", motion of the plate {plate} since its epoch {epoch:g}"
+    return _by_plate(moved, plate, year - epoch), method, (f"map: JGD2011 moved by the {method}",)
 
 
 def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:

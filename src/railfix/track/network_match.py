@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
-from typing import Final
+from typing import Any, Final
 
 import networkx as nx
 import numpy as np
@@ -64,7 +64,12 @@ class PlanLog:
     sigma_m: Floats
 
     def in_frame_of(
-        self, network: Network, *, epoch: float | None = None, plate: str | None = None
+        self,
+        network: Network,
+        *,
+        epoch: float | None = None,
+        plate: str | None = None,
+        parameters: str | PathLike[str] | None = None,
     ) -> tuple[PlanLog, FrameShift]:
         """The positions, which are in the frame of the satellites, in that of the network.
 
@@ -83,7 +88,8 @@ class PlanLog:
             )
         time = np.sort(times)[len(times) // 2] if len(times) else np.datetime64("now", "ns")
         ecef = ecef_from_geodetic(self.latitude_deg, self.longitude_deg, np.zeros(len(self.latitude_deg)))
-        moved, shift = in_map_frame(ecef, network.frame, time, epoch=epoch, plate=plate, named=network.named)
+        how: dict[str, Any] = {"epoch": epoch, "plate": plate, "parameters": parameters}
+        moved, shift = in_map_frame(ecef, network.frame, time, named=network.named, **how)
         latitude, longitude, _ = geodetic_from_ecef(moved)
         return replace(self, latitude_deg=latitude, longitude_deg=longitude), shift
 
