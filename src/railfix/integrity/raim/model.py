@@ -23,6 +23,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
+from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
 
@@ -166,26 +167,44 @@ class Compact:
 
 def compact(model: LinearModel) -> Compact:
     """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
-    used = model.used
+    arrays = (model.root_weight, model.design, model.covariance_m2, model.clock, model.clock_covariance_m2)
+    more = (model.residual, model.gain_m)
+    names = [item.name for item in fields(Compact)]
+    found = side_by_side(*(np.ascontiguousarray(array) for array in (*arrays, *more)))
+    return Compact(**dict(zip(names, found, strict=True)))
+
+
+@compiled_by("raim")
+def side_by_side(
+    root_weight: Floats,
+    design: Floats,
+    covariance_m2: Floats,
+    clock: Indices,
+    clock_covariance_m2: Floats,
+    residual: Floats,
+    gain_m: Floats,
+) -> tuple[Indices, Masks, Floats, Floats, Floats, Floats]:
+    """Return the fields of `Compact`; arrays of `LinearModel` in C order."""
+    used = root_weight > 0
     n = int(np.count_nonzero(used, axis=1).max(initial=0))
     channel = np.argsort(~used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(used, channel, axis=1)
-    root = np.take_along_axis(model.root_weight, channel, axis=1)
-    design = np.take_along_axis(model.design, channel[..., None], axis=1)
-    clock = model.clock[channel]
-    epoch = np.arange(len(model))[:, None, None]
-    projector = model.clock_covariance_m2[epoch, clock[:, :, None], clock[:, None, :]]
+    root = np.take_along_axis(root_weight, channel, axis=1)
+    design = np.take_along_axis(design, channel[..., None], axis=1)
+    own = clock[channel]
+    epoch = np.arange(len(root))[:, None, None]
+    projector = clock_covariance_m2[epoch, own[:, :, None], own[:, None, :]]
     projector *= -root[:, :, None]
     projector *= root[:, None, :]
-    projector -= (design @ model.covariance_m2) @ design.swapaxes(1, 2)
+    projector -= (design @ covariance_m2) @ design.swapaxes(1, 2)
     projector[:, np.arange(n), np.arange(n)] += used
-    return Compact(
-        channel=channel,
-        used=used,
-        projector=projector,
-        residual=np.take_along_axis(model.residual, channel, axis=1),
-        sigma_m=np.where(used, 1.0 / np.where(used, root, 1.0), 0.0),
-        gain_m=np.take_along_axis(model.gain_m, channel[..., None], axis=1),
+    return (
+        channel,
+        used,
+        projector,
+        np.take_along_axis(residual, channel, axis=1),
+        np.where(used, 1.0 / np.where(used, root, 1.0), 0.0),
+        np.take_along_axis(gain_m, channel[..., None], axis=1),
     )
 
 
