@@ -12,17 +12,22 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.result import Tracked, TrackStatus
 from railfix.tracking.rows import Kind
+from railfix.tracking.smoother import Later, Smoothed, Step, smoothed
 from railfix.tracking.state import TrackState
 
 __all__ = [
     "GnssEpochs",
     "Kind",
+    "Later",
     "Line",
     "RangeEpochs",
     "SensorEpochs",
+    "Smoothed",
+    "Step",
     "TrackState",
     "TrackStatus",
     "Tracked",
     "TrackingLimits",
+    "smoothed",
     "track",
 ]

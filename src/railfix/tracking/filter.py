@@ -36,6 +36,7 @@ from railfix.tracking.robust import (
 )
 from railfix.tracking.rows import DIRECTION_MPS, Rows, rows_of, sensor_rows
 from railfix.tracking.search import seek
+from railfix.tracking.smoother import Step
 from railfix.tracking.state import SATELLITES, Bank, TrackState, Unknown, begun_anew
 
 _PLACES: Final = [Unknown.PLACE, Unknown.BEFORE]
@@ -48,6 +49,7 @@ def track(
     *,
     limits: TrackingLimits | None = None,
     sensors: SensorEpochs | None = None,
+    trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
     """Places along the trajectory, each from its own and earlier epochs.
 
@@ -60,6 +62,8 @@ def track(
         Left by the epochs before; None at the start.
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
+    trace : list of Step, optional
+        Gets what the smoother needs of each epoch (`railfix.tracking.smoother`); all epochs are then done by numpy.
 
     Returns
     -------
@@ -74,13 +78,13 @@ def track(
         chunk = prepared(epochs, state, limits)
         anew = np.asarray(chunk.fresh.any(axis=1))
         fast = None
-        if kernels.CHOSEN == "numba" and limits.level == "off":
+        if kernels.CHOSEN == "numba" and limits.level == "off" and trace is None:
             fast = Compiled(import_module("railfix.kernels.tracking"), chunk, line, sensors, limits, result)
         epoch = 0
         while epoch < len(epochs):
             done = epoch if fast is None else fast.advance(state, epoch)
             if done == epoch:
-                _step(chunk, epoch, line, state, limits, sensors, result, bool(anew[epoch]))
+                _step(chunk, epoch, line, state, limits, sensors, result, bool(anew[epoch]), trace)
                 done += 1
             epoch = done
         leave(chunk, epochs, state, limits)
@@ -96,6 +100,7 @@ def _step(
     sensors: SensorEpochs,
     result: Tracked,
     anew: bool,
+    trace: list[Step] | None,
 ) -> None:
     """One epoch: changes the state, writes its row of the result."""
     dt = float(chunk.interval_s[epoch])
@@ -109,13 +114,18 @@ def _step(
             state.bank = replace(state.bank, mean=means, covariance=covariances)
     lost = seek(state, chunk, epoch, line, limits)
     state.time = chunk.time[epoch]
+    step = Step(dt=dt, cut=np.zeros(state.mean.shape, dtype=np.bool_), satellite=state.satellite)
+    step.narrowed, state.narrowed = state.narrowed, None
+    step.cut[:, SATELLITES + np.flatnonzero(chunk.fresh[epoch])] = True
     if not state.hypotheses:
+        if trace is not None:
+            trace.append(step)
         return
     mean = state.mean
     sensed = sensor_rows(sensors, epoch, line, mean, dt, state.direction)
     rows = rows_of(chunk, epoch, line, mean, mean[:, _PLACES], state.log_scale, sensed)
     if len(rows.variance):
-        _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost)
+        _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost, step)
     elif state.bank is not None:
         means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
@@ -127,6 +137,11 @@ def _step(
         chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
         state.mean, state.covariance = state.mean[chosen], state.covariance[chosen]
         state.log_probability, state.origin_m = probability, state.origin_m[chosen]
+        state.parent = state.parent[chosen]
+        step.choose(chosen)
+    if trace is not None:
+        step.mean, step.covariance, step.parent = state.mean, state.covariance, state.parent
+        trace.append(step)
     write_place(result, epoch, state, measured=len(rows.variance) > 0, lost=lost, limits=limits)
 
 
@@ -140,6 +155,7 @@ def _measure(
     sensors: SensorEpochs,
     result: Tracked,
     lost: bool,
+    step: Step,
 ) -> None:
     """Update the state by the rows of an epoch."""
     dt = float(chunk.interval_s[epoch])
@@ -174,6 +190,8 @@ def _measure(
         evidence = with_map_error(evidence, line.at(after[0][:, Unknown.PLACE])[0], state.log_probability, limits)
         log_probability = state.log_probability + evidence
         state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
+    step.cut |= np.diagonal(covariance, axis1=1, axis2=2) != np.diagonal(predicted_covariance, axis1=1, axis2=2)
+    step.updated = (covariance, settled.combine / prior.root[:, :, None], prior.information, update)
     state.mean, state.covariance = on_the_line(*after, line, limits), after[1]
     state.measured = chunk.time[epoch]
     best = most_probable(state.log_probability)

@@ -61,16 +61,9 @@ def predicted(
     step, noise = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
     speed = np.abs(mean[:, Unknown.SPEED])
     travel = speed * dt
-    map_kept = np.exp(-travel / limits.map_absolute_m)
-    code_kept = np.exp(-dt / limits.code_correlation_s - travel / limits.code_correlation_m)
-    doppler_kept = np.exp(-dt / limits.doppler_correlation_s)
-    slow_kept = np.exp(-dt / limits.slow_code_s)
-    kept = np.ones(mean.shape)
-    kept[:, FRESH] = 0.0
-    kept[:, Unknown.MAP_RIGHT] = kept[:, Unknown.MAP_UP] = map_kept
-    kept[:, Unknown.DOPPLER_SPEED] = doppler_kept
-    kept[:, Unknown.CODE_PLACE] = slow_kept
-    kept[:, SATELLITES:] = code_kept[:, None]
+    kept = _kept(mean, dt, limits)
+    map_kept, doppler_kept = kept[:, Unknown.MAP_RIGHT], kept[:, Unknown.DOPPLER_SPEED]
+    slow_kept, code_kept = kept[:, Unknown.CODE_PLACE], kept[:, SATELLITES:]
 
     after = _moved(mean[..., None], kept, step, dt)[..., 0]
     spread = _moved(covariance, kept, step, dt)
@@ -89,7 +82,7 @@ def predicted(
     added[:, Unknown.FORCE_OFFSET] = FORCE_WALK_MPS2**2 * dt
     added[:, Unknown.RADAR] = RADAR_WALK**2 * dt
     added[:, OFFSETS:SATELLITES] = limits.offset_walk_m**2 * dt
-    added[:, SATELLITES:] = (1.0 - code_kept**2)[:, None]
+    added[:, SATELLITES:] = 1.0 - code_kept**2
     length = (limits.map_scale_m * map_scale) ** 2 * travel + limits.phase_walk_m**2 * dt
     place = spread[:, Unknown.PLACE, Unknown.PLACE] + noise[0, 0] + LEAST_STEP_M2
     added[:, FRESH] = _fresh_variances(after, place, length, line, travel, limits)
@@ -102,6 +95,24 @@ def predicted(
     spread[:, Unknown.PHASE_CLOCK, Unknown.DRIFT] += walk * dt**2 / 2.0
     spread[:, Unknown.DRIFT, Unknown.PHASE_CLOCK] += walk * dt**2 / 2.0
     return after, spread
+
+
+def _kept(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
+    """Share of each unknown that is left after an interval, shape (H, N)."""
+    travel = np.abs(mean[:, Unknown.SPEED]) * dt
+    kept = np.ones(mean.shape)
+    kept[:, FRESH] = 0.0
+    kept[:, Unknown.MAP_RIGHT] = kept[:, Unknown.MAP_UP] = np.exp(-travel / limits.map_absolute_m)
+    kept[:, Unknown.DOPPLER_SPEED] = np.exp(-dt / limits.doppler_correlation_s)
+    kept[:, Unknown.CODE_PLACE] = np.exp(-dt / limits.slow_code_s)
+    kept[:, SATELLITES:] = np.exp(-dt / limits.code_correlation_s - travel / limits.code_correlation_m)[:, None]
+    return kept
+
+
+def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
+    """Transition of all unknowns over an interval from a state, shape (N, N); `mean` has shape (N,)."""
+    step, _ = singer(dt, limits.acceleration_mps2, limits.acceleration_s)
+    return np.asarray(_moved(np.eye(len(mean))[None], _kept(mean[None], dt, limits), step, dt)[0])
 
 
 def _moved(rows: Floats, kept: Floats, step: Floats, dt: float) -> Floats:

@@ -10,7 +10,7 @@ from railfix.tracking.hypotheses import begin, beside, places, split
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
-from railfix.tracking.state import TrackState, Unknown
+from railfix.tracking.state import Narrowed, TrackState, Unknown
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> bool:
@@ -20,9 +20,11 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         arc, sigma = places(chunk, epoch, line, limits)
         state.mean, state.covariance = begin(arc, sigma, satellites, line, limits)
         state.log_probability, state.origin_m = np.full(len(arc), -np.log(max(len(arc), 1))), arc
+        state.parent, state.narrowed = np.full(len(arc), -1), None
         return False
     mean, covariance = predicted(state.mean, state.covariance, line, chunk.interval_s[epoch], limits, state.map_scale)
     state.mean, state.covariance = mean, covariance
+    state.parent, state.narrowed = np.arange(len(mean)), None
     lost = state.weak_motion_s >= limits.lost_motion_s or state.weak_code_s >= limits.lost_code_s
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
     wide = covariance[:, Unknown.PLACE, Unknown.PLACE] > limits.start_sigma_m**2
@@ -34,12 +36,17 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     if not len(arc):
         return lost
     parts = [(mean, covariance, state.log_probability, state.origin_m)]
+    narrowed: list[Narrowed | None] = [None] * len(mean)
     for one in np.flatnonzero(wide) if not lost else []:
         reach = 5.0 * np.sqrt(covariance[one, Unknown.PLACE, Unknown.PLACE])
         near = np.abs(arc - mean[one, Unknown.PLACE]) < reach
         if near.any():
             new = split(mean[one], covariance[one], float(state.log_probability[one]), arc[near], sigma[near])
             parts.append((*new, arc[near]))
+            narrowed += [
+                Narrowed(parent=int(one), mean=mean[one], covariance=covariance[one], place_m=at, sigma_m=wide_m)
+                for at, wide_m in zip(arc[near].tolist(), sigma[near].tolist(), strict=True)
+            ]
     if lost:
         best = int(np.argmax(state.log_probability))
         away = np.abs(arc - mean[best, Unknown.PLACE]) > limits.start_separation_m
@@ -51,6 +58,10 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     together = [np.concatenate(items) for items in zip(*parts, strict=True)]
     state.mean, state.covariance, state.origin_m = together[0], together[1], together[3]
     state.log_probability = together[2] - np.logaddexp.reduce(together[2])
+    state.parent = np.full(state.hypotheses, -1)
+    if not lost:
+        state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
+        state.narrowed = narrowed
     state.weak_motion_s = state.weak_code_s = 0.0
     state.code_shift = (0.0, 0.0)
     return lost
@@ -67,3 +78,4 @@ def _try_beside(state: TrackState, limits: TrackingLimits) -> None:
     state.covariance = np.concatenate([state.covariance, covariance])
     state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     state.origin_m = np.concatenate([state.origin_m, mean[:, Unknown.PLACE]])
+    state.parent = np.concatenate([state.parent, np.full(len(mean), -1)])

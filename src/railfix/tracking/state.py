@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final
 
@@ -84,6 +84,27 @@ class Bank:
         return cls(without=(), mean=np.empty((0, width)), covariance=np.empty((0, width, width)), weak_s=np.empty(0))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Narrowed:
+    """One of the narrower hypotheses that a wide one was split into.
+
+    Attributes
+    ----------
+    parent : int
+        The wide one.
+    mean, covariance : ndarray, shapes (N,), (N, N)
+        Of the wide one.
+    place_m, sigma_m : float [m]
+        Of the narrower one.
+    """
+
+    parent: int
+    mean: Floats
+    covariance: Floats
+    place_m: float
+    sigma_m: float
+
+
 @dataclass(kw_only=True)
 class TrackState:
     """What one epoch leaves to the next: H hypotheses of N unknowns. Its arrays are never written to.
@@ -116,6 +137,10 @@ class TrackState:
         Logarithm of the variance of lengths along the map against that of the limits, at least 0.
     bank : Bank or None
         Where levels are asked for.
+    parent : ndarray of int, shape (H,)
+        Hypothesis of the epoch before that each one goes on from; -1 where it began.
+    narrowed : list of Narrowed or None
+        Hypotheses that began at this epoch within wider ones.
     unaided_m : float [m]
         Way since codes were used.
     direction : float
@@ -138,6 +163,8 @@ class TrackState:
     code_shift: tuple[float, float] = (0.0, 0.0)
     map_log_scale: float = 0.0
     bank: Bank | None = None
+    parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    narrowed: list[Narrowed | None] | None = None
     unaided_m: float = 0.0
     direction: float = 0.0
 

@@ -1,0 +1,198 @@
+"""Places from both directions: the filter's answer, and then everything measured after it.
+
+The adjoint form of the smoother (G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
+doi:10.1080/00207177308932424): what all later measurements say of an epoch's unknowns is a vector l and a matrix L,
+
+    mean + P l,   P - P L P
+
+which go backward through updates and predictions without an inverse of any covariance. The weights of the
+measurements are those that the filter gave them; the hypotheses are those that led to the last one. Where a hypothesis
+began, nothing of what comes later reaches the epochs before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Masks, Strings
+from railfix.tracking.limits import TrackingLimits
+from railfix.tracking.predict import transition
+from railfix.tracking.robust import Update
+from railfix.tracking.state import SATELLITES, Narrowed, TrackState, Unknown
+
+
+@dataclass(kw_only=True)
+class Step:
+    """One epoch of the filter with H hypotheses, as it was left.
+
+    Attributes
+    ----------
+    dt : float [s]
+    cut : ndarray of bool, shape (H, N)
+        Unknowns that have begun anew at this epoch.
+    satellite : ndarray of str, shape (N - SATELLITES,)
+    mean, covariance : ndarray, shapes (H, N), (H, N, N)
+        After the epoch.
+    parent : ndarray of int, shape (H,)
+        Hypothesis of the epoch before; -1 where one began.
+    narrowed : list of Narrowed or None
+    updated : tuple or None
+        Covariance before the measurements, shape (H, N, N); combinations in their standard deviations, (H, D, N), and
+        their information, (H, D, D); and the update. None without a measurement.
+    """
+
+    dt: float
+    cut: Masks
+    satellite: Strings
+    mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
+    covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
+    parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
+    updated: tuple[Floats, Floats, Floats, Update] | None = None
+    narrowed: list[Narrowed | None] | None = None
+
+    def choose(self, chosen: Indices) -> None:
+        """Keep some hypotheses."""
+        self.cut = self.cut[chosen]
+        if self.narrowed is not None:
+            self.narrowed = [self.narrowed[k] for k in chosen.tolist()]
+        if self.updated is not None:
+            prior, combine, information, update = self.updated
+            kept = Update(**{name: getattr(update, name)[chosen] for name in update.__dataclass_fields__})
+            self.updated = (prior[chosen], combine[chosen], information[chosen], kept)
+
+    def before(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+        """Carry what later epochs say of hypothesis h backward through its measurements."""
+        if self.updated is not None:
+            vector, matrix = self._before_measurements(h, vector, matrix)
+        part = None if self.narrowed is None else self.narrowed[h]
+        if part is not None:
+            # The density of the narrower one over the wide one, as if its place had been measured.
+            place = Unknown.PLACE
+            wide = part.covariance[place, place]
+            back = np.eye(len(vector))
+            share = (1.0 - part.sigma_m**2 / wide) / wide
+            back[place] -= share * part.covariance[place]
+            vector, matrix = back @ vector, back @ matrix @ back.T
+            vector[place] += (part.place_m - part.mean[place]) / wide
+            matrix[place, place] += share
+        return vector, matrix
+
+    def _before_measurements(self, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
+        assert self.updated is not None
+        prior, combine, information, update = self.updated
+        said = combine[h].T @ information[h]
+        gained = said @ combine[h] - said @ update.covariance[h] @ said.T
+        back = np.eye(len(vector)) - gained @ prior[h]
+        return said @ update.change[h] + back @ vector, gained + back @ matrix @ back.T
+
+
+@dataclass(frozen=True, kw_only=True)
+class Later:
+    """What all later epochs say of the unknowns after an epoch.
+
+    Attributes
+    ----------
+    place_m : float
+        Of the hypothesis that they go on from; NaN for none.
+    vector, matrix : ndarray, shapes (N,), (N, N)
+    satellite : ndarray of str, shape (N - SATELLITES,)
+    """
+
+    place_m: float
+    vector: Floats
+    matrix: Floats
+    satellite: Strings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Smoothed:
+    """Places of T epochs from both directions; NaN where the filter has none.
+
+    Attributes
+    ----------
+    arc_m, sigma_m : ndarray, shape (T,) [m]
+    speed_mps : ndarray, shape (T,)
+    """
+
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats
+
+
+def smoothed(
+    steps: list[Step], before: TrackState, later: Later | None, limits: TrackingLimits
+) -> tuple[Smoothed, Later]:
+    """Smooth the epochs of a chunk.
+
+    Parameters
+    ----------
+    steps : list of Step
+        From `railfix.tracking.track`, one an epoch.
+    before : TrackState
+        Before the chunk.
+    later : Later or None
+        From the chunk after; None at the end.
+    limits : TrackingLimits
+
+    Returns
+    -------
+    Smoothed
+    Later
+        For the chunk before.
+    """
+    size = len(steps)
+    satellite = steps[-1].satellite if size else before.satellite
+    width = SATELLITES + len(satellite)
+    arc, sigma, speed = np.full(size, np.nan), np.full(size, np.nan), np.full(size, np.nan)
+    vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
+    last = steps[-1].mean if size else before.mean
+    if later is not None and np.isfinite(later.place_m) and len(last):
+        index = int(np.argmin(np.abs(last[:, Unknown.PLACE] - later.place_m)))
+        vector, matrix = _arranged(later, satellite)
+    for t in range(size - 1, -1, -1):
+        step = steps[t]
+        if not len(step.mean):
+            vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
+            continue
+        mean, covariance = step.mean[index], step.covariance[index]
+        row = covariance[Unknown.PLACE]
+        variance = row[Unknown.PLACE] - row @ matrix @ row
+        if covariance[Unknown.PLACE, Unknown.PLACE] <= limits.expired_sigma_m**2:
+            arc[t], sigma[t] = mean[Unknown.PLACE] + row @ vector, np.sqrt(max(variance, 0.0))
+            speed[t] = mean[Unknown.SPEED] + covariance[Unknown.SPEED] @ vector
+        vector, matrix = step.before(index, vector, matrix)
+        parent, cut = int(step.parent[index]), step.cut[index]
+        earlier = steps[t - 1].mean if t else before.mean
+        if parent < 0 or parent >= len(earlier):
+            vector, matrix, index = np.zeros(width), np.zeros((width, width)), 0
+            continue
+        start = np.zeros(width)
+        start[: earlier.shape[1]] = earlier[parent]
+        move = transition(start, step.dt, limits)
+        move[cut] = 0.0
+        vector, matrix, index = move.T @ vector, move.T @ matrix @ move, parent
+    place = float(before.mean[index, Unknown.PLACE]) if len(before.mean) > index else float("nan")
+    known = len(before.satellite)
+    return (
+        Smoothed(arc_m=arc, sigma_m=sigma, speed_mps=speed),
+        Later(
+            place_m=place,
+            vector=vector[: SATELLITES + known],
+            matrix=matrix[: SATELLITES + known, : SATELLITES + known],
+            satellite=before.satellite,
+        ),
+    )
+
+
+def _arranged(later: Later, satellite: Strings) -> tuple[Floats, Floats]:
+    """The vector and matrix for other satellites; those that are not in the state any more said nothing."""
+    _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
+    to = np.concatenate([np.arange(SATELLITES), SATELLITES + here])
+    of = np.concatenate([np.arange(SATELLITES), SATELLITES + there])
+    width = SATELLITES + len(satellite)
+    vector, matrix = np.zeros(width), np.zeros((width, width))
+    vector[to] = later.vector[of]
+    matrix[np.ix_(to, to)] = later.matrix[np.ix_(of, of)]
+    return vector, matrix
