@@ -1,7 +1,7 @@
 """Scores of the filter along the track on the real recordings: ``python tests/filter_score.py [TABLE ...]``.
 
-Tables: ``figures`` (with single epochs beside), ``ablation`` (without each kind of measurement), ``gaps`` (windows
-without satellites, with and without a wheel), ``starts`` (cold starts), ``levels`` (faults of single satellites),
+Tables: ``figures`` (single epochs beside, and smoothed), ``ablation`` (without each kind of measurement), ``gaps``
+(windows without satellites, with and without a wheel), ``starts`` (cold starts), ``levels`` (faults of one satellite),
 ``cost``. One setting for all recordings; distances are straight ones on the map.
 """
 
@@ -23,6 +23,7 @@ from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.pipeline import along_track
 from railfix.pipeline.config import parse_config
+from railfix.pipeline.smoothing import Replay, SmoothedTrack, smooth
 from railfix.ranges.weights import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
@@ -52,6 +53,12 @@ class Case:
             self.epochs if epochs is None else epochs, Line.of(self.trajectory), limits=limits, sensors=sensors
         )[0]
 
+    def smoothed(self, sensors: SensorEpochs | None = None) -> SmoothedTrack:
+        """Places from both directions."""
+        limits = TrackingLimits()
+        replay = Replay(epochs=self.epochs, sensors=sensors or SensorEpochs(), before=None)
+        return smooth([replay], Line.of(self.trajectory), limits)
+
     def part(self, first: int, end: int) -> Case:
         """Some epochs of it."""
         per_epoch = (
@@ -67,7 +74,7 @@ class Case:
             single_arc_m=self.single_arc_m[rows],
         )
 
-    def error(self, found: Tracked) -> np.ndarray:
+    def error(self, found: Tracked | SmoothedTrack) -> np.ndarray:
         arc = along_track.on_line_m(found, self.trajectory)
         return straight_distance(arc, self.reference, self.trajectory)
 
@@ -155,6 +162,9 @@ def show_figures(all_cases: list[Case]) -> None:
                 found = case.run(sensors=sensors)
                 error = case.error(found)[case.observed]
                 print(f"{case.name:9s} {label:13s}  {figures_of(error, found.sigma_m[case.observed])}")
+                both = case.smoothed(sensors)
+                text = figures_of(case.error(both)[case.observed], both.sigma_m[case.observed])
+                print(f"{case.name:9s} {'  smoothed':13s}  {text}", flush=True)
 
 
 def show_ablation(all_cases: list[Case]) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Final
 from railfix.core import errors, reasons
 from railfix.pipeline.config import Config
 from railfix.pipeline.tables import OBSERVATION_COLUMNS, POSITION_COLUMNS
-from railfix.pipeline.train_table import TRAIN_COLUMNS
+from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run.route import ON_TRACK_COLUMNS, TRACK_COLUMNS
 from railfix.tracking import TrackStatus
 
@@ -168,6 +168,7 @@ def document() -> str:
     lines += _exit_codes()
     lines += _columns("Columns of `positions.csv` and `positions.parquet`", POSITION_COLUMNS)
     lines += _columns("Columns of `train.csv` and `train.parquet`", TRAIN_COLUMNS)
+    lines += _columns("Further columns of `train.*` with `--smooth`", SMOOTHED_COLUMNS)
     lines += _columns("Further columns of `positions.*` and `train.*` of a run on a network", ON_TRACK_COLUMNS)
     lines += _columns("Columns of `tracks.csv` and `tracks.parquet`", TRACK_COLUMNS)
     lines += _columns("Columns of `observations.parquet`", OBSERVATION_COLUMNS)

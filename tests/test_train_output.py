@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
@@ -13,19 +15,23 @@ from polars.testing import assert_frame_equal
 from typer.testing import CliRunner
 
 from railfix.cli import app
+from railfix.core.errors import SettingsError
 from railfix.pipeline.config import Config
 from railfix.pipeline.tables import OBSERVATION_COLUMNS
-from railfix.pipeline.train_table import TRAIN_COLUMNS
+from railfix.pipeline.train_table import SMOOTHED_COLUMNS, TRAIN_COLUMNS
 from railfix.run import RunInputs, RunOptions, RunSummary, run_files
 from railfix.simulate.demonstration import demo_inputs
 
 SPAN = {"start": datetime(2024, 3, 5, 3, 10, 5), "end": datetime(2024, 3, 5, 3, 10, 13)}
 
 
-def _run(out: Path, config: Config, chunk: int) -> RunSummary:
+def _inputs() -> RunInputs:
     demo = demo_inputs()
-    inputs = RunInputs(front=demo.front, rear=demo.rear, nav=demo.nav, track=demo.track, vehicle=demo.vehicle)
-    return run_files(inputs, config, out=out, options=RunOptions(observations="write", chunk_epochs=chunk, **SPAN))
+    return RunInputs(front=demo.front, rear=demo.rear, nav=demo.nav, track=demo.track, vehicle=demo.vehicle)
+
+
+def _run(out: Path, config: Config, chunk: int) -> RunSummary:
+    return run_files(_inputs(), config, out=out, options=RunOptions(observations="write", chunk_epochs=chunk, **SPAN))
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +48,47 @@ def test_one_row_an_epoch_and_antenna_with_all_columns(tracked: RunSummary) -> N
     assert (train["status"] == "tracking").mean() > 0.9
     assert tracked.files["train.csv"].read_text().splitlines()[0] == ",".join(TRAIN_COLUMNS)
     assert train["sources"].str.contains("code").all()
+
+
+@pytest.mark.requirement("E5")
+def test_smoothed_columns_stand_beside_those_of_the_filter(tracked: RunSummary, tmp_path: Path) -> None:
+    tables = {}
+    for chunk in (1000, 30):
+        options = RunOptions(chunk_epochs=chunk, smooth="on", **SPAN)
+        files = run_files(_inputs(), Config(filter="track"), out=tmp_path / str(chunk), options=options).files
+        tables[chunk] = pl.read_parquet(files["train.parquet"])
+        assert pl.read_csv(files["train.csv"]).columns == tables[chunk].columns == [*TRAIN_COLUMNS, *SMOOTHED_COLUMNS]
+    train = tables[1000]
+    assert_frame_equal(train.select(*TRAIN_COLUMNS), pl.read_parquet(tracked.files["train.parquet"]))
+    assert_frame_equal(train.select(*SMOOTHED_COLUMNS), tables[30].select(*SMOOTHED_COLUMNS), abs_tol=1e-6)
+    assert (train["smoothed_sigma_m"] <= train["along_sigma_m"] + 1e-6).all()
+    away = ((train["smoothed_chainage_m"] - train["chainage_m"]).abs() / train["along_sigma_m"]).to_numpy()
+    assert 1e-3 < away.max() < 4.0
+    last = train.group_by("antenna", maintain_order=True).last()
+    assert (last["smoothed_chainage_m"] - last["chainage_m"]).abs().to_numpy().max() < 1e-6
+
+
+@pytest.mark.requirement("E5")
+def test_antennas_in_processes_of_their_own_are_smoothed_too(tracked: RunSummary, tmp_path: Path) -> None:
+    if sys.platform != "linux":
+        pytest.skip("processes for each antenna need Linux")
+    demo, out = demo_inputs(), tmp_path / "run"
+    words = [sys.executable, "-m", "railfix", "run", "--front", demo.front[0], "--rear", demo.rear[0], "--nav"]
+    words += [demo.nav[0], "--track", demo.track[0], "--vehicle", demo.vehicle, "--out", out, "--smooth"]
+    words += ["--workers", "2"]
+    words += ["--start", SPAN["start"].isoformat(), "--end", SPAN["end"].isoformat()]
+    done = subprocess.run([str(word) for word in words], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    train = pl.read_parquet(out / "train.parquet")
+    assert len(train) == len(pl.read_parquet(tracked.files["train.parquet"]))
+    assert train["smoothed_chainage_m"].is_not_null().all()
+
+
+@pytest.mark.requirement("E5")
+def test_smoothing_needs_the_filter(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="--smooth needs the filter"):
+        run_files(_inputs(), Config(filter="off"), out=tmp_path / "run", options=RunOptions(smooth="on"))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.requirement("E5")

@@ -22,7 +22,8 @@ def run(
       position: chainage, its standard deviation, coordinates, and the conventional position for
       comparison
     - `train.csv` and `train.parquet`: positions of the filter along the track over all epochs so far,
-      with speed, direction and the probability of the branch (not with `--filter off`)
+      with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also by
+      what was measured later
     - `observations.parquet` (with `--observations`): one row per epoch, satellite and signal
     - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and
       reason, positioning rate

@@ -20,6 +20,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.return_gate import ReturnState, refused_codes
 from railfix.pipeline.sensor_epochs import SensorState, Surroundings, sensor_epochs
+from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
@@ -107,6 +108,8 @@ class AlongTrack:
     standstill : ndarray of bool, shape (T,)
     motion : ndarray of int8, shape (T,)
         `railfix.motion.slip.MotionState` since the epoch before, by wheel and inertial unit.
+    replay : tuple of Replay
+        What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
     """
 
     tracked: Tracked
@@ -119,6 +122,7 @@ class AlongTrack:
     direction: Codes
     standstill: Masks
     motion: Codes
+    replay: tuple[Replay, ...] = ()
 
     @property
     def time(self) -> Datetimes:
@@ -163,7 +167,7 @@ def along_track(
     """
     epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
     line = Line.of(trajectory) if state.line is None else state.line
-    tracked, motion, after = _tracked(
+    tracked, motion, replays, after = _tracked(
         epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings, alone
     )
     inside = on_line_m(tracked, trajectory)
@@ -182,6 +186,7 @@ def along_track(
         direction=direction.astype(np.int8),
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
         motion=motion,
+        replay=replays,
     )
     return result, replace(after, line=line)
 
@@ -195,7 +200,7 @@ def _tracked(
     samples: SensorSamples | None,
     surroundings: Surroundings | None,
     alone: tuple[Floats, Floats] | None,
-) -> tuple[Tracked, Codes, FilterState]:
+) -> tuple[Tracked, Codes, tuple[Replay, ...], FilterState]:
     """Places of the filter, motion by the sensors, and the state to pass on.
 
     With sensors the epochs are taken in stretches of `_STRETCH_NS` of GPS time, however the log is cut: the place by
@@ -211,8 +216,9 @@ def _tracked(
     edges = np.flatnonzero(np.diff(number, prepend=number[:1], append=number[-1:])) if sensing else np.empty(0, np.intp)
     parts: list[Tracked] = []
     motions: list[Codes] = []
+    replays: list[Replay] = []
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
-        part = epochs if last - first == len(epochs) else _part(epochs, first, last)
+        part = epochs if last - first == len(epochs) else epochs.part(first, last)
         if len(part) and state.fixed is not None and _stretch(part.time[0]) != _stretch(state.fixed.time):
             state = _begun_anew(state, state.fixed)
         before = state.sensors
@@ -226,11 +232,12 @@ def _tracked(
         if alone is not None and sensing and len(part):
             part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], state, config)
             state = replace(state, gate=gate)
+        replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
         tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
         state = replace(state, track=after, sensors=kept, fixed=_fixed(tracked) if len(part) else state.fixed)
         parts.append(tracked)
         motions.append(sensed.state)
-    return _joined(parts), np.concatenate(motions), state
+    return _joined(parts), np.concatenate(motions), tuple(replays), state
 
 
 def _gated(
@@ -294,13 +301,6 @@ def _fixed(tracked: Tracked) -> Fixed:
     return Fixed(time=tracked.time[-1], arc_m=arc if decided else np.nan, sigma_m=sigma, speed_mps=speed)
 
 
-def _part(epochs: GnssEpochs, first: int, last: int) -> GnssEpochs:
-    """Some epochs; what belongs to channels stays whole."""
-    named = ("satellite", "clock")
-    values = {f.name: getattr(epochs, f.name) for f in fields(epochs) if f.name not in named}
-    return replace(epochs, **{name: value[first:last] for name, value in values.items()})
-
-
 def _joined(parts: list[Tracked]) -> Tracked:
     """Places of one stretch after the other."""
     if len(parts) == 1:
@@ -308,7 +308,7 @@ def _joined(parts: list[Tracked]) -> Tracked:
     return Tracked(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Tracked)})
 
 
-def on_line_m(tracked: Tracked, trajectory: Trajectory) -> Floats:
+def on_line_m(tracked: Tracked | SmoothedTrack, trajectory: Trajectory) -> Floats:
     """Return arc lengths on the trajectory, shape (T,) [m].
 
     Beyond an end by no more than errors allow (four sigmas, or those of codes at a start) a place is that end; NaN

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
 import polars as pl
 
 from railfix.motion.slip import MotionState
-from railfix.pipeline.along_track import AlongTrack
+from railfix.pipeline.along_track import AlongTrack, on_line_m
 from railfix.pipeline.results import Result
 from railfix.pipeline.sensed_motion import CARRIED
+from railfix.pipeline.smoothing import SmoothedTrack
 from railfix.pipeline.tables import float_column, in_time_order
+from railfix.track.trajectory import Trajectory
 from railfix.tracking import Kind, TrackStatus
 
 #: Words of the column ``status`` of the filter along the track, and of ``direction``.
@@ -66,6 +69,13 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "innovation_place_m": "place by a feature of the line, or range to a ground unit, less the predicted one",
 }
 
+#: Columns that smoothing adds (`railfix run --smooth`).
+SMOOTHED_COLUMNS: Final[dict[str, str]] = {
+    "smoothed_chainage_m": "distance along the line by everything measured before and after the epoch",
+    "smoothed_sigma_m": "its standard deviation",
+    "smoothed_speed_mps": "speed along the line, in the same way",
+}
+
 
 def train_table(result: Result) -> pl.DataFrame:
     """Return the positions of the filter along the track, one row per epoch and antenna in order of time.
@@ -81,6 +91,37 @@ def train_table(result: Result) -> pl.DataFrame:
     """
     parts = [antenna_train(name, tracked) for name, tracked in result.fusion.items()]
     return in_time_order(parts) if parts else pl.DataFrame()
+
+
+def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    """Return rows of the table with `SMOOTHED_COLUMNS`.
+
+    Parameters
+    ----------
+    table : polars.DataFrame
+        Rows of `train_table`.
+    smoothed : mapping of str to polars.DataFrame
+        By antenna; its rows in the same order.
+    """
+    antenna = table["antenna"].to_numpy()
+    values = {name: np.full(len(table), np.nan) for name in SMOOTHED_COLUMNS}
+    for name, rows in smoothed.items():
+        mine = antenna == name
+        for column, whole in values.items():
+            whole[mine] = rows[column].fill_null(np.nan).to_numpy()
+    return table.with_columns(**{name: float_column(column) for name, column in values.items()})
+
+
+def smoothed_table(result: SmoothedTrack, trajectory: Trajectory) -> pl.DataFrame:
+    """Return `SMOOTHED_COLUMNS` of one antenna, one row per epoch."""
+    inside = on_line_m(result, trajectory)
+    return pl.DataFrame(
+        {
+            "smoothed_chainage_m": float_column(trajectory.chainage_at(inside)),
+            "smoothed_sigma_m": float_column(result.sigma_m),
+            "smoothed_speed_mps": float_column(result.speed_mps),
+        }
+    )
 
 
 def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import re
 import signal
 import sys
+import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -25,14 +27,16 @@ from railfix.motion.samples import SensorSamples
 from railfix.pipeline.compared import PlacedRanges, PositionVerdict, Published, SentRanges
 from railfix.pipeline.processor import AntennaChunk, EpochProcessor
 from railfix.pipeline.results import State
+from railfix.pipeline.smoothing import Replay, smooth
 from railfix.pipeline.tables import observations_table, positions_table
-from railfix.pipeline.train_table import train_table
+from railfix.pipeline.train_table import smoothed_table, train_table
 from railfix.run.chunks import Pieces
 from railfix.run.inputs import Antenna
 from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
 from railfix.screens import Verdict
+from railfix.tracking import Line
 
 if TYPE_CHECKING:
     import polars as pl
@@ -71,10 +75,19 @@ class AntennaRun:
         Of the whole run.
     observations : bool
         Whether rows of observations are wanted.
+    smooth : bool
+        Whether what the filter was given is kept, for `smoothed`.
     """
 
     def __init__(
-        self, name: str, processor: EpochProcessor, log: Log, sensors: SensorSamples, *, observations: bool
+        self,
+        name: str,
+        processor: EpochProcessor,
+        log: Log,
+        sensors: SensorSamples,
+        *,
+        observations: bool,
+        smooth: bool = False,
     ) -> None:
         self.name, self.log = name, log
         self._processor, self._sensors, self._observations = processor, sensors, observations
@@ -82,6 +95,7 @@ class AntennaRun:
         self._tally = AntennaTally(min_satellites=processor.config.min_satellites)
         self._state = State()
         self._chunk: AntennaChunk | None = None
+        self._replays: Replays | None = Replays() if smooth else None
 
     def more(self) -> Datetimes | None:
         """Read the next piece and return its time tags; None at the end of the log."""
@@ -123,6 +137,8 @@ class AntennaRun:
         """Return what the chunk gives to the results."""
         result, self._state = self._processor.gathered({self.name: self.chunk}, self._state)
         self._tally.add(result.antennas[self.name])
+        if self._replays is not None:
+            self._replays.keep(result.fusion[self.name].replay)
         return Rows(
             positions=positions_table(result),
             train=train_table(result) if result.fusion else None,
@@ -130,6 +146,35 @@ class AntennaRun:
             tally=self._tally,
             notes=result.notes,
         )
+
+    def smoothed(self) -> pl.DataFrame:
+        """Return the smoothed columns of all epochs, after the last chunk."""
+        assert self._replays is not None, "nothing was kept to smooth"
+        trajectory = self._processor.trajectories[self.name]
+        result = smooth(self._replays.backward(), Line.of(trajectory), self._processor.config.tracking)
+        return smoothed_table(result, trajectory)
+
+
+class Replays:
+    """What the filter was given, chunk by chunk, in a file that ends with the process."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run
+        self._starts: list[int] = []
+
+    def __del__(self) -> None:
+        self._file.close()
+
+    def keep(self, chunk: tuple[Replay, ...]) -> None:
+        """Add a chunk."""
+        self._starts.append(self._file.tell())
+        pickle.dump(chunk, self._file, protocol=pickle.HIGHEST_PROTOCOL)
+
+    def backward(self) -> Iterator[Replay]:
+        """Yield what was kept, the last first."""
+        for start in reversed(self._starts):
+            self._file.seek(start)
+            yield from reversed(pickle.load(self._file))
 
 
 class OtherProcess:
@@ -230,6 +275,12 @@ class OtherProcess:
         rows: Rows = self._answer()
         return rows
 
+    def smoothed(self) -> pl.DataFrame:
+        """See `AntennaRun`."""
+        self._ask("smoothed")
+        table: pl.DataFrame = self._answer()
+        return table
+
 
 def processes(asked: int) -> int:
     """Return how many processes a run may have.
@@ -278,7 +329,7 @@ def _serve(pipe: Connection, other_end: Connection, make: Callable[[], AntennaRu
                 pipe.send(("more", (answer, run.log.share, run.log.problems, run.log.skipped)))
             elif step == "screened":
                 pipe.send((step, SentRanges.of(answer)))
-            elif step in ("solved", "finished"):
+            elif step in ("solved", "finished", "smoothed"):
                 pipe.send((step, answer))
                 if step == "finished":
                     run.read_ahead()

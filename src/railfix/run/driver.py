@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import MismatchError
+from railfix.core.errors import MismatchError, SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.io.sp3 import read_sp3
@@ -42,6 +42,7 @@ from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filter
 from railfix.run.route import RouteOfLog, find_route
 from railfix.run.sensor_checks import sensor_notes
 from railfix.run.sensors import check_units, read_sensors, read_units
+from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
@@ -136,14 +137,18 @@ def run_files(
         navigation, line, logs = open_inputs(inputs, options, config)
         sensors, units = sensors_of(inputs)
         processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
-        write = options.observations == "write"
+        write, smooth = options.observations == "write", options.smooth == "on"
+        if smooth and config.filter == "off":
+            raise SettingsError("--smooth needs the filter along the track; leave out --filter off")
         runs: dict[str, AntennaRun | OtherProcess] = {
-            name: AntennaRun(name, processor, log, sensors, observations=write)
+            name: AntennaRun(name, processor, log, sensors, observations=write, smooth=smooth)
             for name, log in logs.items()
             if name not in {other.name for other in others}
         }
         runs |= {other.name: other.reads(logs[other.name]) for other in others}
         tally = _position(runs, line, processor, folder, progress)
+        if smooth:
+            add_smoothed(runs, folder)
         check_same_time(tally)
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
@@ -254,7 +259,14 @@ def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunO
     navigation, line, logs = open_inputs(inputs, options, config)
     sensors, units = sensors_of(inputs)
     processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
-    return AntennaRun(name, processor, logs[name], sensors, observations=options.observations == "write")
+    return AntennaRun(
+        name,
+        processor,
+        logs[name],
+        sensors,
+        observations=options.observations == "write",
+        smooth=options.smooth == "on",
+    )
 
 
 def _notes_of_sensors(folder: OutputFolder, sensors: SensorSamples, config: Config) -> tuple[str, ...]:

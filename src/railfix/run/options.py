@@ -106,6 +106,8 @@ class RunOptions(Settings):
         Epochs in memory at a time.
     start, end : datetime or None
         First epoch, and the time before which the last one lies, GPS time.
+    smooth : {"off", "on"}
+        Whether `train.*` gets the columns of the smoother.
     workers : int
         See `railfix.run.antennas.processes`.
     track : TrackReading
@@ -125,6 +127,11 @@ class RunOptions(Settings):
     overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
     chunk_epochs: int = option(
         "Epochs in memory at a time; the results do not depend on it.", 3000, name="--chunk", metavar="EPOCHS", ge=1
+    )
+    smooth: Literal["off", "on"] = option(
+        "Also smooth the filter along the track: places by everything measured before and after, in columns of train.*",
+        "off",
+        name="--smooth",
     )
     workers: int = option(
         "Processes side by side: 2 gives each of two antennas its own (Linux); the results do not depend on it. 0: 2 "

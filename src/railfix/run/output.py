@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -128,6 +128,19 @@ class OutputFolder:
             piece = self.staged(name).with_name(f"{name}.{len(pieces):06d}")
             table.write_parquet(piece, compression="lz4", statistics=False)
             pieces.append(piece)
+
+    def change(self, name: str, widened: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
+        """Write a table again, Parquet and CSV, piece by piece with its rows changed."""
+        import polars as pl
+
+        from railfix.pipeline.tables import rounded
+
+        self._csv.pop(f"{name}.csv").close()
+        with _writing(self.path / f"{name}.parquet"):
+            for piece in self._pieces[f"{name}.parquet"]:
+                table = widened(pl.read_parquet(piece, memory_map=False))
+                table.write_parquet(piece, compression="lz4", statistics=False)
+                self.append_csv(f"{name}.csv", rounded(table))
 
     def scan(self, name: str) -> pl.LazyFrame:
         """Return what was appended so far to a Parquet file."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings
@@ -45,6 +45,12 @@ class GnssEpochs:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def part(self, first: int, last: int) -> GnssEpochs:
+        """Epochs from one up to another; what belongs to channels stays whole."""
+        of_channels = ("satellite", "clock")
+        values = {f.name: getattr(self, f.name)[first:last] for f in fields(self) if f.name not in of_channels}
+        return replace(self, **values)
 
 
 @dataclass(frozen=True, kw_only=True)
