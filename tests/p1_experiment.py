@@ -86,6 +86,7 @@ FILTER_WAYS: Final = (
     Way("filter", FILTERED, "filtered"),
     Way("filter, wheel, inertial", FILTERED, "filtered", sensors=True),
 )
+FILTER_SYSTEMS: Final = ("GJ", "GJE")
 _NONE: Final = (Status.TOO_FEW_SATELLITES, Status.UNOBSERVABLE, Status.NO_CONVERGENCE, Status.NO_OBSERVATION)
 #: Large errors this near in time are one line of the list [epochs].
 BURST_EPOCHS: Final = 50
@@ -289,7 +290,11 @@ def extent(campaign: Campaign) -> str:
 
 
 def commercial(
-    folder: Path, runs: Sequence[int] = (0, 1, 2, 3), seed: int | None = None, ways: Sequence[Way] = WAYS
+    folder: Path,
+    runs: Sequence[int] = (0, 1, 2, 3),
+    seed: int | None = None,
+    ways: Sequence[Way] = WAYS,
+    systems: Sequence[str] = SYSTEMS,
 ) -> Campaign:
     """The scenario p1-commercial, or its runs on another line and place."""
     curve, recipe = cn0_curve(folder), load_recipe("p1-commercial")
@@ -300,7 +305,7 @@ def commercial(
         if not any(way.sensors for way in ways):
             scenario = scenario.replaced(sensors=None)
         name = recipe.names[number] if seed is None else f"seed-{seed}"
-        campaigns.append(ridden(Bench(scenario, name, ways, SYSTEMS, curve)))
+        campaigns.append(ridden(Bench(scenario, name, ways, systems, curve)))
     return together(campaigns)
 
 
@@ -350,7 +355,7 @@ def filtered_report(folder: Path) -> Iterator[str]:
     """The filter along the track beside the conventional position, line by line as each is done."""
     campaigns = []
     for number in range(4):
-        campaigns.append(commercial(folder, (number,), ways=FILTER_WAYS))
+        campaigns.append(commercial(folder, (number,), ways=FILTER_WAYS, systems=FILTER_SYSTEMS))
         yield ""
         yield extent(campaigns[-1])
         yield from main_table(campaigns[-1], everywhere)
@@ -379,7 +384,7 @@ def unobserved_lines(campaign: Campaign) -> Iterator[str]:
 
 def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
     """Every epoch of 10 m and more of a way, and what it is made of; of many together in time the largest."""
-    for letters in SYSTEMS:
+    for letters in dict.fromkeys(letters for letters, _ in campaign.found):
         items = campaign.breaking.get((letters, way), [])
         yield f"{'+'.join(letters)} {way}: {len(items)} epochs of {LARGE_M:g} m and more"
         bursts: list[list[Breaking]] = []

@@ -114,18 +114,23 @@ def ride(text: str = "{}", name: str = "demo") -> Ride:
     return made(load_recipe(name).scenario().replaced(**changes))
 
 
-def made(scenario: Scenario) -> Ride:
-    """The ride of a scenario: its front antenna."""
-    simulation = Simulation(scenario)
-    pieces = list(simulation.pieces("front", chunk_epochs=100_000))
-    assert len(pieces) == 1
+def sensors_of(simulation: Simulation) -> tuple[SensorSamples, GroundUnits | None]:
+    """Samples of the sensors of a run, and its ground units."""
     tables = sensor_tables(simulation)
     with tempfile.TemporaryDirectory() as folder:
         paths = {n: Path(folder) / f"{n}.parquet" for n in tables if n != "wheel_slips"}
         for n, path in paths.items():
             tables[n].write_parquet(path)
         units = read_units(paths.pop("ranging_units")) if "ranging_units" in paths else None
-        samples = read_sensors(**paths)
+        return read_sensors(**paths), units
+
+
+def made(scenario: Scenario) -> Ride:
+    """The ride of a scenario: its front antenna."""
+    simulation = Simulation(scenario)
+    pieces = list(simulation.pieces("front", chunk_epochs=100_000))
+    assert len(pieces) == 1
+    samples, units = sensors_of(simulation)
     line, geometry = simulation.line, pieces[0].geometry
     return Ride(
         simulation=simulation,
