@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Floats
+from railfix.motion.singer import singer_steps
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import FRESH, OFFSETS, SATELLITES, Unknown
@@ -24,27 +25,9 @@ LEAST_STEP_M2: Final = 1e-6
 
 
 def singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Floats, Floats]:
-    """Transition of place, speed and acceleration, and the covariance of its noise, shapes (3, 3).
-
-    Acceleration as a first-order Gauss-Markov process (R. A. Singer, 1970, doi:10.1109/TAES.1970.310128), the noise
-    by Van Loan's integral in the limit of white jerk for short steps.
-    """
-    x = dt / tau_s
-    once, twice = np.exp(-x), np.exp(-2.0 * x)
-    step = np.array([[1.0, dt, tau_s**2 * (x - 1.0 + once)], [0.0, 1.0, tau_s * (1.0 - once)], [0.0, 0.0, once]])
-    density = 2.0 * sigma_mps2**2 / tau_s
-    if x < 0.1:
-        noise = np.array(
-            [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
-        )
-    else:
-        a = tau_s**5 * (1.0 - twice + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * once)
-        b = tau_s**4 * (twice + 1.0 - 2.0 * once + 2.0 * x * once - 2.0 * x + x**2)
-        c = tau_s**3 * (1.0 - twice - 2.0 * x * once)
-        d = tau_s**3 * (4.0 * once - 3.0 - twice + 2.0 * x)
-        e = tau_s**2 * (twice + 1.0 - 2.0 * once)
-        noise = 0.5 * np.array([[a, b, c], [b, d, e], [c, e, tau_s * (1.0 - twice)]])
-    return step, density * noise
+    """`railfix.motion.singer.singer_steps` of one interval, shapes (3, 3)."""
+    step, noise = singer_steps(np.array([dt]), sigma_mps2, tau_s)
+    return step[0], noise[0]
 
 
 singer = lru_cache(maxsize=64)(singer_step)
