@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import pytest
 
+from network_made import made_network
+from railfix.core.errors import MismatchError
 from railfix.ground.authority import Authority
 from railfix.ground.interlocking import (
     ALL_RULES,
@@ -23,6 +25,7 @@ from railfix.ground.interlocking import (
 )
 from railfix.ground.interlocking_text import from_json, to_json
 from railfix.ground.layout import Layout, LoopStation, overlap
+from railfix.ground.layout_network import layout_of
 from railfix.ground.on_board import OnBoard, OnBoardLimits
 from railfix.ground.traffic import Conditions, traffic
 from railfix.io.train_message import MessageError, MessageStatus, TrainMessage
@@ -234,3 +237,47 @@ def test_bytes_of_an_authority() -> None:
     for wrong in (data[:-1], data + b"x", b"\x02" + data[1:], data[:-2] + b"\x05" + data[-1:]):
         with pytest.raises(MessageError):
             Authority.decode(wrong)
+
+
+def test_layout_of_a_network_map() -> None:
+    """Three units of 2 km: 440 m of single line, two tracks of 1120 m 3.6 m apart, 440 m; the second is on the left."""
+    network = made_network(9.0)
+    found = layout_of(network)
+    assert [s.name for s in found.layout.stations] == ["02", "12", "22"]
+    for k, station in enumerate(found.layout.stations):
+        assert station.begin_m == pytest.approx(2000.0 * k + 440.0, abs=0.5)
+        assert station.end_m == pytest.approx(2000.0 * k + 1560.0, abs=0.5)
+        # points of the map are 20 m apart: 2.67 m aside at 40 m, 3.6 m at 60 m, so 3.5 m at 57.8 m; steps of 2 m
+        assert 57.8 <= station.points_m <= 57.8 + 2.0 + 1.0
+    assert found.tracks[:4] == (("0a",), ("02", "01"), ("0b",), ("1a",))
+    right = layout_of(network, drive="right")
+    assert right.tracks[1] == ("01", "02")
+    # the files' order and directions do not matter
+    turned = replace(
+        network,
+        tracks=tuple(track.reversed() for track in network.tracks),
+        links=tuple(
+            replace(link, first_end=1 - link.first_end, second_end=1 - link.second_end) for link in network.links
+        ),
+    )
+    assert [s.points_m for s in layout_of(turned).layout.stations] == [s.points_m for s in found.layout.stations]
+    assert layout_of(turned).tracks[1] in (("02", "01"), ("21", "22"))
+
+
+def test_networks_that_are_no_single_line_are_refused() -> None:
+    network = made_network(9.0)
+    with pytest.raises(MismatchError, match="passing loops; the interlocking needs two"):
+        layout_of(made_network(3.0))
+    with pytest.raises(MismatchError, match="4 open ends"):
+        layout_of(made_network(6.0, line_km=2.0))
+    without_one = replace(network, links=tuple(link for link in network.links if 2 not in (link.first, link.second)))
+    with pytest.raises(MismatchError, match="open ends"):
+        layout_of(without_one)
+
+
+def test_a_route_over_the_layout_of_a_network() -> None:
+    run = traffic(1, trains=3, layout=layout_of(made_network(9.0)).layout)
+    for _ in range(600):
+        run.step()
+    assert run.violations == Counter()
+    assert run.centre.routes_set > 2

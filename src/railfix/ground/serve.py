@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
@@ -23,6 +23,7 @@ from railfix.ground.centre import CentreLimits
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import InterlockingLimits, TrainInterval
 from railfix.ground.layout import Layout, LoopStation, PointName
+from railfix.ground.layout_network import layout_of
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import BEARERS, CentreLinks
 from railfix.ground.monitor import MonitorLimits
@@ -33,6 +34,7 @@ from railfix.ground.supervision import Supervision, at_start, standing_train
 from railfix.ground.triangle import TriangleLimits, Verdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io import read_navigation
+from railfix.track.network_read import read_network
 
 #: Period of the centre's work [s].
 STEP_S = 1.0
@@ -115,6 +117,11 @@ class CentreFile(Settings):
     listen : dict of {"A", "B"} to HOST:PORT
         Address of each bearer.
     stations : tuple of LoopStation
+        The line; or else
+    network : tuple of Path
+        Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout_network`).
+    drive : {"left", "right"}
+        Side on which trains pass a station of the network.
     trains : tuple of TrainPlace
         Where they are at the first start; afterwards the database knows.
     database : str
@@ -133,7 +140,9 @@ class CentreFile(Settings):
 
     keys: Path
     listen: dict[LinkName, Address]
-    stations: Annotated[tuple[LoopStation, ...], Field(min_length=2)]
+    stations: tuple[LoopStation, ...] = ()
+    network: tuple[Path, ...] = ()
+    drive: Literal["left", "right"] = "left"
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -148,6 +157,10 @@ class CentreFile(Settings):
     def _both_bearers_and_known_places(self) -> Self:
         if set(self.listen) != set(BEARERS):
             raise ValueError("listen has an address for each of A and B")
+        if bool(self.stations) == bool(self.network):
+            raise ValueError("the line is given by stations, or by network, and not by both")
+        if self.network:
+            return self  # looked at again with its stations
         layout, numbers = self.layout, [train.number for train in self.trains]
         if len(set(numbers)) < len(numbers):
             raise ValueError("two trains have the same number")
@@ -163,6 +176,26 @@ class CentreFile(Settings):
         if len(set(places)) < len(places):
             raise ValueError("two trains stand on the same track")
         return self
+
+    def with_stations(self, folder: Path) -> Self:
+        """Return the settings with the stations of the network, whose files are relative to a folder.
+
+        Raises
+        ------
+        InputFileError, MismatchError
+            A map file cannot be read, or the network is no single line with passing loops.
+        SettingsError
+            A train stands where there is no station.
+        """
+        if not self.network:
+            return self
+        stations = layout_of(read_network([folder / name for name in self.network]), drive=self.drive).layout.stations
+        try:
+            return self.replaced(stations=stations, network=())
+        except ValidationError as error:
+            named = ", ".join(f"{s.name} {s.inner_m[0]:.0f} to {s.inner_m[1]:.0f} m" for s in stations)
+            message = error.errors()[0]["msg"].removeprefix("Value error, ")
+            raise SettingsError(f"trains: {message}; the network has {named}") from None
 
     @property
     def layout(self) -> Layout:
@@ -244,7 +277,7 @@ async def run_centre(
     SettingsError
         A setting is wrong, or an address cannot be listened at.
     """
-    settings = load_settings(CentreFile, path, what="a file of a centre")
+    settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
     for name in ("authority.pem", "centre.pem", "centre.key"):
         if not (keys / name).is_file():

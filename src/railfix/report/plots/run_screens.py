@@ -144,7 +144,7 @@ def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFra
         mine = positions.filter(pl.col("antenna") == antenna)
         seen = observations.filter(pl.col("antenna") == antenna)
         time, chainage = mine["time_gpst"].to_numpy(), floats(mine, "chainage_m")
-        epoch = np.searchsorted(time, seen.select("time_gpst").collect()["time_gpst"].to_numpy()).astype(np.int32)
+        epoch = np.searchsorted(time, seen.select("time_gpst").collect()["time_gpst"].to_numpy())
         rows = _Rows(positions=mine, observations=seen, epoch=epoch)
         for name, picture in _pictures(antenna, rows, config):
             if np.isfinite(picture.metric).any():
