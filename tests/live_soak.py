@@ -69,7 +69,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
         navigation=sent_by(navigation, np.datetime64("1980-01-06", "ns"), start),
         messages=None,
     )
-    engine = LiveEngine(processor, LiveSettings(period_s=1.0 / rate_hz, no_input="skip"))
+    engine = LiveEngine(processor, LiveSettings(period_s=min(1.0 / rate_hz, 60.0), no_input="skip"))
     memory: list[float] = []
     counts = {"outputs": 0, "saved": 0}
 

@@ -17,8 +17,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import railfix
+from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.core.timescale import to_week
 from railfix.gnss.observations import Observations
@@ -35,6 +37,7 @@ from railfix.simulate.demo_data import demo_files
 from ubx_made import log_of
 
 pytestmark = pytest.mark.requirement("A8")
+RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
 EPOCHS = 12
 QUICK = LiveSettings(
     period_s=1.0, no_input="skip", reconnect="off", reconnect_first_s=0.02, reconnect_longest_s=0.04, silence_s=0.3
@@ -343,6 +346,23 @@ def test_rtcm_live_is_dated_by_the_clock() -> None:
     seen = asyncio.run(run())
     assert len(seen) == 5
     assert abs(seen[0] - now) <= np.timedelta64(84 * 3600 + 20, "s")
+
+
+def test_a_date_for_rtcm_in_run_and_convert(tmp_path: Path) -> None:
+    """One option for both: without it the log cannot be dated, with it its epochs are those of that week."""
+    files, path = demo_files(), tmp_path / "log.rtcm3"
+    path.write_bytes(msm7(np.arange(5) * 1000 + 200_000_000))
+    run = ["run", "--front", str(path), "--nav", str(files["nav"]), "--track", str(files["track"])]
+    convert = ["convert", str(path), "--out", str(tmp_path / "log.rnx")]
+    for words in ([*run, "--out", str(tmp_path / "run")], convert):
+        undated = RUNNER.invoke(app, words)
+        assert undated.exit_code == 3
+        assert "give one with --date" in " ".join(undated.output.split())
+    assert RUNNER.invoke(app, [*convert, "--date", "2024-03-05"]).exit_code == 0
+    dated = railfix.read_observations(tmp_path / "log.rnx")
+    assert dated.time[0] == np.datetime64("2024-03-05T07:33:20")
+    done = RUNNER.invoke(app, [*run, "--out", str(tmp_path / "run"), "--date", "2024-03-05"])
+    assert done.exit_code == 7, done.output  # dated, but its codes are nonsense: no position
 
 
 def test_an_epoch_without_its_last_message_does_not_hold_up_the_stream() -> None:

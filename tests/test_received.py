@@ -23,7 +23,9 @@ from pipeline_cases import (
 )
 from railfix.core.errors import SettingsError
 from railfix.core.reasons import Reason
-from railfix.gnss.navigation import Navigation
+from railfix.core.timescale import timedelta
+from railfix.gnss.navigation import GlonassRecords, Navigation
+from railfix.gnss.orbits.record_selection import validity_s
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
@@ -174,3 +176,33 @@ def test_stages_take_read_only_values(monkeypatch: pytest.MonkeyPatch, carrier: 
         assert excluded or carrier == "smoothed"
         both = np.concatenate([found.antennas[name].reason, more.antennas[name].reason])
         np.testing.assert_array_equal(both, expected.antennas[name].reason)
+
+
+@pytest.mark.requirement("A8")
+def test_expired_records_are_dropped_but_for_the_newest(recordings: Path) -> None:
+    """A day of records, hour by hour: what is kept is what is valid, and the last one of every satellite."""
+    day = read_navigation(recordings / "static" / "ESBC_2020177" / "ESBC00DNK_R_20201770000_01D_MN.rnx.gz")
+    config, kept = parse_config({}), known_from_start(parse_config({}))
+    start = np.datetime64("2020-06-25T00:00:00", "ns")
+    sizes = []
+    for hour in range(24):
+        now = start + np.timedelta64(hour, "h")
+        sent = (day.kepler.transmitted > now - np.timedelta64(1, "h")) & (day.kepler.transmitted <= now)
+        sent_glonass = (day.glonass.toe > now - np.timedelta64(1, "h")) & (day.glonass.toe <= now)
+        new = replace(rows(day, sent), glonass=glonass_rows(day, sent_glonass))
+        kept = receive(kept, config, now, navigation=new)
+        known = kept.navigation.kepler
+        sizes.append(len(known) + len(kept.navigation.glonass))
+        heard = (day.kepler.transmitted > start - np.timedelta64(1, "h")) & (day.kepler.transmitted <= now)
+        valid = heard & (day.kepler.toe + timedelta(validity_s(day.kepler)) >= now)
+        assert set(zip(known.satellite, known.toe, strict=True)) >= set(
+            zip(day.kepler.satellite[valid], day.kepler.toe[valid], strict=True)
+        )
+        assert set(known.satellite) == set(day.kepler.satellite[heard])
+    assert max(sizes[6:]) < 1.3 * sizes[6]
+    assert sizes[-1] < 0.5 * (len(day.kepler) + len(day.glonass))
+
+
+def glonass_rows(navigation: Navigation, chosen: np.ndarray) -> GlonassRecords:
+    names = navigation.glonass.__dataclass_fields__
+    return GlonassRecords(**{name: getattr(navigation.glonass, name)[chosen] for name in names})
