@@ -144,6 +144,40 @@ def test_periods_without_input_have_a_message(logs: dict[str, tuple[Observations
     assert sum(o.result is not None for o in outputs) == 60
 
 
+def test_one_message_a_period_however_epochs_come(logs: dict[str, tuple[Observations, ...]]) -> None:
+    """Live, epochs in bursts of five and late by up to 90 ms: a message each period, of the newest epoch; all rows."""
+    engine, period = LiveEngine(processor("front"), LiveSettings()), 100 * MS
+    epochs = logs["front"][:60]
+    start = tag_ns(epochs[0])
+    rng = np.random.default_rng(4)
+    arrivals = [
+        (tag_ns(epoch) + (4 - k % 5) * period if 20 <= k < 40 else tag_ns(epoch) + int(rng.uniform(0, 90) * MS), k)
+        for k, epoch in enumerate(epochs)
+    ]
+    arrivals.sort(key=lambda arrival: (arrival[0], arrival[1]))
+    engine.start(now_ns=start - period)
+    sent: list[tuple[int, LiveOutput]] = []
+    rows: list[LiveOutput] = []
+    end = start + 61 * period
+    for now in range(start - period, end, 2 * MS):
+        while arrivals and arrivals[0][0] <= now:
+            engine.push("front", epochs[arrivals.pop(0)[1]], now_ns=now)
+        for output in engine.poll(now_ns=now, sent_ns=now):
+            if output.part != "rows":
+                sent.append((now, output))
+            if output.part != "message" and output.result is not None:
+                rows.append(output)
+    assert len(rows) == 60
+    assert [output.message.sequence for _, output in sent] == list(range(1, len(sent) + 1))
+    assert abs(len(sent) - (end - start) // period) <= 3  # by the jitter; without it there were some twenty more
+    between = np.diff([now for now, _ in sent]) / MS
+    assert between.min() >= 50.0
+    assert between.max() <= 200.0
+    tags = [output.message.time_ns for _, output in sent if output.message.status is not MessageStatus.NO_INPUT]
+    assert tags == sorted(set(tags))
+    assert engine.counts["superseded"] == 60 - len(tags) > 0
+
+
 def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]]) -> None:
     engine = LiveEngine(processor("front"), LiveSettings(restart_epochs=3))
     first = list(logs["front"][60:90])

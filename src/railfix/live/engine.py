@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -30,10 +31,20 @@ _LONGEST_QUEUE = 100
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """One message, and the result it was made from (None without input)."""
+    """One message, and the result it was made from (None without input).
+
+    Attributes
+    ----------
+    message : TrainMessage
+    result : Result or None
+    part : {"both", "rows", "message"}
+        What of it goes out: both; the rows of the result alone, because the message of its period has gone out
+        before; or such a message later, alone.
+    """
 
     message: TrainMessage
     result: Result | None
+    part: Literal["both", "rows", "message"] = "both"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +112,8 @@ class LiveEngine:
     ----------
     counts : Counter of str
         Epochs by what became of them: "paired", "front alone", "rear alone", "duplicate", "late", "out of order",
-        "tag step", "restart", "no input", "dropped, too many waiting".
+        "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
+        "dropped, too many waiting".
     told : deque of str
         Sentences for the log on what happened: restarts, what became of a saved state.
     """
@@ -122,6 +134,9 @@ class LiveEngine:
         self._heard = self._heard_at_push = 0
         self._sequence = 0
         self._due_ns: int | None = None
+        self._pending: LiveOutput | None = None
+        self._silent = False
+        self._period_ns = round(settings.period_s * 1e9)
         self._tolerance_ns = round(processor.config.antenna_pair.tag_tolerance_s * 1e9)
 
     def learn(self, navigation: Navigation) -> None:
@@ -224,8 +239,8 @@ class LiveEngine:
                 return False
             self._restart()
         elif last is not None:
-            step = (tag_ns - last) % round(self.settings.period_s * 1e9)
-            if min(step, round(self.settings.period_s * 1e9) - step) > 500_000:
+            step = (tag_ns - last) % self._period_ns
+            if min(step, self._period_ns - step) > 500_000:
                 self.counts["tag step"] += 1
         self._backward[antenna] = []
         self._last_tag[antenna] = tag_ns
@@ -251,27 +266,71 @@ class LiveEngine:
         now_ns : int [ns]
             The clock that `push` was given.
         sent_ns : int [ns], optional
-            GPS time of sending for the message; without it the epoch's own time.
+            GPS time of sending for the message; then one message goes out a period, that of the newest epoch. Without
+            it (recorded epochs, the clock is that of their tags) every epoch has its message.
         """
-        outputs = [self._processed(epochs, now_ns, sent_ns) for epochs in self._pairs(now_ns)]
-        period = round(self.settings.period_s * 1e9)
-        silent = not outputs and self._due_ns is not None and self.settings.no_input == "send"
-        if silent and self._due_ns is not None and now_ns - self._due_ns >= period + period // 2:
+        outputs = [self._processed(epochs) for epochs in self._pairs(now_ns)]
+        if sent_ns is None:
+            numbered = [self._sent(output, self._tag_of(output)) for output in outputs]
+            if outputs:
+                self._due_ns, self._silent = now_ns, False
+        else:
+            numbered = self._one_a_period(outputs, now_ns, sent_ns)
+        if numbered or self._due_ns is None or self.settings.no_input == "skip":
+            return numbered
+        if now_ns - self._due_ns >= self._patience_ns():
             self.counts["no input"] += 1
-            self._sequence += 1
-            self._due_ns += period
+            self._due_ns += self._patience_ns()
+            self._silent = True
             last = max(self._last_tag.values(), default=sent_ns or 0)
-            message = no_input_message(
-                self.settings, sequence=self._sequence, time_ns=last, sent_ns=last if sent_ns is None else sent_ns
-            )
-            outputs.append(LiveOutput(message=message, result=None))
-        return outputs
+            message = no_input_message(self.settings, sequence=0, time_ns=last, sent_ns=last)
+            numbered.append(self._sent(LiveOutput(message=message, result=None), last if sent_ns is None else sent_ns))
+        return numbered
+
+    def _patience_ns(self) -> int:
+        """Longest time without a message: half a period more than one after an epoch, then one period."""
+        return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
+
+    def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
+        """Outputs of which at most one carries the message: the newest, half a period after the last one at least.
+
+        The newest message of epochs that came too early for that waits until a period after the last one, unless a
+        newer one takes its place.
+        """
+        if self._due_ns is None:
+            self._due_ns = now_ns - self._period_ns
+        elapsed_ns = now_ns - self._due_ns
+        rows = [replace(output, part="rows") for output in outputs]
+        if not outputs and (self._pending is None or elapsed_ns < self._period_ns):
+            return rows
+        newest = outputs[-1] if outputs else self._pending
+        self.counts["superseded"] += len(outputs) - 1 + (self._pending is not None) if outputs else 0
+        self._pending = None
+        if newest is None or elapsed_ns < self._period_ns // 2:
+            self._pending = newest
+            return rows
+        self._due_ns, self._silent = now_ns, False
+        if outputs:
+            return [*rows[:-1], self._sent(newest, sent_ns)]
+        return [replace(self._sent(newest, sent_ns), part="message")]
+
+    def _sent(self, output: LiveOutput, sent_ns: int) -> LiveOutput:
+        """An output with the next sequence number and the time of sending."""
+        self._sequence += 1
+        return replace(output, message=output.message.replaced(sequence=self._sequence, sent_ns=sent_ns))
+
+    @staticmethod
+    def _tag_of(output: LiveOutput) -> int:
+        """Time tag of the newest epoch of an output."""
+        assert output.result is not None
+        return max(int((a.time[-1] - GPS_EPOCH).astype(np.int64)) for a in output.result.antennas.values())
 
     def wait_s(self, *, now_ns: int) -> float:
         """Time after which `poll` has to be called again, if nothing arrives before [s]."""
         times = [self.settings.period_s]
         if self._due_ns is not None:
-            times.append((self._due_ns - now_ns) * 1e-9 + 1.5 * self.settings.period_s)
+            longest = self._patience_ns() if self._pending is None else self._period_ns
+            times.append((self._due_ns - now_ns + longest) * 1e-9)
         for queue in self._waiting.values():
             if queue:
                 times.append((queue[0].arrived_ns - now_ns) * 1e-9 + self.settings.pair_wait_s)
@@ -295,7 +354,7 @@ class LiveEngine:
                 self.counts["paired" if len(together) > 1 else f"{next(iter(together))} alone"] += 1
             yield together
 
-    def _processed(self, heads: dict[str, _Waiting], now_ns: int, sent_ns: int | None) -> LiveOutput:
+    def _processed(self, heads: dict[str, _Waiting]) -> LiveOutput:
         heard, news = max(head.heard for head in heads.values()), _FromSatellites(heard=0)
         while self._from_satellites and self._from_satellites[0].heard <= heard:
             news = news.with_later(self._from_satellites.popleft())
@@ -303,10 +362,5 @@ class LiveEngine:
         result, self._state = self.processor.process(
             epochs, self._state, navigation=news.navigation, messages=news.messages
         )
-        self._done_ns = max(int((part.time[-1] - GPS_EPOCH).astype(np.int64)) for part in epochs.values())
-        self._sequence += 1
-        self._due_ns = now_ns
-        message = message_of(
-            result, self.settings, sequence=self._sequence, sent_ns=self._done_ns if sent_ns is None else sent_ns
-        )
-        return LiveOutput(message=message, result=result)
+        self._done_ns = max(head.tag_ns for head in heads.values())
+        return LiveOutput(message=message_of(result, self.settings, sequence=0, sent_ns=0), result=result)

@@ -166,6 +166,11 @@ def _sentence(body: str) -> bytes:
     return f"${body}*{checksum:02X}\r\n".encode("ascii")
 
 
+def wants(form: Form, output: LiveOutput) -> bool:
+    """Whether a form takes an output: rows of tables those with rows, all others those with a message."""
+    return output.part != ("message" if form in (positions_rows, train_rows) else "rows")
+
+
 def whole_message(form: Form, output: LiveOutput) -> bytes:
     """A message for a target that keeps messages apart: without the length that streams need."""
     data = form(output)

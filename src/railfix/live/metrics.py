@@ -56,8 +56,10 @@ class Metrics:
         """Count messages that go out now, and the time they took together."""
         now = time.monotonic()
         for output in outputs:
-            self.messages[output.message.status] += 1
             self.processing_s.append(seconds / len(outputs))
+            if output.part == "rows":
+                continue
+            self.messages[output.message.status] += 1
             if self._sent is not None:
                 self.between_s.append(now - self._sent)
             self._sent = now

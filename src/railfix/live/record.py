@@ -38,7 +38,7 @@ class ResultTables:
 
     def add(self, output: LiveOutput) -> None:
         """Take the rows of one output."""
-        if output.result is None:
+        if output.result is None or output.part == "message":
             return
         self._positions.append(positions_table(output.result))
         if output.result.fusion:

@@ -17,7 +17,7 @@ from urllib.parse import unquote, urlsplit
 
 from railfix.core.errors import OutputError, SettingsError
 from railfix.live.engine import LiveOutput
-from railfix.live.forms import Form, forms, whole_message
+from railfix.live.forms import Form, forms, wants, whole_message
 from railfix.live.outlets import Outlet
 from railfix.live.settings import LiveSettings
 
@@ -160,7 +160,12 @@ class OutletSink:
     def __init__(self, name: str, target: Any, *, waiting: int, full: str) -> None:
         self._target = target
         self._outlet: Outlet[LiveOutput] = Outlet(name, target.send, waiting=waiting, full=full)
-        self.name, self.send = name, self._outlet.send
+        self.name = name
+
+    def send(self, output: LiveOutput) -> None:
+        """Hand over one output, if it has what the form takes."""
+        if wants(self._target.form, output):
+            self._outlet.send(output)
 
     @property
     def dropped(self) -> int:
@@ -218,7 +223,7 @@ class TcpServerSink:
 
     def send(self, output: LiveOutput) -> None:
         """Send to everybody."""
-        data = self.form(output)
+        data = self.form(output) if wants(self.form, output) else b""
         for writer in list(self._readers):
             if writer.transport.get_write_buffer_size() > _LARGEST_BACKLOG:
                 writer.transport.abort()
