@@ -245,8 +245,9 @@ def test_layout_of_a_network_map() -> None:
     found = layout_of(network)
     assert [s.name for s in found.layout.stations] == ["02", "12", "22"]
     for k, station in enumerate(found.layout.stations):
-        assert station.begin_m == pytest.approx(2000.0 * k + 440.0, abs=0.5)
-        assert station.end_m == pytest.approx(2000.0 * k + 1560.0, abs=0.5)
+        # along the track aside, 0.24 m longer in each station
+        assert station.begin_m == pytest.approx(2000.0 * k + 440.0 + 0.24 * k, abs=0.1)
+        assert station.end_m == pytest.approx(2000.0 * k + 1560.0 + 0.24 * (k + 1), abs=0.1)
         # points of the map are 20 m apart: 2.67 m aside at 40 m, 3.6 m at 60 m, so 3.5 m at 57.8 m; steps of 2 m
         assert 57.8 <= station.points_m <= 57.8 + 2.0 + 1.0
     assert found.tracks[:4] == (("0a",), ("02", "01"), ("0b",), ("1a",))
