@@ -97,6 +97,21 @@ def test_a_track_is_divided_where_another_ends_on_it(tmp_path: Path) -> None:
     assert [f.kind for f in quality.findings] == ["dead end"] * 3
 
 
+def test_a_geojson_network_with_heights_has_its_names_and_relations(recordings: Path, tmp_path: Path) -> None:
+    """The Belgian network with a height at each point: the same tracks and connections as without."""
+    path = recordings / "rail" / "infrabel" / "network_airport.geojson"
+    document = json.loads(path.read_text())
+    for feature in document["features"]:
+        if feature["geometry"]["type"] == "LineString":
+            feature["geometry"]["coordinates"] = [[*p, 50.0] for p in feature["geometry"]["coordinates"]]
+    raised = tmp_path / "raised.geojson"
+    raised.write_text(json.dumps({**document, "name": "tracks"}))
+    plan, solid = read_network([path]), read_network([raised], height_datum="ellipsoidal")
+    assert solid.names == plan.names
+    assert solid.links == plan.links
+    assert not any(np.isnan(track.height_m).any() for track in solid.tracks)
+
+
 def test_check_finds_a_gap_a_kink_and_a_track_twice() -> None:
     net = made_network(10.0)
     x = np.linspace(0.0, 440.0, 23)

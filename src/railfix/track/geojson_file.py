@@ -25,6 +25,8 @@ RFC_CRS: Final = "OGC:CRS84"
 _DATUM_HELP: Final = (
     "give height_datum 'ellipsoidal' or 'orthometric', as an option (--height-datum) or as a member of the file"
 )
+#: Property of features that are connections of tracks, no tracks (`railfix.track.network_read`).
+RELATION: Final = "netelementA"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
@@ -39,13 +41,15 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
         for number, feature in enumerate(features, start=1):
             if not isinstance(feature, dict):
                 raise InputFileError(path, f"feature {number} is not an object")
-            yield from _lines(path, feature, f"feature {number}", inherited | own)
+            identity = _identity(feature) if len(features) > 1 else {}
+            yield from _lines(path, feature, f"feature {number}", inherited | own | identity)
     elif kind == "Feature":
         properties = node.get("properties") or {}
         geometry = node.get("geometry")
         if not isinstance(properties, dict) or not isinstance(geometry, dict):
             raise InputFileError(path, f"{label or 'the feature'} has no geometry")
-        yield from _lines(path, geometry, label, inherited | own | properties)
+        if RELATION not in properties:
+            yield from _lines(path, geometry, label, inherited | own | properties)
     elif kind == "LineString":
         yield _Line(path, label, node.get("coordinates"), inherited | own, -1)
     elif kind == "MultiLineString":
@@ -60,6 +64,14 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
         raise InputFileError(
             path, f"{where}type {kind!r}; LineString or MultiLineString (or features of them) expected"
         )
+
+
+def _identity(feature: dict[str, Any]) -> dict[str, str]:
+    """Name of one of several features: its id, where it has no name of its own."""
+    properties = feature.get("properties")
+    own = properties.get("id") if isinstance(properties, dict) else None
+    identity = feature.get("id") if own is None else own
+    return {} if identity is None else {"name": str(identity)}
 
 
 class _Line:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ending
+from railfix.track.geojson_file import RELATION
 from railfix.track.network import Link, Network, end_points
 from railfix.track.read import read_segments
 from railfix.track.route import first_gap, orient
@@ -79,11 +80,11 @@ def _relations(path: str | PathLike[str]) -> list[Relation]:
     relations = []
     for _, rows, _ in read_layers(path, geometry="Point"):
         for row in rows:
-            if {"netelementA", "netelementB", "positionOnA", "positionOnB"} <= set(row):
+            if {RELATION, "netelementB", "positionOnA", "positionOnB"} <= set(row):
                 relations.append(
                     Relation(
                         name=str(row.get("id", "")),
-                        first=str(row["netelementA"]),
+                        first=str(row[RELATION]),
                         second=str(row["netelementB"]),
                         first_end=int(row["positionOnA"]),
                         second_end=int(row["positionOnB"]),
