@@ -1,35 +1,43 @@
-"""Time of the centre for one second of a hundred trains at 1 Hz: ``python tests/ground_scale.py``."""
+"""Time of the centre for one second of a hundred trains at 1 Hz: ``python tests/ground_scale.py``.
+
+Reports in, supervision, one commit, authorities out; the links are left out (`tests/benchmarks/bench_links.py`).
+"""
 
 from __future__ import annotations
 
 import tempfile
 import time
 
-from railfix.ground.centre import CentreLimits, TrainRecord, report_received
-from railfix.ground.interlocking import extended
+from railfix.ground.control import ControlCentre
 from railfix.ground.store import Store
 from railfix.ground.traffic import line_with_loops, traffic
+from railfix.io.train_message import encode
 
 
 def main() -> None:
     """Print the times."""
-    run, seconds = traffic(1, trains=100, layout=line_with_loops(60)), 10
-    records = {number: TrainRecord(train=number) for number in run.trains}
+    run, seconds, sent, now = traffic(1, trains=100, layout=line_with_loops(60)), 20, [0], [0.0]
+
+    def send(_train: int, _data: bytes) -> None:
+        sent[0] += 1
+
     with tempfile.TemporaryDirectory() as folder, Store(f"sqlite:///{folder}/centre.db") as store:
+        control = ControlCentre(
+            supervision=run.centre, store=store, curves={}, send=send, clock=lambda: now[0], wall_ns=lambda: 0
+        )
+        reports = [
+            [(number, encode(train.message(float(second)))) for number, train in run.trains.items()]
+            for second in range(seconds)
+        ]
         processor, clock = time.process_time(), time.perf_counter()
-        for second in range(seconds):
-            for number, train in run.trains.items():
-                message = train.message(float(second))
-                records[number], _ = report_received(records[number], message, float(second), limits=CentreLimits())
-            store.save(*records.values())
+        for each in reports:
+            now[0] += 1.0
+            for number, payload in each:
+                control.report(number, payload)
+            control.step()
         processor, clock = time.process_time() - processor, time.perf_counter() - clock
-    print(f"reports and store: {processor / seconds:.3f} s of processor, {clock / seconds:.3f} s")
-    for _ in range(5):
-        run.step()
-    processor = time.process_time()
-    for _ in range(seconds):
-        extended(run.state, run.layout, limits=run.limits)
-    print(f"authorities: {(time.process_time() - processor) / seconds:.3f} s of processor")
+    print(f"{control.reports} reports, {sent[0]} authorities, {run.centre.routes_set} routes in {seconds} s of traffic")
+    print(f"a second of traffic: {processor / seconds:.3f} s of processor, {clock / seconds:.3f} s")
 
 
 if __name__ == "__main__":

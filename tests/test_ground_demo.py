@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import shutil
+import ssl
 import subprocess
 import tempfile
 import threading
@@ -22,6 +23,7 @@ from starlette.responses import HTMLResponse, StreamingResponse
 from starlette.routing import Route
 
 from railfix.ground.demo import FAULT_S, run_demo
+from railfix.ground.keys import write_keys
 from railfix.ground.web import MOST_WRONG, SESSION_S, PageServer, Sessions, page_app
 from report_page import _OPTIONS, Page, browser, fetched
 
@@ -62,12 +64,12 @@ def test_the_story_of_the_demonstration(demo: tuple[dict[str, Any], dict[str, An
 
 
 @contextmanager
-def served(app: Starlette) -> Iterator[str]:
+def served(app: Starlette, certificate: tuple[Path, Path] | None = None) -> Iterator[str]:
     """Address of an application that is served in a thread."""
     started, end, urls = threading.Event(), threading.Event(), []
 
     async def work() -> None:
-        server = PageServer(app)
+        server = PageServer(app, certificate=certificate)
         await server.start()
         urls.append(server.url)
         started.set()
@@ -230,6 +232,23 @@ def test_orders_need_a_log_in(demo: tuple[dict[str, Any], dict[str, Any]]) -> No
         assert desk.post("login", {"password": "secret"})[0] == 200
         assert desk.post("logout") == (200, None)
         assert desk.post("orders/route", {"train": 2})[0] == 403
+
+
+def test_beyond_loopback_addresses_the_page_is_served_by_tls(
+    demo: tuple[dict[str, Any], dict[str, Any]], tmp_path: Path
+) -> None:
+    write_keys(tmp_path, [1])
+    app = page_app(lambda: demo[1], {}, sessions=Sessions(password="secret"))
+    context = ssl.create_default_context(cafile=tmp_path / "authority.pem")
+    context.check_hostname = False  # the certificate names "centre"
+    with served(app, (tmp_path / "centre.pem", tmp_path / "centre.key")) as url:
+        assert url.startswith("https://")
+        data, headers = json.dumps({"password": "secret"}).encode(), {"Content-Type": "application/json"}
+        request = urllib.request.Request(url + "login", data=data, headers=headers, method="POST")
+        with urllib.request.urlopen(request, context=context) as answer:
+            assert "Secure" in answer.headers["Set-Cookie"].split("; ")
+        with pytest.raises(urllib.error.URLError, match="CERTIFICATE_VERIFY_FAILED"):
+            urllib.request.urlopen(url)
 
 
 DESK = """<!DOCTYPE html><iframe id="page" src="/"></iframe><script>
