@@ -18,8 +18,8 @@ from railfix.cli import app
 from railfix.core.errors import InputFileError
 from railfix.evaluate.ablation import Ablation, ablate_files, choices
 from railfix.gnss.observations import Observations
+from railfix.io.logs import scan_observations
 from railfix.io.reference_log import read_reference
-from railfix.io.rinex import scan_observations
 from railfix.pipeline.config import parse_config
 from railfix.run import RunInputs, RunOptions, run_files
 from railfix.run import sources as run_sources

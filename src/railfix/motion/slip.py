@@ -68,6 +68,9 @@ class SlipLimits(Settings):
         Sine of the pitch: 35 permille of line (P2 2.1) and 10 permille of body.
     map_limit : float
         Sine of the pitch against the line's: 0.1 m/s2 of wheel against train.
+    noise_sigmas, noise_s : float
+        The limit is never less than so many standard deviations of that difference while the wheel rolls, learnt over
+        such a time: a body that pitches shakes its accelerometer too, the more the higher it is mounted.
     confirm_s : float
         Time over the limit after which a slip is one.
     latch_mps, latch_share, latch_s : float
@@ -92,6 +95,8 @@ class SlipLimits(Settings):
     rule: Literal["map", "p2"] = "map"
     p2_limit: float = Field(default=0.045, gt=0)
     map_limit: float = Field(default=0.015, gt=0)
+    noise_sigmas: float = Field(default=5.0, ge=0)
+    noise_s: float = Field(default=30.0, gt=0)
     confirm_s: float = Field(default=0.1, ge=0)
     latch_mps: float = Field(default=0.15, gt=0)
     latch_share: float = Field(default=0.01, ge=0)
@@ -262,7 +267,7 @@ class _Automaton:
         self.state = MotionState.INIT
         self.speed, self.way, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
         self.pitch, self.bias = float("nan"), 0.0
-        self._smooth, self._limit = 0.0, limits.map_limit
+        self._smooth, self._limit, self._square = 0.0, limits.map_limit, 0.0
         self._over = self._fits = self._silent = self._carried = self._apart = self._age = 0.0
         self._rest = float("nan")
         #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
@@ -299,7 +304,8 @@ class _Automaton:
             share = min(dt / limits.smoothing_s, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
         # A held pitch is that of some place behind.
-        self._limit = limits.map_limit if sine == sine or rate == rate else limits.p2_limit
+        least = limits.map_limit if sine == sine or rate == rate else limits.p2_limit
+        self._limit = max(least, limits.noise_sigmas * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
             self._carry(dt, inertial)
             self._release(dt, wheel, heard=heard)
@@ -362,6 +368,8 @@ class _Automaton:
             over, value = abs(self._smooth) > self._limit, self._smooth
         self._over = self._over + dt if over else 0.0
         self.speed = wheel
+        if not over:
+            self._square += min(dt / limits.noise_s, 1.0) * (self._smooth**2 - self._square)
         if not over and sine == sine:
             share = min(dt / limits.offset_s, 1.0)
             self.offset += share * GRAVITY_MPS2 * self._smooth
