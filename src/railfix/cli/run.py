@@ -24,6 +24,10 @@ def run(
     - `train.csv` and `train.parquet`: positions of the filter along the track over all epochs so far,
       with speed, direction and the probability of the branch (not with `--filter off`); with `--smooth` also by
       what was measured later
+    - `tracks.csv` and `tracks.parquet` (TRACK a network of tracks in one file): every track near each position with
+      its probability; the route is found from the log, and alternatives are named
+    - `track.csv`: the track as it was used, where it is not that of its file (route of a network, other heights or
+      frame)
     - `observations.parquet` (with `--observations`): one row per epoch, satellite and signal
     - `run.json`: versions, hashes of the inputs, settings given and used, counts by status and
       reason, positioning rate
