@@ -79,8 +79,10 @@ class Separations:
 def scaled(variance_m2: Floats, map_m: Floats, scale: Floats) -> Floats:
     """Variance with the noise scale, of one without (last axis of `map_m` is across and up)."""
     from_map = map_m[..., 0] ** 2 + map_m[..., 1] ** 2
-    square = scale**2 if variance_m2.ndim == 1 else scale[:, None] ** 2
-    return np.asarray(np.maximum(square * (variance_m2 - from_map) + from_map, 0.0))
+    variance = variance_m2 - from_map
+    variance *= scale**2 if variance_m2.ndim == 1 else scale[:, None] ** 2
+    variance += from_map
+    return np.maximum(variance, 0.0, out=variance)
 
 
 def all_in_view(
@@ -169,7 +171,12 @@ def without_two(full: AllInView, first: Indices, second: Indices) -> Separations
         shown = np.where(seen, (x * gain_1[t, k] + y * gain_2[t, k]) / np.where(seen, size, 1.0) ** 2, 0.0)
         weight_1[t, k], weight_2[t, k] = x * shown, y * shown
     moved = -(weight_1 * full.residual[:, first] + weight_2 * full.residual[:, second])
-    response = weight_1[..., None] * full.map_gain_m[:, first] + weight_2[..., None] * full.map_gain_m[:, second]
+    # Across and up are each contiguous, as all sums run over the pairs.
+    response = np.moveaxis(np.empty((2, *weight_1.shape)), 0, -1)
+    for axis in range(2):
+        of_map = np.ascontiguousarray(full.map_gain_m[..., axis])
+        np.multiply(weight_1, of_map[:, first], out=response[..., axis])
+        response[..., axis] += weight_2 * of_map[:, second]
     left = None
     if full.by_range:
         left = gain[:, None, :] - weight_1[..., None] * full.projector[:, first]
@@ -429,15 +436,15 @@ def _separations(
     whole_response = full.map_m[:, None] + response
     apart = scaled(square, response, full.scale)
     total = scaled(full.variance_m2[:, None] + square, whole_response, full.scale)
-    bias = np.abs((whole_response * full.map_bias[:, None]).sum(axis=2))
+    bias = whole_response[..., 0] * full.map_bias[:, :1] + whole_response[..., 1] * full.map_bias[:, 1:]
+    np.abs(bias, out=bias)
     if left is not None and full.range_bias is not None:
         bias = bias + np.einsum("tki,ti->tk", np.abs(left), full.range_bias)
     if left is not None and full.beyond is not None:
         apart = apart + np.einsum("tki,ti->tk", (left - full.gain_m[:, None]) ** 2, full.beyond)
         total = total + np.einsum("tki,ti->tk", left**2, full.beyond)
-    return Separations(
-        sigma_m=np.where(blind, np.inf, np.sqrt(total)),
-        separation_sigma_m=np.where(blind, np.inf, np.sqrt(apart)),
-        moved_m=np.where(blind, 0.0, moved),
-        bias_m=np.where(blind, 0.0, bias),
-    )
+    np.sqrt(total, out=total)
+    np.sqrt(apart, out=apart)
+    if blind.any():
+        total[blind], apart[blind], moved[blind], bias[blind] = np.inf, np.inf, 0.0, 0.0
+    return Separations(sigma_m=total, separation_sigma_m=apart, moved_m=moved, bias_m=bias)
