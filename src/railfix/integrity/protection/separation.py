@@ -349,12 +349,18 @@ def without_map(
 class _Group:
     """A group of channels left out, T epochs."""
 
-    across: Floats  # (T, n, n) of the rest onto the group
-    pull: Floats  # (T, n) of the residuals of the group on the position
+    place: Indices  # (T, m) of the group in the compact arrays, and of others where it has fewer
+    inverse: Floats  # (T, m, m) S_JJ^+; 0 for others
     square: Floats  # (T,) variance of the distance
     moved: Floats  # (T,)
     response: Floats  # (T, 2) of the distance to the map error
     blind: Masks  # (T,)
+
+    def across(self, projector: Floats) -> Floats:
+        """Return what of the rest falls onto the group, ``S S_JJ^+``, shape (T, n, n)."""
+        whole, epoch = np.zeros(projector.shape), np.arange(len(projector))[:, None, None]
+        whole[epoch, self.place[:, :, None], self.place[:, None, :]] = self.inverse
+        return np.asarray(projector @ whole)
 
 
 def _group(full: AllInView, members: Masks) -> _Group:
@@ -362,19 +368,24 @@ def _group(full: AllInView, members: Masks) -> _Group:
 
     Where S_JJ is singular (a clock of the group alone), the direction that no residual shows must move nothing.
     """
-    mask, projector, gain = members.astype(np.float64), full.projector, full.gain_m
-    values, vectors = np.linalg.eigh(projector * mask[:, :, None] * mask[:, None, :])
+    most = max(1, int(np.count_nonzero(members, axis=1).max(initial=0)))
+    place = np.argsort(~members, axis=1, kind="stable")[:, :most]
+    epoch = np.arange(len(members))[:, None]
+    mask = members[epoch, place].astype(np.float64)
+    both = mask[:, :, None] * mask[:, None, :]
+    gain, residual = full.gain_m[epoch, place] * mask, full.residual[epoch, place]
+    values, vectors = np.linalg.eigh(full.projector[epoch[..., None], place[:, :, None], place[:, None, :]] * both)
     some = values > LEAST_REDUNDANCY
     inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
-    inverse *= mask[:, :, None] * mask[:, None, :]
-    hidden = np.einsum("tij,ti->tj", vectors * mask[:, :, None], gain * mask) * ~some
+    inverse *= both
+    hidden = np.einsum("tij,ti->tj", vectors, gain) * ~some
     pull = np.einsum("tij,tj->ti", inverse, gain)
     return _Group(
-        across=projector @ inverse,
-        pull=pull,
+        place=place,
+        inverse=inverse,
         square=(pull * gain).sum(axis=1),
-        moved=-(pull * full.residual).sum(axis=1),
-        response=np.einsum("ti,tij->tj", pull, full.map_gain_m),
+        moved=-(pull * residual).sum(axis=1),
+        response=np.einsum("ti,tij->tj", pull, full.map_gain_m[epoch, place]),
         blind=np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(full.variance_m2),
     )
 
@@ -389,7 +400,9 @@ def without_group(full: AllInView, members: Masks) -> Separations:
         Places of the group in the compact arrays; some epochs may have none.
     """
     group = _group(full, members)
-    left = (full.gain_m - np.einsum("tij,tj->ti", group.across, full.gain_m))[:, None] if full.by_range else None
+    left = None
+    if full.by_range:
+        left = (full.gain_m - np.einsum("tij,tj->ti", group.across(full.projector), full.gain_m))[:, None]
     return _separations(
         full, group.square[:, None], group.response[:, None], group.moved[:, None], left, group.blind[:, None]
     )
@@ -408,7 +421,7 @@ def without_constellation_and_one(full: AllInView, members: Masks) -> Separation
         Places of the constellation in the compact arrays; some epochs may have none.
     """
     group = _group(full, members)
-    rest, across = full.used & ~members, group.across
+    rest, across = full.used & ~members, group.across(full.projector)
     projector, gain = full.projector, full.gain_m
     left_gain = rest * (gain - np.einsum("tij,tj->ti", across, gain))
     left_residual = rest * (full.residual - np.einsum("tij,tj->ti", across, full.residual))
