@@ -222,7 +222,6 @@ def test_mqtt(subscribed: tuple[int, list[bytes]], form: str) -> None:
 
     async def run() -> None:
         sink = await open_sink(f"{form}@mqtt://127.0.0.1:{port}/railway/train 7")
-        await asyncio.sleep(0.2)
         for k in range(50):
             sink.send(output(k))
         await asyncio.to_thread(sink.close)
@@ -269,6 +268,30 @@ def test_mqtt_broker_that_goes_away_and_comes_back(tmp_path: Path) -> None:
 
     try:
         asyncio.run(run())
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def test_mqtt_broker_that_asks_for_a_password(tmp_path: Path) -> None:
+    pytest.importorskip("paho.mqtt.client", reason="paho-mqtt is not installed")
+    if shutil.which("mosquitto_passwd") is None:
+        pytest.skip("mosquitto_passwd (Debian package mosquitto) is not installed")
+    port = free_port()
+    process = started_broker(tmp_path, port, password=True)
+
+    async def run(login: str) -> None:
+        sink = await open_sink(f"json@mqtt://{login}127.0.0.1:{port}/x")
+        sink.send(output(1))
+        await asyncio.to_thread(sink.close)
+        assert sink.failed == 0
+        assert "p%3As" not in sink.name
+
+    try:
+        asyncio.run(run("train:p%3As@"))
+        for login in ("", "train:wrong@"):
+            with pytest.raises(OutputError, match="refuses the connection"):
+                asyncio.run(run(login))
     finally:
         process.terminate()
         process.wait(10)

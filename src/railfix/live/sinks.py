@@ -7,6 +7,7 @@ Forms: see `railfix.live.forms`. Targets: ``-`` (standard output), a file, ``udp
 from __future__ import annotations
 
 import asyncio
+import queue
 import socket
 import sys
 from collections import deque
@@ -23,6 +24,8 @@ from railfix.live.settings import LiveSettings
 
 #: Bytes that may wait for a slow reader of a TCP sink; more and the reader is disconnected.
 _LARGEST_BACKLOG: Final = 1 << 20
+#: Longest wait for the answer of an MQTT broker [s].
+_ANSWER_S: Final = 10.0
 _HELP: Final = (
     "expected FORM@TARGET, FORM one of json, cbor, nmea, tpv, etcs, positions, train, TARGET -, a file, udp://, "
     "tcp-server:// or mqtt://"
@@ -112,18 +115,21 @@ class MqttTarget:
         self._client = client.Client(enums.CallbackAPIVersion.VERSION2)
         if parts.username is not None:
             self._client.username_pw_set(unquote(parts.username), unquote(parts.password or ""))
-        refused: list[str] = []
-
-        def answered(_client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-            if reason.is_failure:
-                refused.append(str(reason))
-
-        self._client.on_connect = answered
+        answers: queue.Queue[Any] = queue.Queue()
+        self._client.on_connect = lambda _client, _data, _flags, reason, _properties: answers.put(reason)
         try:
             self._client.connect(str(parts.hostname), int(parts.port or 0))
         except OSError as error:
             raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: cannot be connected to ({error})") from None
         self._client.loop_start()
+        try:
+            answer = answers.get(timeout=_ANSWER_S)
+        except queue.Empty:
+            answer = "no answer"
+        self._client.on_connect = None
+        if not self._client.is_connected():
+            self._client.loop_stop()
+            raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker refuses the connection ({answer})")
 
     def send(self, output: LiveOutput) -> None:
         """Publish one message, none where the form has nothing to say.
