@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 import railfix
+import railfix.core
+import railfix.ground
+import railfix.motion
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.simulate.demo_data import demo_files

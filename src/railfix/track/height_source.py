@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 from pyproj import CRS, Transformer
-from scipy.ndimage import map_coordinates
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
@@ -131,6 +130,8 @@ def _sampled(raster: Any, place: Floats) -> Floats:
 
     Read in windows about neighbouring points, so that memory does not grow with the raster.
     """
+    from scipy.ndimage import map_coordinates
+
     low = np.floor(place.min(axis=1)).astype(np.int64)
     size = np.floor(place.max(axis=1)).astype(np.int64) + 2 - low
     if size.prod() > _WINDOW_CELLS and place.shape[1] > 1:

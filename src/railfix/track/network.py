@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, cast
+from typing import TYPE_CHECKING, Final, cast
 
-import networkx as nx
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -23,6 +22,9 @@ from railfix.track.polyline import NearestOnPolyline, project_on_segments
 from railfix.track.route import one_frame
 from railfix.track.segment import Segment
 from railfix.track.track import UNNAMED, interpolate_kilometrage
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 #: Way over which the direction of an end is taken [m].
 _DIRECTION_M: Final = 10.0
@@ -119,6 +121,8 @@ class Network:
     @cached_property
     def graph(self) -> nx.DiGraph[int]:
         """Directed graph of passages: node 4 t + 2 e is entering track t at end e, 4 t + 2 e + 1 leaving it there."""
+        import networkx as nx
+
         graph: nx.DiGraph[int] = nx.DiGraph()
         for t, length in enumerate(self.length_m.tolist()):
             graph.add_edge(4 * t, 4 * t + 3, weight=length)
@@ -249,6 +253,8 @@ class Network:
 
     def _ways_from(self, node: int, stop: int) -> tuple[dict[int, float], dict[int, list[int]]]:
         """Lengths and paths from a node, first near it and, where the track is not among them, in the whole network."""
+        import networkx as nx
+
         for cutoff in (_NEAR_WAY_M, None):
             length, path = cast(
                 "tuple[dict[int, float], dict[int, list[int]]]",

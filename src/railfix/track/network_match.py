@@ -15,7 +15,6 @@ from functools import partial
 from os import PathLike
 from typing import Any, Final
 
-import networkx as nx
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
@@ -280,6 +279,8 @@ class _Transitions:
         return False
 
     def _from(self, track: int, end: int, reach_m: float) -> dict[int, float]:
+        import networkx as nx
+
         searched, ways = self._ways.get((track, end), (-1.0, {}))
         node = 4 * track + 2 * end + 1
         if searched < reach_m and node in self._network.graph:
