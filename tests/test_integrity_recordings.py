@@ -13,7 +13,6 @@ import pytest
 
 import integrity_recordings
 from integrity_recordings import ALARM_LIMITS_M, Group
-from railfix.core.reasons import Status
 from railfix.integrity.raim import constrained_model
 from railfix.integrity.stanford import Region
 
@@ -41,16 +40,11 @@ def median_level(group: Group) -> float:
     return float(np.median(level[np.isfinite(level)]))
 
 
-def test_no_error_passes_its_level_but_one_on_another_piece_of_the_line(groups):
-    """M8T, one second: codes of two satellites 500 m early put it onto another street, status uncertain."""
+def test_no_error_passes_its_level(groups):
     total = 0
     for (name, model), group in groups.items():
-        found = [epoch for one in group for epoch in integrity_recordings.over_level(one)]
         total += sum(int(np.isfinite(one.level_m).sum()) for one in group)
-        assert len(found) <= (name == "urbannav_m8t"), (name, model)
-        for epoch in found:
-            assert epoch.why.startswith("another place of the line"), epoch
-            assert epoch.status == Status.UNCERTAIN.text
+        assert not [epoch for one in group for epoch in integrity_recordings.over_level(one)], (name, model)
     assert total > 12_000
 
 
@@ -71,15 +65,15 @@ def test_the_verdict_never_lets_an_error_pass(groups):
     ("name", "model", "median_m", "limit_m", "rate"),
     [
         ("urbannav_f9p", "none", 45.0, 40.0, 0.45),
-        ("urbannav_f9p", "all others", 80.0, 40.0, 0.10),
+        ("urbannav_f9p", "all others", 80.0, 40.0, 0.05),
         ("urbannav_m8t", "none", 80.0, 40.0, 0.25),
-        ("urbannav_m8t", "all others", 90.0, 40.0, 0.10),
+        ("urbannav_m8t", "all others", 120.0, 40.0, 0.04),
         ("gsdc", "none", 95.0, 40.0, 0.08),
-        ("gsdc", "all others", 120.0, 40.0, 0.07),
-        ("japan", "none", 10.0, 10.0, 0.98),
-        ("japan", "all others", 80.0, 40.0, 0.05),
+        ("gsdc", "all others", 160.0, 40.0, 0.04),
+        ("japan", "none", 10.0, 10.0, 0.93),
+        ("japan", "all others", 170.0, 200.0, 0.90),
         ("japan", "own first half", 6.0, 10.0, 0.98),
-        ("japan", "own first half, base", 13.0, 10.0, 0.80),
+        ("japan", "own first half, base", 13.0, 20.0, 0.98),
         ("geonet2005", "none", 20.0, 20.0, 0.50),
         ("geonet2005", "same, no C/N0", 65.0, 40.0, 0.15),
     ],
@@ -92,13 +86,17 @@ def test_levels_and_availability(groups, name, model, median_m, limit_m, rate):
 
 
 @pytest.mark.requirement("C3")
-def test_a_model_of_open_sky_is_found_out_in_a_city(groups):
-    """Far too narrow there: the separations contradict each other instead of errors passing levels."""
-    for name, least in (("urbannav_f9p", 0.35), ("urbannav_m8t", 0.35), ("gsdc", 0.03)):
-        (one,) = groups[name, "open sky, base"]
-        assert one.alarms.sum() > least * one.observed.sum(), name
-        (other,) = groups[name, "all others"]
-        assert other.alarms.sum() < 0.02 * other.observed.sum(), name
+def test_a_model_of_open_sky_makes_no_small_levels_in_a_city(groups):
+    """Far too narrow there: the receiver's own scale sets the sigmas."""
+    for name in ("urbannav_f9p", "urbannav_m8t", "gsdc"):
+        assert median_level(groups[name, "open sky, base"]) > 0.8 * median_level(groups[name, "none"]), name
+
+
+@pytest.mark.requirement("C3")
+def test_no_model_moves_a_position(groups):
+    for name in ("urbannav_f9p", "urbannav_m8t", "gsdc", "japan"):
+        (one,), (other,) = groups[name, "none"], groups[name, "all others"]
+        assert np.array_equal(one.result.arc_m, other.result.arc_m, equal_nan=True), name
 
 
 @pytest.mark.requirement("C3")
@@ -140,7 +138,12 @@ def test_the_level_follows_from_what_the_result_tells(groups):
     model = constrained_model(
         integrity_recordings.ranges_of(result), one.trajectory, arc, section=np.maximum(result.constrained.section, 0)
     )
-    level = result.protection.level
+    level, scale = result.protection.level, result.noise_scale
     has = np.isfinite(level.sigma_m) & np.isfinite(result.arc_m)
     assert has.sum() > 600
-    assert np.sqrt(model.covariance_m2[has, 0, 0]) == pytest.approx(level.sigma_m[has], rel=1e-6)
+    map_response = model.covariance_m2[:, 0, 1:] * np.sqrt(np.diag(model.prior)[1:])
+    of_map = (map_response**2).sum(axis=1)
+    bound = np.nan_to_num(result.bound_sigma_m[:, result.columns]) * model.root_weight
+    beyond = np.maximum(bound**2 - scale[:, None] ** 2, 0.0) * model.used
+    expected = scale**2 * (model.covariance_m2[:, 0, 0] - of_map) + of_map + (model.gain_m[..., 0] ** 2 * beyond).sum(1)
+    assert np.sqrt(expected[has]) == pytest.approx(level.sigma_m[has], rel=1e-6)
