@@ -181,6 +181,19 @@ def test_a_train_that_runs_back_over_another_track_has_a_route_and_says_so() -> 
     assert left_out[0] in (1, 2)
 
 
+def test_a_gap_in_the_map_ends_the_route_and_is_said() -> None:
+    """Of tracks without a connection those before or behind it are the route, and the others are left out."""
+    made = made_network(10.0)
+    for cut in (0, 2):
+        links = tuple(link for link in made.links if {link.first, link.second} not in ({cut, 1}, {1, 3}, {2, 3}))
+        net = replace(made, links=links)
+        log, _ = made_run(made, [0, 1, 3], rng=np.random.default_rng(5), sigma_m=0.05)
+        route, left_out = route_of(net, match(net, log, sigma_m=0.3))
+        assert set(route) | set(left_out) >= {0, 1, 3}
+        assert not set(route) & set(left_out)
+        assert 1 <= len(left_out) <= 2
+
+
 def test_positions_are_matched_in_the_frame_of_the_map() -> None:
     """Positions of satellites on tracks in ETRS89: on them when moved, 0.8 m north-east of them as they are."""
     made = made_network(10.0)

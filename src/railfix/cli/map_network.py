@@ -169,7 +169,7 @@ def route(
             raise MismatchError(f"{positions}: no position lies near a track of the network")
         if left_out:
             beside = ", ".join(net.names[k] for k in left_out)
-            notes.append(f"the run turned back, perhaps over {beside}, which no route joins to the others")
+            notes.append(f"no route joins these tracks to {beside}: the run turned back there, or the map has a gap")
     elif len(net.tracks) == 1:
         passed = [0]
     else:

@@ -181,7 +181,7 @@ class RouteOfLog:
         )
         if self.left_out:
             beside = ", ".join(self.network.names[k] for k in self.left_out)
-            first += f"; the train turned back, perhaps over {beside}, which no route joins to these"
+            first += f"; no route joins these to {beside}: the train turned back there, or the map has a gap"
         more = len(self.alternatives) - _NAMED
         rest = (f"route: {more} more stretches with alternatives are in run.json",) if more > 0 else ()
         return (*self.network.notes, first, *(a.sentence for a in self.alternatives[:_NAMED]), *rest)

@@ -322,7 +322,8 @@ def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
     """Tracks that a run passed, and those that it may have passed but no route can join to them.
 
     Gaps are filled with the shortest way over navigable connections. A train that runs back over tracks it has
-    passed stays on the same route; where it runs back over others, the less probable ones are left out.
+    passed stays on the same route; where it runs back over others, or the map has a gap, the less probable ones are
+    left out.
 
     Returns
     -------
@@ -336,14 +337,17 @@ def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
     passed = [int(t) for t in seen[np.concatenate([[True], np.diff(seen) != 0])]]
     if (route := network.route_over(passed)) is not None:
         return route, []
-    # the train turned back: of the legs between its turns the most probable one
+    # the train turned back, or the map has a gap: of the legs between the most probable one
     legs: list[list[int]] = []
     start = 0
-    while start < len(passed) - 1:
-        # a prefix of a route is one
-        count = bisect_left(range(2, len(passed) - start + 1), 1, key=partial(_ends_a_leg, network, passed[start:])) + 1
-        legs.append(network.shortest_route(passed[start : start + count]))
-        start += count - 1
+    while start < len(passed):
+        rest = passed[start:]
+        # the longest prefix that is a route: every prefix of one is
+        count = bisect_left(range(2, len(rest) + 1), 1, key=partial(_ends_a_leg, network, rest)) + 1
+        legs.append(network.shortest_route(rest[:count]))
+        if count == len(rest):
+            break
+        start += max(count - 1, 1)
     share = {t: float(matched.probabilities[matched.candidates.track == t].sum()) for t in set(passed)}
     route = max(legs, key=lambda leg: sum(share.get(t, 0.0) for t in set(leg)))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
