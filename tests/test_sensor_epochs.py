@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from railfix.core.errors import InputFileError
+from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.timescale import timedelta
 from railfix.motion.samples import InertialSamples, RadarSpeeds, SensorSamples, TachometerPulses
 from railfix.pipeline.sensor_epochs import SensorLimits, SensorState, sensor_epochs
-from railfix.run.sensors import read_sensors, until
+from railfix.run.sensors import check_units, read_sensors, read_units, until
 from tracking_cases import START, bent_line
 
 LIMITS = SensorLimits()
@@ -141,3 +141,23 @@ def test_tables_are_read_and_bad_ones_named(tmp_path: Path) -> None:
     back.write_text("time_gpst,pulse\n2024-03-05T03:10:00.2,1\n2024-03-05T03:10:00.1,2\n")
     with pytest.raises(InputFileError, match="falls"):
         read_sensors(tachometer=back)
+
+
+@pytest.mark.requirement("E4")
+def test_ranges_and_ground_units_are_read_and_held_against_each_other(tmp_path: Path) -> None:
+    ranges, units = tmp_path / "ranges.csv", tmp_path / "units.csv"
+    ranges.write_text("time_gpst,unit,range_m\n2024-03-05T03:10:00.1,A,55.1\n2024-03-05T03:10:00.3,B,40.2\n")
+    units.write_text("unit,x_m,y_m,z_m\nA,1.0,2.0,3.0\nB,4.0,5.0,6.0\n")
+    samples, surveyed = read_sensors(ranging=ranges), read_units(units)
+    assert samples.ranging.station.tolist() == ["A", "B"]
+    assert np.isnan(samples.ranging.sigma_m).all()
+    np.testing.assert_array_equal(surveyed.ecef_m[1], [4.0, 5.0, 6.0])
+    check_units(samples, surveyed, units)
+    with pytest.raises(MismatchError, match="ground unit A, and there is no --ranging-units"):
+        check_units(samples, None, None)
+    units.write_text("unit,x_m,y_m,z_m\nA,1.0,2.0,3.0\nA,4.0,5.0,6.0\n")
+    with pytest.raises(InputFileError, match="names unit A twice"):
+        read_units(units)
+    units.write_text("unit,x_m,y_m\nA,1.0,2.0\n")
+    with pytest.raises(InputFileError, match="has no column z_m"):
+        read_units(units)
