@@ -19,7 +19,7 @@ from railfix.ground.authority import Authority
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.keys import write_keys
 from railfix.ground.link_figure import draw_coverage
-from railfix.ground.link_quality import LinkName
+from railfix.ground.link_quality import LinkLimits, LinkName
 from railfix.ground.links import BEARERS, CentreLinks, TrainLinks
 from railfix.ground.monitor import MonitorState
 from railfix.ground.on_board import OnBoard
@@ -188,6 +188,7 @@ async def run_demo(
                 {bearer: relays[number, bearer].address for bearer in BEARERS},
                 local,
                 received=lambda payload: traffic.authority(Authority.decode(payload)),
+                limits=LinkLimits(idle_s=10.0),  # its outages are short in real time
             )
         try:
             for links in trains.values():

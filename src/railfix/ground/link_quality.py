@@ -30,7 +30,8 @@ class LinkLimits(Settings):
     place_m : float [m]
         Length of a place of the coverage map.
     idle_s : float [s]
-        A connection without any packet for this time is made anew.
+        A connection without any packet for this time, at most 10 s, is made anew: so the trains of a centre that was
+        killed come back.
     """
 
     answer_s: float = Field(default=1.0, gt=0)
@@ -39,7 +40,7 @@ class LinkLimits(Settings):
     good_s: float = Field(default=30.0, ge=0)
     window: int = Field(default=60, ge=1)
     place_m: float = Field(default=100.0, gt=0)
-    idle_s: float = Field(default=5.0, gt=0)
+    idle_s: float = Field(default=5.0, gt=0, le=10)
 
 
 @dataclass(kw_only=True)

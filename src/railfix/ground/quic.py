@@ -23,8 +23,8 @@ from cryptography import x509
 
 #: Name of the protocol in the handshake.
 PROTOCOL: Final = "railfix-link/1"
-#: A connection without any packet ends after this time [s]; so the trains of a centre that was killed connect again.
-IDLE_S: Final = 5.0
+#: A connection without any packet ends after this time [s], or earlier where the train wants so (`LinkLimits.idle_s`).
+IDLE_S: Final = 10.0
 _REJECTED: Final = 0x101
 
 
