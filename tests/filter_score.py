@@ -1,7 +1,7 @@
 """Scores of the filter along the track on the real recordings: ``python tests/filter_score.py [TABLE ...]``.
 
 Tables: ``figures`` (single epochs beside, and smoothed), ``ablation`` (without each kind of measurement), ``gaps``
-(windows without satellites, with and without a wheel), ``starts`` (cold starts), ``levels`` (faults of one satellite),
+(windows without satellites, with and without a wheel), ``levels`` (faults of one satellite),
 ``cost``. One setting for all recordings; distances are straight ones on the map.
 """
 
@@ -219,31 +219,6 @@ def show_gaps(all_cases: list[Case]) -> None:
                     )
 
 
-def show_starts(all_cases: list[Case]) -> None:
-    """Cold starts every 40 s: wrong places (over 50 m) after some time, and the probability given to them."""
-    for case in all_cases:
-        t = seconds(case.epochs.time - case.epochs.time[0])
-        wrong: dict[int, list[bool]] = {0: [], 10: [], 60: []}
-        sure: list[bool] = []
-        for begin in np.arange(0.0, t[-1] - 60.0, 40.0):
-            first, end = (int(k) for k in np.searchsorted(t, [begin, begin + 61.0]))
-            if end == first:
-                continue
-            piece = case.part(first, end)
-            found = piece.run()
-            error = piece.error(found)
-            for after in wrong:
-                at = int(np.searchsorted(t[first:end], begin + after))
-                if at < len(error) and np.isfinite(error[at]):
-                    wrong[after].append(bool(error[at] > 50.0))
-                    if found.probability[at] > 0.99:
-                        sure.append(bool(error[at] > 50.0))
-        counts = ", ".join(f"{after} s {sum(w)} of {len(w)}" for after, w in wrong.items())
-        print(
-            f"{case.name:9s} wrong after {counts}; with probability over 0.99: {sum(sure)} of {len(sure)}", flush=True
-        )
-
-
 def show_levels(all_cases: list[Case]) -> None:
     """Faults of one satellite 60 s after a cold start, over 60 s: errors over the level; without a fault first."""
     for whole in all_cases:
@@ -287,7 +262,6 @@ TABLES = {
     "figures": show_figures,
     "ablation": show_ablation,
     "gaps": show_gaps,
-    "starts": show_starts,
     "levels": show_levels,
     "cost": show_cost,
 }

@@ -130,6 +130,7 @@ class Numbers(NamedTuple):
     chord_m: float
     gravity_mps2: float
     switch: float
+    most_odds: float
     decided: float
     tracking: int
     several: int
@@ -1175,7 +1176,10 @@ def advance(
                 for c in range(3):
                     square += (points[h, c] - points[best, c]) ** 2
                 part = square / (square + numbers.map_branch_m**2)
-                right[h] = memory.log_probability[h] + evidence[best] + part * (evidence[h] - evidence[best])
+                odds = memory.log_probability[h] - memory.log_probability[best]
+                most = numbers.most_odds * square / numbers.map_branch_m**2
+                after_odds = odds + part * (evidence[h] - evidence[best])
+                right[h] = min(max(after_odds, min(odds, -most)), max(odds, most))
             total = _log_sum(right, count)
             for h in range(count):
                 memory.log_probability[h] = right[h] - total

@@ -230,6 +230,7 @@ def _numbers(kernel: ModuleType, limits: TrackingLimits) -> Any:
         "chord_m": rows.CHORD_M,
         "gravity_mps2": rows.GRAVITY_MPS2,
         "switch": hypotheses.SWITCH,
+        "most_odds": hypotheses.MOST_ODDS,
         "decided": DECIDED,
         "tracking": int(TrackStatus.TRACKING),
         "coasting": int(TrackStatus.COASTING),

@@ -16,7 +16,7 @@ from railfix.tracking.chunk import Chunk, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
-from railfix.tracking.hypotheses import most_probable, on_the_line, surviving, with_map_error
+from railfix.tracking.hypotheses import judged, most_probable, on_the_line, surviving
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
@@ -187,8 +187,7 @@ def _measure(
         after = applied(mean, covariance, prior, update)
     if state.hypotheses > 1:
         evidence = log_evidence(settled, prior, update, degrees)
-        evidence = with_map_error(evidence, line.at(after[0][:, Unknown.PLACE])[0], state.log_probability, limits)
-        log_probability = state.log_probability + evidence
+        log_probability = judged(state.log_probability, evidence, line.at(after[0][:, Unknown.PLACE])[0], limits)
         state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     step.cut |= np.diagonal(covariance, axis1=1, axis2=2) != np.diagonal(predicted_covariance, axis1=1, axis2=2)
     step.updated = (covariance, settled.combine / prior.root[:, :, None], prior.information, update)

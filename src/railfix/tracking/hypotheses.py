@@ -14,7 +14,8 @@ from railfix.tracking.line import Line
 from railfix.tracking.predict import CODE_CLOCK_SIGMA_M
 from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Unknown
 
-#: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between [m].
+#: The line is searched at points this far apart; a Gaussian of `start_sigma_m` covers what lies between, and codes
+#: count with the error that a place between two points makes [m].
 _SPACING_M: Final = 15.0
 #: Places whose logarithm of likelihood is this far below the best are not begun with.
 _WORSE: Final = 12.0
@@ -28,6 +29,8 @@ FORCE_PRIOR_MPS2: Final = 0.1
 RADAR_PRIOR: Final = 0.02
 #: How much more probable another place must be to be gone by: near-equal ones would take turns.
 SWITCH: Final = 3.0
+#: Logarithm of the odds that a difference of one `map_branch_m` can give: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
+MOST_ODDS: Final = 2.25
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
@@ -57,7 +60,7 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     for group in groups:
         distance, _ = range_with_rotation(chunk.sat_ecef_m[epoch, group], points[:, None, :])
         residual = chunk.measured[0, epoch, group] - distance
-        variance = (1.0 + limits.code_white_share**2) * chunk.code_sigma_m[epoch, group] ** 2
+        variance = (1.0 + limits.code_white_share**2) * chunk.code_sigma_m[epoch, group] ** 2 + _SPACING_M**2 / 12.0
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(limits.passes):
             weight = (degrees + 1.0) / (degrees + (residual - clock) ** 2 / variance) / variance
@@ -176,27 +179,31 @@ def beside(mean: Floats, covariance: Floats, limits: TrackingLimits) -> tuple[Fl
     return means, covariances, np.full(len(steps), np.log(_BESIDE_SHARE / len(steps)))
 
 
-def with_map_error(log_evidence: Floats, ecef_m: Floats, log_probability: Floats, limits: TrackingLimits) -> Floats:
-    """Evidence of the hypotheses where branches lie within the error of the map, shape (H,).
+def judged(log_probability: Floats, log_evidence: Floats, ecef_m: Floats, limits: TrackingLimits) -> Floats:
+    """Probabilities after an epoch, up to a constant, where branches may lie within the error of the map, shape (H,).
 
     Two branches a few metres apart differ in their ranges by as much as the map may be wrong, at every epoch alike:
     summed over epochs the difference would decide between them, and often wrongly. The difference to the most probable
-    hypothesis counts by ``d^2 / (d^2 + map_branch_m^2)`` with their distance d.
+    hypothesis counts by ``d^2 / (d^2 + map_branch_m^2)`` with their distance d, and takes the logarithm of their odds
+    no further than ``d^2 / (2 s^2)``, all that a place known without noise could say with a map that is wrong by
+    map_branch_m / 3 at each branch (s^2 twice its square). What motion decided while they were apart stays.
 
     Parameters
     ----------
+    log_probability : ndarray, shape (H,)
+        Before the epoch.
     log_evidence : ndarray, shape (H,)
         Of this epoch.
     ecef_m : ndarray, shape (H, 3) [m]
         Places of the hypotheses.
-    log_probability : ndarray, shape (H,)
-        Before the epoch.
     limits : TrackingLimits
     """
     best = int(np.argmax(log_probability))
     square = ((ecef_m - ecef_m[best]) ** 2).sum(axis=1)
-    share = square / (square + limits.map_branch_m**2)
-    return np.asarray(log_evidence[best] + share * (log_evidence - log_evidence[best]))
+    before = log_probability - log_probability[best]
+    after = before + square / (square + limits.map_branch_m**2) * (log_evidence - log_evidence[best])
+    most = MOST_ODDS * square / limits.map_branch_m**2
+    return np.asarray(np.clip(after, np.minimum(before, -most), np.maximum(before, most)))
 
 
 def on_the_line(mean: Floats, covariance: Floats, line: Line, limits: TrackingLimits) -> Floats:
