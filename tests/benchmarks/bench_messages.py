@@ -76,8 +76,8 @@ def main() -> None:
     options = parser.parse_args()
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     receiver.bind(("127.0.0.1", 0))
-    receiver.settimeout(20.0)
-    began = time.monotonic() + 8.0  # after the program has started
+    receiver.settimeout(90.0)
+    began = time.monotonic() + 15.0  # after the program has started
     until, ports, started = began + options.seconds, list[int](), threading.Event()
     threading.Thread(target=lambda: asyncio.run(both(began, until, ports, started)), daemon=True).start()
     started.wait(30)
