@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 import protection_oracle
 import raim_oracle as oracle
 from railfix.integrity.protection import RiskBudget, along_track_level
+from railfix.integrity.protection.groups import without_group
 from railfix.integrity.protection.separation import (
     Separations,
     all_in_view,
     without_constellation,
-    without_group,
     without_map,
     without_one,
     without_two,

@@ -27,14 +27,13 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
 from railfix.integrity.protection.allocation import Allocation, allocate
+from railfix.integrity.protection.groups import without_constellation_and_one, without_group
 from railfix.integrity.protection.risk import RiskBudget, one_sided_k, pair_sum
 from railfix.integrity.protection.separation import (
     AllInView,
     Separations,
     all_in_view,
     without_constellation,
-    without_constellation_and_one,
-    without_group,
     without_map,
     without_one,
     without_three,

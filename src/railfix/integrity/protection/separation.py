@@ -22,7 +22,7 @@ from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import LinearModel, compact, regular_inverse
 
 #: Effect on the position, in its own sigmas, below which a satellite has none.
-_NO_EFFECT: Final = 1e-6
+NO_EFFECT: Final = 1e-6
 
 
 @dataclass(frozen=True)
@@ -136,9 +136,9 @@ def without_one(full: AllInView) -> Separations:
     share, gain = np.einsum("tii->ti", full.projector), full.gain_m
     checked = share > LEAST_REDUNDANCY
     weight = np.where(checked, gain / np.where(checked, share, 1.0), 0.0)
-    blind = ~checked & (np.abs(gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
+    blind = ~checked & (np.abs(gain) > NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
     left = gain[:, None, :] - weight[:, :, None] * full.projector if full.by_range else None
-    return _separations(full, weight * gain, weight[..., None] * full.map_gain_m, -weight * full.residual, left, blind)
+    return separations(full, weight * gain, weight[..., None] * full.map_gain_m, -weight * full.residual, left, blind)
 
 
 def without_two(full: AllInView, first: Indices, second: Indices) -> Separations:
@@ -166,7 +166,7 @@ def without_two(full: AllInView, first: Indices, second: Indices) -> Separations
         size = x**2 + y**2
         seen = size > LEAST_REDUNDANCY
         hidden = np.where(seen, np.abs(y * gain_1[t, k] - x * gain_2[t, k]), np.hypot(gain_1[t, k], gain_2[t, k]))
-        limit = _NO_EFFECT * np.sqrt(full.variance_m2[t]) * np.where(seen, np.sqrt(size), 1.0)
+        limit = NO_EFFECT * np.sqrt(full.variance_m2[t]) * np.where(seen, np.sqrt(size), 1.0)
         blind[t, k] = hidden > limit
         shown = np.where(seen, (x * gain_1[t, k] + y * gain_2[t, k]) / np.where(seen, size, 1.0) ** 2, 0.0)
         weight_1[t, k], weight_2[t, k] = x * shown, y * shown
@@ -181,7 +181,7 @@ def without_two(full: AllInView, first: Indices, second: Indices) -> Separations
     if full.by_range:
         left = gain[:, None, :] - weight_1[..., None] * full.projector[:, first]
         left -= weight_2[..., None] * full.projector[:, second]
-    return _separations(full, weight_1 * gain_1 + weight_2 * gain_2, response, moved, left, blind)
+    return separations(full, weight_1 * gain_1 + weight_2 * gain_2, response, moved, left, blind)
 
 
 def without_three(full: AllInView, members: Indices) -> Separations:
@@ -221,7 +221,7 @@ def without_three(full: AllInView, members: Indices) -> Separations:
         shown = values > LEAST_REDUNDANCY
         share = np.einsum("sij,si->sj", vectors, np.take_along_axis(gain[t], places, axis=1))
         hidden = np.sqrt((np.where(shown, 0.0, share) ** 2).sum(axis=1))
-        blind[t, at] = hidden > _NO_EFFECT * np.sqrt(full.variance_m2[t])
+        blind[t, at] = hidden > NO_EFFECT * np.sqrt(full.variance_m2[t])
         solved = np.where(shown, share / np.where(shown, values, 1.0), 0.0)
         weights[:, t, at] = np.einsum("sij,sj->is", vectors, solved)
     square, moved, left = np.zeros(gain_1.shape), np.zeros(gain_1.shape), None
@@ -234,7 +234,7 @@ def without_three(full: AllInView, members: Indices) -> Separations:
         left = np.repeat(gain[:, None, :], len(members), axis=1)
         for place, weight in zip((i, j, k), weights, strict=True):
             left -= weight[..., None] * full.projector[:, place]
-    return _separations(full, np.maximum(square, 0.0), response, moved, left, blind)
+    return separations(full, np.maximum(square, 0.0), response, moved, left, blind)
 
 
 def without_constellation(model: LinearModel, members: Masks, full: AllInView) -> Separations:
@@ -278,7 +278,7 @@ def without_constellation(model: LinearModel, members: Masks, full: AllInView) -
         response = np.matmul(model.design, row[..., None])[..., 0]
         response += ((1.0 + more * mass) * (row * pull).sum(axis=1))[:, None] * between
         kept = np.take_along_axis(np.where(members, 0.0, response), full.channel, axis=1)[:, None]
-    return _separations(
+    return separations(
         full,
         (row[:, 0] - covariance[:, 0, 0])[:, None],
         (-row[:, 1:] * prior - full.map_m)[:, None],
@@ -345,104 +345,7 @@ def without_map(
     return alone, with_one
 
 
-@dataclass(frozen=True)
-class _Group:
-    """A group of channels left out, T epochs."""
-
-    place: Indices  # (T, m) of the group in the compact arrays, and of others where it has fewer
-    inverse: Floats  # (T, m, m) S_JJ^+; 0 for others
-    square: Floats  # (T,) variance of the distance
-    moved: Floats  # (T,)
-    response: Floats  # (T, 2) of the distance to the map error
-    blind: Masks  # (T,)
-
-    def across(self, projector: Floats) -> Floats:
-        """Return what of the rest falls onto the group, ``S S_JJ^+``, shape (T, n, n)."""
-        whole, epoch = np.zeros(projector.shape), np.arange(len(projector))[:, None, None]
-        whole[epoch, self.place[:, :, None], self.place[:, None, :]] = self.inverse
-        return np.asarray(projector @ whole)
-
-
-def _group(full: AllInView, members: Masks) -> _Group:
-    """``S_JJ^+`` of a group of channels, and what leaving it out does.
-
-    Where S_JJ is singular (a clock of the group alone), the direction that no residual shows must move nothing.
-    """
-    most = max(1, int(np.count_nonzero(members, axis=1).max(initial=0)))
-    place = np.argsort(~members, axis=1, kind="stable")[:, :most]
-    epoch = np.arange(len(members))[:, None]
-    mask = members[epoch, place].astype(np.float64)
-    both = mask[:, :, None] * mask[:, None, :]
-    gain, residual = full.gain_m[epoch, place] * mask, full.residual[epoch, place]
-    values, vectors = np.linalg.eigh(full.projector[epoch[..., None], place[:, :, None], place[:, None, :]] * both)
-    some = values > LEAST_REDUNDANCY
-    inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
-    inverse *= both
-    hidden = np.einsum("tij,ti->tj", vectors, gain) * ~some
-    pull = np.einsum("tij,tj->ti", inverse, gain)
-    return _Group(
-        place=place,
-        inverse=inverse,
-        square=(pull * gain).sum(axis=1),
-        moved=-(pull * residual).sum(axis=1),
-        response=np.einsum("ti,tij->tj", pull, full.map_gain_m[epoch, place]),
-        blind=np.sqrt((hidden**2).sum(axis=1)) > _NO_EFFECT * np.sqrt(full.variance_m2),
-    )
-
-
-def without_group(full: AllInView, members: Masks) -> Separations:
-    """Any group of channels left out whole, K = 1.
-
-    Parameters
-    ----------
-    full : AllInView
-    members : ndarray of bool, shape (T, n)
-        Places of the group in the compact arrays; some epochs may have none.
-    """
-    group = _group(full, members)
-    left = None
-    if full.by_range:
-        left = (full.gain_m - np.einsum("tij,tj->ti", group.across(full.projector), full.gain_m))[:, None]
-    return _separations(
-        full, group.square[:, None], group.response[:, None], group.moved[:, None], left, group.blind[:, None]
-    )
-
-
-def without_constellation_and_one(full: AllInView, members: Masks) -> Separations:
-    """A whole constellation left out with each channel of the others, K = n.
-
-    What leaving out the constellation J makes of the projector, the residuals and the gains of the rest,
-    ``S - S_.J S_JJ^+ S_J.`` and the like, is what `without_one` needs of it.
-
-    Parameters
-    ----------
-    all_of : Whole
-    members : ndarray of bool, shape (T, n)
-        Places of the constellation in the compact arrays; some epochs may have none.
-    """
-    group = _group(full, members)
-    rest, across = full.used & ~members, group.across(full.projector)
-    projector, gain = full.projector, full.gain_m
-    left_gain = rest * (gain - np.einsum("tij,tj->ti", across, gain))
-    left_residual = rest * (full.residual - np.einsum("tij,tj->ti", across, full.residual))
-    left_map = rest[..., None] * (full.map_gain_m - across @ full.map_gain_m)
-    left_projector = (projector - across @ projector) * (rest[:, :, None] & rest[:, None, :])
-    share = np.einsum("tii->ti", left_projector)
-    checked = share > LEAST_REDUNDANCY
-    weight = np.where(checked, left_gain / np.where(checked, share, 1.0), 0.0)
-    left = left_gain[:, None, :] - weight[:, :, None] * left_projector if full.by_range else None
-    alone = ~checked & (np.abs(left_gain) > _NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
-    return _separations(
-        full,
-        np.maximum(group.square[:, None] + weight * left_gain, 0.0),
-        group.response[:, None] + weight[..., None] * left_map,
-        group.moved[:, None] - weight * left_residual,
-        left,
-        (alone | group.blind[:, None]) & rest,
-    )
-
-
-def _separations(
+def separations(
     full: AllInView, square: Floats, response: Floats, moved: Floats, left: Floats | None, blind: Masks
 ) -> Separations:
     """From variance of the distance (T, K), response to the map error (T, K, 2), gains of what is left (T, K, n)."""

@@ -167,11 +167,16 @@ class Compact:
 
 def compact(model: LinearModel) -> Compact:
     """The residual projector over the channels in use, in their order; (T, n, n) of memory."""
-    arrays = (model.root_weight, model.design, model.covariance_m2, model.clock, model.clock_covariance_m2)
-    more = (model.residual, model.gain_m)
-    names = [item.name for item in fields(Compact)]
-    found = side_by_side(*(np.ascontiguousarray(array) for array in (*arrays, *more)))
-    return Compact(**dict(zip(names, found, strict=True)))
+    channel, used, projector, residual, sigma, gain = side_by_side(
+        np.ascontiguousarray(model.root_weight),
+        np.ascontiguousarray(model.design),
+        np.ascontiguousarray(model.covariance_m2),
+        np.ascontiguousarray(model.clock),
+        np.ascontiguousarray(model.clock_covariance_m2),
+        np.ascontiguousarray(model.residual),
+        np.ascontiguousarray(model.gain_m),
+    )
+    return Compact(channel=channel, used=used, projector=projector, residual=residual, sigma_m=sigma, gain_m=gain)
 
 
 @compiled_by("raim")
