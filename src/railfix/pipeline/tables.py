@@ -119,7 +119,8 @@ OBSERVATION_COLUMNS: Final[dict[str, str]] = {
     "sigma_m": "standard deviation that the weights assume",
     "corrected_code_m": "pseudorange, satellite clock, group delay and atmosphere applied",
     **_screen_columns("observations"),
-    "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty",
+    "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty; empty where the "
+    "robust fit rejected them",
     "innovation_code_m": "filter along the track: code less what earlier epochs predict",
     "innovation_phase_m": "the same of the change of the carrier phase since the epoch before",
     "innovation_doppler_mps": "the same of the Doppler",
