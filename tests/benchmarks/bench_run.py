@@ -3,7 +3,7 @@
 The two 86 MB logs are simulated first (or taken from ``--run``). Both programs are whole processes,
 started in turn; medians of the rounds, and their ratio, are printed::
 
-    python tests/benchmarks/bench_run.py [--run FOLDER] [--rounds 3] [--screens all|mask] [--profile]
+    python tests/benchmarks/bench_run.py [--run FOLDER] [--rounds 3] [--screens all|mask] [--filter off|track]
 """
 
 from __future__ import annotations
@@ -67,10 +67,10 @@ def simulate(folder: Path) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
-def railfix_command(folder: Path, out: Path, config: Path | None) -> list[str]:
+def railfix_command(folder: Path, out: Path, config: Path | None, tracking: str) -> list[str]:
     command = [sys.executable, "-m", "railfix", "run", "--front", f"{folder}/front.rnx", "--rear", f"{folder}/rear.rnx"]
     command += ["--nav", f"{folder}/nav.rnx", "--track", f"{folder}/track.csv", "--vehicle", f"{folder}/vehicle.toml"]
-    command += ["--filter", "off"]  # single epochs, as rnx2rtkp positions them
+    command += ["--filter", tracking]
     return [*command, "--out", str(out), *(["--config", str(config)] if config else [])]
 
 
@@ -81,13 +81,13 @@ def line(name: str, rounds: list[Spent]) -> float:
     return wall
 
 
-def compare(folder: Path, scratch: Path, *, rounds: int, config: Path | None) -> None:
+def compare(folder: Path, scratch: Path, *, rounds: int, config: Path | None, tracking: str) -> None:
     own: list[Spent] = []
     other: list[Spent] = []
     conf = scratch / "single.conf"
     conf.write_text(RTKLIB_SETTINGS)
     for number in range(rounds):
-        own.append(run(railfix_command(folder, scratch / f"out{number}", config)))
+        own.append(run(railfix_command(folder, scratch / f"out{number}", config, tracking)))
         shutil.rmtree(scratch / f"out{number}")
         if shutil.which("rnx2rtkp"):
             spent = [
@@ -105,11 +105,11 @@ def compare(folder: Path, scratch: Path, *, rounds: int, config: Path | None) ->
         print(f"railfix is {ratio:.2f} times as fast (wanted: 1; goal: 10)")
 
 
-def profiled(folder: Path, scratch: Path, config: Path | None) -> None:
+def profiled(folder: Path, scratch: Path, config: Path | None, tracking: str) -> None:
     from railfix.cli import main as railfix_main
 
     def once() -> None:
-        sys.argv = ["railfix", *railfix_command(folder, scratch / "profiled", config)[3:]]
+        sys.argv = ["railfix", *railfix_command(folder, scratch / "profiled", config, tracking)[3:]]
         try:
             railfix_main()
         except SystemExit as left:
@@ -127,6 +127,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="folder of a simulated run, made with --plain")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: as RTKLIB, elevation only")
+    parser.add_argument("--filter", choices=("off", "track"), default="off", help="off: single epochs, as rnx2rtkp")
     parser.add_argument("--profile", action="store_true", help="print where the time of one more run goes")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="railfix-bench-") as name:
@@ -139,10 +140,11 @@ def main() -> None:
             config = scratch / "mask.toml"
             config.write_text(MASK_ONLY)
         size = sum((folder / f"{a}.rnx").stat().st_size for a in ("front", "rear")) / 1e6
-        print(f"two logs of an hour at 10 Hz, {size:.0f} MB in all, screens: {options.screens}")
-        compare(folder, scratch, rounds=options.rounds, config=config)
+        chosen = f"screens: {options.screens}, filter: {options.filter}"
+        print(f"two logs of an hour at 10 Hz, {size:.0f} MB in all, {chosen}")
+        compare(folder, scratch, rounds=options.rounds, config=config, tracking=options.filter)
         if options.profile:
-            profiled(folder, scratch, config)
+            profiled(folder, scratch, config, options.filter)
 
 
 if __name__ == "__main__":
