@@ -226,6 +226,18 @@ def test_the_next_run_works_after_fifty_kills(desk: Desk, name: str) -> None:
     _check_kills(desk, KILLED[name], 50, signal.SIGKILL, seed=2)
 
 
+def test_a_signal_while_the_results_folder_is_made_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(_: object) -> bool:
+        raise SystemExit(128 + signal.SIGTERM)
+
+    monkeypatch.setattr("railfix.run.lock._try_lock", ended)
+    with pytest.raises(SystemExit):
+        OutputFolder(tmp_path / "new" / "out")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP], ids=lambda n: n.name)
 def test_a_terminated_run_leaves_nothing(desk: Desk, number: signal.Signals) -> None:
     words = [word.format(desk=desk.folder, out="out") for word in KILLED["run"].split()]

@@ -59,18 +59,18 @@ def make_staging(folder: Path) -> Staging:
     while True:
         name = folder / f"{_PREFIX}{secrets.token_hex(4)}"
         lock = name.with_name(name.name + _LOCK).open("x", encoding="ascii")
-        lock.write(f"{os.getpid()}\n")
-        lock.flush()
-        # Another process may have taken the new file for a leftover before it was locked.
-        if _try_lock(lock) and Path(lock.name).exists():
-            break
+        staging = Staging(path=name, lock=lock)
+        try:
+            lock.write(f"{os.getpid()}\n")
+            lock.flush()
+            # Another process may have taken the new file for a leftover before it was locked.
+            if _try_lock(lock) and Path(lock.name).exists():
+                name.mkdir()
+                return staging
+        except BaseException:  # a signal that ends the program among them
+            staging.remove()
+            raise
         lock.close()
-    try:
-        name.mkdir()
-    except OSError:
-        Staging(path=name, lock=lock).remove()
-        raise
-    return Staging(path=name, lock=lock)
 
 
 def clean_up(folder: Path) -> None:

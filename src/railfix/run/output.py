@@ -58,21 +58,17 @@ class OutputFolder:
         self._staged: list[str] = []
         with _writing(path):
             check_folder(path, overwrite=overwrite)
-            self._make()
             try:
+                self._make()
                 self._staging = make_staging(path)
-            except OSError:
+            except BaseException:  # a signal that ends the program among them
                 self._unmake()
                 raise
 
     def _make(self) -> None:
         missing = [p for p in (self.path, *self.path.parents) if not p.exists()]
         for folder in reversed(missing):
-            try:
-                folder.mkdir()
-            except OSError:
-                self._unmake()
-                raise
+            folder.mkdir()
             self._made.append(folder)
 
     def _unmake(self) -> None:
