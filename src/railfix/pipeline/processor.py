@@ -363,7 +363,7 @@ class AntennaChunk:
     def solved(self) -> Published:
         """Solve and return what is published of the positions."""
         processor = self._processor
-        predicted: PredictedPlace | None = None  # from the filter along the track, once there is one
+        predicted: PredictedPlace | None = None  # the filter hands none on: single epochs do not depend on it
         self._ranges, self._solution, self.state = solve(
             self._ranges, processor._index[self._name], processor.config, self.state, predicted=predicted
         )
