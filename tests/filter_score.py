@@ -63,7 +63,7 @@ class Case:
         """Some epochs of it."""
         per_epoch = (
             "time", "sat_ecef_m", "sat_velocity_mps", "code_m", "code_sigma_m", "phase_m", "phase_joined", "rate_mps",
-            "cn0_dbhz",
+            "cn0_dbhz", "off_map",
         )  # fmt: skip
         rows = slice(first, end)
         return replace(
@@ -118,6 +118,7 @@ def smartloc_case(data: Path) -> Case:
         phase_joined=np.zeros(nothing.shape, dtype=bool),
         rate_mps=nothing,
         cn0_dbhz=log.cn0_dbhz,
+        off_map=np.zeros(len(log.time), dtype=bool),
     )
     lines = (folder / "Berlin_Potsdamer_Platz_Input.txt").read_text(encoding="ascii").splitlines()
     odometry = np.array([[float(x) for x in line.split()[1:3]] for line in lines if line.startswith("odom3")])

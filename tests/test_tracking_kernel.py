@@ -62,6 +62,10 @@ def _case(name: str) -> tuple[GnssEpochs, Line, SensorEpochs | None]:
         joined[random.random(code.shape) < 0.1] = False
         step = 299_792.458 * (np.arange(len(code)) >= 50)[:, None]
         epochs = replace(epochs, code_m=code + step, phase_m=epochs.phase_m + step, phase_joined=joined, rate_mps=rate)
+    if name == "off map":
+        away = np.zeros(len(case.arc_m), dtype=bool)
+        away[40:60] = away[:3] = True
+        epochs = replace(epochs, off_map=away)
     if name == "gap":
         gap = np.zeros(len(case.arc_m), dtype=bool)
         gap[40:43] = gap[60:95] = True
@@ -70,7 +74,7 @@ def _case(name: str) -> tuple[GnssEpochs, Line, SensorEpochs | None]:
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("name", ["plain", "10 Hz", "branches", "sensors", "faults", "gap"])
+@pytest.mark.parametrize("name", ["plain", "10 Hz", "branches", "sensors", "faults", "gap", "off map"])
 def test_the_compiled_filter_gives_what_numpy_gives(name: str) -> None:
     epochs, line, sensors = _case(name)
     expected, one = _with("numpy", epochs, line, sensors=sensors)
@@ -82,7 +86,7 @@ def test_the_compiled_filter_gives_what_numpy_gives(name: str) -> None:
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("name", ["sensors", "faults", "branches"])
+@pytest.mark.parametrize("name", ["sensors", "faults", "branches", "off map"])
 def test_epochs_one_by_one_give_what_the_whole_gives(name: str) -> None:
     epochs, line, sensors = _case(name)
     whole, _ = _with("numba", epochs, line, sensors=sensors)

@@ -93,6 +93,7 @@ def ride(
         phase_joined=np.ones(shape, dtype=bool),
         rate_mps=(ahead - distance) / step + 30.0 + doppler_error,
         cn0_dbhz=np.full(shape, 45.0),
+        off_map=np.zeros(shape[0], dtype=bool),
     )
     return Ride(epochs, arc, speed, trajectory)
 
@@ -106,7 +107,7 @@ def without_epochs(epochs: GnssEpochs, mask: np.ndarray) -> GnssEpochs:
 def part(epochs: GnssEpochs, which: slice) -> GnssEpochs:
     """Some epochs."""
     per_epoch = ("time", "sat_ecef_m", "sat_velocity_mps", "code_m", "code_sigma_m", "phase_m", "phase_joined")
-    values = {name: getattr(epochs, name)[which] for name in (*per_epoch, "rate_mps", "cn0_dbhz")}
+    values = {name: getattr(epochs, name)[which] for name in (*per_epoch, "rate_mps", "cn0_dbhz", "off_map")}
     return replace(epochs, **values)
 
 

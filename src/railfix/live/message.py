@@ -128,7 +128,9 @@ def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple
     if not _filtered(track):
         if not math.isfinite(place):
             return place, MessageStatus.NO_POSITION
-        return place, MessageStatus.POSITION if single is Status.OK and available else MessageStatus.DOUBTFUL
+        on_map = track is None or not len(track) or track.tracked.status[-1] != TrackStatus.OFF_MAP
+        good = single is Status.OK and available and on_map
+        return place, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
     filtered = float(track.chainage_m[-1])
     status = TrackStatus(int(track.tracked.status[-1]))
     if status is TrackStatus.COASTING:

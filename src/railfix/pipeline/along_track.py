@@ -67,6 +67,29 @@ class Fixed:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SingleEpochs:
+    """What each epoch by itself says to the filter, shape (T,) each.
+
+    Attributes
+    ----------
+    noise_scale : ndarray
+        Noise of the receiver's codes against their sigmas.
+    arc_m, sigma_m : ndarray [m]
+        Position: after an outage codes count again when it agrees with the place that the sensors carried.
+    off_map : ndarray of bool
+        The train is away from the line: `railfix.pipeline.off_map`.
+    map_offset : ndarray of bool
+        3-D positions of the last minutes lie beside or above the line.
+    """
+
+    noise_scale: Floats
+    arc_m: Floats
+    sigma_m: Floats
+    off_map: Masks
+    map_offset: Masks
+
+
+@dataclass(frozen=True, kw_only=True)
 class FilterState:
     """State of the filter along the track of one antenna after a chunk.
 
@@ -135,7 +158,7 @@ class AlongTrack:
 
 def along_track(
     ranges: CorrectedRanges,
-    noise_scale: Floats,
+    single: SingleEpochs,
     trajectory: Trajectory,
     navigation: Navigation,
     config: Config,
@@ -143,7 +166,6 @@ def along_track(
     *,
     samples: SensorSamples | None = None,
     surroundings: Surroundings | None = None,
-    alone: tuple[Floats, Floats] | None = None,
 ) -> tuple[AlongTrack, FilterState]:
     """Return the filtered positions of one antenna, and the state to pass on.
 
@@ -151,8 +173,7 @@ def along_track(
     ----------
     ranges : CorrectedRanges
         After all screens and exclusions.
-    noise_scale : ndarray, shape (T,)
-        Noise of the receiver's codes against their sigmas.
+    single : SingleEpochs
     trajectory : Trajectory
     navigation : Navigation
     config : Config
@@ -161,15 +182,16 @@ def along_track(
         Of the sensors on board since the chunk before.
     surroundings : Surroundings, optional
         Features of the line and ground units that the sensors meet.
-    alone : tuple of ndarray, shapes (T,), optional [m]
-        Arc length and standard deviation of each epoch by itself: after an outage codes count again when it agrees with
-        the place that the sensors carried.
     """
-    epochs, slips = gnss_epochs(ranges, noise_scale, navigation, config, state.slips)
+    epochs, slips = gnss_epochs(ranges, single.noise_scale, navigation, config, state.slips)
+    epochs = replace(epochs, off_map=single.off_map)
     line = Line.of(trajectory) if state.line is None else state.line
     tracked, motion, replays, after = _tracked(
-        epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings, alone
-    )
+        epochs, trajectory, line, config, replace(state, slips=slips), samples, surroundings,
+        (single.arc_m, single.sigma_m),
+    )  # fmt: skip
+    beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
+    tracked = replace(tracked, status=np.where(beside, np.int8(TrackStatus.MAP_OFFSET), tracked.status))
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -199,7 +221,7 @@ def _tracked(
     state: FilterState,
     samples: SensorSamples | None,
     surroundings: Surroundings | None,
-    alone: tuple[Floats, Floats] | None,
+    alone: tuple[Floats, Floats],
 ) -> tuple[Tracked, Codes, tuple[Replay, ...], FilterState]:
     """Places of the filter, motion by the sensors, and the state to pass on.
 
@@ -229,7 +251,7 @@ def _tracked(
         samples = None
         if sensors.ranges is not None:
             sensors = replace(sensors, ranges=_gated_ranges(sensors.ranges, part.time, line, state, config))
-        if alone is not None and sensing and len(part):
+        if sensing and len(part):
             part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], state, config)
             state = replace(state, gate=gate)
         replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
@@ -351,6 +373,7 @@ def gnss_epochs(
         phase_joined=~slips.slip[:, columns],
         rate_mps=np.where(healthy & dopplers, -SPEED_OF_LIGHT / ranges.frequency_hz * ranges.doppler_hz, np.nan),
         cn0_dbhz=ranges.cn0_dbhz,
+        off_map=np.zeros(len(obs.time), dtype=np.bool_),
     )
     return epochs, after
 

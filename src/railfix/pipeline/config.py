@@ -136,6 +136,9 @@ class Config(ScreenSettings):
     off_map_risk : float
         A position is off the map where its ranges fit the line worse than the 3-D position by more than noise explains
         with this probability, the noise judged by the residuals of the 3-D fit.
+    off_map_s : float [s]
+        The filter along the track gives up its place once every position for so long was off the map, and begins
+        anew once none was for so long. On the recordings, with a right map, no two positions in a row are off it.
     ionosphere : {"klobuchar", "off"}
     troposphere : {"saastamoinen", "off"}
     max_ephemeris_age_s : float or None
@@ -207,6 +210,7 @@ class Config(ScreenSettings):
     min_satellites: int = Field(default=3, ge=2)
     dilution_limit: float = Field(default=20.0, gt=0)
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
+    off_map_s: float = Field(default=10.0, gt=0)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)

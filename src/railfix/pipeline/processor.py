@@ -16,7 +16,7 @@ import numpy as np
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.along_track import AlongTrack, FilterState, along_track
+from railfix.pipeline.along_track import AlongTrack, FilterState, SingleEpochs, along_track
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
@@ -28,6 +28,7 @@ from railfix.pipeline.received import Received, known_from_start, receive
 from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensor_epochs import Surroundings
 from railfix.pipeline.solution import Solution, solve
+from railfix.positioning.map_offset import beyond_threshold
 from railfix.positioning.section_search import PredictedPlace, SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
@@ -388,16 +389,27 @@ class AntennaChunk:
         if processor.config.filter == "track":
             self.tracked, self.filter_state = along_track(
                 self._ranges,
-                self._solution.noise_scale,
+                self._single_epochs(result),
                 trajectory,
                 self._received.navigation,
                 processor.config,
                 self.filter_state,
                 samples=self._sensors,
                 surroundings=processor.surroundings(self._name, self._sensors),
-                alone=(result.arc_m, result.own_sigma_m),
             )
         return result
+
+    def _single_epochs(self, result: AntennaResult) -> SingleEpochs:
+        """What each epoch by itself says to the filter along the track."""
+        assert self._solution is not None
+        found, limits = self._solution, self._processor.config.map_offset
+        return SingleEpochs(
+            noise_scale=found.noise_scale,
+            arc_m=result.arc_m,
+            sigma_m=result.own_sigma_m,
+            off_map=found.off_map,
+            map_offset=beyond_threshold(found.map_offset, limits),
+        )
 
 
 def conditions_of(config: Config) -> Conditions:

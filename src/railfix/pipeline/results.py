@@ -15,6 +15,7 @@ from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
 from railfix.pipeline.along_track import AlongTrack, FilterState
 from railfix.pipeline.carrier_stage import CarrierState
+from railfix.pipeline.off_map import OffMapState
 from railfix.pipeline.received import Received
 from railfix.positioning.carrier import PhasePositions
 from railfix.positioning.constrained import Constrained
@@ -89,6 +90,8 @@ class AntennaState:
         Sums behind the noise scales.
     map_offset : MapOffsetState
         Sums behind the test of the map.
+    off_map : OffMapState
+        Whether the train was away from the line.
     offsets : OffsetState
         Inter-system biases estimated so far.
     screens : mapping of str to object
@@ -99,6 +102,7 @@ class AntennaState:
 
     noise: NoiseState = field(default_factory=NoiseState)
     map_offset: MapOffsetState = field(default_factory=MapOffsetState)
+    off_map: OffMapState = field(default_factory=OffMapState)
     offsets: OffsetState = field(default_factory=OffsetState)
     screens: Mapping[str, Any] = field(default_factory=dict)
     carrier: CarrierState | None = None

@@ -17,6 +17,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.level_stage import protection_levels, risk_of
+from railfix.pipeline.off_map import off_map_epochs
 from railfix.pipeline.open_places import places_beyond_the_level
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
@@ -61,6 +62,8 @@ class Solution:
     phase : PhasePositions or None
     protection : ProtectionResult or None
     map_offset : MapOffset
+    off_map : ndarray of bool, shape (T,)
+        The train is away from the line: `railfix.pipeline.off_map`.
     """
 
     point: SinglePoint
@@ -75,6 +78,7 @@ class Solution:
     phase: PhasePositions | None
     protection: ProtectionResult | None
     map_offset: MapOffset
+    off_map: Masks
 
 
 def solve(
@@ -121,9 +125,12 @@ def solve(
         time, constrained.wsse, redundancy, teaching, robust, state.noise, limits=config.noise_scale
     )
     scale = np.maximum(scale, _least_scale(config))
+    away, off_map_state = off_map_epochs(
+        time, np.isfinite(constrained.arc_m) & ~off_map, off_map, state.off_map, longest_s=config.off_map_s
+    )
     offset, map_state = map_offset(
         time, agreeing, free, corrected.nominal_m, np.maximum(scale, 1.0) ** 2, trajectory,
-        constrained.arc_m, state.map_offset, limits=config.map_offset,
+        constrained.arc_m, away, state.map_offset, limits=config.map_offset,
     )  # fmt: skip
     model = constrained_model(ranges, trajectory, constrained.arc_m, section=np.maximum(constrained.section, 0))
     if "raim" in config.screens and config.raim_protection == "on":
@@ -179,12 +186,13 @@ def solve(
         phase=phase,
         protection=level,
         map_offset=offset,
+        off_map=away,
     )
     noise = state.noise
     if len(time):
         age = noise_age(time, noise, limits=config.noise_scale)
         noise = NoiseState(time=time[-1], age=float(age[-1]), robust=robust_sums, remaining=stated_sums)
-    after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, carrier=carrier)
+    after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, off_map=off_map_state, carrier=carrier)
     return corrected, solution, after
 
 

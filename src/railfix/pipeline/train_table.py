@@ -28,7 +28,8 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "antenna": "`front` or `rear`",
     "status": "`tracking`; `several_branches`, the most probable place of several; `coasting`, predicted without a "
     "measurement; `lost`, measurements contradict the track and places are sought again; `expired`, predicted too "
-    "far; `not_started`",
+    "far; `not_started`; `off_map`, no place, the satellites put the train away from the line; `map_offset`, a place "
+    "on a line that 3-D positions of the last minutes lie beside or above",
     "chainage_m": "distance along the line from the first point of the track",
     "kilometrage_m": "the line's own marking, where the track has one",
     "along_sigma_m": "standard deviation along the line",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from pydantic import Field
@@ -21,6 +22,9 @@ from railfix.positioning.forgetting import ages, decayed_sums, steps_s
 from railfix.positioning.normal_equations import Ranges, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
+
+#: Sums of a window.
+_SUMS: Final = 9
 
 
 class MapOffsetLimits(Settings):
@@ -75,13 +79,14 @@ class MapOffsetState:
         Of the last epoch; NaT before the first.
     age : float [windows]
         Of the last epoch.
-    sums : ndarray, shape (9,)
-        Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples.
+    sums : ndarray, shape (18,)
+        Information matrix (across, mixed, up), information times offset (2), nominal covariance (3), samples: of the
+        epochs that are on the map, then of those off it.
     """
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0
-    sums: Floats = field(default_factory=lambda: np.zeros(9))
+    sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +143,7 @@ def map_offset(
     variance: Floats,
     trajectory: Trajectory,
     arc_m: Floats,
+    off_map: Masks,
     state: MapOffsetState,
     *,
     limits: MapOffsetLimits | None = None,
@@ -158,6 +164,9 @@ def map_offset(
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
         Positions on the line; NaN where there is none.
+    off_map : ndarray of bool, shape (T,)
+        The train is away from the line. These epochs have a window of their own: what a train was beside while it was
+        away says nothing of the map once it is on it.
     state : MapOffsetState
     limits : MapOffsetLimits, optional
 
@@ -194,8 +203,10 @@ def map_offset(
     )
     samples = limits.window_s / limits.correlation_s
     age = ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=samples)
+    values = np.concatenate([np.where(off_map[:, None] == off, values, 0.0) for off in (False, True)], axis=1)
     before, after = decayed_sums(age, values, state.sums, state.age)
-    sums = before + values
+    both = before + values
+    sums = np.where(off_map[:, None], both[:, _SUMS:], both[:, :_SUMS])
     enough = sums[:, 8] >= limits.least_samples
     sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))

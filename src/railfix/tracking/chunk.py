@@ -49,6 +49,8 @@ class Chunk:
         Of the satellite's correlated error.
     fresh : ndarray of bool, shape (T, S)
         Satellites whose error begins at an epoch.
+    off_map : ndarray of bool, shape (T,)
+        The train is away from the line.
     """
 
     time: Datetimes
@@ -65,6 +67,7 @@ class Chunk:
     variance: Floats
     code_sigma_m: Floats
     fresh: Masks
+    off_map: Masks
 
 
 def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
@@ -125,6 +128,7 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
         ),
         code_sigma_m=epochs.code_sigma_m,
         fresh=fresh & ~kept,
+        off_map=epochs.off_map,
     )
 
 

@@ -59,13 +59,13 @@ class Compiled:
         self.kernel, self.chunk, self.limits, self.result = kernel, chunk, limits, result
         interval, singers = np.unique(chunk.interval_s, return_inverse=True)
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
-        ranged = sensors.ranges
+        ranged, left = sensors.ranges, chunk.apart | chunk.off_map
         sensor, sigma = _columns(sensors, len(chunk.time))
         self.sensed = [bool(column.any()) for column in np.isfinite(sensor).T]
         values = {
             "time_s": seconds(chunk.time - chunk.time[0]),
             "interval_s": chunk.interval_s,
-            "left": chunk.apart if ranged is None else chunk.apart | np.isfinite(ranged.range_m).any(axis=1),
+            "left": left if ranged is None else left | np.isfinite(ranged.range_m).any(axis=1),
             "singer": singers.reshape(-1).astype(np.intp),
             "step": np.stack([step for step, _ in matrices]),
             "noise": np.stack([noise for _, noise in matrices]),

@@ -29,6 +29,8 @@ class GnssEpochs:
     rate_mps : ndarray, shape (T, K) [m/s]
         Range rate by the Doppler with the satellite clock and the troposphere's change taken off.
     cn0_dbhz : ndarray, shape (T, K)
+    off_map : ndarray of bool, shape (T,)
+        Epochs at which the train is known to be away from the line: places are forgotten, nothing is used.
     """
 
     time: Datetimes
@@ -42,6 +44,7 @@ class GnssEpochs:
     phase_joined: Masks
     rate_mps: Floats
     cn0_dbhz: Floats
+    off_map: Masks
 
     def __len__(self) -> int:
         return len(self.time)

@@ -21,7 +21,7 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
 from railfix.tracking.predict import predicted
-from railfix.tracking.result import Tracked, write_place, write_rows
+from railfix.tracking.result import Tracked, TrackStatus, write_place, write_rows
 from railfix.tracking.robust import (
     DOUBTFUL,
     FREEDOM,
@@ -104,8 +104,13 @@ def _step(
 ) -> None:
     """One epoch: changes the state, writes its row of the result."""
     dt = float(chunk.interval_s[epoch])
-    if chunk.apart[epoch]:
+    if chunk.apart[epoch] or chunk.off_map[epoch]:
         state.forget()
+    if chunk.off_map[epoch]:
+        state.time, result.status[epoch] = chunk.time[epoch], TrackStatus.OFF_MAP
+        if trace is not None:
+            trace.append(Step(dt=dt, cut=np.zeros(state.mean.shape, dtype=np.bool_), satellite=state.satellite))
+        return
     if anew:
         fresh = np.flatnonzero(chunk.fresh[epoch])
         state.mean, state.covariance = begun_anew(state.mean, state.covariance, SATELLITES + fresh)

@@ -34,6 +34,11 @@ class TrackStatus(IntEnum):
     EXPIRED = 4
     #: No place yet: no epoch so far had redundant codes.
     NOT_STARTED = 5
+    #: No place: the satellites have put the train away from the line for some time.
+    OFF_MAP = 6
+    #: One place, but 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it is
+    #: another track.
+    MAP_OFFSET = 7
 
     @property
     def text(self) -> str:

@@ -195,13 +195,14 @@ class TrackState:
         )
 
     def forget(self) -> None:
-        """Begin anew: no hypothesis, no sub-filter, no clock known."""
+        """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
         width = SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.log_probability = self.origin_m = np.empty(0)
         self.offset_known = np.zeros(len(CLOCKS), dtype=np.bool_)
         self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
-        self.code_shift = (0.0, 0.0)
+        self.code_shift = self.log_scale = (0.0, 0.0)
+        self.map_log_scale = 0.0
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:

@@ -1,0 +1,66 @@
+"""Whether the train is on the map at all: the verdicts of single epochs over some seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from railfix.core.arrays import Datetimes, Masks
+from railfix.core.timescale import seconds
+
+_NEVER: Final = np.datetime64("NaT", "ns")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffMapState:
+    """What one chunk leaves to the next.
+
+    Attributes
+    ----------
+    off : bool
+        The train was off the map at the last epoch.
+    known : bool
+        A position has been on the map, or off it for long enough: before, the first position decides.
+    since : datetime64[ns]
+        First of the positions in a row that say the contrary of `off`; NaT where the last one says the same.
+    """
+
+    off: bool = False
+    known: bool = False
+    since: np.datetime64 = _NEVER
+
+
+def off_map_epochs(
+    time: Datetimes, on_map: Masks, off_map: Masks, state: OffMapState, *, longest_s: float
+) -> tuple[Masks, OffMapState]:
+    """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
+
+    It is once all positions for `longest_s` are off the map, and is not any more once all for so long are on it: one
+    position with reflected signals leaves no line, and one that the ranges of a train far away happen to fit is no
+    return. The first position of a log decides alone.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    on_map, off_map : ndarray of bool, shape (T,)
+        Positions of each epoch by itself that its ranges fit, or contradict; neither where there is none.
+    state : OffMapState
+    longest_s : float [s]
+    """
+    off, known, since = state.off, state.known, state.since
+    result = np.full(len(time), off)
+    judged = np.flatnonzero(on_map | off_map)
+    runs = np.split(judged, np.flatnonzero(np.diff(off_map[judged])) + 1) if len(judged) else []
+    for run in runs:
+        says = bool(off_map[run[0]])
+        if known and says == off:
+            since = _NEVER
+            continue
+        since = time[run[0]] if np.isnat(since) else since
+        enough = run[seconds(time[run] - since) >= longest_s] if known else run
+        if len(enough):
+            result[enough[0] :] = says
+            off, known, since = says, True, _NEVER
+    return result, OffMapState(off=off, known=known, since=since)

@@ -1,0 +1,121 @@
+"""Whether the train is on the map at all, by single epochs over some seconds (requirements B6, E5)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pipeline_cases import clean_trajectories, demo_observations
+from railfix.core.reasons import Status
+from railfix.core.timescale import timedelta
+from railfix.io.rinex import read_navigation
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.off_map import OffMapState, off_map_epochs
+from railfix.pipeline.processor import EpochProcessor
+from railfix.pipeline.results import AntennaResult
+from railfix.simulate.demo_data import demo_files
+from railfix.tracking import TrackStatus, track
+from test_wrong_map import moved
+from tracking_cases import part, ride
+
+START = np.datetime64("2026-03-01T10:00:00", "ns")
+
+
+def judged(said: str, cuts: tuple[int, ...] = (), longest_s: float = 3.0) -> str:
+    """Verdicts of epochs a second apart: positions on the map (+), off it (-), none (.)."""
+    time = START + timedelta(np.arange(float(len(said))))
+    on, off = np.array([c == "+" for c in said]), np.array([c == "-" for c in said])
+    state, parts = OffMapState(), []
+    for first, last in zip((0, *cuts), (*cuts, len(said)), strict=True):
+        here = slice(first, last)
+        found, state = off_map_epochs(time[here], on[here], off[here], state, longest_s=longest_s)
+        parts.append(found)
+    return "".join("x" if away else "o" for away in np.concatenate(parts))
+
+
+@pytest.mark.requirement("B6")
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ("++++--++++", "oooooooooo"),  # one reflected signal is no departure
+        ("++------", "oooooxxx"),  # three seconds after the first
+        ("---++---", "xxxxxxxx"),  # the first position decides alone; two that fit are no return
+        ("---+++++", "xxxxxxoo"),
+        ("...---..", "oooxxxxx"),  # nothing is known before a position
+        ("++-..-+-", "oooooxxx"),  # without a position time goes on
+        ("++-...-+", "ooooooxx"),
+    ],
+)
+def test_departure_and_return_take_their_time(said: str, expected: str) -> None:
+    assert judged(said) == expected
+
+
+@pytest.mark.requirement("B6")
+def test_any_cutting_gives_the_same_verdicts() -> None:
+    said = "".join(np.random.default_rng(3).choice(list("+-."), size=400, p=[0.4, 0.4, 0.2]).tolist())
+    said = said.replace("+-+", "+++").replace("-+-", "---")
+    whole = judged(said, longest_s=2.0)
+    assert set(whole) == {"o", "x"}
+    assert judged(said, tuple(range(1, 400)), 2.0) == whole
+    assert judged(said, (7, 8, 150), 2.0) == whole
+
+
+@pytest.mark.requirement("E5")
+def test_the_filter_begins_anew_when_the_train_comes_back() -> None:
+    case = ride(120, noise=1.0)
+    away = np.zeros(120, dtype=bool)
+    away[40:60] = True
+    # Codes of another place: what they would teach must not outlast the departure.
+    code = case.epochs.code_m + np.where(away[:, None], 400.0 * np.arange(case.epochs.code_m.shape[1]), 0.0)
+    epochs = replace(case.epochs, code_m=code, off_map=away)
+    found, _ = track(epochs, case.line)
+    assert (found.status[40:60] == TrackStatus.OFF_MAP).all()
+    assert np.isnan(found.arc_m[40:60]).all()
+    fresh, _ = track(part(case.epochs, slice(60, None)), case.line)
+    np.testing.assert_allclose(found.arc_m[60:], fresh.arc_m, atol=0.3)
+    np.testing.assert_allclose(found.sigma_m[60:], fresh.sigma_m, rtol=0.05)
+
+
+@cache
+def on_moved_map(across_m: float = 0.0, up_m: float = 0.0, risk: float = 1e-3) -> tuple[AntennaResult, np.ndarray]:
+    """The demonstration, one epoch a second, on a line moved aside or up, with statuses of the filter."""
+    line = moved(clean_trajectories()["front"], across_m=across_m, up_m=up_m)
+    config = parse_config({"filter": "track", "map_offset": {"risk": risk}})
+    processor = EpochProcessor(config, {"front": line}, navigation=read_navigation(demo_files()["nav"]))
+    result, _ = processor.process({"front": demo_observations()["front"][::10]})
+    return result.antennas["front"], result.fusion["front"].tracked.status
+
+
+@pytest.mark.requirement("B6")
+def test_the_filter_has_no_place_far_from_the_line() -> None:
+    _, status = on_moved_map(across_m=200.0)
+    assert (status == TrackStatus.OFF_MAP).all()
+
+
+@pytest.mark.requirement("B6")
+def test_the_filter_says_that_the_map_lies_aside() -> None:
+    """16 m too low no epoch by itself finds anything; at a risk of 0.2 the mean of minutes does."""
+    antenna, status = on_moved_map(up_m=16.0, risk=0.2)
+    beside = antenna.status == Status.MAP_OFFSET
+    assert beside.sum() > 50
+    assert (status[beside] == TrackStatus.MAP_OFFSET).all()
+    _, right = on_moved_map()
+    assert not np.isin(right, [TrackStatus.MAP_OFFSET, TrackStatus.OFF_MAP]).any()
+
+
+@pytest.mark.requirement("B6")
+def test_what_was_seen_off_the_map_says_nothing_of_the_map() -> None:
+    """Minutes away from the line, then on it: after the 10 s that a return takes no offset of the map is left."""
+    navigation, config = read_navigation(demo_files()["nav"]), parse_config({})
+    right = clean_trajectories()["front"]
+    log = demo_observations()["front"]
+    away = EpochProcessor(config, {"front": moved(right, across_m=200.0)}, navigation=navigation)
+    _, state = away.process({"front": log[0:1000:10]})
+    back = EpochProcessor(config, {"front": right}, navigation=navigation)
+    result, _ = back.process({"front": log[1000:2000:10]}, state)
+    status = result.antennas["front"].status
+    assert (status[:10] == Status.MAP_OFFSET).all()
+    assert not np.isin(status[11:], [Status.OFF_MAP, Status.MAP_OFFSET]).any()
