@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -153,6 +153,25 @@ class Observations(NotebookTable):
         )
 
 
+def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
+    """Return which channels have an observation of any kind or a loss-of-lock digit, shape (M,).
+
+    Parameters
+    ----------
+    kinds : iterable of ndarray, shape (T, M)
+        Observations by kind.
+    loss_of_lock : ndarray of uint8, shape (T, M)
+    """
+    used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
+    for array in kinds:
+        used |= ~np.isnan(array[:1]).all(axis=0)  # the first epoch tells it of nearly all
+        rest = np.flatnonzero(~used)
+        used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
+    rest = np.flatnonzero(~used)
+    used[rest] = loss_of_lock[:, rest].any(axis=0)
+    return used
+
+
 def concatenate(parts: Sequence[Observations]) -> Observations:
     """Join consecutive parts of one log; channels absent in a part are filled with NaN.
 
@@ -173,11 +192,18 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     column = {key: i for i, key in enumerate(keys)}
     total = sum(len(p) for p in parts)
     shape = (total, len(keys))
-    floats = {n: np.full(shape, np.nan) for n in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")}
-    lock = np.zeros(shape, dtype=np.uint8)
+    complete = all(len(p.satellite) == len(keys) for p in parts)
+    floats = {n: np.empty(shape) for n in ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")}
+    lock = np.empty(shape, dtype=np.uint8)
+    if not complete:
+        lock.fill(0)
+        for target in floats.values():
+            target.fill(np.nan)
     row = 0
     for part in parts:
-        columns = [column[str(s), str(g)] for s, g in zip(part.satellite, part.signal, strict=True)]
+        columns: Any = [column[str(s), str(g)] for s, g in zip(part.satellite, part.signal, strict=True)]
+        if columns == list(range(len(keys))):
+            columns = slice(None)
         rows = slice(row, row + len(part))
         for name, target in floats.items():
             target[rows, columns] = getattr(part, name)

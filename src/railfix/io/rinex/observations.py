@@ -33,7 +33,7 @@ import numpy as np
 
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.files import BrokenLines, FilePath
-from railfix.gnss.observations import Observations, concatenate
+from railfix.gnss.observations import Observations, channels_with_data, concatenate
 from railfix.io.rinex.observations_blocks import BlockReader, Selection
 from railfix.io.rinex.observations_signals import SYSTEMS
 
@@ -229,10 +229,8 @@ def _with_problems(piece: Observations, source: Observations) -> Observations:
 
 def without_empty_channels(observations: Observations) -> Observations:
     """Drop the channels that have neither an observation nor a loss-of-lock digit."""
-    used = observations.loss_of_lock.any(axis=0)
     arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")
-    for name in arrays:
-        used |= ~np.isnan(getattr(observations, name)).all(axis=0)
+    used = channels_with_data([getattr(observations, name) for name in arrays], observations.loss_of_lock)
     if used.all():
         return observations
     return replace(

@@ -17,12 +17,14 @@ from railfix.io.rinex.fault_log import CYCLE_SLIPS, DUPLICATES, EXTERNAL_EVENTS,
 from railfix.io.rinex.header import RinexHeader, apply_records, parse_header, read_header_bytes
 from railfix.io.rinex.observations_decode import decode, lines_per_satellite
 from railfix.io.rinex.observations_epochs import Epochs, find_epochs
+from railfix.io.rinex.observations_fields import PADDING
 from railfix.io.rinex.observations_lines import Lines, split_lines
 
 #: Bytes of text read at a time: large enough for array operations, small enough for the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
 #: A longer line is no RINEX, not even one that a failing recorder filled with zeros.
 _MAX_LINE_BYTES: Final = 8 << 20
+_BLANKS: Final = b" " * PADDING
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
@@ -82,7 +84,7 @@ class BlockReader:
     def blocks(self) -> Generator[Observations]:
         """Yield runs of epochs in the order of the file; a run may be empty."""
         with open_stream(self.path) as stream:
-            head, text = read_header_bytes(stream)
+            head, rest = read_header_bytes(stream)
             notes: list[str] | None = None if self._log.stops else []
             header = parse_header(self.path, head, notes=notes)
             for note in notes or ():
@@ -91,14 +93,12 @@ class BlockReader:
             at_end = False
             while not at_end and self.last_ns < self._selection.end_ns:
                 block, at_end = self._read(stream)
-                text += block
-                if at_end and not text.endswith(b"\n"):
-                    text += b"\n"
-                end = text.rfind(b"\n") + 1
-                if len(text) - end > _MAX_LINE_BYTES:
+                last = b"\n" if at_end and not rest.endswith(b"\n") else b""
+                text = b"".join((rest, block, last, _BLANKS))
+                if len(text) - (text.rfind(b"\n") + 1) > _MAX_LINE_BYTES:
                     message = f"the line is longer than {_MAX_LINE_BYTES} characters; this is no RINEX file"
                     raise InputFileError(self.path, message, line=number + text.count(b"\n"))
-                lines = split_lines(text[:end], first_number=number, keep_blank=header.version < 3.0)
+                lines = split_lines(text, first_number=number, keep_blank=header.version < 3.0)
                 used = 0
                 while used < len(lines):
                     part = lines[used:]
@@ -107,9 +107,10 @@ class BlockReader:
                     used += taken
                     if not taken:
                         break
+                stop = 0
                 if used:
-                    number = int(lines.number[used - 1]) + 1
-                    text = text[int(lines.stop[used - 1]) :]
+                    number, stop = int(lines.number[used - 1]) + 1, int(lines.stop[used - 1])
+                rest = text[stop : -len(_BLANKS)]
 
     def _read(self, stream: ByteStream) -> tuple[bytes, bool]:
         try:

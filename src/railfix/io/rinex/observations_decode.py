@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Floats, Integers, Masks, Strings
+from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks, Strings
+from railfix.gnss.observations import channels_with_data
 from railfix.io.rinex.fault_log import NOT_SELECTED, SATELLITES, UNKNOWN_SYSTEMS, FaultLog
 from railfix.io.rinex.header import RinexHeader
 from railfix.io.rinex.observations_epochs import Epochs
-from railfix.io.rinex.observations_fields import FIELD_WIDTH, Fields, Words, gather, parse
+from railfix.io.rinex.observations_fields import FIELD_WIDTH, Fields, gather, joined, read_fields
 from railfix.io.rinex.observations_lines import Lines
 from railfix.io.rinex.observations_signals import KINDS, SYSTEMS, Column
+from railfix.kernels import compiled_by
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
@@ -75,8 +78,7 @@ def decode(
     parts = []
     for system in SYSTEMS:
         chosen = rows[rows.letter == ord(system)]
-        columns = header.columns(system)
-        if len(chosen.epoch) and columns:
+        if len(chosen.epoch) and (columns := header.columns(system)):
             chosen, fields = _values(lines, chosen, system, columns, header, log)
             parts.append((system, chosen, fields, columns))
     return _scatter(parts, len(epochs))
@@ -115,15 +117,15 @@ def _selected(lines: Lines, rows: Rows, *, header: RinexHeader, systems: frozens
         lines.number[rows.line[broken]],
         lambda i: f"no satellite name can be read ('{lines.text(int(rows.line[broken][i]))[:20]}')",
     )
-    known = np.isin(rows.letter, np.frombuffer(SYSTEMS.encode(), dtype=np.uint8))
+    known = _is_one_of(rows.letter, SYSTEMS)
     log.count(UNKNOWN_SYSTEMS, int((~known & ~broken).sum()))
     kept = known & ~broken
     if systems is not None:
-        in_selection = np.isin(rows.letter, np.frombuffer("".join(sorted(systems)).encode(), dtype=np.uint8))
+        in_selection = _is_one_of(rows.letter, systems)
         log.count(NOT_SELECTED, int((kept & ~in_selection).sum()))
         kept &= in_selection
-    declared = "".join(s for s in SYSTEMS if header.types_of(s) is not None)
-    undeclared = kept & ~np.isin(rows.letter, np.frombuffer(declared.encode(), dtype=np.uint8))
+    declared = [s for s in SYSTEMS if header.types_of(s) is not None]
+    undeclared = kept & ~_is_one_of(rows.letter, declared)
     log.faults(
         SATELLITES,
         lines.number[rows.line[undeclared]],
@@ -133,6 +135,19 @@ def _selected(lines: Lines, rows: Rows, *, header: RinexHeader, systems: frozens
     return rows if kept.all() else rows[kept]
 
 
+def _is_one_of(letter: Bytes, letters: Iterable[str]) -> Masks:
+    table = np.zeros(256, dtype=np.bool_)
+    table[[ord(each) for each in letters]] = True
+    return np.asarray(table[letter])
+
+
+def _numbered(key: Integers) -> tuple[Integers, Integers]:
+    """Return the different small numbers in ascending order, and which of them each one is."""
+    occurs = np.zeros(int(key.max(initial=0)) + 1, dtype=np.bool_)
+    occurs[key] = True
+    return np.flatnonzero(occurs), (np.cumsum(occurs) - 1)[key]
+
+
 def _name(rows: Rows, i: int) -> str:
     return f"{chr(rows.letter[i])}{rows.number[i]:02d}"
 
@@ -140,7 +155,7 @@ def _name(rows: Rows, i: int) -> str:
 def _without_repeats(lines: Lines, rows: Rows, epochs: int, log: FaultLog) -> Rows:
     """Keep the first row of a satellite that occurs twice in an epoch."""
     key = rows.letter.astype(np.int64) * 100 + rows.number
-    names, name = np.unique(key, return_inverse=True)
+    names, name = _numbered(key)
     row = np.arange(len(key))
     last = np.zeros((epochs, len(names)), dtype=np.int64)
     last[rows.epoch, name] = row
@@ -162,15 +177,18 @@ def _values(
 ) -> tuple[Rows, Fields]:
     """Parse the selected columns of the satellite lines; rows with faults are dropped and recorded."""
     count = len(header.types_of(system) or ())
-    if header.version >= 3.0:
-        start, length = lines.start[rows.line] + 3, lines.length[rows.line] - 3
-        words = gather(lines.data, start, length, count)
-        too_long = _continues(lines.data, start, length, FIELD_WIDTH * count)
-    else:
-        words, too_long = _gather_lines(lines, rows, count)
-    if len(columns) < count:
-        words = np.ascontiguousarray(words[:, [c.index for c in columns]])
-    fields = parse(words, np.array([c.divisor for c in columns]))
+    width, before = (count, 3) if header.version >= 3.0 else (FIELDS_PER_LINE, 0)
+    too_long = np.zeros(len(rows.line), dtype=np.bool_)
+    parts = []
+    for k, first in enumerate(range(0, count, width)):
+        line = rows.line + k
+        start, length = lines.start[line] + before, lines.length[line] - before
+        too_long |= _continues(lines.data, start, length, FIELD_WIDTH * min(width, count - first))
+        here = [column for column in columns if first <= column.index < first + width]
+        if here:
+            index, divisor = np.array([c.index - first for c in here]), np.array([c.divisor for c in here])
+            parts.append(read_fields(lines.data, start, length, index, divisor))
+    fields = parts[0] if len(parts) == 1 else joined(parts)
     log.faults(
         SATELLITES,
         lines.number[rows.line[too_long]],
@@ -181,10 +199,11 @@ def _values(
 
     def message(i: int) -> str:
         j = int(np.argmax(fields.bad[which[i]]))
-        text = words[which[i], j].tobytes().decode("latin-1")
+        line, place = divmod(columns[j].index, width)
+        text = lines.text(int(rows.line[which[i]]) + line)[before + FIELD_WIDTH * place :][:FIELD_WIDTH]
         return (
-            f"{columns[j].name} of {_name(rows[which], i)} is '{text}', a number with its digits for loss of lock "
-            "and signal strength was expected"
+            f"{columns[j].name} of {_name(rows[which], i)} is '{text:<{FIELD_WIDTH}}', a number with its digits for "
+            "loss of lock and signal strength was expected"
         )
 
     log.faults(SATELLITES, lines.number[rows.line[which]], message)
@@ -204,47 +223,59 @@ def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Ma
     return result
 
 
-def _gather_lines(lines: Lines, rows: Rows, count: int) -> tuple[Words, Masks]:
-    """Gather the fields of a RINEX 2 satellite from its lines of five fields."""
-    parts = []
-    too_long = np.zeros(len(rows.line), dtype=np.bool_)
-    for k, first in enumerate(range(0, count, FIELDS_PER_LINE)):
-        here = rows.line + k
-        fields = min(FIELDS_PER_LINE, count - first)
-        parts.append(gather(lines.data, lines.start[here], lines.length[here], fields))
-        too_long |= _continues(lines.data, lines.start[here], lines.length[here], FIELD_WIDTH * fields)
-    return np.concatenate(parts, axis=1), too_long
-
-
 def _scatter(parts: list[tuple[str, Rows, Fields, tuple[Column, ...]]], epochs: int) -> Dense:
     """Fill arrays over epochs and channels; channels without any observation are dropped."""
     satellites: list[str] = []
     signals: list[str] = []
     placed = []
     for system, rows, fields, columns in parts:
-        numbers, place = np.unique(rows.number, return_inverse=True)
+        numbers, place = _numbered(rows.number)
         names = sorted({c.signal for c in columns})
         placed.append((len(satellites) + place * len(names), rows, fields, columns, names))
         satellites += [f"{system}{n:02d}" for n in numbers.tolist() for _ in names]
         signals += names * len(numbers)
     shape = (epochs, len(satellites))
-    kinds = tuple(np.full(shape, np.nan) for _ in KINDS)
-    lock = np.zeros(shape, dtype=np.uint8)
+    kinds, lock = np.full((len(KINDS), *shape), np.nan), np.zeros(shape, dtype=np.uint8)
     for base, rows, fields, columns, names in placed:
         cell = rows.epoch * shape[1] + base
-        for j, column in enumerate(columns):
-            at = cell + names.index(column.signal)
-            value = fields.value[:, j]
-            kinds[column.kind].reshape(-1)[at] = np.where(value == 0.0, np.nan, value)
-            if KINDS[column.kind] == "L":
-                lock.reshape(-1)[at] = fields.lock[:, j]
-    used = lock.any(axis=0)
-    for array in kinds:
-        used |= ~np.isnan(array).all(axis=0)
+        kind, signal = np.array([c.kind for c in columns]), np.array([names.index(c.signal) for c in columns])
+        placed_fields(kinds, lock, cell, kind, signal, fields.value, fields.lock)
+    used = channels_with_data(kinds, lock)
     keep = np.flatnonzero(used) if not used.all() else slice(None)
+    code, phase, doppler, cn0 = kinds[:, :, keep]
     return Dense(
         satellite=np.array(satellites, dtype="<U3")[keep],
         signal=np.array(signals, dtype="<U2")[keep],
-        kinds=(kinds[0][:, keep], kinds[1][:, keep], kinds[2][:, keep], kinds[3][:, keep]),
+        kinds=(code, phase, doppler, cn0),
         lock=lock[:, keep],
     )
+
+
+@compiled_by("reading")
+def placed_fields(
+    kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
+) -> tuple[Floats, Bytes]:
+    """Put fields in their places of the dense arrays; zeros are absent.
+
+    Parameters
+    ----------
+    kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
+        By kind of observable; filled in place.
+    cell : ndarray of int, shape (n,)
+        Epoch times M plus the first channel of the satellite, of each line.
+    kind, signal : ndarray of int, shape (k,)
+        Of each field: its kind of observable, and its channel among those of the satellite.
+    value, digit : ndarray, shape (n, k)
+        Values, and loss-of-lock digits.
+
+    Returns
+    -------
+    kinds, lock
+    """
+    flat, flat_lock = kinds.reshape(len(kinds), -1), lock.reshape(-1)
+    for j in range(len(kind)):
+        at = cell + signal[j]
+        flat[kind[j], at] = np.where(value[:, j] == 0.0, np.nan, value[:, j])
+        if KINDS[kind[j]] == "L":
+            flat_lock[at] = digit[:, j]
+    return kinds, lock

@@ -12,13 +12,15 @@ decimals, an exponent, letters) are marked and read one at a time with `float`.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Bytes, Floats, Integers, Masks
+from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
+from railfix.kernels import compiled_by
 
 Words = NDArray[np.uint64]
 
@@ -84,6 +86,12 @@ class Fields:
     bad: Masks
 
 
+def joined(parts: Sequence[Fields]) -> Fields:
+    """Return the fields of the same satellites side by side."""
+    arrays = ([getattr(part, name) for part in parts] for name in ("value", "lock", "bad"))
+    return Fields(*(np.concatenate(some, axis=1) for some in arrays))
+
+
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
     """Gather fields of lines as pairs of 64-bit words; characters beyond the end of a line are blank.
 
@@ -117,13 +125,15 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
     return words
 
 
-def parse(words: Words, divisor: Floats) -> Fields:
-    """Parse fields.
+def read_fields(data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats) -> Fields:
+    """Read fields of lines.
 
     Parameters
     ----------
-    words : ndarray of uint64, shape (n, k, 2)
-        From `gather`.
+    data, start, length
+        As for `gather`.
+    index : ndarray of int, shape (k,)
+        Which fields of each line.
     divisor : ndarray, shape (k,)
         Divisor of the written value (SYS / SCALE FACTOR; 1 where there is none).
 
@@ -131,26 +141,47 @@ def parse(words: Words, divisor: Floats) -> Fields:
     -------
     Fields
     """
-    rows, columns, _ = words.shape
-    value = np.empty((rows, columns))
-    lock = np.empty((rows, columns), dtype=np.uint8)
-    bad = np.zeros((rows, columns), dtype=np.bool_)
-    thousand = divisor * 1000.0
-    uniform = bool(np.all(divisor == 1.0))
-    step = max(_CHUNK // max(columns, 1), 1)
-    for first in range(0, rows, step):
-        part = slice(first, first + step)
-        flat = words[part].reshape(-1, 2)
-        thousandths, odd = _thousandths(flat, lock[part])
-        per = 1000.0 if uniform else thousand
-        np.divide(thousandths.reshape(-1, columns), per, out=value[part])
-        if odd.any():
-            where = np.flatnonzero(odd)
-            read, wrong = _read_slowly(flat[where])
-            value[part].reshape(-1)[where] = read / divisor[where % columns]
-            lock[part].reshape(-1)[where[wrong]] = 0
-            bad[part].reshape(-1)[where] = wrong
+    value, lock, odd = decoded_fields(data, start, length, index, divisor)
+    bad = np.zeros(value.shape, dtype=np.bool_)
+    row, column = np.nonzero(odd)
+    if len(row):
+        at = FIELD_WIDTH * index[column]
+        read, wrong = _read_slowly(gather(data, start[row] + at, length[row] - at, 1).reshape(-1, 2))
+        value[row, column] = read / divisor[column]
+        lock[row[wrong], column[wrong]] = 0
+        bad[row, column] = wrong
     return Fields(value, lock, bad)
+
+
+@compiled_by("reading")
+def decoded_fields(
+    data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
+) -> tuple[Floats, Bytes, Masks]:
+    """Decode the fields of the usual form, shape (n, k); the arguments are those of `read_fields`.
+
+    Returns
+    -------
+    value : ndarray of float64
+        NaN where blank or of another form.
+    lock : ndarray of uint8
+        Loss-of-lock digit; 255 where the last two characters are neither blanks nor digits.
+    odd : ndarray of bool
+        The field has another form.
+    """
+    words = gather(data, start, length, int(index.max()) + 1)
+    if len(index) < words.shape[1]:
+        words = np.ascontiguousarray(words[:, index])
+    shape = (len(start), len(index))
+    value, lock, odd = np.empty(shape), np.empty(shape, dtype=np.uint8), np.empty(shape, dtype=np.bool_)
+    per = divisor * 1000.0
+    step = max(_CHUNK // shape[1], 1)
+    for first in range(0, shape[0], step):
+        part = slice(first, first + step)
+        thousandths, other = _thousandths(words[part].reshape(-1, 2), lock[part])
+        thousandths[other] = np.nan
+        np.divide(thousandths.reshape(-1, shape[1]), per, out=value[part])
+        odd[part] = other.reshape(-1, shape[1])
+    return value, lock, odd
 
 
 def _thousandths(flat: Words, lock: Bytes) -> tuple[Floats, Masks]:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Bytes, Integers, Masks
-from railfix.io.rinex.observations_fields import PADDING
+from railfix.kernels import compiled_by
 
 _DAY_NS: Final = 86_400_000_000_000
 _BLANK: Final = ord(" ")
@@ -61,28 +61,34 @@ class Lines:
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block that ends with a line end into lines.
+    """Split a block into lines; what follows its last line end belongs to none.
 
     Parameters
     ----------
     text : bytes
+        Followed by `PADDING` blanks.
     first_number : int
         Line number of the first line.
     keep_blank : bool
         Whether empty lines are kept (RINEX 2: a satellite without observations).
     """
-    data = np.frombuffer(text + b" " * PADDING, dtype=np.uint8)
-    end = np.flatnonzero(data == ord("\n"))
+    data = np.frombuffer(text, dtype=np.uint8)
+    end = line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
     length = end - start
-    if b"\r" in text:
-        length -= (length > 0) & (data[end - 1] == ord("\r"))
+    length -= (length > 0) & (data[end - 1] == ord("\r"))
     number = np.arange(first_number, first_number + len(end))
     lines = Lines(data, start, length, end + 1, number)
-    if keep_blank or not (length == 0).any():
+    if keep_blank or length.all():
         return lines
     kept = length > 0
     return Lines(data, start[kept], length[kept], end[kept] + 1, number[kept])
+
+
+@compiled_by("reading")
+def line_ends(data: Bytes) -> Integers:
+    """Return the places of the line feeds in a text."""
+    return np.flatnonzero(data == ord("\n"))
 
 
 @dataclass(frozen=True)
@@ -133,19 +139,19 @@ def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochL
     mark and with a year of two digits (80 to 99 are 19xx).
     """
     width = epoch_width(version)
-    text = lines.columns(which, width)
+    text = np.ascontiguousarray(lines.columns(which, width).T)  # a row for each column of the file
     at = width - 35
-    flag, flag_ok = _number(text[:, 31 + at : 32 + at])
-    count, count_ok = _number(text[:, 32 + at : 35 + at])
+    flag, flag_ok = _number(text[31 + at : 32 + at])
+    count, count_ok = _number(text[32 + at : 35 + at])
     year_from = 2 if version >= 3.0 else 1
-    year, year_ok = _number(text[:, year_from : 6 + at])
+    year, year_ok = _number(text[year_from : 6 + at])
     if version < 3.0:
         year = year + np.where(year >= 80, 1900, 2000)
-    parts = [_number(text[:, first + at : first + at + 2]) for first in (7, 10, 13, 16, 19)]
+    parts = [_number(text[first + at : first + at + 2]) for first in (7, 10, 13, 16, 19)]
     (month, month_ok), (day, day_ok), (hour, hour_ok), (minute, minute_ok), (second, second_ok) = parts
-    fraction, fraction_ok = _fraction(text[:, 22 + at : 29 + at])
+    fraction, fraction_ok = _fraction(text[22 + at : 29 + at])
     gaps = [first + at for first in (6, 9, 12, 15, 18, 29, 30)] + [0 if version < 3.0 else 1]
-    placed = (text[:, gaps] == _BLANK).all(axis=1) & (text[:, 21 + at] == ord("."))
+    placed = (text[gaps] == _BLANK).all(axis=0) & (text[21 + at] == ord("."))
     month_ok &= (month >= 1) & (month <= 12)
     months = (year - 1970) * 12 + np.where(month_ok, month, 1) - 1
     first_day = months.astype("M8[M]").astype("M8[D]").astype(np.int64)
@@ -183,20 +189,25 @@ def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
 
 
 def _number(text: Bytes) -> tuple[Integers, Masks]:
-    """Parse right-aligned digits of each row, and flag the valid rows."""
-    digits = text.astype(np.int64) - _ZERO
-    is_digit = (digits >= 0) & (digits <= 9)
-    blank = text == _BLANK
-    fine = (is_digit | blank).all(axis=1) & is_digit[:, -1] & ~(is_digit[:, :-1] & blank[:, 1:]).any(axis=1)
-    weights = 10 ** np.arange(text.shape[1] - 1, -1, -1)
-    return np.where(fine, np.where(is_digit, digits, 0) @ weights, 0), fine
+    """Parse right-aligned digits, shape (width, n), and flag the valid ones."""
+    digits = text - np.uint8(_ZERO)
+    is_digit, blank = digits <= 9, text == _BLANK
+    fine = (is_digit | blank).all(axis=0) & is_digit[-1] & ~(is_digit[:-1] & blank[1:]).any(axis=0)
+    return np.where(fine, _value(digits, is_digit), 0), fine
 
 
 def _fraction(text: Bytes) -> tuple[Integers, Masks]:
-    """Parse left-aligned decimals of each row as a number of units of the last decimal."""
-    _, fine = _number(text[:, ::-1])
-    digits = np.where(text == _BLANK, 0, text.astype(np.int64) - _ZERO)
-    return digits @ (10 ** np.arange(text.shape[1] - 1, -1, -1)), fine
+    """Parse left-aligned decimals, shape (width, n), as a number of units of the last decimal."""
+    _, fine = _number(text[::-1])
+    return _value(text - np.uint8(_ZERO), text != _BLANK), fine
+
+
+def _value(digits: Bytes, counted: Masks) -> Integers:
+    """Return the value of digits, those not counted 0."""
+    value = np.zeros(digits.shape[1], dtype=np.int64)
+    for row, here in zip(digits, counted, strict=True):
+        value = 10 * value + np.where(here, row, 0)
+    return value
 
 
 def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
