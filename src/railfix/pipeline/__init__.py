@@ -1,19 +1,5 @@
 """Positions of a log or stream, epoch by epoch: settings, processor, results."""
 
-from railfix.pipeline.config import Config, load_config
-from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
-from railfix.pipeline.tables import observations_table, positions_table, to_xarray
+import lazy_loader
 
-__all__ = [
-    "AntennaResult",
-    "AntennaState",
-    "Config",
-    "EpochProcessor",
-    "Result",
-    "State",
-    "load_config",
-    "observations_table",
-    "positions_table",
-    "to_xarray",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

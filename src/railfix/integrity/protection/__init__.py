@@ -8,21 +8,6 @@ From the model of `railfix.integrity.raim`::
     status = availability(got.level_m, 20.0, consistent=got.consistent)
 """
 
-from railfix.integrity.protection.level import Cause, ProtectionLevel, along_track_level
-from railfix.integrity.protection.risk import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, SATELLITE_PRIOR, RiskBudget, k_factor
-from railfix.integrity.protection.status import LevelStatus, availability
+import lazy_loader
 
-__all__ = [
-    "K_H_NPA",
-    "K_H_PA",
-    "K_V",
-    "MOST_EXCLUDED",
-    "SATELLITE_PRIOR",
-    "Cause",
-    "LevelStatus",
-    "ProtectionLevel",
-    "RiskBudget",
-    "along_track_level",
-    "availability",
-    "k_factor",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

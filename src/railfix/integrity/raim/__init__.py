@@ -13,24 +13,6 @@ The noise scale multiplies the sigmas of the ranges after the fit: the fit itsel
 balance between ranges and map error, stays that of the weights.
 """
 
-from railfix.integrity.raim.detection import Detection, RaimLimits, detect, threshold
-from railfix.integrity.raim.exclusion import Exclusion, Outcome, exclude, worst_channel
-from railfix.integrity.raim.model import LinearModel, constrained_model, point_model
-from railfix.integrity.raim.reliability import Reliability, noncentrality, reliability
+import lazy_loader
 
-__all__ = [
-    "Detection",
-    "Exclusion",
-    "LinearModel",
-    "Outcome",
-    "RaimLimits",
-    "Reliability",
-    "constrained_model",
-    "detect",
-    "exclude",
-    "noncentrality",
-    "point_model",
-    "reliability",
-    "threshold",
-    "worst_channel",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

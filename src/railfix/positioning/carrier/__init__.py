@@ -5,37 +5,6 @@ detects where arcs end, `smooth_codes` is the Hatch filter, and `phase_positions
 from code and phase with the same geometry and clocks and one ambiguity per arc.
 """
 
-from __future__ import annotations
+import lazy_loader
 
-from railfix.positioning.carrier.ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions
-from railfix.positioning.carrier.arcs import ArcState, number_arcs
-from railfix.positioning.carrier.continuity import ContinuityLimits, ContinuityState, TrackJumps, track_jumps
-from railfix.positioning.carrier.filtered import PhaseState, phase_positions
-from railfix.positioning.carrier.observation_model import Phases, corrected_phase_m
-from railfix.positioning.carrier.slips import SlipLimits, SlipReason, Slips, SlipState, find_slips
-from railfix.positioning.carrier.smoothing import Smoothed, SmoothingLimits, SmoothingState, smooth_codes
-
-__all__ = [
-    "ArcAmbiguities",
-    "ArcState",
-    "ContinuityLimits",
-    "ContinuityState",
-    "PhaseLimits",
-    "PhasePositions",
-    "PhaseState",
-    "Phases",
-    "SlipLimits",
-    "SlipReason",
-    "SlipState",
-    "Slips",
-    "Smoothed",
-    "SmoothingLimits",
-    "SmoothingState",
-    "TrackJumps",
-    "corrected_phase_m",
-    "find_slips",
-    "number_arcs",
-    "phase_positions",
-    "smooth_codes",
-    "track_jumps",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,23 @@
+# The names of `railfix.integrity.raim`, imported at their first use (lazy-loader).
+
+from .detection import Detection, RaimLimits, detect, threshold
+from .exclusion import Exclusion, Outcome, exclude, worst_channel
+from .model import LinearModel, constrained_model, point_model
+from .reliability import Reliability, noncentrality, reliability
+
+__all__ = [
+    "Detection",
+    "Exclusion",
+    "LinearModel",
+    "Outcome",
+    "RaimLimits",
+    "Reliability",
+    "constrained_model",
+    "detect",
+    "exclude",
+    "noncentrality",
+    "point_model",
+    "reliability",
+    "threshold",
+    "worst_channel",
+]

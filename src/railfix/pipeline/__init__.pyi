@@ -1,0 +1,19 @@
+# The names of `railfix.pipeline`, imported at their first use (lazy-loader).
+
+from .config import Config, load_config
+from .processor import EpochProcessor
+from .results import AntennaResult, AntennaState, Result, State
+from .tables import observations_table, positions_table, to_xarray
+
+__all__ = [
+    "AntennaResult",
+    "AntennaState",
+    "Config",
+    "EpochProcessor",
+    "Result",
+    "State",
+    "load_config",
+    "observations_table",
+    "positions_table",
+    "to_xarray",
+]

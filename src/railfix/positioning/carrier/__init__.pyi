@@ -1,0 +1,34 @@
+# The names of `railfix.positioning.carrier`, imported at their first use (lazy-loader).
+
+from .ambiguities import ArcAmbiguities, PhaseLimits, PhasePositions
+from .arcs import ArcState, number_arcs
+from .continuity import ContinuityLimits, ContinuityState, TrackJumps, track_jumps
+from .filtered import PhaseState, phase_positions
+from .observation_model import Phases, corrected_phase_m
+from .slips import SlipLimits, SlipReason, Slips, SlipState, find_slips
+from .smoothing import Smoothed, SmoothingLimits, SmoothingState, smooth_codes
+
+__all__ = [
+    "ArcAmbiguities",
+    "ArcState",
+    "ContinuityLimits",
+    "ContinuityState",
+    "PhaseLimits",
+    "PhasePositions",
+    "PhaseState",
+    "Phases",
+    "SlipLimits",
+    "SlipReason",
+    "SlipState",
+    "Slips",
+    "Smoothed",
+    "SmoothingLimits",
+    "SmoothingState",
+    "TrackJumps",
+    "corrected_phase_m",
+    "find_slips",
+    "number_arcs",
+    "phase_positions",
+    "smooth_codes",
+    "track_jumps",
+]

@@ -1,0 +1,21 @@
+# The names of `railfix.ranges.sbas`, imported at their first use (lazy-loader).
+
+from .corrections import SbasCorrections, SbasState, best_prn
+from .files import from_receiver, read_sbas
+from .messages import SbasMessages
+from .results import IonosphereDelays, IonosphereState, SatelliteCorrections, SatelliteState
+from .standard import SbasLimits
+
+__all__ = [
+    "IonosphereDelays",
+    "IonosphereState",
+    "SatelliteCorrections",
+    "SatelliteState",
+    "SbasCorrections",
+    "SbasLimits",
+    "SbasMessages",
+    "SbasState",
+    "best_prn",
+    "from_receiver",
+    "read_sbas",
+]
