@@ -316,3 +316,25 @@ def test_two_at_a_time_are_counted_against_independence() -> None:
     error[:40] = 50.0  # twenty times both satellites
     rate = fault_rate(replace(samples_of(error, 45.0, 0.0, 45.0), block=block))
     assert rate.together == pytest.approx(20.0 / (1000 * 0.02**2), rel=1e-9)
+
+
+def test_low_satellites_of_one_side_are_counted_together() -> None:
+    """Four satellites a block of time, two on either side; of each pair of faults the place decides what it counts."""
+    blocks, each = 1000, 4
+    n = blocks * each
+    of, satellite = np.arange(n) // each, np.arange(n) % each
+    azimuth = np.array([60.0, 120.0, 240.0, 300.0])[satellite]
+    error = np.zeros(n)
+    for first, pair in ((0, (0, 1)), (10, (2, 3)), (20, (0, 2)), (30, (1,))):
+        error[(of >= first) & (of < first + 5) & np.isin(satellite, pair)] = 50.0
+    samples = replace(
+        samples_of(error, 30.0, 0.0, 45.0), block=of * 1_000_000 + satellite, relative_azimuth_deg=azimuth
+    )
+    rate = fault_rate(samples)
+    # Five blocks on the right, five on the left; faults of either side or of one satellite do not count.
+    assert (rate.side_blocks, rate.side_faulty_blocks) == (2 * blocks, 10)
+    assert rate.side_upper == pytest.approx(0.00846, rel=0.01)  # Clopper and Pearson: 10 of 2000
+    high = fault_rate(replace(samples, elevation_deg=np.full(n, 45.0)))
+    assert (high.side_blocks, high.side_faulty_blocks, high.side_upper) == (0, 0, 1.0)
+    unused = fault_rate(replace(samples, used=satellite != 0))
+    assert (unused.side_blocks, unused.side_faulty_blocks) == (blocks, 5)

@@ -1,4 +1,4 @@
-"""Local faults on a line: ranges beyond a bound in sigmas of the protection level; their rate and places."""
+"""Local faults on a line: ranges beyond a bound in sigmas of the protection level; their rate, sides and places."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from scipy.special import betaincinv
 
-from railfix.core.arrays import Integers
+from railfix.core.arrays import Integers, Masks
 from railfix.ranges.error_model.fit import ErrorSamples
 from railfix.ranges.error_model.model import FaultRate
 
@@ -15,15 +15,19 @@ from railfix.ranges.error_model.model import FaultRate
 _SATELLITES: Final = 1_000_000
 
 
-def fault_rate(samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: float = 0.95) -> FaultRate:
-    """Measure the rate of local faults among the ranges that passed every screen.
+def fault_rate(
+    samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: float = 0.95, side_elevation_deg: float = 45.0
+) -> FaultRate:
+    """Measure the rate of local faults among the ranges that passed every screen, singly and by sides of the track.
 
     Parameters
     ----------
     samples : ErrorSamples
     beyond_sigma : float
     confidence : float
-        Of the upper bound.
+        Of the upper bounds.
+    side_elevation_deg : float [deg]
+        Elevation up to which satellites count as low, as `RiskBudget.side_elevation_deg`.
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m)
     faulty = used & (np.abs(samples.error_m) > beyond_sigma * samples.sigma_m)
@@ -31,7 +35,9 @@ def fault_rate(samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: 
     ranges, count = int(used.sum()), int(faulty.sum())
     # Within a faulty block only a part of the ranges is faulty; without one, one range of a block would be.
     part = (count / ranges) / (len(bad) / len(every)) if len(bad) else 1.0
-    upper = float(betaincinv(len(bad) + 1, len(every) - len(bad), confidence)) if len(every) > len(bad) else 1.0
+    upper = _upper(len(bad), len(every), confidence)
+    low = used & (samples.elevation_deg < side_elevation_deg)
+    sides, side_faults = (_sides_of_two(samples, which) for which in (low, low & faulty))
     return FaultRate(
         beyond_sigma=beyond_sigma,
         ranges=ranges,
@@ -41,7 +47,23 @@ def fault_rate(samples: ErrorSamples, *, beyond_sigma: float = 5.0, confidence: 
         prior=count / ranges if ranges else 0.0,
         upper=min(1.0, part * upper),
         together=_together(every, bad),
+        side_blocks=sides,
+        side_faulty_blocks=side_faults,
+        side_upper=min(1.0, part * _upper(side_faults, sides, confidence)),
     )
+
+
+def _upper(hits: int, trials: int, confidence: float) -> float:
+    """Upper end of the one-sided interval of a probability (Clopper and Pearson)."""
+    return float(betaincinv(hits + 1, trials - hits, confidence)) if trials > hits else 1.0
+
+
+def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
+    """Blocks of time with two satellites or more on a side of the track among some samples, each side for itself."""
+    right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
+    one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
+    _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
+    return int(np.count_nonzero(satellites >= 2))
 
 
 def faulty_stretches(

@@ -142,6 +142,12 @@ class FaultRate(Settings):
         to use.
     together : float
         Blocks of time with two faulty satellites or more, over what independent satellites give; 0 without any.
+    side_blocks, side_faulty_blocks : int
+        Blocks of time with two low satellites or more on one side of the track, each side counted for itself, and
+        those in which two of these were faulty.
+    side_upper : float
+        Upper end of the 95 % interval of the probability that low satellites of one side are faulty together, by
+        those blocks: the `side_prior` to use, where it is small enough to leave a level. 1 without such blocks.
     """
 
     beyond_sigma: float = Field(gt=0)
@@ -152,6 +158,9 @@ class FaultRate(Settings):
     prior: float = Field(ge=0, le=1)
     upper: float = Field(ge=0, le=1)
     together: float = Field(ge=0)
+    side_blocks: int = Field(default=0, ge=0)
+    side_faulty_blocks: int = Field(default=0, ge=0)
+    side_upper: float = Field(default=1.0, ge=0, le=1)
 
 
 @dataclass(frozen=True, kw_only=True)
