@@ -1,18 +1,18 @@
-"""Protection levels on simulated commercial lines: is any epoch misled, and how often is the level of use?
+"""Protection levels on simulated lines: is any epoch misled, and how often is the level of use?
 
-``python tests/integrity_campaign.py FOLDER [--runs 48] [--jobs 2]`` simulates runs over lines, places and skies
-that all differ (the shipped scenario ``p1-commercial`` under other seeds), half of which make an error model
-that the other half is judged by, and the other way round. Each run is kept in FOLDER, so that a broken
-campaign goes on where it was. ``--summary`` prints the tables of what is there; ``--model FILE`` judges the same
-runs by a model of another generator, such as one of the recordings (``tests/integrity_recordings.py`` writes them).
+``python tests/integrity_campaign.py FOLDER [--scenario p1-commercial] [--rate 10] [--runs 48] [--jobs 2]`` simulates
+runs over lines, places and skies that all differ (a shipped scenario under other seeds), half of which make an error
+model that the other half is judged by, and the other way round. Each run is kept in FOLDER, so that a broken campaign
+goes on where it was. ``--summary`` prints the tables of what is there; ``--model FILE`` judges the same runs by a model
+of another generator: that of another scenario (``OTHER_FOLDER/model-all.toml``) or of the recordings
+(``tests/integrity_recordings.py`` writes them).
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import time as clock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -50,16 +50,27 @@ ANTENNAS = ("front", "rear")
 ALARM_LIMITS_M = (10.0, 20.0, 40.0)
 #: Bins of the models: finer in C/N0 than by default, there are millions of samples.
 BINS = ErrorBins(cn0_dbhz=(0.0, 30.0, 35.0, 37.5, 40.0, 42.5, 45.0, 47.5, 50.0, 60.0))
-#: Kinds of levels by the model that they rest on; those of any other model are "other".
-NAMES = {None: "plain", "model-even": "judged", "model-odd": "judged"}
+#: Halves of the runs.
+HALVES = ("even", "odd")
+#: Errors beyond so many sigmas of the level are local faults, as in `railfix error-model`.
+FAULT_SIGMAS = 5.0
 #: Settings of both halves.
 SETTINGS: dict[str, Any] = {"elevation": {"mask_deg": 15.0}}
 
 
-def scenario_of(run: int) -> Scenario:
+@dataclass(frozen=True)
+class Runs:
+    """A shipped scenario, and the rate of its epochs [Hz]; None: its own."""
+
+    scenario: str
+    rate_hz: float | None = None
+
+
+def scenario_of(run: int, runs: Runs) -> Scenario:
     """A run over a line, a place and a sky of its own."""
-    recipe = load_recipe("p1-commercial")
-    base = recipe.scenario(run % 2)
+    recipe = load_recipe(runs.scenario)
+    direction = run % 2 % len(recipe.names)
+    base = recipe.scenario(direction)
     changes = {
         "seed": 100 + run,
         "place_seed": 100 + run,
@@ -67,7 +78,8 @@ def scenario_of(run: int) -> Scenario:
         "line": {"azimuth_deg": (75.0 + 137.5 * run) % 360.0, "generated": {"seed": 100 + run}},
     }
     changes["start"] = changes["start"].astype("datetime64[s]").item()
-    return recipe.scenario(run % 2, changes=changes)
+    scenario = recipe.scenario(direction, changes=changes).replaced(sensors=None)
+    return scenario if runs.rate_hz is None else scenario.replaced(rate_hz=runs.rate_hz)
 
 
 @dataclass(frozen=True)
@@ -103,12 +115,12 @@ class Played:
         return np.interp(piece.geometry.chainage_m, line.sampled_chainage_m(), line.track().chainage_m)
 
 
-def gather(run: int, folder: Path) -> None:
+def gather(run: int, runs: Runs, folder: Path) -> None:
     """Range errors of a run, for the model."""
     out = folder / f"samples-{run:03d}.npz"
     if out.exists():
         return
-    played, parts = Played.of(scenario_of(run)), []
+    played, parts = Played.of(scenario_of(run, runs)), []
     for chunk in played.results({**SETTINGS, "protection": "off"}):
         for number, (name, (found, piece)) in enumerate(chunk.items()):
             reference = truth_of(found, piece)
@@ -155,17 +167,21 @@ def model_of(runs: list[int], folder: Path, name: str) -> Path:
     return path
 
 
-def judge(run: int, model: Path | None, folder: Path) -> None:
-    """Errors and levels of a run, weighted by a model of other runs."""
-    out = folder / f"{NAMES.get(model and model.stem, 'other')}-{run:03d}.npz"
+def judge(run: int, runs: Runs, model: Path, folder: Path, kind: str) -> None:
+    """Errors and levels of a run by a model of other runs."""
+    out = folder / f"{kind}-{run:03d}.npz"
     if out.exists():
         return
-    played = Played.of(scenario_of(run))
-    settings = SETTINGS if model is None else {**SETTINGS, "error_model": str(model)}
+    played = Played.of(scenario_of(run, runs))
+    settings = {**SETTINGS, "error_model": str(model)}
     rows: dict[str, list[np.ndarray]] = {}
+    ranges = np.zeros(2, dtype=np.int64)
     for chunk in played.results(settings):
-        for number, (found, piece) in enumerate(chunk.values()):
+        for number, (name, (found, piece)) in enumerate(chunk.items()):
             level = found.protection.level
+            samples = range_errors(found, played.trajectories[name], truth_of(found, piece)).samples
+            faulty = samples.used & (np.abs(samples.error_m) > FAULT_SIGMAS * samples.sigma_m)
+            ranges += [np.count_nonzero(samples.used), np.count_nonzero(faulty)]
             true = played.true_chainage_m(piece)
             row = {
                 "time": found.time,
@@ -185,7 +201,7 @@ def judge(run: int, model: Path | None, folder: Path) -> None:
             }
             for key, values in row.items():
                 rows.setdefault(key, []).append(values)
-    _keep(out, {key: np.concatenate(values) for key, values in rows.items()})
+    _keep(out, {**{key: np.concatenate(values) for key, values in rows.items()}, "ranges": ranges})
 
 
 def _keep(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -238,6 +254,8 @@ def summary(rows: dict[str, np.ndarray]) -> Iterator[str]:
     yield f"error / level: p50 {np.median(ratio):.3f}, p99.9 {np.percentile(ratio, 99.9):.3f}, max {ratio.max():.3f}"
     p50, p95 = np.percentile(error[has], [50, 95])
     yield f"|error|: p50 {p50:.2f}, p95 {p95:.2f}, max {error[has].max():.2f} m"
+    used, faulty = rows["ranges"].reshape(-1, 2).sum(axis=0)
+    yield f"{used:,} ranges used, {faulty:,} beyond {FAULT_SIGMAS:g} sigma of the level ({faulty / used:.1e})"
     yield "environment   observed   no check against   level p50   available 10 m   20 m   40 m   |error| max"
     for name in np.unique(rows["environment"]).tolist():
         here = observed & (rows["environment"] == name)
@@ -262,44 +280,48 @@ def summary(rows: dict[str, np.ndarray]) -> Iterator[str]:
         )
 
 
-def campaign(folder: Path, runs: int, jobs: int) -> None:
+def in_parallel(function: Callable[..., None], jobs: int, *arguments: list[Any]) -> None:
+    """Call a function for each run."""
+    with ProcessPoolExecutor(max_workers=jobs) as pool:
+        list(pool.map(function, *arguments))
+
+
+def campaign(folder: Path, runs: Runs, count: int, jobs: int) -> None:
     """Simulate, model, judge."""
     folder.mkdir(parents=True, exist_ok=True)
-    even, odd = list(range(0, runs, 2)), list(range(1, runs, 2))
-    with ProcessPoolExecutor(max_workers=jobs) as pool:
-        list(pool.map(gather, range(runs), [folder] * runs))
-        # A half judges by what the other half has made.
-        for_odd, for_even = model_of(even, folder, "model-even"), model_of(odd, folder, "model-odd")
-        models = [for_even if run % 2 == 0 else for_odd for run in range(runs)]
-        list(pool.map(judge, range(runs), models, [folder] * runs))
+    every, same = list(range(count)), [runs] * count
+    in_parallel(gather, jobs, every, same, [folder] * count)
+    # A half judges by what the other half has made; the model of all is for other scenarios.
+    for_odd, for_even = model_of(every[::2], folder, "model-even"), model_of(every[1::2], folder, "model-odd")
+    model_of(every, folder, "model-all")
+    models = [for_even if run % 2 == 0 else for_odd for run in every]
+    in_parallel(judge, jobs, every, same, models, [folder] * count, ["judged"] * count)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--scenario", default="p1-commercial")
+    parser.add_argument("--rate", type=float, help="epochs a second (default: of the scenario)")
     parser.add_argument("--runs", type=int, default=48)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--summary", action="store_true")
     parser.add_argument("--model", type=Path, help="judge the runs of FOLDER by this model, of another generator")
     options = parser.parse_args()
-    began = clock.perf_counter()
-    if options.model is not None:
-        with ProcessPoolExecutor(max_workers=options.jobs) as pool:
-            runs = range(options.runs)
-            list(pool.map(judge, runs, [options.model] * options.runs, [options.folder] * options.runs))
-        print("\n".join(summary(table(options.folder, "other"))))
-        print(f"{clock.perf_counter() - began:.0f} s")
-        return
-    if not options.summary:
-        campaign(options.folder, options.runs, options.jobs)
-    print("\n".join(summary(table(options.folder, "judged"))))
-    for name in ("model-even", "model-odd"):
-        model = read_error_model(options.folder / f"{name}.toml")
+    count, runs = options.runs, Runs(options.scenario, options.rate)
+    kind = "judged" if options.model is None else f"by-{options.model.parent.name}-{options.model.stem}"
+    if options.model is None and not options.summary:
+        campaign(options.folder, runs, count, options.jobs)
+    elif not options.summary:
+        same = [runs] * count, [options.model] * count, [options.folder] * count, [kind] * count
+        in_parallel(judge, options.jobs, list(range(count)), *same)
+    print("\n".join(summary(table(options.folder, kind))))
+    for path in [options.model] if options.model else [options.folder / f"model-{half}.toml" for half in HALVES]:
+        model = read_error_model(path)
         print(
-            f"{name}: {int(model.after.count.sum()):,} ranges after the screens, bound sigma "
+            f"{path.stem}: {int(model.after.count.sum()):,} ranges after the screens, bound sigma "
             f"{np.nanmin(model.after.bound_sigma_m):.2f} to {np.nanmax(model.after.bound_sigma_m):.2f} m"
         )
-    print(f"{clock.perf_counter() - began:.0f} s")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from urban_comparison import Sample, city, cn0_by_elevation, figures, simulated, weighted_median
+from urban_comparison import VALIDATION_SEEDS, Sample, city, cn0_by_elevation, figures, simulated, weighted_median
 from urban_comparison import recordings as recorded_cities
 
 pytestmark = pytest.mark.requirement("D4")
@@ -57,21 +57,32 @@ def test_it_is_the_class_of_the_recorded_cities(urban: Sample, recordings: Path)
         assert theirs.late_over_20_m > 8.0 * theirs.early_over_20_m
 
 
-def test_the_city_is_as_bad_as_the_recordings_that_it_is_calibrated_on(recordings: Path) -> None:
-    """Tails, faults beyond 5 sigma and C/N0 within 25 % of the mean of both receivers in Hong Kong, one value apart."""
-    sample, theirs = city(), recorded_cities(recordings)[:2]
-    ours, both = figures(sample), [figures(recorded) for recorded in theirs]
-    for name in ("p95_m", "p99_m", "over_20_m", "over_50_m", "beyond_5_sigma"):
-        middle = np.mean([getattr(f, name) for f in both])
-        assert getattr(ours, name) == pytest.approx(middle, rel=0.25), name
+@pytest.fixture(scope="module")
+def calibrated() -> Sample:
+    return city()
+
+
+def test_the_city_is_as_bad_as_the_recordings_that_it_is_calibrated_on(calibrated: Sample, recordings: Path) -> None:
+    """Tails and faults beyond 5 sigma of both receivers in Hong Kong or within 25 % beside them, and their C/N0."""
+    theirs = recorded_cities(recordings)[:2]
+    ours, both = figures(calibrated), [figures(recorded) for recorded in theirs]
+    for name in ("p95_m", "p99_m", "over_20_m", "over_50_m", "beyond_5_sigma", "correlation_10_s"):
+        values = [getattr(f, name) for f in both]
+        assert 0.75 * min(values) < getattr(ours, name) < 1.25 * max(values), name
+    assert ours.early_over_20_m < 0.004
     assert ours.correlation_1_s > 0.9
     assert 0.8 < ours.pair_ratio < 1.6
-    # Mean, p5 and p95 of C/N0 from 10 to 70 deg; the weakest at 50 to 60 deg are 38 % off (22 against 16 dB-Hz).
+    # Mean, p5 and p95 of C/N0 from 10 to 70 deg.
     recorded_cn0 = np.mean([cn0_by_elevation(recorded) for recorded in theirs], axis=0)[1:7]
-    off = np.abs(cn0_by_elevation(sample)[1:7] / recorded_cn0 - 1.0)
+    off = np.abs(cn0_by_elevation(calibrated)[1:7] / recorded_cn0 - 1.0)
     assert off[:, [0, 2]].max() < 0.15
-    assert np.delete(off[:, 1], 4).max() < 0.25
-    assert off[4, 1] < 0.45
+    assert off[:, 1].max() < 0.30
+
+
+def test_other_seeds_of_the_city_are_like_those_of_the_calibration(calibrated: Sample) -> None:
+    ours, others = figures(calibrated), figures(city(seeds=VALIDATION_SEEDS))
+    for name in ("p95_m", "p99_m", "over_20_m", "over_50_m", "beyond_5_sigma", "two_faults", "correlation_10_s"):
+        assert getattr(others, name) == pytest.approx(getattr(ours, name), rel=0.15), name
 
 
 def test_the_weighted_median_is_the_middle_by_weight() -> None:

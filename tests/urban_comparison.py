@@ -2,7 +2,8 @@
 
 Run ``python tests/urban_comparison.py`` with the recordings beside the checkout; without them only the
 simulated columns are printed. The kinds of `railfix.simulate.environment.section_kinds` are not fitted; the
-scenario `city` is calibrated on the Hong Kong recordings, Berlin and the Pixel are for validation.
+scenario `city` is calibrated on the Hong Kong recordings with some seeds, Berlin and the Pixel and other seeds are for
+validation: ``python tests/urban_comparison.py calibration`` prints them side by side.
 ``python tests/urban_comparison.py speed`` prints the processor time.
 """
 
@@ -13,17 +14,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
 import recordings_score
 import recordings_truth
+from integrity_campaign import Played
 from railfix.core.arrays import Floats, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Reason
 from railfix.evaluate import interpolate_reference
+from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import AntennaResult
 from railfix.ranges.weights import CodeNoise, code_sigma_m
 from railfix.simulate import LineSettings, RunSettings, Scenario, Simulation, SkySettings, write_run
@@ -37,6 +40,12 @@ SYSTEMS: Final = "GJEC"
 LENGTH_M: Final = 4000.0
 CRUISE_MPS: Final = 40.0 / 3.6
 SEEDS: Final = (1, 2, 3)
+#: Seeds of `city` that it was calibrated with, and others that were not looked at before it was.
+CALIBRATION_SEEDS: Final = tuple(range(1, 13))
+VALIDATION_SEEDS: Final = tuple(range(101, 113))
+#: Bands of elevation [deg] and of C/N0 [dB-Hz] of the calibration's table.
+BANDS_DEG: Final = ((10.0, 20.0), (20.0, 30.0), (30.0, 40.0), (40.0, 50.0), (50.0, 60.0), (60.0, 90.0))
+BANDS_DBHZ: Final = ((10.0, 18.0), (18.0, 26.0), (26.0, 34.0), (34.0, 60.0))
 #: Reasons for which a code is not compared.
 NO_RANGE: Final = int(
     Reason.UNHEALTHY
@@ -173,13 +182,18 @@ def faults_by_elevation(sample: Sample) -> Floats:
     return table
 
 
-def city(name: str = "city", *, seeds: tuple[int, ...] = SEEDS, duration_s: float = 780.0) -> Sample:
-    """A shipped scenario over several seeds, structures and skies, with all of its errors."""
+def city_scenario(seed: int, *, duration_s: float = 780.0) -> Scenario:
+    """The scenario `city` with another seed, other structures and another sky."""
+    changes = {"seed": seed, "place_seed": seed, "duration_s": duration_s}
+    start = np.datetime64("2024-03-05T00:10:00", "ns") + np.timedelta64(5 * seed, "h")
+    return load_recipe("city").scenario(changes=changes).replaced(start=start)
+
+
+def city(name: str = "city", *, seeds: tuple[int, ...] = CALIBRATION_SEEDS) -> Sample:
+    """The scenario `city` over several seeds, structures and skies, with all of its errors."""
     parts = []
     for seed in seeds:
-        changes = {"seed": seed, "place_seed": seed, "duration_s": duration_s}
-        start = np.datetime64("2024-03-05T00:10:00", "ns") + np.timedelta64(5 * seed, "h")
-        scenario = load_recipe(name).scenario(changes=changes).replaced(start=start)
+        scenario = city_scenario(seed)
         for piece in Simulation(scenario).pieces("front"):
             elevation = piece.geometry.elevation_deg
             parts.append(
@@ -193,6 +207,82 @@ def city(name: str = "city", *, seeds: tuple[int, ...] = SEEDS, duration_s: floa
                 )
             )
     return together(f"sim. {name}", parts)
+
+
+def calibration_figures(sample: Sample) -> dict[str, tuple[str, Floats]]:
+    """What `city` is calibrated by: format of a value, and the values; NaN where there are too few codes."""
+    error, f = sample.errors_m(), figures(sample)
+    used, rows = np.isfinite(error) & (sample.elevation_deg >= MASK_DEG), {}
+
+    def quantiles(values: Floats, parts: list[float]) -> Floats:
+        return np.percentile(values, parts) if len(values) >= 20 else np.full(len(parts), np.nan)
+
+    for low, high in BANDS_DEG:
+        inside = used & (sample.elevation_deg >= low) & (sample.elevation_deg < high)
+        name, late = f"{low:.0f}-{high:.0f} deg", error[inside & (error > 20.0)]
+        rows[f"C/N0 p5, p50, p95 [dB-Hz], {name}"] = "{:.0f}", quantiles(sample.cn0_dbhz[inside], [5, 50, 95])
+        share = 100.0 * len(late) / inside.sum() if inside.sum() >= 100 else np.nan
+        rows[f"late over 20 m [%], {name}"] = "{:.1f}", np.array([share])
+        rows[f"their delay p25, p50, p75 [m], {name}"] = "{:.0f}", quantiles(late, [25, 50, 75])
+    for low, high in BANDS_DBHZ:
+        inside = used & (sample.cn0_dbhz >= low) & (sample.cn0_dbhz < high)
+        rows[f"error p5, p50, p95 [m], {low:.0f}-{high:.0f} dB-Hz"] = "{:.0f}", quantiles(error[inside], [5, 50, 95])
+    rows["error p50, p95, p99 [m]"] = "{:.3g}", np.array([f.p50_m, f.p95_m, f.p99_m])
+    shares = f.over_20_m, f.over_50_m, f.early_over_20_m, f.beyond_5_sigma
+    rows["over 20 m, over 50 m, early over 20 m, beyond 5 sigma [%]"] = "{:.2g}", 100.0 * np.array(shares)
+    rows["epochs with two, with three over 20 m [%]"] = "{:.0f}", 100.0 * np.array([f.two_faults, f.three_faults])
+    rows["pairs over independent"] = "{:.2f}", np.array([f.pair_ratio])
+    rows["correlation after 1 s, 10 s"] = "{:.2f}", np.array([f.correlation_1_s, f.correlation_10_s])
+    return rows
+
+
+def print_calibration(data: Path) -> None:
+    """Calibration and validation of `city` in one table, and the spread of single seeds."""
+    columns = recordings(data)
+    columns[2:2] = [
+        replace(city(seeds=seeds), name=f"city, seeds {seeds[0]}-{seeds[-1]}")
+        for seeds in (CALIBRATION_SEEDS, VALIDATION_SEEDS)
+    ]
+    tables = [calibration_figures(sample) for sample in columns]
+    print("| | " + " | ".join(sample.name for sample in columns) + " |")
+    print("|---" * (len(columns) + 1) + "|")
+    for name, (form, _) in tables[0].items():
+        cells = [" ".join("-" if np.isnan(v) else form.format(v) for v in table[name][1]) for table in tables]
+        print(f"| {name} | " + " | ".join(cells) + " |")
+    print("\n| single seeds of the validation, least to largest | |\n|---|---|")
+    alone = [figures(city(seeds=(seed,))) for seed in VALIDATION_SEEDS]
+    for name in ("p95_m", "p99_m", "over_20_m", "over_50_m", "beyond_5_sigma", "two_faults", "pair_ratio"):
+        values = [getattr(f, name) for f in alone]
+        print(f"| {name} | {min(values):.3g} to {max(values):.3g} |")
+
+
+def city_errors_m(settings: dict[str, Any], seeds: tuple[int, ...] = VALIDATION_SEEDS) -> Floats:
+    """Errors of the front antenna along the line of `city`; NaN without a position."""
+    errors = []
+    for seed in seeds:
+        played = Played.of(city_scenario(seed))
+        for chunk in played.results(settings):
+            found, piece = chunk["front"]
+            errors.append(found.chainage_m - played.true_chainage_m(piece))
+    return np.concatenate(errors)
+
+
+def print_positions(data: Path) -> None:
+    """Errors along the line of the scenario and of recordings, without and with all screens."""
+    print("\n| positions along the line | screens | epochs | rate % | p50 m | p95 m | largest m | over 20 m % |")
+    print("|---" * 8 + "|")
+    runs = (recordings_score.urbannav_f9p, recordings_score.urbannav_m8t, recordings_score.gsdc)
+    for title, screens in (("elevation", {"screens": ["elevation"]}), ("all", {})):
+        settings = {"elevation": {"mask_deg": 15.0}, "protection": "off", **screens}
+        found = [(o.name, o.error_m) for o in (run(data, parse_config(settings)) for run in runs)]
+        found.append((f"city, seeds {VALIDATION_SEEDS[0]}-{VALIDATION_SEEDS[-1]}", city_errors_m(settings)))
+        for name, error in found:
+            size = np.abs(error[np.isfinite(error)])
+            p50, p95 = np.percentile(size, [50, 95])
+            print(
+                f"| {name} | {title} | {len(error)} | {100 * len(size) / len(error):.1f} | {p50:.2f} | {p95:.1f} "
+                f"| {size.max():.0f} | {100 * (size > 20.0).mean():.2f} |"
+            )
 
 
 def cn0_by_elevation(sample: Sample) -> Floats:
@@ -366,12 +456,16 @@ def print_speed() -> None:
 
 
 def main() -> int:
+    data = Path(__file__).resolve().parents[2] / "shared" / "data"
     if sys.argv[1:] == ["speed"]:
         print_speed()
         return 0
+    if sys.argv[1:] == ["calibration"]:
+        print_calibration(data)
+        print_positions(data)
+        return 0
     samples = [simulated(kind) for kind in ("none", "open", "suburban", "urban", "station", "canyon")]
-    samples += [city(), replace(city(seeds=(4, 5, 6)), name="sim. city, other seeds")]
-    data = Path(__file__).resolve().parents[2] / "shared" / "data"
+    samples += [city(), replace(city(seeds=VALIDATION_SEEDS), name="sim. city, other seeds")]
     if data.is_dir():
         samples += recordings(data)
     print_tables(samples)
