@@ -6,6 +6,7 @@ Run ``python tests/p1_experiment.py PART`` for the tables of docs/p1-results.md,
 short      the first two minutes of that, in seconds
 commercial 145.2 km of the scenario p1-commercial: every configuration beside P1
 others     the same on lines and places of five other seeds
+corrected  GPS alone on the nine lines of both, with and without the corrections of simulated SBAS messages
 filtered   the filter along the track on the lines of "commercial", without sensors and with two
 test-line  figures 7 and 8 and table 4
 static     two and three satellites, standing at many points of the test line
@@ -46,6 +47,7 @@ from p1_test_line import line_report
 from railfix.core.arrays import Masks
 from railfix.core.reasons import CHECK_FAILED, Status
 from railfix.simulate import Scenario
+from railfix.simulate.sbas import SbasSettings
 from railfix.simulate.scenario_file import load_recipe
 
 #: P1, chapter 5: largest error and positioning rate, conventional and by P1's method.
@@ -87,6 +89,15 @@ FILTER_WAYS: Final = (
     Way("filter, wheel, inertial", FILTERED, "filtered", sensors=True),
 )
 FILTER_SYSTEMS: Final = ("GJ", "GJE")
+#: Uncorrected and corrected, side by side; the messages are of GPS, as those of P1.
+CORRECTED_WAYS: Final = tuple(
+    replace(way, name=f"{way.name}{word}", sbas=sbas)
+    for way in WAYS
+    if way.name != "default, ok" and way.name != "strict, ok"
+    for word, sbas in (("", False), (", SBAS", True))
+)
+#: The service's own errors, as in the scenario commercial-full.
+SERVICE: Final = SbasSettings(clock_sigma_m=0.1)
 _NONE: Final = (Status.TOO_FEW_SATELLITES, Status.UNOBSERVABLE, Status.NO_CONVERGENCE, Status.NO_OBSERVATION)
 #: Large errors this near in time are one line of the list [epochs].
 BURST_EPOCHS: Final = 50
@@ -145,7 +156,7 @@ def main_table(campaign: Campaign, where: Callable[[Passage], Masks]) -> Iterato
     """Every way of every choice of systems in a line."""
     yield from HEAD.splitlines()
     for letters, way in campaign.found:
-        yardstick = campaign.found[letters, WAYS[0].name]
+        yardstick = campaign.found[letters, WAYS[0].name + (", SBAS" if way.endswith(", SBAS") else "")]
         name = f"{'+'.join(letters):7s} {way}"
         yield row(name, campaign.passages, campaign.found[letters, way], yardstick, where)
 
@@ -304,6 +315,8 @@ def commercial(
         scenario = recipe.scenario(number, changes=other)
         if not any(way.sensors for way in ways):
             scenario = scenario.replaced(sensors=None)
+        if any(way.sbas for way in ways):
+            scenario = scenario.replaced(sbas=SERVICE)
         name = recipe.names[number] if seed is None else f"seed-{seed}"
         campaigns.append(ridden(Bench(scenario, name, ways, systems, curve)))
     return together(campaigns)
@@ -349,6 +362,22 @@ def others_report(folder: Path) -> Iterator[str]:
     """The same tables for other lines and places."""
     campaigns = [commercial(folder, (number,), seed) for seed, number in OTHER_RUNS]
     yield from commercial_report(together(campaigns))
+
+
+def corrected_report(folder: Path) -> Iterator[str]:
+    """GPS with and without SBAS corrections, P1's figures beside their like: all data, and ways without tunnels."""
+    names = ("commercial lines", "other lines")
+    shipped = commercial(folder, ways=CORRECTED_WAYS, systems=("G",))
+    others = [commercial(folder, (n,), seed, CORRECTED_WAYS, ("G",)) for seed, n in OTHER_RUNS]
+    for name, campaign in zip(names, (shipped, together(others)), strict=True):
+        yield f"{name}: {extent(campaign)}"
+        yield f"all data (P1, corrected by MSAS: largest error {P1_LARGEST_M[0]} m to {P1_LARGEST_M[1]} m)"
+        yield from main_table(campaign, everywhere)
+        yield f"ways without tunnels (P1: rate {P1_RATE[0]} % to {P1_RATE[1]} %)"
+        yield from main_table(campaign, without_tunnels)
+        yield ""
+        yield from ranges_table(campaign)
+        yield ""
 
 
 def filtered_report(folder: Path) -> Iterator[str]:
@@ -426,6 +455,8 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from short_report(folder)
     elif part == "filtered":
         yield from filtered_report(folder)
+    elif part == "corrected":
+        yield from corrected_report(folder)
     elif part == "others":
         yield from others_report(folder)
     elif part == "test-line":
@@ -434,7 +465,7 @@ def report(part: str, folder: Path) -> Iterator[str]:
         yield from static_report()
 
 
-PARTS: Final = ("short", "commercial", "others", "filtered", "test-line", "static")
+PARTS: Final = ("short", "commercial", "others", "corrected", "filtered", "test-line", "static")
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -23,6 +23,7 @@ from railfix.run.processor import processor_of
 from railfix.run.sensors import read_sensors, until
 from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
+from railfix.simulate.sbas.service import sbas_messages, write_sbas
 from railfix.simulate.scenario import ANTENNAS, RunSettings
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.sensors.tables import sensor_tables
@@ -51,6 +52,8 @@ class Way:
         As `Config.largest_sigma_m` with failed checks dropped, put upon the results of a run with a wider limit.
     sensors : bool
         Whether the filter gets the tachometer and the inertial unit of the scenario.
+    sbas : bool
+        Whether positions are corrected by the scenario's SBAS messages.
     """
 
     name: str
@@ -58,11 +61,12 @@ class Way:
     positions: Literal["conventional", "constrained", "checked", "ok", "filtered"] = "constrained"
     largest_sigma_m: float = np.inf
     sensors: bool = False
+    sbas: bool = False
 
     @property
     def key(self) -> str:
         """Ways alike in it are looked at in one run."""
-        return repr((self.settings, self.sensors))
+        return repr((self.settings, self.sensors, self.sbas))
 
 
 @cache
@@ -161,20 +165,25 @@ class Bench:
             path = Path(folder) / "vehicle.toml"
             write_toml(path, vehicle_table(scenario.vehicle))
             vehicle = read_vehicle(path)
-        self.trajectories = {a: antenna_trajectory(track, vehicle, a) for a in ANTENNAS}
-        self.ways, self.systems = ways, systems
-        self.sensors = samples_of(self.simulation) if any(way.sensors for way in ways) else SensorSamples()
-        #: One processor for settings that are the same, whichever of their results is looked at.
-        self.processors: dict[tuple[str, str], EpochProcessor] = {}
-        for letters in systems:
-            for way in ways:
-                common = {"systems": list(letters), "protection": "off", "cn0_curve": curve and str(curve)}
-                settings = {**way.settings, **common}
-                key = (letters, way.key)
-                if key not in self.processors:
-                    self.processors[key] = processor_of(
-                        parse_config(settings), self.simulation.navigation, self.trajectories
-                    )
+            self.trajectories = {a: antenna_trajectory(track, vehicle, a) for a in ANTENNAS}
+            self.ways, self.systems = ways, systems
+            self.sensors = samples_of(self.simulation) if any(way.sensors for way in ways) else SensorSamples()
+            messages = Path(folder) / "messages.sbs"
+            if scenario.sbas is not None:
+                write_sbas(sbas_messages(self.simulation, scenario.sbas), messages)
+            #: One processor for settings that are the same, whichever of their results is looked at.
+            self.processors: dict[tuple[str, str], EpochProcessor] = {}
+            for letters in systems:
+                for way in ways:
+                    common = {"systems": list(letters), "protection": "off", "cn0_curve": curve and str(curve)}
+                    if way.sbas:
+                        common["sbas"] = [str(messages)]
+                    settings = {**way.settings, **common}
+                    key = (letters, way.key)
+                    if key not in self.processors:
+                        self.processors[key] = processor_of(
+                            parse_config(settings), self.simulation.navigation, self.trajectories
+                        )
 
     def sensing(self, words: str) -> bool:
         """Whether the ways of a key have sensors."""
