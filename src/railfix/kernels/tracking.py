@@ -71,6 +71,8 @@ class Course(NamedTuple):
     gradient: Floats
     sigma_plan_m: float
     sigma_height_m: float
+    start_m: float
+    end_m: float
 
 
 class Numbers(NamedTuple):
@@ -957,6 +959,13 @@ def advance(
             break
         if scalars[_WEAK_MOTION] > 0.0 and count <= numbers.most_hypotheses // 2:
             break
+        # Beyond an end of a closed line numpy lets places go on where it closes.
+        beyond = False
+        for h in range(count):
+            beyond = beyond or (memory.mean[h, _S] < course.arc_m[0] and course.start_m == -math.inf)
+            beyond = beyond or (memory.mean[h, _S] > course.arc_m[-1] and course.end_m == math.inf)
+        if beyond:
+            break
         for kind in range(4):
             counts[kind] = 0
         known = True
@@ -1183,9 +1192,8 @@ def advance(
             total = _log_sum(right, count)
             for h in range(count):
                 memory.log_probability[h] = right[h] - total
-        line_end = course.arc_m[-1]
         for h in range(count):
-            excess = min(max(new_mean[h, _S], course.arc_m[0]), line_end) - new_mean[h, _S]
+            excess = min(max(new_mean[h, _S], course.start_m), course.end_m) - new_mean[h, _S]
             own_variance = new_covariance[h, _S, _S]
             if abs(excess) > 2.0 * math.sqrt(own_variance) and abs(excess) <= numbers.start_sigma_m:
                 for c in range(n):

@@ -88,6 +88,7 @@ def track(
                 done += 1
             epoch = done
         leave(chunk, epochs, state, limits)
+    np.add(result.arc_m, line.round_m(result.arc_m), out=result.arc_m)
     return result, state
 
 
@@ -117,6 +118,7 @@ def _step(
         if state.bank is not None:
             means, covariances = begun_anew(state.bank.mean, state.bank.covariance, SATELLITES + fresh)
             state.bank = replace(state.bank, mean=means, covariance=covariances)
+    state.go_round(line)
     lost = seek(state, chunk, epoch, line, limits)
     state.time = chunk.time[epoch]
     step = Step(dt=dt, cut=np.zeros(state.mean.shape, dtype=np.bool_), satellite=state.satellite)

@@ -214,7 +214,7 @@ def on_the_line(mean: Floats, covariance: Floats, line: Line, limits: TrackingLi
     before the line.
     """
     place = mean[:, Unknown.PLACE]
-    excess = np.clip(place, line.arc_m[0], line.arc_m[-1]) - place
+    excess = np.clip(place, *line.bounds_m) - place
     sigma = np.sqrt(covariance[:, Unknown.PLACE, Unknown.PLACE])
     excess = np.where((np.abs(excess) > 2.0 * sigma) & (np.abs(excess) <= limits.start_sigma_m), excess, 0.0)
     if not excess.any():

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.track.trajectory import Trajectory
+
+#: A line goes on where its end comes this close to another place of it [m]: no other track is as near.
+_CLOSED_M: Final = 3.0
+#: In the same direction: cosine of the angle between them.
+_SAME_WAY: Final = 0.9
+#: Places this near along the line are the end itself [m].
+_END_M: Final = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +84,46 @@ class Line:
         return self.ecef_m[index] + along[:, None] * self.segment[index], axes
 
     @cached_property
+    def joins_m(self) -> tuple[float, float]:
+        """Arc lengths at which a closed line goes on before its start and after its end; NaN at an open end."""
+        return self._beside(0), self._beside(-1)
+
+    def _beside(self, end: int) -> float:
+        """Arc length of the nearest other place of the line to one of its ends, in the same direction; NaN without."""
+        from_end = self.ecef_m[end] - self.ecef_m[:-1]
+        length = np.diff(self.arc_m)
+        along = np.clip((from_end * self.segment).sum(axis=1), 0.0, length)
+        apart = np.linalg.norm(from_end - along[:, None] * self.segment, axis=1)
+        arc = self.arc_m[:-1] + along
+        other = np.abs(arc - self.arc_m[end]) > _END_M
+        other &= (apart < _CLOSED_M) & (self.segment @ self.segment[end] > _SAME_WAY)
+        return float(arc[other][np.argmin(apart[other])]) if other.any() else float("nan")
+
+    @cached_property
+    def bounds_m(self) -> tuple[float, float]:
+        """Arc lengths of the open ends; infinite where the line is closed."""
+        before, after = self.joins_m
+        return (
+            float(self.arc_m[0]) if np.isnan(before) else -np.inf,
+            float(self.arc_m[-1]) if np.isnan(after) else np.inf,
+        )
+
+    def round_m(self, arc_m: Floats) -> Floats:
+        """How far back along the line places beyond an end of a closed line are, shape as given [m]; 0 for others.
+
+        Parameters
+        ----------
+        arc_m : ndarray [m]
+        """
+        before, after = np.nan_to_num(self.joins_m, nan=np.inf)
+        first, last = self.arc_m[0], self.arc_m[-1]
+        return np.where(
+            (arc_m > last) & np.isfinite(after),
+            after - last,
+            np.where((arc_m < first) & np.isfinite(before), before - first, 0.0),
+        )
+
+    @cached_property
     def middle_m(self) -> Floats:
         """Arc lengths of the middles of the segments, shape (V - 1,) [m]."""
         return 0.5 * (self.arc_m[1:] + self.arc_m[:-1])
@@ -85,7 +133,14 @@ class Line:
         """Everything by its name, arrays as writable copies, row by row."""
         names = ("arc_m", "ecef_m", "axes", "segment", "middle_m", "gradient")
         arrays = {name: np.array(getattr(self, name), order="C") for name in names}
-        return {**arrays, "sigma_plan_m": float(self.sigma_plan_m), "sigma_height_m": float(self.sigma_height_m)}
+        start, end = self.bounds_m
+        return {
+            **arrays,
+            "sigma_plan_m": float(self.sigma_plan_m),
+            "sigma_height_m": float(self.sigma_height_m),
+            "start_m": start,
+            "end_m": end,
+        }
 
     def gradient_at(self, arc_m: Floats) -> Floats:
         """Climb over horizontal length, between the middles of segments, shape (H,)."""

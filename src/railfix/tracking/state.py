@@ -10,6 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.tracking.epochs import Previous
+from railfix.tracking.line import Line
 
 #: Letters of the receiver clocks of codes, in the order of their offsets in the state.
 CLOCKS: Final = ("G", "E", "C", "R", "I")
@@ -193,6 +194,18 @@ class TrackState:
             previous=None,
             measured=np.datetime64("NaT", "ns"),
         )
+
+    def go_round(self, line: Line) -> None:
+        """Let places beyond an end of a closed line go on where it closes."""
+        back = line.round_m(self.mean[:, Unknown.PLACE])
+        if not back.any():
+            return
+        self.mean, self.origin_m = self.mean.copy(), self.origin_m + back
+        self.mean[:, Unknown.PLACE] += back
+        if self.bank is not None and back[0]:
+            mean = self.bank.mean.copy()
+            mean[:, Unknown.PLACE] += back[0]
+            self.bank = replace(self.bank, mean=mean)
 
     def forget(self) -> None:
         """Begin anew: no hypothesis, no sub-filter, no clock known, nothing learnt of noise and map."""
