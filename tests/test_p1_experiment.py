@@ -40,7 +40,7 @@ def test_the_first_minutes_are_as_the_document_shows(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.requirement("D2")
 @pytest.mark.requirement("D4")
-@pytest.mark.parametrize("part", ["commercial", "others", "test-line"])
+@pytest.mark.parametrize("part", ["commercial", "others", "corrected", "test-line"])
 def test_a_whole_part_is_as_the_document_shows(part: str, tmp_path: Path) -> None:
     assert_same(printed(part, tmp_path), shown(part))
 
