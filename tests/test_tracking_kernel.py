@@ -4,23 +4,30 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from importlib.util import find_spec
+from typing import Literal
 
 import numpy as np
 import pytest
 
 from railfix import kernels
-from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackState, track
+from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackState, track
 from tracking_cases import bent_line, part, ride, without_epochs
 
 pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (railfix[fast])")
 
 
 def _with(
-    chosen: str, epochs: GnssEpochs, line: Line, state: TrackState | None = None, sensors: SensorEpochs | None = None
+    chosen: str,
+    epochs: GnssEpochs,
+    line: Line,
+    state: TrackState | None = None,
+    sensors: SensorEpochs | None = None,
+    *,
+    level: Literal["on", "off"] = "on",
 ) -> tuple[Tracked, TrackState]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "CHOSEN", chosen)
-        return track(epochs, line, state, sensors=sensors)
+        return track(epochs, line, state, sensors=sensors, limits=TrackingLimits(level=level))
 
 
 def _assert_equal(given: Tracked, expected: Tracked, tolerance: float) -> None:
@@ -79,6 +86,9 @@ def test_the_compiled_filter_gives_what_numpy_gives(name: str) -> None:
     epochs, line, sensors = _case(name)
     expected, one = _with("numpy", epochs, line, sensors=sensors)
     given, other = _with("numba", epochs, line, sensors=sensors)
+    assert one.bank is not None
+    assert other.bank is not None
+    assert set(other.bank.without) == set(one.bank.without)
     _assert_equal(given, expected, 1e-6)
     assert other.direction == one.direction
     assert other.measured == one.measured

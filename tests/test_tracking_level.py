@@ -9,18 +9,61 @@ import pytest
 from scipy.stats import norm
 
 from railfix.tracking import TrackingLimits, track
-from railfix.tracking.bank import factors
+from railfix.tracking.bank import budget, level_m
+from railfix.tracking.state import Bank
 from tracking_cases import part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits(level="on")
 
 
 @pytest.mark.requirement("C2")
-def test_factors_spend_the_risk() -> None:
-    limits = TrackingLimits(level_risk_per_hour=1e-7, level_samples_per_hour=60.0, level_fault_prior=1e-3)
-    noise, fault = factors(limits)
-    spent = 60.0 * (2.0 * norm.sf(noise) + 1e-3 * 2.0 * norm.sf(fault))
-    assert spent == pytest.approx(1e-7, rel=1e-6)
+def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
+    """Against the equation by quadrature, with sources of every kind; not a multiple of each that is alike."""
+    given = budget(LIMITS)
+    assert given.risk == pytest.approx(1e-7 / 60.0)
+    place, sigma = np.array([0.4, -2.0, 0.1, 1.0]), np.array([1.6, 2.5, 1.1, 3.0])
+    covariance = np.zeros((4, 30, 30))
+    covariance[:, 0, 0] = sigma**2
+    mean = np.zeros((4, 30))
+    mean[:, 0] = 100.0 + place
+    bank = Bank(without=("G01", "E", "G", "wheel"), mean=mean, covariance=covariance, weak_s=np.zeros(4))
+    level, noise, apart = level_m(bank, 100.0, 1.0, LIMITS)
+    prior = np.array([given.prior[kind] for kind in (0, 1, 1, 2)])
+    spent = 2.0 * norm.sf(level) + prior @ (norm.sf((level - place) / sigma) + norm.sf((level + place) / sigma))
+    assert spent == pytest.approx(given.risk, rel=1e-6)
+    assert apart == pytest.approx(2.0)
+    assert noise == pytest.approx(norm.isf(0.5 * given.risk))
+
+
+@pytest.mark.requirement("C2")
+def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
+    case = ride(20, noise=1.0)
+    limits = TrackingLimits(level="on", level_constellation_prior=0.0)
+    _, state = track(case.epochs, case.line, limits=limits)
+    assert state.bank is not None
+    assert set(state.bank.without) == set(case.epochs.satellite)
+    rare = budget(TrackingLimits(level_constellation_prior=1e-13, level_fault_prior=1e-3))
+    assert rare.prior[1] == 0.0
+    assert rare.risk < budget(LIMITS).risk
+
+
+@pytest.mark.requirement("C2")
+def test_a_satellite_behind_a_bridge_keeps_its_sub_filter_and_one_long_gone_has_none() -> None:
+    case = ride(190, noise=1.0, seed=3)
+    names = ("code_m", "phase_m", "rate_mps")
+    blank = {name: getattr(case.epochs, name).copy() for name in names}
+    for name in names:
+        blank[name][40:45, 2] = np.nan
+        blank[name][20:, 5] = np.nan
+    code = blank["code_m"]
+    code[20:40, 2] += 25.0
+    code[45:, 2] += 25.0
+    result, state = track(replace(case.epochs, **blank), case.line, limits=LIMITS)
+    assert state.bank is not None
+    assert str(case.epochs.satellite[2]) in state.bank.without
+    assert str(case.epochs.satellite[5]) not in state.bank.without
+    # A sub-filter that had begun anew would ask for K1 times what codes of one epoch tell.
+    assert result.level_m[45:50].max() < 1.5 * result.level_m[35:40].max()
 
 
 @pytest.mark.requirement("C2")

@@ -55,6 +55,7 @@ class Epochs(NamedTuple):
     variance: Floats
     code_sigma_m: Floats
     fresh: Masks
+    remembered: Masks
     sensor: Floats
     sensor_sigma: Floats
     unsigned: bool
@@ -133,6 +134,13 @@ class Numbers(NamedTuple):
     gravity_mps2: float
     switch: float
     most_odds: float
+    level_passes: int
+    level_risk: float
+    level_k: float
+    precision_m: float
+    rounds: int
+    scale_bound: float
+    joined: float
     decided: float
     tracking: int
     several: int
@@ -165,6 +173,59 @@ class Memory(NamedTuple):
     scalars: Floats
 
 
+class Subfilters(NamedTuple):
+    """Sub-filters of the level by their source (`railfix.tracking.bank`): satellites by slot, clocks, sensors.
+
+    None of them where levels are off. `running` marks those that there are; `prior` is the probability of a fault of
+    each source, 0 where it needs no sub-filter, `k` the sigmas that follow from it; `begun` has the variances of the
+    compact unknowns and those of an epoch that one begins with; `clock` is that of each satellite.
+    """
+
+    running: Masks
+    mean: Floats
+    covariance: Floats
+    weak_s: Floats
+    prior: Floats
+    k: Floats
+    begun: Floats
+    clock: Indices
+
+
+class Work(NamedTuple):
+    """Work space of an epoch; the last row of each array belongs to sub-filters and second starts."""
+
+    mean: Floats
+    spread: Floats
+    design: Floats
+    value: Floats
+    sensed: Floats
+    cross: Floats
+    root: Floats
+    own: Floats
+    information: Floats
+    after: Floats
+    change: Floats
+    weight: Floats
+    residual: Floats
+    fitted: Floats
+    new_mean: Floats
+    new_covariance: Floats
+    system: Floats
+    factor: Floats
+    lower: Floats
+    right: Floats
+    ordered: Floats
+    gain: Floats
+    less: Floats
+    rows: Floats
+    kept: Floats
+    place: Integers
+    share: Floats
+    point: Floats
+    axes: Floats
+    bend: Floats
+
+
 _HYPOTHESES, _WEAK_MOTION, _WEAK_CODE, _SCALE_DOPPLER, _SCALE_PHASE, _UNAIDED, _DIRECTION, _MEASURED = range(8)
 _SHIFT, _SHIFT_VARIANCE, _MAP_SCALE = 8, 9, 10
 
@@ -186,6 +247,10 @@ class Answers(NamedTuple):
     force_offset_mps2: Floats
     radar_scale: Floats
     map_scale: Floats
+    level_m: Floats
+    level_noise_m: Floats
+    separation_m: Floats
+    amount_m: Floats
     used: Integers
     innovation: Floats
     sensed: Floats
@@ -217,6 +282,46 @@ def _at(
         square = math.sqrt(square)
         for c in range(3):
             axes[p, k, c] /= square
+
+
+@kernel
+def _ends(course: Course, now: float, before: float, point: Floats, axes: Floats, bend: Floats) -> None:
+    """Points and axes now and at the epoch before, and the change of the tangent between to the right and up."""
+    for end in range(2):
+        arc = now if end == 0 else before
+        _at(course.arc_m, course.ecef_m, course.axes, course.segment, arc, point, end, axes)
+    for k in range(2):
+        bend[k] = 0.0
+        for c in range(3):
+            bend[k] += (axes[0, 0, c] - axes[1, 0, c]) * axes[0, k + 1, c]
+
+
+@kernel
+def _roughened(spread: Floats, n: int, start_sigma_m: float, bend: Floats, h: int) -> None:
+    """Add what the line bends by where the place is uncertain to the displacements across."""
+    length = spread[h, n + _STEP_ALONG, n + _STEP_ALONG] - 1e-8
+    vague = min(spread[h, _S, _S] - length, start_sigma_m**2)
+    spread[h, n + _STEP_RIGHT, n + _STEP_RIGHT] += vague * bend[0] ** 2
+    spread[h, n + _STEP_UP, n + _STEP_UP] += vague * bend[1] ** 2
+
+
+@kernel
+def _onto_line(mean: Floats, covariance: Floats, n: int, first_m: float, last_m: float, reach_m: float, h: int) -> None:
+    """Put a place a little beyond an end of the line on it (`railfix.tracking.hypotheses.on_the_line`)."""
+    excess = min(max(mean[h, _S], first_m), last_m) - mean[h, _S]
+    variance = covariance[h, _S, _S]
+    if abs(excess) > 2.0 * math.sqrt(variance) and abs(excess) <= reach_m:
+        for c in range(n):
+            mean[h, c] += covariance[h, c, _S] / variance * excess
+
+
+@kernel
+def _restart(spread: Floats, unknown: int, variance: float, h: int) -> None:
+    """Make an unknown independent of all else."""
+    for c in range(spread.shape[1]):
+        spread[h, unknown, c] = 0.0
+        spread[h, c, unknown] = 0.0
+    spread[h, unknown, unknown] = variance
 
 
 @kernel
@@ -294,7 +399,7 @@ def _median(values: Floats, h: int, first: int, size: int, ordered: Floats) -> f
 def _predict(
     dt: float, steps: Floats, noises: Floats, singer: int, course: Course, numbers: Numbers, active: Active,
     mean: Floats, covariance: Floats, after: Floats, spread: Floats, rows: Floats, kept: Floats, h: int,
-    map_log_scale: float
+    to: int, map_log_scale: float
 ) -> None:
     """Write mean and covariance of the compact unknowns and of those of the epoch."""
     n = mean.shape[1]
@@ -327,65 +432,65 @@ def _predict(
         rows[n + _PHASE, j] = dt * covariance[h, _D, j]
     for i in range(n + 3):
         for j in range(3, n):
-            spread[h, i, j] = kept[j] * rows[i, j]
+            spread[to, i, j] = kept[j] * rows[i, j]
         for j in range(3):
-            spread[h, i, j] = (
+            spread[to, i, j] = (
                 steps[singer, j, 0] * rows[i, 0] + steps[singer, j, 1] * rows[i, 1] + steps[singer, j, 2] * rows[i, 2]
             )
-        spread[h, i, n + _OLD_S] = rows[i, _S]
-        spread[h, i, n + _OLD_V] = rows[i, _V]
-        spread[h, i, n + _PHASE] = dt * rows[i, _D]
+        spread[to, i, n + _OLD_S] = rows[i, _S]
+        spread[to, i, n + _OLD_V] = rows[i, _V]
+        spread[to, i, n + _PHASE] = dt * rows[i, _D]
         for j in range(n + 3, n + _EPOCH):
-            spread[h, i, j] = 0.0
-            spread[h, j, i] = 0.0
+            spread[to, i, j] = 0.0
+            spread[to, j, i] = 0.0
     for i in range(n + 3, n + _EPOCH):
         for j in range(n + 3, n + _EPOCH):
-            spread[h, i, j] = 0.0
+            spread[to, i, j] = 0.0
     for i in range(3):
         for j in range(3):
-            spread[h, i, j] += noises[singer, i, j]
-    spread[h, _S, _S] += numbers.least_step_m2
-    spread[h, _V, _V] += numbers.least_step_m2
+            spread[to, i, j] += noises[singer, i, j]
+    spread[to, _S, _S] += numbers.least_step_m2
+    spread[to, _V, _V] += numbers.least_step_m2
     walk = numbers.clock_walk_mps**2
-    spread[h, _D, _D] += walk * dt
-    spread[h, n + _PHASE, n + _PHASE] += walk * dt**3 / 3.0 + 1e-6
-    spread[h, n + _PHASE, _D] += walk * dt**2 / 2.0
-    spread[h, _D, n + _PHASE] += walk * dt**2 / 2.0
-    spread[h, _RIGHT, _RIGHT] += course.sigma_plan_m**2 * (1.0 - map_kept**2)
-    spread[h, _UP, _UP] += course.sigma_height_m**2 * (1.0 - map_kept**2)
-    spread[h, _Z, _Z] += numbers.slow_code_m**2 * (1.0 - slow_kept**2)
+    spread[to, _D, _D] += walk * dt
+    spread[to, n + _PHASE, n + _PHASE] += walk * dt**3 / 3.0 + 1e-6
+    spread[to, n + _PHASE, _D] += walk * dt**2 / 2.0
+    spread[to, _D, n + _PHASE] += walk * dt**2 / 2.0
+    spread[to, _RIGHT, _RIGHT] += course.sigma_plan_m**2 * (1.0 - map_kept**2)
+    spread[to, _UP, _UP] += course.sigma_height_m**2 * (1.0 - map_kept**2)
+    spread[to, _Z, _Z] += numbers.slow_code_m**2 * (1.0 - slow_kept**2)
     lasting = numbers.doppler_error_mps + numbers.doppler_error_share * speed
-    spread[h, _W, _W] += lasting**2 * (1.0 - doppler_kept**2)
+    spread[to, _W, _W] += lasting**2 * (1.0 - doppler_kept**2)
     if active.wheel >= 0:
-        spread[h, active.wheel, active.wheel] += numbers.wheel_walk**2 * dt
+        spread[to, active.wheel, active.wheel] += numbers.wheel_walk**2 * dt
     if active.force >= 0:
-        spread[h, active.force, active.force] += numbers.force_walk_mps2**2 * dt
+        spread[to, active.force, active.force] += numbers.force_walk_mps2**2 * dt
     if active.radar >= 0:
-        spread[h, active.radar, active.radar] += numbers.radar_walk**2 * dt
+        spread[to, active.radar, active.radar] += numbers.radar_walk**2 * dt
     for i in active.offset:
         if i >= 0:
-            spread[h, i, i] += numbers.offset_walk_m**2 * dt
+            spread[to, i, i] += numbers.offset_walk_m**2 * dt
     for i in active.satellite:
         if i >= 0:
-            spread[h, i, i] += 1.0 - code_kept**2
+            spread[to, i, i] += 1.0 - code_kept**2
     for i in range(3, n):
-        after[h, i] = kept[i] * mean[h, i]
+        after[to, i] = kept[i] * mean[h, i]
     for i in range(3):
-        after[h, i] = (
+        after[to, i] = (
             steps[singer, i, 0] * mean[h, 0] + steps[singer, i, 1] * mean[h, 1] + steps[singer, i, 2] * mean[h, 2]
         )
-    after[h, n + _OLD_S], after[h, n + _OLD_V], after[h, n + _PHASE] = mean[h, _S], mean[h, _V], dt * mean[h, _D]
+    after[to, n + _OLD_S], after[to, n + _OLD_V], after[to, n + _PHASE] = mean[h, _S], mean[h, _V], dt * mean[h, _D]
     for i in range(n + 3, n + _EPOCH):
-        after[h, i] = 0.0
+        after[to, i] = 0.0
     rough = 2.0 * numbers.map_roughness_m**2 * (1.0 - math.exp(-travel / numbers.map_correlation_m)) + 1e-8
-    spread[h, n + _STEP_RIGHT, n + _STEP_RIGHT] = rough
-    spread[h, n + _STEP_UP, n + _STEP_UP] = rough
+    spread[to, n + _STEP_RIGHT, n + _STEP_RIGHT] = rough
+    spread[to, n + _STEP_UP, n + _STEP_UP] = rough
     # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
     length = numbers.map_scale_m**2 * math.exp(map_log_scale) * travel + numbers.phase_walk_m**2 * dt
-    spread[h, _S, _S] += length
-    spread[h, n + _STEP_ALONG, n + _STEP_ALONG] = length + 1e-8
-    spread[h, _S, n + _STEP_ALONG] = spread[h, n + _STEP_ALONG, _S] = -length
-    spread[h, n + _CODE, n + _CODE] = numbers.code_clock_sigma_m**2
+    spread[to, _S, _S] += length
+    spread[to, n + _STEP_ALONG, n + _STEP_ALONG] = length + 1e-8
+    spread[to, _S, n + _STEP_ALONG] = spread[to, n + _STEP_ALONG, _S] = -length
+    spread[to, n + _CODE, n + _CODE] = numbers.code_clock_sigma_m**2
 
 
 @kernel
@@ -403,13 +508,7 @@ def _equations(
     """
     n, dt = mean.shape[1] - _EPOCH, epochs.interval_s[t]
     nc, nph, nd, ns = counts[0], counts[1], counts[2], counts[3]
-    for end in range(2):
-        arc = now if end == 0 else before
-        _at(course.arc_m, course.ecef_m, course.axes, course.segment, arc, point, end, axes)
-    for k in range(2):
-        bend[k] = 0.0
-        for c in range(3):
-            bend[k] += (axes[0, 0, c] - axes[1, 0, c]) * axes[0, k + 1, c]
+    _ends(course, now, before, point, axes, bend)
     moved, moved_before = mean[h, _S] - now, mean[h, n + _OLD_S] - before
     for k in range(epochs.has.shape[2]):
         if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
@@ -871,9 +970,208 @@ def _surviving(
 
 
 @kernel
+def _value_of(
+    epochs: Epochs, t: int, active: Active, work: Work, counts: Indices, codes: Indices, sensors: Indices, best: int,
+    h: int
+) -> None:
+    """Write measured less computed about another mean than that of the equations, `work.mean[h]`."""
+    mean, design, value = work.mean, work.design, work.value
+    n = mean.shape[1] - _EPOCH
+    nc, nph, nd, ns = counts[0], counts[1], counts[2], counts[3]
+    place, speed = mean[h, _S] - mean[best, _S], mean[h, _V] - mean[best, _V]
+    old, old_speed = mean[h, n + _OLD_S] - mean[best, n + _OLD_S], mean[h, n + _OLD_V] - mean[best, n + _OLD_V]
+    displaced = place + mean[h, _Z] - mean[best, _Z]
+    right, up = mean[h, _RIGHT] - mean[best, _RIGHT], mean[h, _UP] - mean[best, _UP]
+    clock = mean[h, n + _PHASE] - mean[best, n + _PHASE]
+    lasting, drift = speed + mean[h, _W] - mean[best, _W], mean[h, _D] - mean[best, _D]
+    for i in range(nc):
+        k = codes[i]
+        offset, error = active.offset[epochs.offset[k]], active.satellite[epochs.slot[k]]
+        value[h, i] = value[best, i] - (
+            design[best, i, 0] * displaced + design[best, i, 1] * right + design[best, i, 2] * up
+            + mean[h, offset] - mean[best, offset] + epochs.code_sigma_m[t, k] * (mean[h, error] - mean[best, error])
+        )
+    for i in range(nc, nc + nph):
+        value[h, i] = value[best, i] - design[best, i, 0] * (place - old) - clock
+    for i in range(nc + nph, nc + nph + nd):
+        value[h, i] = value[best, i] - design[best, i, 2] * lasting - drift
+    for j in range(ns):
+        i, kind = nc + nph + nd + j, sensors[j]
+        own = 0.0
+        if kind == _WHEEL_ROW:
+            own = mean[h, active.wheel] - mean[best, active.wheel]
+        elif kind == _RADAR_ROW:
+            own = mean[h, active.radar] - mean[best, active.radar]
+        elif kind == _FORCE_ROW:
+            own = mean[h, active.force] - mean[best, active.force]
+        sensed = work.sensed
+        value[h, i] = value[best, i] - (
+            sensed[best, j, 0] * place + sensed[best, j, 1] * old + sensed[best, j, 2] * speed
+            + sensed[best, j, 3] * old_speed + sensed[best, j, 4] * own
+        )
+
+
+@kernel
+def _subfilters(
+    epochs: Epochs, t: int, course: Course, numbers: Numbers, active: Active, bank: Subfilters, work: Work,
+    variance: Floats, counts: Indices, codes: Indices, phases: Indices, dopplers: Indices, sensors: Indices,
+    anew: Masks, best: int, h: int, map_log_scale: float
+) -> None:
+    """Do an epoch of all sub-filters (`railfix.tracking.bank.levelled`); `best` has the equations, `h` is free."""
+    mean, spread = work.mean, work.spread
+    width = mean.shape[1]
+    n = width - _EPOCH
+    nc, nph, nd, ns = counts[0], counts[1], counts[2], counts[3]
+    gnss, size, dt = nc + nph + nd, nc + _MOTION + ns, epochs.interval_s[t]
+    slots, sources = len(active.satellite), len(bank.running)
+    clocks = sources - _SENSORS - slots
+    source = np.zeros(sources, dtype=np.bool_)
+    several = 0
+    for i in range(nc):
+        clock = slots + epochs.offset[codes[i]]
+        several += not source[clock]
+        source[clock] = True
+    for k in range(clocks):
+        source[slots + k] = source[slots + k] and several > 1
+    for k in range(epochs.has.shape[2]):
+        if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
+            source[epochs.slot[k]] = True
+    for j in range(ns):
+        source[slots + clocks + sensors[j]] = True
+    met = np.zeros(sources, dtype=np.bool_)
+    for k in range(slots):
+        if epochs.remembered[t, k]:
+            met[slots + bank.clock[k]] = True
+            source[k] = source[k] or best > 0
+    before = False
+    for b in range(sources):
+        before = before or bank.running[b]
+    before = before and not best
+    masked = np.empty(len(variance))
+    for i in range(gnss + ns):
+        for c in range(4):
+            work.design[h, i, c] = work.design[best, i, c]
+    for j in range(ns):
+        for c in range(6):
+            work.sensed[h, j, c] = work.sensed[best, j, c]
+    for b in range(sources):
+        satellite = b < slots
+        if best or (satellite and not epochs.remembered[t, b]):
+            bank.running[b] = False
+        if bank.running[b] and bank.weak_s[b] >= numbers.lost_motion_s:
+            bank.running[b], met[b] = False, True
+        if bank.running[b]:
+            _predict(
+                dt, epochs.step, epochs.noise, epochs.singer[t], course, numbers, active, bank.mean, bank.covariance,
+                mean, spread, work.rows, work.kept, b, h, map_log_scale,
+            )
+            _ends(course, mean[h, _S], mean[h, n + _OLD_S], work.point, work.axes, work.bend)
+            _roughened(spread, n, numbers.start_sigma_m, work.bend, h)
+            sigma = math.sqrt(spread[h, _S, _S])
+            near = abs(mean[h, _S] - mean[best, _S]) < numbers.joined * sigma
+            near = near and sigma < (1.0 + numbers.joined) * math.sqrt(spread[best, _S, _S])
+            if near and satellite and not source[b]:
+                bank.running[b] = False
+                continue
+        elif source[b] and bank.prior[b] > 0.0:
+            bank.running[b], bank.weak_s[b] = True, 0.0
+            copied = before and not met[b]
+            for c in range(width):
+                mean[h, c] = mean[best, c] if copied else 0.0
+                for e in range(width):
+                    spread[h, c, e] = spread[best, c, e] if copied else 0.0
+                if not copied:
+                    spread[h, c, c] = bank.begun[c]
+            if not copied:
+                mean[h, _S] = mean[h, n + _OLD_S] = mean[best, _S]
+        else:
+            continue
+        for kind in range(2):
+            if anew[best, kind]:
+                unknown = n + _PHASE if kind == 0 else _D
+                mean[h, unknown] = mean[best, unknown]
+                _restart(spread, unknown, numbers.unknown_clock**2, h)
+        mean[h, n + _CODE] = mean[best, n + _CODE]
+        for i in range(gnss):
+            k = codes[i] if i < nc else (phases[i - nc] if i < nc + nph else dopplers[i - nc - nph])
+            own = epochs.slot[k] if satellite else slots + epochs.offset[k]
+            masked[i] = math.inf if own == b else variance[i]
+        for j in range(ns):
+            masked[gnss + j] = math.inf if slots + clocks + sensors[j] == b else variance[gnss + j]
+        _value_of(epochs, t, active, work, counts, codes, sensors, best, h)
+        _combine(
+            epochs.offset, epochs.slot, epochs.code_sigma_m, t, active, numbers.sensor_floor, spread, codes, counts,
+            sensors, work.design, work.sensed, variance, work.cross, work.root, work.own, work.place, work.share, h
+        )
+        _inverse(work.own, h, size, work.factor, work.lower, work.information, h)
+        _first_weights(
+            counts, work.design, work.value, masked, work.root, work.own, numbers.degrees, 0.0, 0.0, work.sensed,
+            work.weight, work.ordered, h, h,
+        )
+        _rounds(
+            counts, work.design, work.value, masked, work.root, work.information, numbers.degrees,
+            numbers.level_passes, work.change, work.after, work.weight, work.residual, work.fitted, work.system,
+            work.factor, work.lower, work.right, h, h, h,
+        )
+        weak = False
+        for part in range(2):
+            first, last = (0, nc) if part == 0 else (nc, gnss)
+            total, used = 0.0, 0
+            for i in range(first, last):
+                if masked[i] < math.inf:
+                    total += work.weight[h, i]
+                    used += 1
+            least = numbers.lost_code_weight if part == 0 else numbers.lost_motion_weight
+            weak = weak or (used > 0 and total < least * used)
+        bank.weak_s[b] = bank.weak_s[b] + dt if weak else 0.0
+        _apply(
+            size, n, mean, spread, work.cross, work.own, work.information, work.after, work.change, work.gain,
+            work.less, work.new_mean, work.new_covariance, h,
+        )
+        _onto_line(work.new_mean, work.new_covariance, n, course.start_m, course.end_m, numbers.start_sigma_m, h)
+        for c in range(n):
+            bank.mean[b, c] = work.new_mean[h, c]
+            for e in range(n):
+                bank.covariance[b, c, e] = work.new_covariance[h, c, e]
+
+
+@kernel
+def _level(place: float, sigma: float, bank: Subfilters, numbers: Numbers, answers: Answers, t: int) -> float:
+    """Return the level of a place, write its parts (`railfix.tracking.bank.level_m`)."""
+    noise, apart = numbers.level_k * sigma, math.nan
+    level = noise
+    for b in range(len(bank.running)):
+        if bank.running[b]:
+            away = abs(bank.mean[b, _S] - place)
+            apart = away if math.isnan(apart) else max(apart, away)
+            level = max(level, away + bank.k[b] * math.sqrt(bank.covariance[b, _S, _S]))
+    answers.level_noise_m[t], answers.separation_m[t] = noise, apart
+    if math.isnan(apart):
+        return math.inf
+    for _ in range(numbers.rounds):
+        away = level / sigma
+        spent = math.erfc(away / math.sqrt(2.0))
+        slope = 2.0 * math.exp(-0.5 * away * away) / sigma
+        for b in range(len(bank.running)):
+            if bank.running[b]:
+                own = math.sqrt(bank.covariance[b, _S, _S])
+                for side in (-1.0, 1.0):
+                    away = (level + side * abs(bank.mean[b, _S] - place)) / own
+                    spent += bank.prior[b] * 0.5 * math.erfc(away / math.sqrt(2.0))
+                    slope += bank.prior[b] * math.exp(-0.5 * away * away) / own
+        slope /= math.sqrt(2.0 * math.pi)
+        step = spent / slope * math.log(spent / numbers.level_risk)
+        level += step
+        if abs(step) < numbers.precision_m:
+            break
+    return level
+
+
+@kernel
 def _finish(
     t: int, best: int, aided: bool, measured: bool, dt: float, numbers: Numbers, active: Active, memory: Memory,
-    answers: Answers, work_mean: Floats, work_covariance: Floats, work: Floats, ranked: Indices, kept: Indices
+    bank: Subfilters, answers: Answers, work_mean: Floats, work_covariance: Floats, work: Floats, ranked: Indices,
+    kept: Indices
 ) -> None:
     """End an epoch: direction, way without codes, hypotheses to go on with; write its answer."""
     scalars = memory.scalars
@@ -905,6 +1203,14 @@ def _finish(
     if active.radar >= 0:
         answers.radar_scale[t] = memory.mean[0, active.radar]
     answers.map_scale[t] = math.exp(0.5 * scalars[_MAP_SCALE])
+    if len(bank.running):
+        level = _level(memory.mean[0, _S], sigma, bank, numbers, answers, t)
+        # Contradicted by its measurements the track itself is in doubt, which no sub-filter beside it bounds.
+        doubtful = answers.code_weight[t] < numbers.lost_code_weight
+        if doubtful or answers.motion_weight[t] < numbers.lost_motion_weight:
+            level = math.inf
+        answers.level_m[t] = level
+        answers.amount_m[t] = max(level, numbers.scale_bound * scalars[_UNAIDED])
     if measured:
         answers.status[t] = numbers.tracking if probability >= numbers.decided else numbers.several
     else:
@@ -913,8 +1219,8 @@ def _finish(
 
 @kernel
 def advance(
-    epochs: Epochs, course: Course, numbers: Numbers, active: Active, memory: Memory, answers: Answers, first: int,
-    last: int
+    epochs: Epochs, course: Course, numbers: Numbers, active: Active, memory: Memory, bank: Subfilters,
+    answers: Answers, first: int, last: int
 ) -> int:
     """Do epochs from `first` on; return the first that is left to numpy, or `last`."""
     scalars = memory.scalars
@@ -923,16 +1229,16 @@ def advance(
     width = n + _EPOCH
     largest, most_rows = channels + _MOTION + _SENSORS, 3 * channels + _SENSORS
     room = len(memory.log_probability)
-    mean, spread = np.empty((room, width)), np.empty((room, width, width))
-    design, value = np.empty((room, most_rows, 4)), np.empty((room, most_rows))
+    mean, spread = np.empty((room + 1, width)), np.empty((room + 1, width, width))
+    design, value = np.empty((room + 1, most_rows, 4)), np.empty((room + 1, most_rows))
     innovation = np.empty((room, most_rows))
-    sensed, variance = np.empty((room, _SENSORS, 6)), np.empty(most_rows)
-    cross, root = np.empty((room, largest, width)), np.empty((room, largest))
+    sensed, variance = np.empty((room + 1, _SENSORS, 6)), np.empty(most_rows)
+    cross, root = np.empty((room + 1, largest, width)), np.empty((room + 1, largest))
     own, information = np.empty((room + 1, largest, largest)), np.empty((room + 1, largest, largest))
     after, change = np.empty((room + 1, largest, largest)), np.empty((room + 1, largest))
     weight, residual = np.empty((room + 1, most_rows)), np.empty((room + 1, most_rows))
     fitted = np.empty((room + 1, most_rows))
-    new_mean, new_covariance = np.empty((room, n + 1)), np.empty((room, n, n))
+    new_mean, new_covariance = np.empty((room + 1, n + 1)), np.empty((room + 1, n, n))
     log_after, log_before, evidence = np.empty(room), np.empty(room), np.empty(room)
     now, before = np.empty(room), np.empty(room)
     system = np.empty((room + 1, largest, largest))
@@ -948,6 +1254,12 @@ def advance(
     points, axes = np.empty((room, 3)), np.empty((room, 3, 3))
     point, two_axes = np.empty((2, 3)), np.empty((2, 3, 3))
     work, ranked, kept_ones = np.empty((2, room)), np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
+    anew = np.zeros((room, 2), dtype=np.bool_)
+    shared = Work(
+        mean, spread, design, value, sensed, cross, root, own, information, after, change, weight, residual, fitted,
+        new_mean, new_covariance, system, factor, lower, right, ordered, gain, less, rows_work, kept, place, share,
+        point, two_axes, bend,
+    )
     degrees, passes = numbers.degrees, numbers.passes
 
     done = first
@@ -990,14 +1302,15 @@ def advance(
                 k = active.satellite[i]
                 for h in range(count):
                     memory.mean[h, k] = 0.0
-                    for c in range(n):
-                        memory.covariance[h, k, c] = 0.0
-                        memory.covariance[h, c, k] = 0.0
-                    memory.covariance[h, k, k] = 1.0
+                    _restart(memory.covariance, k, 1.0, h)
+                for b in range(len(bank.running)):
+                    if bank.running[b]:
+                        bank.mean[b, k] = 0.0
+                        _restart(bank.covariance, k, 1.0, b)
         for h in range(count):
             _predict(
                 epochs.interval_s[t], epochs.step, epochs.noise, epochs.singer[t], course, numbers, active, memory.mean,
-                memory.covariance, mean, spread, rows_work, kept, h, scalars[_MAP_SCALE],
+                memory.covariance, mean, spread, rows_work, kept, h, h, scalars[_MAP_SCALE],
             )
         for kind in range(_SENSORS):
             if not math.isfinite(epochs.sensor[t, kind]):
@@ -1018,10 +1331,20 @@ def advance(
                     memory.mean[h, c] = mean[h, c]
                     for e in range(n):
                         memory.covariance[h, c, e] = spread[h, c, e]
+            for b in range(len(bank.running)):
+                if bank.running[b]:
+                    _predict(
+                        epochs.interval_s[t], epochs.step, epochs.noise, epochs.singer[t], course, numbers, active,
+                        bank.mean, bank.covariance, mean, spread, rows_work, kept, b, room, scalars[_MAP_SCALE],
+                    )
+                    for c in range(n):
+                        bank.mean[b, c] = mean[room, c]
+                        for e in range(n):
+                            bank.covariance[b, c, e] = spread[room, c, e]
             best = _most_probable(memory.log_probability, count, numbers.switch)
             _finish(
-                t, best, False, False, epochs.interval_s[t], numbers, active, memory, answers, new_mean, new_covariance,
-                work, ranked, kept_ones,
+                t, best, False, False, epochs.interval_s[t], numbers, active, memory, bank, answers, new_mean,
+                new_covariance, work, ranked, kept_ones,
             )
             done = t + 1
             continue
@@ -1034,7 +1357,7 @@ def advance(
         for j in range(ns):
             variance[gnss + j] = epochs.sensor_sigma[t, sensors[j]] ** 2
 
-        doubtful, shift = False, 0.0
+        doubtful, shift, map_scale = False, 0.0, scalars[_MAP_SCALE]
         going = _most_probable(memory.log_probability, count, numbers.switch)
         for h in range(count):
             now[h], before[h] = mean[h, _S], mean[h, n + _OLD_S]
@@ -1042,10 +1365,8 @@ def advance(
                 epochs, t, course, active, numbers, mean, now[h], before[h], codes, phases, dopplers, counts, sensors,
                 scalars[_DIRECTION], sight, design, value, sensed, bend, point, two_axes, h
             )
-            length = spread[h, n + _STEP_ALONG, n + _STEP_ALONG] - 1e-8
-            vague = min(spread[h, _S, _S] - length, numbers.start_sigma_m**2)
-            spread[h, n + _STEP_RIGHT, n + _STEP_RIGHT] += vague * bend[0] ** 2
-            spread[h, n + _STEP_UP, n + _STEP_UP] += vague * bend[1] ** 2
+            _roughened(spread, n, numbers.start_sigma_m, bend, h)
+            anew[h, 0] = anew[h, 1] = False
             begin, end = 0, nc
             for kind in range(3):
                 if end > begin:
@@ -1059,10 +1380,8 @@ def advance(
                         for i in range(begin, end):
                             value[h, i] -= middle
                     if kind > 0 and stepped:
-                        for c in range(width):
-                            spread[h, unknown, c] = 0.0
-                            spread[h, c, unknown] = 0.0
-                        spread[h, unknown, unknown] = numbers.unknown_clock**2
+                        _restart(spread, unknown, numbers.unknown_clock**2, h)
+                        anew[h, kind - 1] = True
                 begin, end = end, nc + nph if kind == 0 else gnss
             for i in range(rows):
                 innovation[h, i] = value[h, i]
@@ -1193,11 +1512,7 @@ def advance(
             for h in range(count):
                 memory.log_probability[h] = right[h] - total
         for h in range(count):
-            excess = min(max(new_mean[h, _S], course.start_m), course.end_m) - new_mean[h, _S]
-            own_variance = new_covariance[h, _S, _S]
-            if abs(excess) > 2.0 * math.sqrt(own_variance) and abs(excess) <= numbers.start_sigma_m:
-                for c in range(n):
-                    new_mean[h, c] += new_covariance[h, c, _S] / own_variance * excess
+            _onto_line(new_mean, new_covariance, n, course.start_m, course.end_m, numbers.start_sigma_m, h)
             for c in range(n):
                 memory.mean[h, c] = new_mean[h, c]
                 for e in range(n):
@@ -1241,8 +1556,13 @@ def advance(
             answers.used[t, 3 + sensors[j]] += weight[best, gnss + j] > 0.5
             answers.sensed[t, sensors[j]] = innovation[best, gnss + j]
 
+        if len(bank.running):
+            _subfilters(
+                epochs, t, course, numbers, active, bank, shared, variance, counts, codes, phases, dopplers, sensors,
+                anew, best, room, map_scale,
+            )
         _finish(
-            t, best, nc > 0, True, dt, numbers, active, memory, answers, new_mean, new_covariance, work, ranked,
+            t, best, nc > 0, True, dt, numbers, active, memory, bank, answers, new_mean, new_covariance, work, ranked,
             kept_ones,
         )
         done = t + 1

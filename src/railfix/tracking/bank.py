@@ -2,25 +2,29 @@
 
 Each sub-filter runs the same recursion without one satellite, one constellation or one sensor, from its own beginning:
 a fault of that source, however long it has lasted and whatever it has left in the state, is not in it. With the place
-s and its standard deviation sigma, and those of the sub-filters::
+s and its standard deviation sigma, those of the sub-filters, Q the upper tail of the normal distribution and p_b the
+probability that source b is faulty or was so recently that the filter still remembers it, the level L solves::
 
-    level = max(K0 sigma, max over b of |s - s_b| + K1 sigma_b)
+    2 Q(L / sigma) + sum over b of p_b [Q((L - |s - s_b|) / sigma_b) + Q((L + |s - s_b|) / sigma_b)] = risk
 
-K0 spends the risk on noise without a fault, K1 that on a fault of one source with its prior probability (the
-hypotheses of R. G. Brown and P. W. McBurney, 1988, over a filter instead of an epoch). The separation bounds the error,
-it is no test: robust filters can settle in different modes without a fault.
+of an independent error. Every hypothesis thus spends what it needs instead of an equal share (the hypotheses of
+R. G. Brown and P. W. McBurney, 1988, the allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, over a
+filter instead of an epoch). The separation bounds the error, it is no test: robust filters can settle in different
+modes without a fault.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from railfix.core.arrays import Floats, Masks, Strings
-from railfix.tracking.hypotheses import begin
+from railfix.tracking.chunk import FORGOTTEN
+from railfix.tracking.hypotheses import begin, on_the_line
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
@@ -32,15 +36,63 @@ from railfix.tracking.state import CLOCKS, SATELLITES, Bank, Unknown
 SENSORS: Final = {Kind.WHEEL: "wheel", Kind.RADAR: "radar", Kind.FORCE: "force", Kind.PLACE: "place"}
 #: Share of a way that a source without codes may be wrong by: a worn or wrongly entered wheel.
 SCALE_BOUND: Final = 0.02
+#: How long a fault common to a constellation lasts until users are told [s] (ARAIM milestone 3 report: an hour).
+CONSTELLATION_FAULT_S: Final = 3600.0
+#: Sources whose probabilities add up to less than this share of the risk need no sub-filter, if there are so many.
+SPARED: Final = 0.1
+MOST_SOURCES: Final = 64
+#: A source that is not measured needs no sub-filter once it has left the filter: place and standard deviation differ
+#: by less than this share of the standard deviation.
+JOINED: Final = 0.05
+#: Newton's steps for the level end when one is smaller than this [m].
+PRECISION_M: Final = 1e-7
+ROUNDS: Final = 20
 
 
-def factors(limits: TrackingLimits) -> tuple[float, float]:
-    """Sigmas without a fault and beside the separation, K0 and K1.
+@dataclass(frozen=True, kw_only=True)
+class Budget:
+    """Risk of an independent error and probabilities of faults, with the factors that follow from them.
 
-    Half of the risk of an hour goes to each, over so many independent errors an hour, on both sides.
+    Attributes
+    ----------
+    risk : float
+    k : float
+        Sigmas that noise without a fault exceeds with the risk, on either side.
+    prior : tuple of float
+        Probability that a satellite, a constellation, a sensor is faulty or still remembered; 0 needs no sub-filter.
+    k_fault : tuple of float
+        Sigmas that noise exceeds on one side with the risk over that probability: what a sub-filter asks for at least.
     """
-    risk = 0.5 * limits.level_risk_per_hour / limits.level_samples_per_hour
-    return float(-ndtri(0.5 * risk)), float(-ndtri(min(0.5 * risk / limits.level_fault_prior, 0.5)))
+
+    risk: float
+    k: float
+    prior: tuple[float, float, float]
+    k_fault: tuple[float, float, float]
+
+
+@lru_cache(maxsize=8)
+def budget(limits: TrackingLimits) -> Budget:
+    """Risk of an independent error and what the sources have of it.
+
+    The filter remembers a source for as long as its errors stay in the state, `FORGOTTEN` correlation times after a
+    fault that lasts for one independent error, or `CONSTELLATION_FAULT_S` for one of a constellation.
+    """
+    risk = limits.level_risk_per_hour / limits.level_samples_per_hour
+    remembered_s = FORGOTTEN * limits.code_correlation_s
+    local = 1.0 + remembered_s * limits.level_samples_per_hour / 3600.0
+    exposed = [
+        min(local * limits.level_fault_prior, 1.0),
+        min((1.0 + remembered_s / CONSTELLATION_FAULT_S) * limits.level_constellation_prior, 1.0),
+        min(local * limits.level_sensor_prior, 1.0),
+    ]
+    kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
+    risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
+    return Budget(
+        risk=risk,
+        k=float(-ndtri(0.5 * risk)),
+        prior=(kept[0], kept[1], kept[2]),
+        k_fault=tuple(float(-ndtri(min(risk / prior, 0.5))) if prior else 0.0 for prior in kept),  # type: ignore[arg-type]
+    )
 
 
 def levelled(
@@ -50,7 +102,7 @@ def levelled(
     before: tuple[Floats, Floats],
     stepped: Masks,
     satellite: Strings,
-    new: frozenset[str],
+    remembered: frozenset[str],
     line: Line,
     dt: float,
     limits: TrackingLimits,
@@ -63,7 +115,7 @@ def levelled(
     bank : Bank
         After the epoch before.
     rows : Rows
-        About the mean of the most probable hypothesis, clocks near the epoch's.
+        For changes from the mean of the most probable hypothesis, clocks near the epoch's.
     best : int
         Its row.
     before : tuple of ndarray, shapes (N,), (N, N)
@@ -72,8 +124,8 @@ def levelled(
         Clocks that begin anew.
     satellite : ndarray of str, shape (M,)
         Of each row, empty for sensors.
-    new : frozenset of str
-        Satellites that the filter meets for the first time.
+    remembered : frozenset of str
+        Satellites measured before the epoch, so recently that their errors are in the state.
     line : Line
     dt : float [s]
     limits : TrackingLimits
@@ -84,16 +136,24 @@ def levelled(
         means, covariances = predicted(bank.mean, bank.covariance, line, dt, limits, map_scale)
     else:
         means, covariances = bank.mean, bank.covariance
-    names = _sources(rows, satellite)
+    names = _sources(rows, satellite, limits)
+    if not bank.without:  # what the hypothesis has met before is still in it
+        names = [*names, *(name for name in sorted(remembered) if name not in names)]
     # One that its own measurements contradict has settled somewhere else and begins anew.
+    weak = bank.weak_s >= limits.lost_motion_s
+    sigma = np.sqrt(covariances[:, Unknown.PLACE, Unknown.PLACE])
+    near = np.abs(means[:, Unknown.PLACE] - mean[Unknown.PLACE]) < JOINED * sigma
+    near &= sigma < (1.0 + JOINED) * np.sqrt(covariance[Unknown.PLACE, Unknown.PLACE])
     kept = [
         k
         for k, name in enumerate(bank.without)
-        if (name in names or name in CLOCKS or name in SENSORS.values()) and bank.weak_s[k] < limits.lost_motion_s
+        if not weak[k] and (kind_of(name) or (name in remembered and (name in names or not near[k])))
     ]
     added = [name for name in names if name not in {bank.without[k] for k in kept}]
-    copies = [name in new and len(bank.without) > 0 for name in added]
-    weak = np.concatenate([bank.weak_s[kept], np.zeros(len(added))])
+    # The filter itself is one without a source that it has not met.
+    met = {clock_of(name) for name in remembered} | {bank.without[k] for k in np.flatnonzero(weak)}
+    copies = [len(bank.without) > 0 and name not in met for name in added]
+    weak_s = np.concatenate([bank.weak_s[kept], np.zeros(len(added))])
     fresh = begin(
         np.full(len(added), mean[Unknown.PLACE]),
         np.full(len(added), limits.start_sigma_m),
@@ -108,7 +168,7 @@ def levelled(
     covariances = np.concatenate([covariances[kept], fresh[1]])
     without = (*(bank.without[k] for k in kept), *added)
     if not without:
-        return Bank(without=without, mean=means, covariance=covariances, weak_s=weak)
+        return Bank(without=without, mean=means, covariance=covariances, weak_s=weak_s)
     for unknown in np.flatnonzero(stepped):
         means[:, unknown] = mean[unknown]
         covariances[:, unknown, :] = covariances[:, :, unknown] = 0.0
@@ -122,9 +182,10 @@ def levelled(
     prior = prior_of(own, covariances)
     weight = first_weights(own, prior, degrees)
     update = robust_update(own, prior, weight, degrees=degrees, passes=limits.level_passes, use=use)
-    weak = np.where(_contradicted(rows, update.weight, use, limits), weak + dt, 0.0)
+    weak_s = np.where(_contradicted(rows, update.weight, use, limits), weak_s + dt, 0.0)
     means, covariances = applied(means, covariances, prior, update)
-    return Bank(without=without, mean=means, covariance=covariances, weak_s=weak)
+    means = on_the_line(means, covariances, line, limits)
+    return Bank(without=without, mean=means, covariance=covariances, weak_s=weak_s)
 
 
 def _contradicted(rows: Rows, weight: Floats, use: Masks, limits: TrackingLimits) -> Masks:
@@ -136,34 +197,59 @@ def _contradicted(rows: Rows, weight: Floats, use: Masks, limits: TrackingLimits
     return found
 
 
-def _sources(rows: Rows, satellite: Strings) -> list[str]:
-    """Satellites with a code, constellations where there are several, and sensors of an epoch."""
-    codes = satellite[rows.codes]
-    names = [str(name) for name in dict.fromkeys(codes.tolist())]
-    letters = [letter for letter in CLOCKS if any(_clock(name) == letter for name in names)]
+def _sources(rows: Rows, satellite: Strings, limits: TrackingLimits) -> list[str]:
+    """Sources of an epoch that need a sub-filter: satellites, constellations of several, sensors."""
+    of_satellite, of_constellation, of_sensor = budget(limits).prior
+    names = [str(name) for name in dict.fromkeys(satellite[: rows.bounds[2]].tolist())]
+    letters = [letter for letter in CLOCKS if any(clock_of(name) == letter for name in satellite[rows.codes].tolist())]
     sensors = [name for kind, name in SENSORS.items() if (rows.kind == kind).any()]
-    return [*names, *(letters if len(letters) > 1 else []), *sensors]
+    return [
+        *(names if of_satellite else []),
+        *(letters if of_constellation and len(letters) > 1 else []),
+        *(sensors if of_sensor else []),
+    ]
 
 
-def _clock(satellite: str) -> str:
+def kind_of(name: str) -> int:
+    """Kind of a source, as `Budget` orders them: satellite, constellation, sensor."""
+    return 1 if name in CLOCKS else 2 if name in SENSORS.values() else 0
+
+
+def clock_of(satellite: str) -> str:
+    """Letter of the clock of a satellite's codes."""
     return "G" if satellite[:1] in ("J", "S") else satellite[:1]
 
 
 def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
     """Rows of a source."""
-    if name in SENSORS.values():
+    if kind_of(name) == 2:
         return np.asarray(rows.kind == next(kind for kind, text in SENSORS.items() if text == name))
-    if name in CLOCKS:
-        return np.array([_clock(str(other)) == name for other in satellite], dtype=np.bool_)
+    if kind_of(name) == 1:
+        return np.array([clock_of(str(other)) == name for other in satellite], dtype=np.bool_)
     return np.asarray(satellite == name)
 
 
 def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) -> tuple[float, float, float]:
-    """Level, its part by noise and the largest separation [m]; infinite without a sub-filter."""
-    noise, fault = factors(limits)
+    """Level, what it is without faults, and the largest separation [m]; infinite without a sub-filter."""
+    given = budget(limits)
+    noise = given.k * sigma_m
     if not bank.without:
-        return float("inf"), noise * sigma_m, float("nan")
+        return float("inf"), noise, float("nan")
     apart = np.abs(bank.mean[:, Unknown.PLACE] - place_m)
     sigma = np.sqrt(bank.covariance[:, Unknown.PLACE, Unknown.PLACE])
-    level = max(noise * sigma_m, float((apart + fault * sigma).max()))
-    return level, noise * sigma_m, float(apart.max())
+    which = [kind_of(name) for name in bank.without]
+    prior, k = np.array(given.prior)[which], np.array(given.k_fault)[which]
+    # From the largest that one hypothesis alone asks for, where the risk of all is too large.
+    level = max(noise, float((apart + k * sigma).max()))
+    centre = np.concatenate([[0.0, 0.0], apart, -apart])
+    spread = np.concatenate([[sigma_m, sigma_m], sigma, sigma])
+    prior = np.concatenate([[1.0, 1.0], prior, prior])
+    for _ in range(ROUNDS):
+        away = (level - centre) / spread
+        spent = float(prior @ ndtr(-away))
+        slope = float(prior @ (np.exp(-0.5 * away**2) / spread)) / np.sqrt(2.0 * np.pi)
+        step = spent / slope * np.log(spent / given.risk)
+        level += step
+        if abs(step) < PRECISION_M:
+            break
+    return level, noise, float(apart.max())

@@ -17,8 +17,8 @@ from railfix.tracking.state import CLOCKS, TrackState
 _SHORTEST_S: Final = 1e-3
 #: Two epochs further apart than this have nothing to do with each other [s].
 _APART_S: Final = 3600.0
-#: Satellites unseen for this many correlation times are dropped from the state.
-_FORGOTTEN: Final = 3.0
+#: Satellites unseen for this many correlation times of codes are dropped from the state.
+FORGOTTEN: Final = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,8 @@ class Chunk:
         Satellites whose error begins at an epoch.
     off_map : ndarray of bool, shape (T,)
         The train is away from the line.
+    remembered : ndarray of bool, shape (T, S)
+        Satellites whose error lasts from before an epoch.
     """
 
     time: Datetimes
@@ -68,6 +70,7 @@ class Chunk:
     code_sigma_m: Floats
     fresh: Masks
     off_map: Masks
+    remembered: Masks
 
 
 def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
@@ -99,7 +102,7 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
     seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT"))
     seen = np.fmax.accumulate(seen, axis=0)
     earlier = np.concatenate([np.array([state.time]), epochs.time[:-1]])
-    kept = seconds(earlier[:, None] - seen[:-1]) <= _FORGOTTEN * limits.code_correlation_s
+    kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * limits.code_correlation_s
     fresh = np.zeros(kept.shape, dtype=np.bool_)
     fresh[:, slot[used]] = any_kind[:, used]
     state.seen = seen[-1]
@@ -129,6 +132,7 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
         code_sigma_m=epochs.code_sigma_m,
         fresh=fresh & ~kept,
         off_map=epochs.off_map,
+        remembered=kept,
     )
 
 
@@ -136,7 +140,7 @@ def leave(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingL
     """Make the state ready to be handed on: without satellites long unseen, with the phases of the last epoch."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
     state.previous = Previous(satellite=epochs.satellite, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
-    kept = seconds(chunk.time[-1] - state.seen) <= _FORGOTTEN * limits.code_correlation_s
+    kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * limits.code_correlation_s
     if not kept.all():
         state.rearrange(np.flatnonzero(kept), ())
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.timescale import seconds, timedelta
-from railfix.tracking import clocks, hypotheses, misfit, predict, rows
+from railfix.tracking import bank, clocks, hypotheses, misfit, predict, rows
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
@@ -19,7 +19,7 @@ from railfix.tracking.line import Line
 from railfix.tracking.predict import singer
 from railfix.tracking.result import DECIDED, Tracked, TrackStatus
 from railfix.tracking.robust import DOUBTFUL, FREEDOM, MOVED_M, RELINEARISED, SENSOR_FLOOR
-from railfix.tracking.state import OFFSETS, SATELLITES, TrackState, Unknown
+from railfix.tracking.state import CLOCKS, OFFSETS, SATELLITES, Bank, TrackState, Unknown
 
 #: Unknowns that are always in use, in the order of the kernel.
 _ALWAYS: Final = np.array([
@@ -28,6 +28,11 @@ _ALWAYS: Final = np.array([
 ])  # fmt: skip
 #: Unknowns of sensors, as the kernel names them, and the columns of measurements that need them.
 _SENSORS: Final = ((Unknown.WHEEL, 0), (Unknown.FORCE_OFFSET, 2), (Unknown.RADAR, 1))
+#: Unknowns of an epoch, as the kernel orders them after those in use.
+_OF_EPOCH: Final = np.array([
+    Unknown.BEFORE, Unknown.SPEED_BEFORE, Unknown.PHASE_CLOCK, Unknown.STEP_RIGHT, Unknown.STEP_UP, Unknown.STEP_ALONG,
+    Unknown.CODE_CLOCK,
+])  # fmt: skip
 #: Satellites come and go: the unknowns in use are chosen again after so many epochs.
 _EPOCHS: Final = 512
 
@@ -56,7 +61,7 @@ class Compiled:
         limits: TrackingLimits,
         result: Tracked,
     ) -> None:
-        self.kernel, self.chunk, self.limits, self.result = kernel, chunk, limits, result
+        self.kernel, self.chunk, self.line, self.limits, self.result = kernel, chunk, line, limits, result
         interval, singers = np.unique(chunk.interval_s, return_inverse=True)
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
         ranged, left = sensors.ranges, chunk.apart | chunk.off_map
@@ -88,6 +93,7 @@ class Compiled:
         if (
             not state.hypotheses
             or np.isnat(state.measured)
+            or (state.bank is None and limits.level == "on")
             or self.epochs.left[first]
             or (state.weak_motion_s > 0.0 and state.hypotheses <= limits.most_hypotheses // 2)
             or state.weak_motion_s >= limits.lost_motion_s
@@ -120,18 +126,52 @@ class Compiled:
             offset_known=_own(state.offset_known),
             scalars=scalars,
         )
+        sub = self._subfilters(state, full)
         done = int(
-            self.kernel.advance(self.epochs, self.course, self.numbers, active, memory, self.answers, first, last)
+            self.kernel.advance(self.epochs, self.course, self.numbers, active, memory, sub, self.answers, first, last)
         )
         if done > first:
-            self._take_back(state, full, memory, first, done)
+            self._take_back(state, full, memory, sub, first, done)
         return done
+
+    def _subfilters(self, state: TrackState, full: Indices) -> Any:
+        """Sub-filters by source, none of them where levels are off."""
+        limits, n = self.limits, len(full)
+        names = _sources(state) if limits.level == "on" else []
+        prior, k = np.zeros(len(names)), np.zeros(len(names))
+        begun = np.zeros(n + len(_OF_EPOCH))
+        running, weak = np.zeros(len(names), dtype=np.bool_), np.zeros(len(names))
+        mean, covariance = np.zeros((len(names), n)), np.zeros((len(names), n, n))
+        if names:
+            given, kinds = bank.budget(limits), [bank.kind_of(name) for name in names]
+            prior[:], k[:] = np.array(given.prior)[kinds], np.array(given.k_fault)[kinds]
+            start = np.full(1, limits.start_sigma_m)
+            _, fresh = hypotheses.begin(np.zeros(1), start, len(state.satellite), self.line, limits)
+            begun[:] = np.diagonal(fresh[0])[np.concatenate([full, _OF_EPOCH])]
+        if names and state.bank is not None:
+            at = [names.index(name) for name in state.bank.without if name in names]
+            kept = [k for k, name in enumerate(state.bank.without) if name in names]
+            running[at], weak[at] = True, state.bank.weak_s[kept]
+            mean[at] = state.bank.mean[kept][:, full]
+            covariance[at] = state.bank.covariance[kept][:, full[:, None], full]
+        clock = [CLOCKS.index(bank.clock_of(name)) for name in state.satellite.tolist()] if names else []
+        return self.kernel.Subfilters(
+            running=running,
+            mean=mean,
+            covariance=covariance,
+            weak_s=weak,
+            prior=prior,
+            k=k,
+            begun=begun,
+            clock=np.array(clock, dtype=np.intp),
+        )
 
     def _in_use(self, state: TrackState, first: int, last: int) -> Indices:
         """Unknowns that are measured in some epochs, or correlated with others."""
         covariance = state.covariance
-        correlated = np.full(covariance.shape[1], False)
-        correlated[:] = np.count_nonzero(covariance, axis=1).max(axis=0) > 1
+        correlated = np.count_nonzero(covariance, axis=1).max(axis=0) > 1
+        if state.bank is not None and len(state.bank.without):
+            correlated |= np.count_nonzero(state.bank.covariance, axis=1).max(axis=0) > 1
         for unknown, column in _SENSORS:
             correlated[unknown] |= self.sensed[column]
         chunk = self.chunk
@@ -141,7 +181,7 @@ class Compiled:
         correlated[:OFFSETS] &= np.isin(np.arange(OFFSETS), [unknown for unknown, _ in _SENSORS])
         return np.concatenate([_ALWAYS, np.flatnonzero(correlated)]).astype(np.intp)
 
-    def _take_back(self, state: TrackState, full: Indices, memory: Any, first: int, done: int) -> None:
+    def _take_back(self, state: TrackState, full: Indices, memory: Any, sub: Any, first: int, done: int) -> None:
         """Put what the kernel leaves into the state; unknowns that are not in use only walk."""
         count = int(memory.scalars[0])
         elapsed = float(self.chunk.interval_s[first:done].sum())
@@ -155,12 +195,15 @@ class Compiled:
         ):
             variance[unknown] += walk**2 * elapsed
         variance[OFFSETS:SATELLITES] += limits.offset_walk_m**2 * elapsed
-        mean = np.repeat(idle[None], count, axis=0)
-        covariance = np.zeros((count, len(idle), len(idle)))
-        diagonal = np.arange(len(idle))
-        covariance[:, diagonal, diagonal] = variance
-        mean[:, full] = memory.mean[:count]
-        covariance[:, full[:, None], full] = memory.covariance[:count]
+
+        def whole(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+            mean = np.repeat(idle[None], len(means), axis=0)
+            covariance = np.zeros((len(means), len(idle), len(idle)))
+            covariance[:, np.arange(len(idle)), np.arange(len(idle))] = variance
+            mean[:, full] = means
+            covariance[:, full[:, None], full] = covariances
+            return mean, covariance
+
         placed = slice(first, done)
         known = np.isfinite(self.result.arc_m[placed])
         for name, unknown in (
@@ -170,7 +213,14 @@ class Compiled:
         ):
             if unknown not in full:
                 getattr(self.result, name)[placed][known] = idle[unknown]
-        state.mean, state.covariance = mean, covariance
+        state.mean, state.covariance = whole(memory.mean[:count], memory.covariance[:count])
+        if limits.level == "on":
+            running = np.flatnonzero(sub.running)
+            names = _sources(state)
+            means, covariances = whole(sub.mean[running], sub.covariance[running])
+            state.bank = Bank(
+                without=tuple(names[k] for k in running), mean=means, covariance=covariances, weak_s=sub.weak_s[running]
+            )
         state.log_probability = memory.log_probability[:count].copy()
         state.origin_m = memory.origin_m[:count].copy()
         state.time = self.chunk.time[done - 1]
@@ -179,6 +229,11 @@ class Compiled:
         state.unaided_m, state.direction = unaided, direction
         state.code_shift, state.map_log_scale = (shift[0], shift[1]), map_scale
         state.measured = self.chunk.time[0] + timedelta(measured)
+
+
+def _sources(state: TrackState) -> list[str]:
+    """Sources of sub-filters in the order of the kernel."""
+    return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values()]
 
 
 def _own(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -231,6 +286,12 @@ def _numbers(kernel: ModuleType, limits: TrackingLimits) -> Any:
         "gravity_mps2": rows.GRAVITY_MPS2,
         "switch": hypotheses.SWITCH,
         "most_odds": hypotheses.MOST_ODDS,
+        "level_risk": bank.budget(limits).risk,
+        "level_k": bank.budget(limits).k,
+        "precision_m": bank.PRECISION_M,
+        "rounds": bank.ROUNDS,
+        "scale_bound": bank.SCALE_BOUND,
+        "joined": bank.JOINED,
         "decided": DECIDED,
         "tracking": int(TrackStatus.TRACKING),
         "coasting": int(TrackStatus.COASTING),

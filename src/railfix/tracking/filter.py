@@ -78,7 +78,7 @@ def track(
         chunk = prepared(epochs, state, limits)
         anew = np.asarray(chunk.fresh.any(axis=1))
         fast = None
-        if kernels.CHOSEN == "numba" and limits.level == "off" and trace is None:
+        if kernels.CHOSEN == "numba" and trace is None:
             fast = Compiled(import_module("railfix.kernels.tracking"), chunk, line, sensors, limits, result)
         epoch = 0
         while epoch < len(epochs):
@@ -205,10 +205,9 @@ def _measure(
         bank = Bank.empty(mean.shape[1]) if state.bank is None or lost or best else state.bank
         stepped = np.diagonal(covariance[best]) != np.diagonal(predicted_covariance[best])
         named = np.where(rows.column >= 0, chunk.satellite[rows.column], "")
-        new = frozenset(state.satellite[chunk.fresh[epoch]].tolist())
-        state.bank = levelled(
-            bank, rows, best, (mean[best], covariance[best]), stepped, named, new, line, dt, limits, state.map_scale
-        )
+        remembered = frozenset(state.satellite[chunk.remembered[epoch]].tolist())
+        own = (mean[best], covariance[best])
+        state.bank = levelled(bank, settled, best, own, stepped, named, remembered, line, dt, limits, state.map_scale)
     learn(state, rows, update, best, dt, limits)
     learn_map(state, 0.0 if best else shift, dt, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])

@@ -78,13 +78,17 @@ class TrackingLimits(Settings):
     bend_m : float
         Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
     level : {"on", "off"}
-        Whether a bank of sub-filters gives a protection level: some 20 filters instead of one.
+        Whether a bank of sub-filters gives a protection level: some 20 filters instead of one, off for what they cost.
     level_risk_per_hour : float
         Probability an hour that the error exceeds the level unnoticed: 1e-7 for the satellite part (P1 2.4).
     level_samples_per_hour : float
         Independent errors an hour: those of codes last about a minute.
     level_fault_prior : float
-        Probability that a source is faulty at such a sample: multipath of a satellite beyond its weight in a city.
+        Probability that a satellite is faulty at such a sample: multipath beyond its weight in a city. An assumption.
+    level_constellation_prior : float
+        Probability that a fault is common to a constellation: 1e-4, that of the ARAIM milestone 3 report for Galileo.
+    level_sensor_prior : float
+        Probability that a sensor on board is faulty at such a sample. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
     expired_sigma_m : float
@@ -133,6 +137,8 @@ class TrackingLimits(Settings):
     level: Literal["on", "off"] = "off"
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     level_samples_per_hour: float = Field(default=60.0, gt=0)
-    level_fault_prior: float = Field(default=1e-3, gt=0, lt=1)
+    level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
+    level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
+    level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_passes: int = Field(default=3, ge=1)
     expired_sigma_m: float = Field(default=200.0, gt=0)
