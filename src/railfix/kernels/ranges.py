@@ -6,13 +6,115 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.kernels.compiling import kernel
 
 _SAGNAC = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: `railfix.positioning.robust_fit._LEAST_SCALE`.
 _LEAST_SCALE = 0.05
+
+
+@kernel
+def _reduce(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    place_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    system: Floats,
+    means: Floats,
+    rows: Floats,
+    totals: Floats,
+) -> None:
+    """Compute the normal equations of one epoch; `offset_m` of length 0 without ties."""
+    channels, groups = len(weight), len(starts)
+    x, y, z = place_ecef_m[0], place_ecef_m[1], place_ecef_m[2]
+    system[:] = 0.0
+    rows[:] = 0.0
+    for g in range(groups):
+        stop = starts[g + 1] if g + 1 < groups else channels
+        total, mean_x, mean_y, mean_z, mean_r = 0.0, 0.0, 0.0, 0.0, 0.0
+        for m in range(starts[g], stop):
+            w = weight[m]
+            if not w > 0.0:
+                continue
+            sx, sy, sz = sat_ecef_m[m, 0], sat_ecef_m[m, 1], sat_ecef_m[m, 2]
+            dx, dy, dz = sx - x, sy - y, sz - z
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+            ux, uy, uz = -dx / distance, -dy / distance, -dz / distance
+            residual = code_m[m] - (distance + _SAGNAC * (sx * y - sy * x))
+            rows[0, m], rows[1, m], rows[2, m], rows[3, m] = ux, uy, uz, residual
+            total += w
+            mean_x += w * ux
+            mean_y += w * uy
+            mean_z += w * uz
+            mean_r += w * residual
+        totals[g] = total
+        if total > 0.0:
+            mean_x, mean_y, mean_z, mean_r = mean_x / total, mean_y / total, mean_z / total, mean_r / total
+        means[0, g], means[1, g], means[2, g], means[3, g] = mean_x, mean_y, mean_z, mean_r
+        for m in range(starts[g], stop):
+            w = weight[m]
+            if not w > 0.0:
+                continue
+            rows[0, m] -= mean_x
+            rows[1, m] -= mean_y
+            rows[2, m] -= mean_z
+            rows[3, m] -= mean_r
+            for i in range(4):
+                wi = w * rows[i, m]
+                for j in range(i, 4):
+                    system[i, j] += wi * rows[j, m]
+    if len(offset_m):
+        _tie(weight, starts, offset_m, sigma_m, system, means, rows, totals)
+    for i in range(4):
+        for j in range(i):
+            system[i, j] = system[j, i]
+
+
+@kernel
+def _tie(
+    weight: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    system: Floats,
+    means: Floats,
+    rows: Floats,
+    totals: Floats,
+) -> None:
+    """Add what the known offsets between the clocks of one epoch say."""
+    channels, groups = len(weight), len(starts)
+    mass, apart, common = np.zeros(groups), np.empty((4, groups)), np.zeros(4)
+    all_mass = 0.0
+    for g in range(groups):
+        if totals[g] > 0.0:
+            mass[g] = 1.0 / (1.0 / totals[g] + sigma_m[g] ** 2)
+        all_mass += mass[g]
+    for i in range(4):
+        for g in range(groups):
+            apart[i, g] = means[i, g] - (offset_m[g] if i == 3 else 0.0)
+            common[i] += mass[g] * apart[i, g]
+        if all_mass > 0.0:
+            common[i] /= all_mass
+    for g in range(groups):
+        if not totals[g] > 0.0:
+            continue
+        for i in range(4):
+            apart[i, g] -= common[i]
+        stop = starts[g + 1] if g + 1 < groups else channels
+        own = 1.0 / (totals[g] * sigma_m[g] ** 2 + 1.0)
+        for i in range(4):
+            for j in range(i, 4):
+                system[i, j] += mass[g] * apart[i, g] * apart[j, g]
+            shift = apart[i, g] * own
+            means[i, g] -= shift
+            for m in range(starts[g], stop):
+                if weight[m] > 0.0:
+                    rows[i, m] += shift
 
 
 @kernel
@@ -27,79 +129,206 @@ def reduced_equations(
 ) -> tuple[Floats, Floats, Floats, Masks]:
     """Compute the normal equations of place and residual with the clocks eliminated; channel by channel."""
     epochs, channels = weight.shape
-    groups = len(starts)
+    groups, no = len(starts), np.empty(0)
     tied = len(offset_m) == epochs
-    system, means = np.zeros((epochs, 4, 4)), np.zeros((epochs, 4, groups))
-    rows, seen = np.zeros((epochs, 4, channels)), np.zeros((epochs, groups), dtype=np.bool_)
-    totals, mass, apart, common = np.empty(groups), np.empty(groups), np.empty((4, groups)), np.empty(4)
+    system, means = np.empty((epochs, 4, 4)), np.empty((epochs, 4, groups))
+    rows, totals = np.empty((epochs, 4, channels)), np.empty((epochs, groups))
     for t in range(epochs):
-        x, y, z = place_ecef_m[t, 0], place_ecef_m[t, 1], place_ecef_m[t, 2]
-        for g in range(groups):
-            stop = starts[g + 1] if g + 1 < groups else channels
-            total, mean_x, mean_y, mean_z, mean_r = 0.0, 0.0, 0.0, 0.0, 0.0
-            for m in range(starts[g], stop):
-                w = weight[t, m]
-                if not w > 0.0:
-                    continue
-                sx, sy, sz = sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2]
-                dx, dy, dz = sx - x, sy - y, sz - z
-                distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-                ux, uy, uz = -dx / distance, -dy / distance, -dz / distance
-                residual = code_m[t, m] - (distance + _SAGNAC * (sx * y - sy * x))
-                rows[t, 0, m], rows[t, 1, m], rows[t, 2, m], rows[t, 3, m] = ux, uy, uz, residual
-                total += w
-                mean_x += w * ux
-                mean_y += w * uy
-                mean_z += w * uz
-                mean_r += w * residual
-            totals[g] = total
-            if total > 0.0:
-                seen[t, g] = True
-                mean_x, mean_y, mean_z, mean_r = mean_x / total, mean_y / total, mean_z / total, mean_r / total
-            means[t, 0, g], means[t, 1, g], means[t, 2, g], means[t, 3, g] = mean_x, mean_y, mean_z, mean_r
-            for m in range(starts[g], stop):
-                w = weight[t, m]
-                if not w > 0.0:
-                    continue
-                rows[t, 0, m] -= mean_x
-                rows[t, 1, m] -= mean_y
-                rows[t, 2, m] -= mean_z
-                rows[t, 3, m] -= mean_r
-                for i in range(4):
-                    wi = w * rows[t, i, m]
-                    for j in range(i, 4):
-                        system[t, i, j] += wi * rows[t, j, m]
-        if tied:
-            all_mass = 0.0
-            for g in range(groups):
-                mass[g] = 1.0 / (1.0 / totals[g] + sigma_m[t, g] ** 2) if seen[t, g] else 0.0
-                all_mass += mass[g]
-            for i in range(4):
-                common[i] = 0.0
-                for g in range(groups):
-                    apart[i, g] = means[t, i, g] - (offset_m[t, g] if i == 3 else 0.0)
-                    common[i] += mass[g] * apart[i, g]
-                if all_mass > 0.0:
-                    common[i] /= all_mass
-            for g in range(groups):
-                if not seen[t, g]:
-                    continue
-                for i in range(4):
-                    apart[i, g] -= common[i]
-                stop = starts[g + 1] if g + 1 < groups else channels
-                own = 1.0 / (totals[g] * sigma_m[t, g] ** 2 + 1.0)
-                for i in range(4):
-                    for j in range(i, 4):
-                        system[t, i, j] += mass[g] * apart[i, g] * apart[j, g]
-                    shift = apart[i, g] * own
-                    means[t, i, g] -= shift
-                    for m in range(starts[g], stop):
-                        if weight[t, m] > 0.0:
-                            rows[t, i, m] += shift
-        for i in range(4):
-            for j in range(i):
-                system[t, i, j] = system[t, j, i]
-    return system, means, rows, seen
+        offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
+        _reduce(
+            sat_ecef_m[t], code_m[t], weight[t], place_ecef_m[t], starts, offset, spread,
+            system[t], means[t], rows[t], totals[t],
+        )  # fmt: skip
+    return system, means, rows, totals > 0.0
+
+
+@kernel
+def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
+    """Clocks and residuals of one epoch after a step (`NormalEquations.after`)."""
+    for g in range(len(totals)):
+        moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
+        clock_m[g] = moved if totals[g] > 0.0 else math.nan
+    for m in range(rows.shape[1]):
+        residual_m[m] = rows[3, m] - (step[0] * rows[0, m] + step[1] * rows[1, m] + step[2] * rows[2, m])
+
+
+@kernel
+def _invert(matrix: Floats, inverse: Floats) -> None:
+    """Invert a symmetric matrix by its cofactors (`inverse_3x3`)."""
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    c00, c11, c22 = d * f - e * e, a * f - c * c, a * d - b * b
+    c01, c02, c12 = c * e - b * f, b * e - c * d, b * c - a * e
+    determinant = a * c00 + b * c01 + c * c02
+    if not determinant > 1e-12 * ((a + d + f) / 3.0) ** 3:
+        determinant = math.nan
+    inverse[0, 0], inverse[1, 1], inverse[2, 2] = c00 / determinant, c11 / determinant, c22 / determinant
+    inverse[0, 1], inverse[0, 2], inverse[1, 2] = c01 / determinant, c02 / determinant, c12 / determinant
+    inverse[1, 0], inverse[2, 0], inverse[2, 1] = inverse[0, 1], inverse[0, 2], inverse[1, 2]
+
+
+@kernel
+def iterated_points(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    start_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    enough: Masks,
+    tolerance_m: float,
+    most: int,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Iterate the 3-D positions; epoch by epoch."""
+    epochs, channels = weight.shape
+    groups, no = len(starts), np.empty(0)
+    tied = len(offset_m) == epochs
+    place, clock = np.full((epochs, 3), np.nan), np.full((epochs, groups), np.nan)
+    matrix, covariance = np.full((epochs, 3, 3), np.nan), np.full((epochs, 3, 3), np.nan)
+    wsse, residual = np.full(epochs, np.nan), np.full((epochs, channels), np.nan)
+    system, means = np.empty((4, 4)), np.empty((4, groups))
+    rows, totals = np.empty((4, channels)), np.empty(groups)
+    current, step, inverse = np.empty(3), np.empty(3), np.empty((3, 3))
+    for t in range(epochs):
+        if not enough[t]:
+            continue
+        current[:] = start_ecef_m[t]
+        offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
+        for _ in range(most):
+            _reduce(
+                sat_ecef_m[t], code_m[t], weight[t], current, starts, offset, spread, system, means, rows, totals
+            )  # fmt: skip
+            _invert(system, inverse)
+            gain = 0.0
+            for i in range(3):
+                step[i] = 0.0
+                for j in range(3):
+                    step[i] += inverse[i, j] * system[j, 3]
+                gain += step[i] * system[i, 3]
+            length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            current += step
+            if length < tolerance_m:
+                place[t] = current
+                matrix[t], covariance[t], wsse[t] = system[:3, :3], inverse, system[3, 3] - gain
+                _settle(step, means, rows, totals, clock[t], residual[t])
+                break
+            if not length < 1e8:
+                break
+    return place, clock, matrix, covariance, wsse, residual
+
+
+@kernel
+def _along(
+    system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
+) -> tuple[float, float, float, float]:
+    """Step, sigma, sigma of an exact map and least WSSE along a section (`railfix.positioning.constrained._along`)."""
+    axes, turned = np.empty((3, 3)), np.empty((3, 3))
+    matrix, vector, inverse = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
+    for k in range(3):
+        axes[0, k], axes[1, k], axes[2, k] = tangent[k], across[k], up[k]
+    for i in range(3):
+        for k in range(3):
+            turned[i, k] = axes[i, 0] * system[0, k] + axes[i, 1] * system[1, k] + axes[i, 2] * system[2, k]
+            vector[i] += axes[i, k] * system[k, 3]
+        for j in range(3):
+            matrix[i, j] = turned[i, 0] * axes[j, 0] + turned[i, 1] * axes[j, 1] + turned[i, 2] * axes[j, 2]
+    matrix[1, 1] += 1.0 / plan**2
+    matrix[2, 2] += 1.0 / height**2
+    own, to_plan, to_height = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    a, b, c = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    determinant = a * c - b * b
+    if not determinant > 0.0:
+        determinant = math.nan
+    first, second = (c * to_plan - b * to_height) / determinant, (a * to_height - b * to_plan) / determinant
+    information = own - (to_plan * first + to_height * second)
+    gradient = vector[0] - (first * vector[1] + second * vector[2])
+    step = sigma = math.nan
+    if information > 1e-12 * own:
+        step, sigma = gradient / information, 1.0 / math.sqrt(information)
+    _invert(matrix, inverse)
+    least = system[3, 3]
+    for i in range(3):
+        for j in range(3):
+            least -= vector[i] * inverse[i, j] * vector[j]
+    return step, sigma, (1.0 / math.sqrt(own) if own > 0.0 else math.nan), least
+
+
+@kernel
+def iterated_along(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    start_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    tangent: Floats,
+    across: Floats,
+    up: Floats,
+    length_m: Floats,
+    vertex: Indices,
+    plan_m: float,
+    height_m: float,
+    tolerance_m: float,
+    most: int,
+) -> tuple[Indices, Floats, Floats, Floats, Integers]:
+    """Iterate the positions along the line; epoch by epoch."""
+    epochs, channels = weight.shape
+    groups, no, last = len(starts), np.empty(0), len(length_m) - 1
+    tied = len(offset_m) == epochs
+    chosen, iterations = np.full(epochs, -1, dtype=np.intp), np.zeros(epochs, dtype=np.int64)
+    solved = np.full((6, epochs), np.nan)
+    clock, residual = np.full((epochs, groups), np.nan), np.full((epochs, channels), np.nan)
+    system, means = np.empty((4, 4)), np.empty((4, groups))
+    rows, totals = np.empty((4, channels)), np.empty(groups)
+    place, jump, unit = np.empty(3), np.empty(3), np.empty(channels)
+    for t in range(epochs):
+        solved[4, t] = 0.0
+        if vertex[t] < 0:
+            continue
+        section = min(vertex[t], last)
+        along, entered = (length_m[section] if vertex[t] > last else 0.0), 0
+        offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
+        for _ in range(most):
+            for i in range(3):
+                place[i] = start_ecef_m[section, i] + along * tangent[section, i]
+            _reduce(sat_ecef_m[t], code_m[t], weight[t], place, starts, offset, spread, system, means, rows, totals)
+            step, sigma, exact, least = _along(system, tangent[section], across[section], up[section], plan_m, height_m)
+            target, length = along + step, length_m[section]
+            below, above = target < 0.0, target > length
+            inside = not (below or above)
+            ended = (below and section == 0 and along == 0.0) or (above and section == last and along == length)
+            iterations[t] += 1
+            settled = (inside and not abs(step) > tolerance_m) or ended
+            if settled or (below and entered < 0) or (above and entered > 0):
+                final = target if inside else along
+                solved[0, t], solved[1, t], solved[2, t], solved[3, t] = final, sigma, exact, least
+                solved[4, t] = abs(step) if ended else 0.0
+                for i in range(3):
+                    jump[i] = step * tangent[section, i] if inside else 0.0
+                    place[i] = start_ecef_m[section, i] + final * tangent[section, i]
+                _settle(jump, means, rows, totals, clock[t], residual[t])
+                if math.isfinite(final):
+                    chosen[t] = section
+                    for m in range(channels):
+                        unit[m] = 1.0 if weight[t, m] > 0.0 else 0.0
+                    _reduce(sat_ecef_m[t], code_m[t], unit, place, starts, offset, spread, system, means, rows, totals)
+                    information = 0.0
+                    for i in range(3):
+                        for j in range(3):
+                            information += tangent[section, i] * system[i, j] * tangent[section, j]
+                    solved[5, t] = 1.0 / math.sqrt(max(information, 0.0))
+                break
+            if below and section > 0:
+                section -= 1
+                along, entered = length_m[section], 1
+            elif above and section < last:
+                section += 1
+                along, entered = 0.0, -1
+            else:
+                along, entered = min(max(target, 0.0), length), 0
+    return chosen, solved, clock, residual, iterations
 
 
 @kernel
@@ -230,14 +459,18 @@ def reweighted(
             middle = min(count // 2, channels - 1)
             median = ordered[middle] if middle < count else 0.0
             scale = max(median * correction[t], _LEAST_SCALE)
+            changed = False
             for k in range(count):
-                size = white[k] / scale
+                size, before = white[k] / scale, factor[k]
                 if not size < reject:
                     factor[k] = 0.0
                 elif size <= keep:
                     factor[k] = 1.0
                 else:
                     factor[k] = ((reject - size) / (reject - keep)) ** 2 * keep / max(size, 1e-9)
+                changed |= factor[k] != before
+            if not changed:
+                break  # every further step would be this one
         for k in range(count):
             if white[k] / scale < reject:
                 kept[t, channel[k]] = True

@@ -16,7 +16,8 @@ from pydantic import Field
 
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.settings import Settings
-from railfix.positioning.normal_equations import NormalEquations, Ranges, inverse_3x3, normal_equations
+from railfix.kernels import compiled_by
+from railfix.positioning.normal_equations import Ranges, inverse_3x3, reduced_equations
 from railfix.track.trajectory import Trajectory
 
 
@@ -50,7 +51,8 @@ class Constrained:
     exact_map_sigma_m : ndarray, shape (T,) [m]
         The part of it that the weights give, as if the map were exact.
     dilution : ndarray, shape (T,)
-        Along-track dilution: sigma along the line for unit, equal weights and an exact map.
+        Along-track dilution: sigma along the line for unit, equal weights and an exact map. Infinite where the
+        satellites stand across the track.
     overshoot_m : ndarray, shape (T,) [m]
         How far beyond an end of the line the ranges pull a position clamped to it; 0 elsewhere.
     clock_m : ndarray, shape (T, G) [m]
@@ -73,15 +75,12 @@ class Constrained:
     iterations: Integers
 
 
-def _along(
-    equations: NormalEquations, trajectory: Trajectory, section: Indices
-) -> tuple[Floats, Floats, Floats, Floats]:
+def _along(system: Floats, axes: Floats, plan_m: float, height_m: float) -> tuple[Floats, Floats, Floats, Floats]:
     """Step and sigma (also of an exact map) along the section, and the least WSSE, map error allowed for."""
-    axes = np.stack([trajectory.tangent[section], trajectory.across[section], trajectory.up[section]], axis=1)
-    matrix = axes @ equations.matrix @ axes.swapaxes(1, 2)
-    matrix[:, 1, 1] += 1.0 / trajectory.sigma_plan_m**2
-    matrix[:, 2, 2] += 1.0 / trajectory.sigma_height_m**2
-    vector = np.einsum("tij,tj->ti", axes, equations.vector)
+    matrix = axes @ system[:, :3, :3] @ axes.swapaxes(1, 2)
+    matrix[:, 1, 1] += 1.0 / plan_m**2
+    matrix[:, 2, 2] += 1.0 / height_m**2
+    vector = np.einsum("tij,tj->ti", axes, system[:, :3, 3])
     # Schur complement of the map error: what remains depends on the distance along the line alone.
     coupling = matrix[:, 0, 1:]
     a, b, c = matrix[:, 1, 1], matrix[:, 1, 2], matrix[:, 2, 2]
@@ -98,7 +97,7 @@ def _along(
     step = np.where(observable, gradient / safe, np.nan)
     sigma = np.where(observable, 1.0 / np.sqrt(safe), np.nan)
     whole = np.einsum("tij,tj->ti", inverse_3x3(matrix), vector)
-    least = equations.wsse - np.einsum("ti,ti->t", whole, vector)
+    least = system[:, 3, 3] - np.einsum("ti,ti->t", whole, vector)
     return step, sigma, exact, least
 
 
@@ -128,56 +127,25 @@ def constrained_position(
     Constrained
     """
     limits = limits or ConstrainedLimits()
-    epochs, channels = ranges.code_m.shape
-    arc, sigma, exact_sigma, wsse = np.full((4, epochs), np.nan)
-    overshoot = np.zeros(epochs)
-    chosen = np.full(epochs, -1, dtype=np.intp)
-    clock = np.full((epochs, len(ranges.groups)), np.nan)
-    residual = np.full((epochs, channels), np.nan)
-    iterations = np.zeros(epochs, dtype=np.int64)
-    length, last = trajectory.length_m, len(trajectory.length_m) - 1
-
-    active = np.flatnonzero((vertex >= 0) & (ranges.n_used - ranges.n_clocks >= 1))
-    section = np.minimum(vertex[active], last)
-    along = np.where(vertex[active] > last, length[section], 0.0)
-    entered = np.zeros(len(active), dtype=np.int8)  # -1 through the lower end, +1 through the upper, 0 not just now
-    for _ in range(limits.max_iterations):
-        if not len(active):
-            break
-        part = ranges if len(active) == epochs else ranges.take(active)
-        place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
-        equations = normal_equations(part, place)
-        step, deviation, exact, least = _along(equations, trajectory, section)
-        target = along + step
-        below, above = target < 0.0, target > length[section]
-        inside = ~below & ~above  # NaN targets are inside and settle as "no position"
-        ended = (below & (section == 0) & (along == 0.0)) | (above & (section == last) & (along == length[section]))
-        turned = (below & (entered < 0)) | (above & (entered > 0))
-        settled = (inside & ~(np.abs(step) > limits.tolerance_m)) | ended | turned
-
-        iterations[active] += 1
-        done = active[settled]
-        final = np.where(inside, target, along)[settled]
-        arc[done] = trajectory.arc_m[section[settled]] + final
-        chosen[done] = np.where(np.isfinite(final), section[settled], -1)
-        sigma[done], exact_sigma[done], wsse[done] = deviation[settled], exact[settled], least[settled]
-        overshoot[done] = np.where(ended, np.abs(step), 0.0)[settled]
-        last_step = np.where(inside, step, 0.0)[settled, None] * trajectory.tangent[section[settled]]
-        clock[done], residual[done] = equations.after(last_step, settled)
-
-        down = below & (section > 0)
-        up = above & (section < last)
-        section = section - down + up
-        along = np.where(down, length[section], np.where(up, 0.0, np.clip(target, 0.0, length[section])))
-        entered = np.where(down, 1, np.where(up, -1, 0)).astype(np.int8)
-        going = ~settled
-        active, section, along, entered = active[going], section[going], along[going], entered[going]
+    section, solved, clock, residual, iterations = iterated_along(
+        *ranges.arrays(trajectory.ecef_m[:-1]),
+        trajectory.tangent,
+        trajectory.across,
+        trajectory.up,
+        trajectory.length_m,
+        np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1),
+        trajectory.sigma_plan_m,
+        trajectory.sigma_height_m,
+        limits.tolerance_m,
+        limits.max_iterations,
+    )
+    along, sigma, exact, wsse, overshoot, dilution = solved
     return Constrained(
-        arc_m=arc,
-        section=chosen,
+        arc_m=trajectory.arc_m[np.maximum(section, 0)] + along,
+        section=section,
         sigma_m=sigma,
-        exact_map_sigma_m=exact_sigma,
-        dilution=along_track_dilution(ranges, trajectory, arc, chosen),
+        exact_map_sigma_m=exact,
+        dilution=dilution,
         overshoot_m=overshoot,
         clock_m=clock,
         wsse=wsse,
@@ -186,26 +154,101 @@ def constrained_position(
     )
 
 
-def along_track_dilution(ranges: Ranges, trajectory: Trajectory, arc_m: Floats, section: Indices) -> Floats:
-    """Sigma along the line for ranges of unit sigma and an exact map: geometry alone, shape (T,).
+@compiled_by("ranges")
+def iterated_along(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    start_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    tangent: Floats,
+    across: Floats,
+    up: Floats,
+    length_m: Floats,
+    vertex: Indices,
+    plan_m: float,
+    height_m: float,
+    tolerance_m: float,
+    most: int,
+) -> tuple[Indices, Floats, Floats, Floats, Integers]:
+    """Iterate positions along the line; the ranges as `reduced_equations` takes them.
 
-    Infinite where the satellites stand across the track, NaN where there is no position.
+    Parameters
+    ----------
+    start_ecef_m, tangent, across, up : ndarray, shape (S, 3)
+        Of each section: its first point [m], and unit vectors.
+    length_m : ndarray, shape (S,) [m]
+    vertex : ndarray of int, shape (T,)
+        Point to start from; -1: none.
+    plan_m, height_m : float [m]
+        Sigmas of the map.
+    tolerance_m, most
+        Last step, and number of steps.
+
+    Returns
+    -------
+    section : ndarray of int, shape (T,)
+    solved : ndarray, shape (6, T)
+        Distance along the section [m]; `sigma_m`, `exact_map_sigma_m`, `wsse`, `overshoot_m` and `dilution` of
+        `Constrained`.
+    clock_m, residual_m, iterations
+        Of `Constrained`.
     """
-    result = np.full(len(ranges), np.nan)
-    at = np.flatnonzero(section >= 0)
-    if not len(at):
-        return result
-    part = ranges if len(at) == len(ranges) else ranges.take(at)
-    unit = Ranges(
-        sat_ecef_m=part.sat_ecef_m,
-        code_m=part.code_m,
-        weight=(part.weight > 0).astype(np.float64),
-        groups=part.groups,
-        ties=part.ties,
-    )
-    equations = normal_equations(unit, trajectory.at_arc(arc_m[at]))
-    tangent = trajectory.tangent[section[at]]
-    information = np.einsum("ti,tij,tj->t", tangent, equations.matrix, tangent)
+    epochs, channels = code_m.shape
+    chosen, iterations = np.full(epochs, -1, dtype=np.intp), np.zeros(epochs, dtype=np.int64)
+    clock, residual = np.full((epochs, len(starts)), np.nan), np.full((epochs, channels), np.nan)
+    solved = np.full((6, epochs), np.nan)
+    solved[4] = 0.0
+    tied, last = len(offset_m) == epochs, len(length_m) - 1
+
+    active = np.flatnonzero(vertex >= 0)
+    section = np.minimum(vertex[active], last)
+    along = np.where(vertex[active] > last, length_m[section], 0.0)
+    entered = np.zeros(len(active), dtype=np.int8)  # -1 through the lower end, +1 through the upper, 0 not just now
+    for _ in range(most):
+        if not len(active):
+            break
+        some = slice(None) if len(active) == epochs else active
+        ties = (offset_m[some], sigma_m[some]) if tied else (offset_m, sigma_m)
+        place = start_ecef_m[section] + along[:, None] * tangent[section]
+        system, means, rows, seen = reduced_equations(
+            sat_ecef_m[some], code_m[some], weight[some], place, starts, *ties
+        )
+        axes = np.stack([tangent[section], across[section], up[section]], axis=1)
+        step, deviation, exact, least = _along(system, axes, plan_m, height_m)
+        target = along + step
+        below, above = target < 0.0, target > length_m[section]
+        inside = ~below & ~above  # NaN targets are inside and settle as "no position"
+        ended = (below & (section == 0) & (along == 0.0)) | (above & (section == last) & (along == length_m[section]))
+        turned = (below & (entered < 0)) | (above & (entered > 0))
+        settled = (inside & ~(np.abs(step) > tolerance_m)) | ended | turned
+
+        iterations[active] += 1
+        done = active[settled]
+        final = np.where(inside, target, along)
+        chosen[done] = np.where(np.isfinite(final), section, -1)[settled]
+        results = (final, deviation, exact, least, np.where(ended, np.abs(step), 0.0))
+        solved[:5, done] = np.stack(results)[:, settled]
+        last_step = (np.where(inside, step, 0.0)[:, None] * tangent[section])[settled, None]
+        clock[done] = np.where(seen, means[:, 3], np.nan)[settled] - np.matmul(last_step, means[settled, :3])[:, 0]
+        residual[done] = rows[settled, 3] - np.matmul(last_step, rows[settled, :3])[:, 0]
+
+        down, upward = below & (section > 0), above & (section < last)
+        section = section - down + upward
+        along = np.where(down, length_m[section], np.where(upward, 0.0, np.clip(target, 0.0, length_m[section])))
+        entered = np.where(down, 1, np.where(upward, -1, 0)).astype(np.int8)
+        going = ~settled
+        active, section, along, entered = active[going], section[going], along[going], entered[going]
+
+    # Sigma along the line for ranges of unit sigma and an exact map: geometry alone.
+    at = np.flatnonzero(chosen >= 0)
+    place = start_ecef_m[chosen[at]] + solved[0, at, None] * tangent[chosen[at]]
+    ties = (offset_m[at], sigma_m[at]) if tied else (offset_m, sigma_m)
+    unit = (weight[at] > 0).astype(np.float64)
+    system = reduced_equations(sat_ecef_m[at], code_m[at], unit, place, starts, *ties)[0]
+    information = np.einsum("ti,tij,tj->t", tangent[chosen[at]], system[:, :3, :3], tangent[chosen[at]])
     with np.errstate(divide="ignore"):
-        result[at] = 1.0 / np.sqrt(np.maximum(information, 0.0))
-    return result
+        solved[5, at] = 1.0 / np.sqrt(np.maximum(information, 0.0))
+    return chosen, solved, clock, residual, iterations

@@ -88,6 +88,15 @@ class Ranges:
             ties=None if self.ties is None else self.ties.take(epochs),
         )
 
+    def arrays(self, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Floats, Indices, Floats, Floats]:
+        """Return what `reduced_equations` takes, at one place an epoch, shape (T, 3) [m]."""
+        offset_m, sigma_m = np.empty((2, 0, len(self.groups)))
+        if self.ties is not None:
+            offset_m, sigma_m = self.ties.offset_m, self.ties.sigma_m
+        floats = (self.sat_ecef_m, self.code_m, self.weight, place_ecef_m, offset_m, sigma_m)
+        sat_ecef_m, code_m, weight, place, offset_m, sigma_m = (np.ascontiguousarray(array) for array in floats)
+        return sat_ecef_m, code_m, weight, place, self.starts, offset_m, sigma_m
+
     @cached_property
     def n_used(self) -> Integers:
         """Channels with weight, shape (T,)."""
@@ -191,17 +200,7 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     -------
     NormalEquations
     """
-    ties = ranges.ties
-    none = np.empty((0, len(ranges.groups)))
-    system, means, rows, seen = reduced_equations(
-        np.ascontiguousarray(ranges.sat_ecef_m),
-        np.ascontiguousarray(ranges.code_m),
-        np.ascontiguousarray(ranges.weight),
-        np.ascontiguousarray(place_ecef_m),
-        ranges.starts,
-        none if ties is None else np.ascontiguousarray(ties.offset_m),
-        none if ties is None else np.ascontiguousarray(ties.sigma_m),
-    )
+    system, means, rows, seen = reduced_equations(*ranges.arrays(place_ecef_m))
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],

@@ -102,15 +102,8 @@ def robust_fit(
         nothing = np.zeros(len(ranges), dtype=np.int64)
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
-    ties, none = ranges.ties, np.empty((0, len(ranges.groups)))
     kept, wsse, solved = reweighted(
-        np.ascontiguousarray(ranges.sat_ecef_m),
-        np.ascontiguousarray(ranges.code_m),
-        np.ascontiguousarray(ranges.weight),
-        np.ascontiguousarray(place_ecef_m),
-        ranges.starts,
-        none if ties is None else np.ascontiguousarray(ties.offset_m),
-        none if ties is None else np.ascontiguousarray(ties.sigma_m),
+        *ranges.arrays(place_ecef_m),
         np.empty((0, 3, 3)) if information is None else np.ascontiguousarray(information),
         np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN,
         limits.keep,
@@ -177,6 +170,8 @@ def reweighted(
         scale = np.maximum(np.where(np.isfinite(median), median, 0.0) * correction, _LEAST_SCALE)
         size = whitened / scale[:, None]
         decline = ((reject - size) / (reject - keep)) ** 2 * keep / np.maximum(size, 1e-9)
-        factor = np.where(used & (size < reject), np.where(size <= keep, 1.0, decline), 0.0)
+        before, factor = factor, np.where(used & (size < reject), np.where(size <= keep, 1.0, decline), 0.0)
+        if np.array_equal(factor, before):
+            break  # every further step would be this one
     kept = used & (size < reject)
     return kept, np.where(kept, whitened**2, 0.0).sum(axis=1), np.isfinite(step).all(axis=1)

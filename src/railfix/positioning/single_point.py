@@ -11,9 +11,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from pydantic import Field
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
+from railfix.kernels import compiled_by
+from railfix.positioning.normal_equations import Ranges, inverse_3x3, reduced_equations
 
 
 class SinglePointLimits(Settings):
@@ -76,37 +77,70 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     SinglePoint
     """
     limits = limits or SinglePointLimits()
-    epochs, channels = ranges.code_m.shape
-    place = np.full((epochs, 3), np.nan)
-    clock = np.full((epochs, len(ranges.groups)), np.nan)
+    place, clock, matrix, covariance, wsse, residual = iterated_points(
+        *ranges.arrays(start_ecef_m),
+        np.asarray(ranges.n_used - ranges.n_clocks >= 3),
+        limits.tolerance_m,
+        limits.max_iterations,
+    )
+    return SinglePoint(
+        ecef_m=place, clock_m=clock, matrix=matrix, covariance_m2=covariance, wsse=wsse, residual_m=residual
+    )
+
+
+@compiled_by("ranges")
+def iterated_points(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    start_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    enough: Masks,
+    tolerance_m: float,
+    most: int,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Iterate 3-D positions; up to `sigma_m` as `reduced_equations` takes them.
+
+    Parameters
+    ----------
+    enough : ndarray of bool, shape (T,)
+        Epochs with satellites for a position; the others are NaN.
+    tolerance_m, most
+        Last step, and number of steps.
+
+    Returns
+    -------
+    ecef_m, clock_m, matrix, covariance_m2, wsse, residual_m
+        Of `SinglePoint`.
+    """
+    epochs, channels = code_m.shape
+    groups = len(starts)
+    place, clock = np.full((epochs, 3), np.nan), np.full((epochs, groups), np.nan)
     matrix, covariance = np.full((2, epochs, 3, 3), np.nan)
-    wsse = np.full(epochs, np.nan)
-    residual = np.full((epochs, channels), np.nan)
-    active = np.flatnonzero(ranges.n_used - ranges.n_clocks >= 3)
+    wsse, residual = np.full(epochs, np.nan), np.full((epochs, channels), np.nan)
+    tied = len(offset_m) == epochs
+    active = np.flatnonzero(enough)
     current = start_ecef_m[active]
-    for _ in range(limits.max_iterations):
+    for _ in range(most):
         if not len(active):
             break
-        part = ranges if len(active) == epochs else ranges.take(active)
-        equations = normal_equations(part, current)
-        inverse = inverse_3x3(equations.matrix)
-        step = np.einsum("tij,tj->ti", inverse, equations.vector)
+        some = slice(None) if len(active) == epochs else active
+        ties = (offset_m[some], sigma_m[some]) if tied else (offset_m, sigma_m)
+        system, means, rows, seen = reduced_equations(
+            sat_ecef_m[some], code_m[some], weight[some], current, starts, *ties
+        )
+        vector, inverse = system[:, :3, 3], inverse_3x3(system[:, :3, :3])
+        step = np.einsum("tij,tj->ti", inverse, vector)
         length = np.sqrt(np.einsum("ti,ti->t", step, step))
-        settled = length < limits.tolerance_m
-        done = active[settled]
+        settled = length < tolerance_m
+        done, last = active[settled], step[settled][:, None]
         place[done] = current[settled] + step[settled]
-        clock[done], residual[done] = equations.after(step[settled], settled)
-        matrix[done] = equations.matrix[settled]
-        covariance[done] = inverse[settled]
-        wsse[done] = equations.wsse[settled] - np.einsum("ti,ti->t", step, equations.vector)[settled]
+        clock[done] = np.where(seen, means[:, 3], np.nan)[settled] - np.matmul(last, means[settled, :3])[:, 0]
+        residual[done] = rows[settled, 3] - np.matmul(last, rows[settled, :3])[:, 0]
+        matrix[done], covariance[done] = system[settled, :3, :3], inverse[settled]
+        wsse[done] = system[settled, 3, 3] - np.einsum("ti,ti->t", step, vector)[settled]
         going = ~settled & (length < 1e8)
-        current = (current + step)[going]
-        active = active[going]
-    return SinglePoint(
-        ecef_m=place,
-        clock_m=clock,
-        matrix=matrix,
-        covariance_m2=covariance,
-        wsse=wsse,
-        residual_m=residual,
-    )
+        current, active = (current + step)[going], active[going]
+    return place, clock, matrix, covariance, wsse, residual

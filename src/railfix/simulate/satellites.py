@@ -54,7 +54,7 @@ def record_state(
         Record of each instant.
     since_toe_s, since_toc_s : ndarray, shape (T,) [s]
     """
-    position, _, relativity = kepler_state(Orbits.from_records(records).take(row), since_toe_s)
+    position, _, relativity = kepler_state(Orbits.of_table(Orbits.from_records(records).table[row]), since_toe_s)
     dt = since_toc_s
     clock = records.af0_s[row] + records.af1[row] * dt + records.af2[row] * dt**2 + relativity
     return np.stack(position, axis=-1), clock

@@ -140,7 +140,7 @@ class Trajectory(NotebookTable):
     @cached_property
     def up(self) -> Floats:
         """Normal of the ellipsoid at each segment, unit vectors, shape (V - 1, 3)."""
-        return read_only(self._axes[:, 2])
+        return read_only(np.ascontiguousarray(self._axes[:, 2]))
 
     @cached_property
     def across(self) -> Floats:

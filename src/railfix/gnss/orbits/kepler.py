@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Integers
+from railfix.core.arrays import Floats
 from railfix.core.constants import (
     EARTH_ROTATION_RATE,
     EARTH_ROTATION_RATE_BEIDOU,
@@ -100,9 +101,15 @@ class Orbits:
             **{name: getattr(records, name) for name in _AS_BROADCAST},
         )
 
-    def take(self, rows: Integers) -> Orbits:
-        """Select rows."""
-        return Orbits(**{item.name: getattr(self, item.name)[rows] for item in fields(Orbits)})
+    @cached_property
+    def table(self) -> Floats:
+        """All values of each orbit, shape (n, 20), in the order of the attributes."""
+        return np.stack([getattr(self, item.name) for item in fields(Orbits)], axis=1)
+
+    @classmethod
+    def of_table(cls, table: Floats) -> Orbits:
+        """Return the orbits of rows of a `table`."""
+        return cls(**{item.name: table[:, i] for i, item in enumerate(fields(Orbits))})
 
 
 _AS_BROADCAST: Final = ("eccentricity", "m0", "i_dot", "cuc", "cus", "crc", "crs", "cic", "cis")

@@ -9,13 +9,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, Indices, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
-from railfix.gnss.orbits.kepler import kepler_state
+from railfix.gnss.orbits.kepler import Orbits, kepler_state
 from railfix.gnss.orbits.precise import precise_clock_s, precise_state
 from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords, prepared_records
+from railfix.kernels import compiled_by
 
 #: Chunks of fewer epochs are computed with all channels together, longer ones channel by channel: the same
 #: arithmetic on every element, arranged so that single live epochs and complete logs are both fast.
@@ -192,12 +193,88 @@ def _fill_kepler(
     usable = seen if precise else seen & valid
     states.too_old[:, channels] = (seen & ~usable).T
     states.future_record[:, channels] = (usable & future).T
-    for k, t, row in _groups(rows, usable):
-        _kepler_group(table, plan, k, t, row, time, code_m, states)
+    kepler_channels(
+        time.astype("datetime64[ns]").astype(np.int64),
+        code_m,
+        channels,
+        rows,
+        usable,
+        table.lookup.toe.astype("datetime64[ns]").astype(np.int64),
+        table.orbits.table,
+        table.clock,
+        table.toe_after_toc_s,
+        table.navigation.kepler.accuracy_m,
+        plan.signal,
+        plan.group_delay_s,
+        plan.unhealthy,
+        states.position_ecef_m,
+        states.velocity_ecef_mps,
+        states.clock_m,
+        states.age_s,
+        states.accuracy_m,
+        states.group_delay_m,
+        states.unhealthy,
+    )
     if record is not None:
         # The newest record decides on health, also where a correction refers to an older one.
         newest_unhealthy = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
         states.unhealthy[:, channels] |= newest_unhealthy.T
+
+
+@compiled_by("orbits")
+def kepler_channels(
+    time_ns: Integers,
+    code_m: Floats,
+    channel: Indices,
+    rows: Integers,
+    usable: Masks,
+    toe_ns: Integers,
+    orbits: Floats,
+    clocks: Floats,
+    ahead_s: Floats,
+    accuracies_m: Floats,
+    signal: Integers,
+    delays_s: Floats,
+    flagged: Masks,
+    position: Floats,
+    velocity: Floats,
+    clock_m: Floats,
+    age_s: Floats,
+    accuracy_m: Floats,
+    delay_m: Floats,
+    unhealthy: Masks,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Masks]:
+    """Compute the states of channels on Keplerian records.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int, shape (T,)
+        Time tags since 1970.
+    code_m : ndarray, shape (T, M) [m]
+    channel : ndarray of int, shape (K,)
+        Which of the M channels.
+    rows, usable : ndarray of int and bool, shape (K, T)
+        Row of the record, and whether it is to be used.
+    toe_ns, orbits, clocks, ahead_s, accuracies_m : ndarray, shapes (R,), (R, 20), (3, R), (R,), (R,)
+        Of each record: toe since 1970, `Orbits.table`, clock polynomial, toe after toc, accuracy.
+    signal, delays_s, flagged
+        Signal of each channel, group delay and health of signals and records: of `ChannelRecords`.
+    position, velocity, clock_m, age_s, accuracy_m, delay_m, unhealthy : ndarray, shapes (T, M, 3) and (T, M)
+        As in `SatelliteStates`; filled in place, and returned.
+    """
+    for k, t, row in _groups(rows, usable):
+        m = channel[k]
+        age = seconds((time_ns[t] - toe_ns[row]).astype("timedelta64[ns]"))
+        since_toe, clock, ahead = age - code_m[t, m] / SPEED_OF_LIGHT, clocks[:, row], ahead_s[row]
+        since_toe = since_toe - _polynomial(clock, since_toe + ahead)
+        place, speed, relativity = kepler_state(Orbits.of_table(orbits[row]), since_toe)
+        for i in range(3):
+            position[t, m, i], velocity[t, m, i] = place[i], speed[i]
+        clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
+        age_s[t, m], accuracy_m[t, m] = age, accuracies_m[row]
+        delay_m[t, m] = SPEED_OF_LIGHT * delays_s[signal[k], row]
+        unhealthy[t, m] = flagged[signal[k], row]
+    return position, velocity, clock_m, age_s, accuracy_m, delay_m, unhealthy
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
@@ -219,31 +296,6 @@ def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]
         for begin, end in zip([0, *edges], [*edges, len(at)], strict=True):
             for first in range(begin, end, _BLOCK):
                 yield channel, at[first : min(first + _BLOCK, end)], of_at[begin : begin + 1]
-
-
-def _kepler_group(
-    table: PreparedRecords,
-    plan: ChannelRecords,
-    k: Any,
-    t: Any,
-    row: Integers,
-    time: Datetimes,
-    code_m: Floats,
-    states: _Arrays,
-) -> None:
-    m, kepler = plan.kepler[k], table.navigation.kepler
-    age = seconds(time[t] - kepler.toe[row])
-    since_toe = age - code_m[t, m] / SPEED_OF_LIGHT
-    clock, ahead = table.clock[:, row], table.toe_after_toc_s[row]
-    since_toe = since_toe - _polynomial(clock, since_toe + ahead)
-    position, velocity, relativity = kepler_state(table.orbits.take(row), since_toe)
-    for i in range(3):
-        states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = position[i], velocity[i]
-    states.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
-    states.age_s[t, m], states.accuracy_m[t, m] = age, kepler.accuracy_m[row]
-    signal = plan.signal[k]
-    states.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
-    states.unhealthy[t, m] = plan.unhealthy[signal, row]
 
 
 def _polynomial(clock: Floats, since_toc_s: Floats) -> Floats:
