@@ -181,7 +181,7 @@ def show_ablation(all_cases: list[Case]) -> None:
             found = case.run(epochs)
             error = case.error(found)[case.observed]
             print(f"{case.name:9s} {label:17s}  {figures_of(error, found.sigma_m[case.observed])}")
-        found = case.run(degrees_of_freedom=1e6)
+        found = case.run(degrees_of_freedom=1e6, late_degrees_of_freedom=1e6)
         error = case.error(found)[case.observed]
         print(f"{case.name:9s} {'not robust':17s}  {figures_of(error, found.sigma_m[case.observed])}")
 

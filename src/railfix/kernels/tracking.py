@@ -79,7 +79,7 @@ class Course(NamedTuple):
 class Numbers(NamedTuple):
     """Settings and constants of the filter, by the names that they have there."""
 
-    degrees: float
+    degrees: tuple[float, float]
     passes: int
     code_correlation_s: float
     code_correlation_m: float
@@ -676,9 +676,17 @@ def _combine(
 
 
 @kernel
+def _weight(square: float, late: bool, degrees: tuple[float, float]) -> float:
+    """Weight of a measurement by its square over its variance: `railfix.tracking.robust.Tails`."""
+    own = degrees[1] if late else degrees[0]
+    return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
+
+
+@kernel
 def _first_weights(
-    counts: Indices, design: Floats, value: Floats, variance: Floats, root: Floats, own: Floats, degrees: float,
-    freedom_place: float, freedom_speed: float, sensed: Floats, weight: Floats, ordered: Floats, h: int, to: int
+    counts: Indices, design: Floats, value: Floats, variance: Floats, root: Floats, own: Floats,
+    degrees: tuple[float, float], freedom_place: float, freedom_speed: float, sensed: Floats, weight: Floats,
+    ordered: Floats, h: int, to: int
 ) -> None:
     """Weights from innovations, without what clocks take up."""
     nc, nph, nd, ns = counts[0], counts[1], counts[2], counts[3]
@@ -703,21 +711,21 @@ def _first_weights(
                         spread += part[c] * own[h, base + c, base + e] * part[e]
                 spread += design[h, i, 0] ** 2 * freedom_place if kind == 1 else design[h, i, 2] ** 2 * freedom_speed
             away = value[h, i] - middle
-            weight[to, i] = (degrees + 1.0) / (degrees + away * away / (spread + variance[i]))
+            weight[to, i] = _weight(away * away / (spread + variance[i]), away > 0.0 and kind == 0, degrees)
         first += size
     for j in range(ns):
         i = nc + nph + nd + j
         spread = (
             root[h, nc + _MOTION + j] ** 2 + sensed[h, j, 0] ** 2 * freedom_place + sensed[h, j, 2] ** 2 * freedom_speed
         )
-        weight[to, i] = (degrees + 1.0) / (degrees + value[h, i] * value[h, i] / (spread + variance[i]))
+        weight[to, i] = _weight(value[h, i] * value[h, i] / (spread + variance[i]), False, degrees)
 
 
 @kernel
 def _rounds(
-    counts: Indices, design: Floats, value: Floats, variance: Floats, root: Floats, information: Floats, degrees: float,
-    passes: int, change: Floats, after: Floats, weight: Floats, residual: Floats, spread: Floats, system: Floats,
-    factor: Floats, lower: Floats, right: Floats, h: int, by: int, to: int
+    counts: Indices, design: Floats, value: Floats, variance: Floats, root: Floats, information: Floats,
+    degrees: tuple[float, float], passes: int, change: Floats, after: Floats, weight: Floats, residual: Floats,
+    spread: Floats, system: Floats, factor: Floats, lower: Floats, right: Floats, h: int, by: int, to: int
 ) -> float:
     """Rounds of reweighting; return log det of the covariance of the combinations after the epoch."""
     nc, nph, nd, ns = counts[0], counts[1], counts[2], counts[3]
@@ -783,7 +791,8 @@ def _rounds(
             spread[to, i] = root[h, k] * root[h, k] * after[to, k, k]
         if turn < passes - 1:
             for i in range(rows + ns):
-                weight[to, i] = (degrees + 1.0) / (degrees + (residual[to, i] ** 2 + spread[to, i]) / variance[i])
+                square = (residual[to, i] ** 2 + spread[to, i]) / variance[i]
+                weight[to, i] = _weight(square, residual[to, i] > 0.0 and i < nc, degrees)
     return log_determinant
 
 
@@ -831,19 +840,21 @@ def _learn_map(scalars: Floats, shift: float, dt: float, numbers: Numbers) -> No
 
 @kernel
 def _evidence(
-    rows: int, size: int, residual: Floats, variance: Floats, change: Floats, information: Floats, log_after: float,
-    log_before: float, degrees: float, h: int, to: int
+    rows: int, nc: int, size: int, residual: Floats, variance: Floats, change: Floats, information: Floats,
+    log_after: float, log_before: float, degrees: tuple[float, float], h: int, to: int
 ) -> float:
+    usual, late = degrees
     fit = 0.0
     for i in range(rows):
-        fit += math.log1p(residual[to, i] ** 2 / (degrees * variance[i]))
+        own = late if i < nc and residual[to, i] > 0.0 else usual
+        fit += own * math.log1p(residual[to, i] ** 2 / (own * variance[i]))
     away = 0.0
     for i in range(size):
         total = 0.0
         for j in range(size):
             total += information[h, i, j] * change[to, j]
         away += change[to, i] * total
-    return float(-0.5 * (degrees + 1.0) * fit - 0.5 * away + 0.5 * (log_after - log_before))
+    return float(-0.5 * (usual + 1.0) / usual * fit - 0.5 * away + 0.5 * (log_after - log_before))
 
 
 @kernel
@@ -1447,10 +1458,10 @@ def advance(
                     residual, fitted, system, factor, lower, right, h, h, room,
                 )
                 one = _evidence(
-                    rows, size, residual, variance, change, information, log_after[h], log_before[h], degrees, h, h
+                    rows, nc, size, residual, variance, change, information, log_after[h], log_before[h], degrees, h, h
                 )
                 two = _evidence(
-                    rows, size, residual, variance, change, information, log_other, log_before[h], degrees, h, room
+                    rows, nc, size, residual, variance, change, information, log_other, log_before[h], degrees, h, room
                 )
                 if two > one:
                     log_after[h] = log_other
@@ -1496,7 +1507,7 @@ def advance(
                 if memory.log_probability[h] > memory.log_probability[best]:
                     best = h
                 evidence[h] = _evidence(
-                    rows, size, residual, variance, change, information, log_after[h], log_before[h], degrees, h, h
+                    rows, nc, size, residual, variance, change, information, log_after[h], log_before[h], degrees, h, h
                 )
                 _at(course.arc_m, course.ecef_m, course.axes, course.segment, new_mean[h, _S], points, h, axes)
             for h in range(count):

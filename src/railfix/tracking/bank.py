@@ -178,10 +178,9 @@ def levelled(
     value = rows.value[best] - (design @ (combine @ (means - mean)[..., None]))[..., 0]
     own = replace(rows, combine=combine, design=design, value=value)
     use = np.stack([~_of(name, rows, satellite) for name in without])
-    degrees = limits.degrees_of_freedom
     prior = prior_of(own, covariances)
-    weight = first_weights(own, prior, degrees)
-    update = robust_update(own, prior, weight, degrees=degrees, passes=limits.level_passes, use=use)
+    weight = first_weights(own, prior, limits.tails)
+    update = robust_update(own, prior, weight, tails=limits.tails, passes=limits.level_passes, use=use)
     weak_s = np.where(_contradicted(rows, update.weight, use, limits), weak_s + dt, 0.0)
     means, covariances = applied(means, covariances, prior, update)
     means = on_the_line(means, covariances, line, limits)

@@ -260,7 +260,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
 @lru_cache(maxsize=8)
 def _numbers(kernel: ModuleType, limits: TrackingLimits) -> Any:
     given = {
-        "degrees": limits.degrees_of_freedom,
+        "degrees": tuple(limits.tails),
         "least_step_m2": predict.LEAST_STEP_M2,
         "code_clock_sigma_m": predict.CODE_CLOCK_SIGMA_M,
         "wheel_walk": predict.WHEEL_WALK,

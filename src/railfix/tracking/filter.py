@@ -173,13 +173,13 @@ def _measure(
     value = rows.value - (rows.design @ (rows.combine @ (mean - before)[..., None]))[..., 0]
     rows = replace(rows, value=value)
     prior = prior_of(rows, covariance)
-    degrees, passes = limits.degrees_of_freedom, limits.passes
-    weight = first_weights(rows, prior, degrees)
+    tails, passes = limits.tails, limits.passes
+    weight = first_weights(rows, prior, tails)
     shift = code_shift(rows, prior, weight, most_probable(state.log_probability))
-    update = robust_update(rows, prior, weight, degrees=degrees, passes=passes)
+    update = robust_update(rows, prior, weight, tails=tails, passes=passes)
     doubtful = min(_least(update.weight[:, part]) for part in (rows.codes, rows.motion)) < DOUBTFUL
     if doubtful:
-        update = better_mode(rows, prior, update, FREEDOM, degrees=degrees, passes=passes)
+        update = better_mode(rows, prior, update, FREEDOM, tails=tails, passes=passes)
     after = applied(mean, covariance, prior, update)
     settled, point = rows, mean[:, _PLACES]
     for _ in range(RELINEARISED):
@@ -190,10 +190,10 @@ def _measure(
         sensed = sensor_rows(sensors, epoch, line, mean, dt, state.direction)
         settled = rows_of(chunk, epoch, line, mean, point, state.log_scale, sensed)
         prior = prior_of(settled, covariance)
-        update = robust_update(settled, prior, update.weight, degrees=degrees, passes=passes)
+        update = robust_update(settled, prior, update.weight, tails=tails, passes=passes)
         after = applied(mean, covariance, prior, update)
     if state.hypotheses > 1:
-        evidence = log_evidence(settled, prior, update, degrees)
+        evidence = log_evidence(settled, prior, update, tails)
         log_probability = judged(state.log_probability, evidence, line.at(after[0][:, Unknown.PLACE])[0], limits)
         state.log_probability = log_probability - np.logaddexp.reduce(log_probability)
     step.cut |= np.diagonal(covariance, axis1=1, axis2=2) != np.diagonal(predicted_covariance, axis1=1, axis2=2)

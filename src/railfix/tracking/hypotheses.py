@@ -56,16 +56,18 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     keep = _thinned(line)
     arc, points = line.arc_m[keep], line.ecef_m[keep]
     likelihood = np.zeros(len(arc))
-    degrees = limits.degrees_of_freedom
+    tails = limits.tails
     for group in groups:
         distance, _ = range_with_rotation(chunk.sat_ecef_m[epoch, group], points[:, None, :])
         residual = chunk.measured[0, epoch, group] - distance
         variance = (1.0 + limits.code_white_share**2) * chunk.code_sigma_m[epoch, group] ** 2 + _SPACING_M**2 / 12.0
         clock = np.median(residual, axis=1, keepdims=True)
         for _ in range(limits.passes):
-            weight = (degrees + 1.0) / (degrees + (residual - clock) ** 2 / variance) / variance
+            away = residual - clock
+            weight = tails.weight(away, away**2 / variance, away.shape[1]) / variance
             clock = (weight * residual).sum(axis=1, keepdims=True) / weight.sum(axis=1, keepdims=True)
-        likelihood -= 0.5 * (degrees + 1.0) * np.log1p((residual - clock) ** 2 / (degrees * variance)).sum(axis=1)
+        away = residual - clock
+        likelihood += tails.log_density(away, away**2 / variance, away.shape[1]).sum(axis=1)
     order = np.argsort(-likelihood, kind="stable")
     order = order[likelihood[order] > likelihood[order[0]] - _WORSE]
     chosen: list[int] = []

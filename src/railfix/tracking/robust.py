@@ -10,6 +10,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Masks
 from railfix.tracking.rows import MOTION, Rows
 from railfix.tracking.state import Unknown
+from railfix.tracking.tails import Tails
 
 #: Share of a sensor's variance that no weight takes away: two sensors of the same combination keep it regular.
 SENSOR_FLOOR: Final = 1e-6
@@ -86,7 +87,7 @@ def prior_of(rows: Rows, covariance: Floats) -> Prior:
     return Prior(root=root, gain=gain, covariance=own, information=information, design=rows.design * root[:, None, :])
 
 
-def first_weights(rows: Rows, prior: Prior, degrees: float, freedom: Floats | None = None) -> Floats:
+def first_weights(rows: Rows, prior: Prior, tails: Tails, freedom: Floats | None = None) -> Floats:
     """Weights from innovations, what a clock common to a kind takes up left out as their median, shape (H, M).
 
     The clocks begin at every epoch nearly unknown: with their prior in it, the variance of an innovation would
@@ -96,7 +97,7 @@ def first_weights(rows: Rows, prior: Prior, degrees: float, freedom: Floats | No
     ----------
     rows : Rows
     prior : Prior
-    degrees : float
+    tails : Tails
     freedom : ndarray, shape (2,), optional
         Variances added to place and speed.
     """
@@ -110,7 +111,7 @@ def first_weights(rows: Rows, prior: Prior, degrees: float, freedom: Floats | No
     for part in rows.common:
         if part.stop > part.start:
             value[:, part] -= median(value[:, part])[:, None]
-    return np.asarray((degrees + 1.0) / (degrees + value**2 / spread))
+    return tails.weight(value, value**2 / spread, codes)
 
 
 def _inverse(matrices: Floats) -> Floats:
@@ -136,7 +137,7 @@ def robust_update(
     prior: Prior,
     weight: Floats,
     *,
-    degrees: float,
+    tails: Tails,
     passes: int,
     use: Masks | None = None,
     information: Floats | None = None,
@@ -144,7 +145,7 @@ def robust_update(
     """Reweighted least squares of one epoch against its prior.
 
     Variational form of Student's t (M. E. Tipping and N. D. Lawrence, Variational inference for Student-t models,
-    2005): the weight of a row is ``(nu + 1) / (nu + (residual^2 + spread) / variance)``.
+    2005): the weight of a row is ``(nu + 1) / (nu + (residual^2 + spread) / variance)``, that of a late code `Tails`.
 
     Parameters
     ----------
@@ -152,7 +153,7 @@ def robust_update(
     prior : Prior
     weight : ndarray, shape (H, M)
         Of the first pass.
-    degrees : float
+    tails : Tails
     passes : int
     use : ndarray of bool, shape (H, M), optional
         Rows that each Gaussian takes.
@@ -171,13 +172,13 @@ def robust_update(
         residual = rows.value - (design @ change[..., None])[..., 0]
         spread = ((design @ after) * design).sum(axis=-1)
         if turn < passes - 1:
-            weight = (degrees + 1.0) / (degrees + (residual**2 + spread) / rows.variance)
+            weight = tails.weight(residual, (residual**2 + spread) / rows.variance, rows.bounds[0])
     return Update(change=change, covariance=after, weight=weight, residual=residual, spread=spread)
 
 
-def log_evidence(rows: Rows, prior: Prior, update: Update, degrees: float) -> Floats:
+def log_evidence(rows: Rows, prior: Prior, update: Update, tails: Tails) -> Floats:
     """Logarithm of the evidence by Laplace's approximation, up to a constant common to the hypotheses, shape (H,)."""
-    fit = -0.5 * (degrees + 1.0) * np.log1p(update.residual**2 / (degrees * rows.variance)).sum(axis=1)
+    fit = tails.log_density(update.residual, update.residual**2 / rows.variance, rows.bounds[0]).sum(axis=1)
     change = update.change
     away = -0.5 * (change[:, None, :] @ prior.information @ change[:, :, None])[:, 0, 0]
     volume = 0.5 * (np.linalg.slogdet(update.covariance)[1] + np.linalg.slogdet(prior.information)[1])
@@ -192,7 +193,7 @@ def applied(mean: Floats, covariance: Floats, prior: Prior, update: Update) -> t
     return mean + (prior.gain @ update.change[..., None])[..., 0], after
 
 
-def better_mode(rows: Rows, prior: Prior, update: Update, freedom: Floats, *, degrees: float, passes: int) -> Update:
+def better_mode(rows: Rows, prior: Prior, update: Update, freedom: Floats, *, tails: Tails, passes: int) -> Update:
     """The update from another start where its evidence is larger, hypothesis by hypothesis.
 
     Student's t has several maxima. The second start frees place and speed first: what most
@@ -207,15 +208,15 @@ def better_mode(rows: Rows, prior: Prior, update: Update, freedom: Floats, *, de
         From the first start.
     freedom : ndarray, shape (2,)
         Variances added to place and speed for the second start.
-    degrees : float
+    tails : Tails
     passes : int
     """
     freed = np.stack([rows.combine[:, :, unknown] / prior.root for unknown in (Unknown.PLACE, Unknown.SPEED)], axis=2)
     free = prior.covariance + (freed * freedom) @ np.swapaxes(freed, 1, 2)
-    weight = first_weights(rows, prior, degrees, freedom)
-    start = robust_update(rows, prior, weight, degrees=degrees, passes=passes, information=_inverse(free))
-    other = robust_update(rows, prior, start.weight, degrees=degrees, passes=passes)
-    better = log_evidence(rows, prior, other, degrees) > log_evidence(rows, prior, update, degrees)
+    weight = first_weights(rows, prior, tails, freedom)
+    start = robust_update(rows, prior, weight, tails=tails, passes=passes, information=_inverse(free))
+    other = robust_update(rows, prior, start.weight, tails=tails, passes=passes)
+    better = log_evidence(rows, prior, other, tails) > log_evidence(rows, prior, update, tails)
     if not better.any():
         return update
 
