@@ -7,14 +7,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import pytest
 
+import raim_oracle
 from railfix import kernels
 from railfix.core.errors import SettingsError
+from railfix.integrity.protection import RiskBudget, along_track_level
+from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import Result
@@ -98,6 +102,43 @@ def test_a_run_is_the_same_with_compiled_kernels() -> None:
                     )
                 else:
                     assert one.equals(other, null_equal=True), column
+
+
+@with_numba
+@pytest.mark.requirement("A7", "C2")
+@pytest.mark.parametrize("systems", ["GGGGG", "GGGEE", "GGGGGEE", "GGGGEEEECCCR", "GGGGGGGGEEEEEEECCCC"])
+@pytest.mark.parametrize("by_range", [False, True])
+def test_levels_of_every_kind_of_hypothesis_are_the_same(systems: str, by_range: bool) -> None:
+    """Constellations, sides, a wrong map, triples; overbounds; satellites that nothing checks."""
+    arc, n, rng = np.linspace(200.0, 1800.0, 12), len(systems), np.random.default_rng(3)
+    ranges = raim_oracle.made(arc, systems, seed=8, faults_m={1: 9.0})
+    weight = ranges.weight * (rng.random(ranges.weight.shape) > 0.15)
+    model = constrained_model(replace(ranges, weight=weight), raim_oracle.LINE, arc)
+    known = np.tile(np.diag([0.1, 0.01]), (12, 1, 1)) * (rng.random(12) > 0.3)[:, None, None]
+    options: dict[str, Any] = {
+        "risk": RiskBudget(
+            risk_per_hour=1e-3, local_prior=1e-3, side_prior=1e-7, constellation_prior={"E": 1e-7, "C": 1e-6}
+        ),
+        "scale": np.linspace(0.6, 2.0, 12),
+        "map_bias_m": rng.normal(size=(12, 2)),
+        "map_seen": (rng.normal(size=(12, 2)), known),
+        "sides": rng.random((12, 2, n)) > 0.6,
+        "n_excluded": np.arange(12) % 3,
+    }
+    if by_range:
+        options |= {"least_sigma_m": rng.uniform(0.0, 5.0, (12, n)), "bias_m": rng.uniform(0.0, 1.0, (12, n))}
+    both = []
+    for chosen in ("numpy", "numba"):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kernels, "CHOSEN", chosen)
+            both.append(along_track_level(model, list(systems), **options))
+    assert n < 6 or np.isfinite(both[0].level_m).any()
+    for name in both[0].__dataclass_fields__:
+        expected, given = getattr(both[0], name), getattr(both[1], name)
+        if expected.dtype.kind == "f":
+            np.testing.assert_allclose(given, expected, rtol=1e-7, atol=TOLERANCE_M, err_msg=name)
+        else:
+            np.testing.assert_array_equal(given, expected, err_msg=name)
 
 
 @pytest.mark.requirement("A7")

@@ -1,4 +1,4 @@
-"""Compiled functions of `railfix.integrity.protection`: the level that the tails of all hypotheses leave."""
+"""Compiled function of `railfix.integrity.protection`: the level that the tails of all hypotheses leave."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import kernel
 
 #: Of `railfix.integrity.protection.tails`.
-_STEPS, _ROUNDS, _CLOSE, _AIM = 4, 4, 1e-3, 0.002
+_CLOSE, _STEPS, _AIM, _ALIKE, _MILLS = 5e-4, 60, 0.002, 1e-9, (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
-#: Tails further out than this many sigmas are nothing beside the risk: 2e-20.
-_FAR = 9.2
-#: erfc(x) = exp(-x^2) P(x) / Q(x) from 0 to 8, within 2e-8 of itself (Cephes; made for 1 to 8, where it is exact).
+_ROOT_HALF = math.sqrt(0.5)
+#: erfc(x) = exp(-x^2) P(x) / Q(x) for x >= 0, within 2e-8 of itself (Cephes; made for 1 to 8, where it is exact).
 _P = (
     2.46196981473530512524e-10, 5.64189564831068821977e-1, 7.46321056442269912687, 4.86371970985681366614e1,
     1.96520832956077098242e2, 5.26445194995477358631e2, 9.34528527171957607540e2, 1.02755188689515710272e3,
@@ -25,59 +24,149 @@ _Q = (
     1.0, 1.32281951154744992508e1, 8.67072140885989742329e1, 3.54937778887819891062e2, 9.75708501743205489753e2,
     1.82390916687909736289e3, 2.24633760818710981792e3, 1.65666309194161350182e3, 5.57535340817727675546e2,
 )  # fmt: skip
+#: exp(x) = 2^k exp(r), |r| <= ln 2 / 2: log2(e), ln 2 in two parts, and the number whose last bits hold k + 1023.
+_LOG2_E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_SHIFT = 6755399441055744.0 + 1023.0
+_E = tuple(1.0 / math.factorial(k) for k in range(12))
+
+
+@kernel
+def _mills(x: float) -> float:
+    """Return the Gaussian tail beyond x >= 0 over the density there."""
+    y = x * _ROOT_HALF
+    p = (((((((_P[0] * y + _P[1]) * y + _P[2]) * y + _P[3]) * y + _P[4]) * y + _P[5]) * y + _P[6]) * y + _P[7]) * y
+    q = (((((((_Q[0] * y + _Q[1]) * y + _Q[2]) * y + _Q[3]) * y + _Q[4]) * y + _Q[5]) * y + _Q[6]) * y + _Q[7]) * y
+    return 0.5 * _ROOT_TWO_PI * (p + _P[8]) / (q + _Q[8])
+
+
+@kernel
+def _bells(z: Floats, bits: Indices, out: Floats) -> None:
+    """Write exp(-z^2/2) into `out`; `bits` is a view of another array of the same length. Loops of vectors."""
+    scratch = bits.view(np.float64)
+    for m in range(len(z)):
+        u = max(-0.5 * z[m] * z[m], -700.0)
+        shifted = u * _LOG2_E + _SHIFT
+        scratch[m] = shifted
+        whole = shifted - _SHIFT
+        r = (u - whole * _LN2_HIGH) - whole * _LN2_LOW
+        value = ((((_E[11] * r + _E[10]) * r + _E[9]) * r + _E[8]) * r + _E[7]) * r + _E[6]
+        out[m] = (((((value * r + _E[5]) * r + _E[4]) * r + _E[3]) * r + 0.5) * r + 1.0) * r + 1.0
+    for m in range(len(z)):
+        bits[m] = bits[m] << 52
+    for m in range(len(z)):
+        out[m] *= scratch[m]
+
+
+@kernel
+def _quantile(probability: float) -> float:
+    """Return the sigmas that noise exceeds on one side with a probability, as `one_sided_k`."""
+    if probability >= 1.0:
+        return -np.inf
+    if not probability > 0.0:
+        return np.inf
+    small = min(probability, 1.0 - probability)
+    if small >= 0.5:
+        return 0.0
+    aim, x = math.log(small), math.sqrt(-2.0 * math.log(small))
+    for _ in range(8):
+        mills = _mills(x)
+        step = (math.log(mills / _ROOT_TWO_PI) - 0.5 * x * x - aim) * mills
+        x += step
+        if abs(step) < 1e-13 * x:
+            break
+    return x if probability < 0.5 else -x
 
 
 @kernel
 def lowered(
-    above_m: Floats, offset_m: Floats, inverse: Floats, weight: Floats, bounds: Indices, allowed: Floats
-) -> tuple[Floats, Codes]:
-    """Lower levels as far as the risk allows, epoch by epoch."""
-    epochs, kinds = len(above_m), len(bounds) - 1
-    level, spender = above_m.copy(), np.zeros(epochs, dtype=np.int8)
-    root_half = math.sqrt(0.5)
+    offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
+) -> tuple[Floats, Codes, Floats, Floats, Indices]:
+    """Return the fields of `Levels`, epoch by epoch."""
+    (epochs, width), kinds = weight.shape, len(bounds) - 1
+    level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
+    part, k_of = np.zeros((epochs, kinds)), np.full((epochs, kinds), -np.inf)
+    worst = np.full((epochs, kinds), -1, dtype=np.intp)
+    inverse, checked, z, bell = np.empty(width), np.empty(width), np.empty(width), np.empty(width)
+    each, tail, bits, ends = np.empty(width), np.empty(width), np.empty(width, dtype=np.int64), np.empty(kinds)
     for t in range(epochs):
-        limit = allowed[t]
-        if not (math.isfinite(above_m[t]) and limit > 0.0):
+        offset, sigma, prior = offset_m[t], sigma_m[t], weight[t]
+        allowed = -reserved[t]
+        for m in range(width):
+            inverse[m] = 1.0 / sigma[m]
+            checked[m] = prior[m] if inverse[m] > 0.0 else 0.0
+        for kind in range(kinds):
+            total, whole = 0.0, 0.0
+            for m in range(bounds[kind], bounds[kind + 1]):
+                total += checked[m]
+                whole += prior[m]
+            left = share[t, kind] - (whole - total)
+            allowed += left
+            needed = whole > share[t, kind]
+            spent = needed and left <= 0.0
+            k = -np.inf
+            if needed and not (left > 0.0 and total == 0.0):
+                k = _quantile(left / total if total > 0.0 else 0.0)
+            k_of[t, kind] = k
+            largest = -np.inf
+            for m in range(bounds[kind], bounds[kind + 1]):
+                if prior[m] > 0.0:
+                    value = -np.inf
+                    if spent and (total == whole or checked[m] == 0.0):
+                        value = np.inf
+                    elif checked[m] > 0.0 and math.isfinite(k):
+                        value = offset[m] + k * sigma[m]
+                    largest = max(largest, value)
+                    each[m] = value
+            part[t, kind] = max(largest, 0.0)
+            alike = largest - _ALIKE * abs(largest) if math.isfinite(largest) else largest
+            for m in range(bounds[kind + 1] - 1, bounds[kind] - 1, -1):
+                if prior[m] > 0.0 and each[m] >= alike > -np.inf:
+                    worst[t, kind] = m - bounds[kind]
+            level[t] = max(level[t], part[t, kind])
+        highest = level[t]
+        if not (math.isfinite(highest) and allowed > 0.0):
             continue
-        aim, here, below = limit * (1.0 - _AIM), above_m[t], 0.0
-        for _ in range(_ROUNDS):
-            for _ in range(_STEPS):
-                total, density, most, largest = 0.0, 0.0, 0, -1.0
-                for k in range(kinds):
-                    part = 0.0
-                    for m in range(bounds[k], bounds[k + 1]):
-                        w = weight[t, m]
-                        z = (offset_m[t, m] - here) * inverse[t, m]
-                        if w == 0.0 or z < -_FAR:
-                            continue
-                        bell = math.exp(-0.5 * z * z)
-                        x = abs(z) * root_half
-                        if x < 1.0:
-                            tail = 0.5 * math.erfc(x)
-                        elif x < 8.0:
-                            p, q = _P[0], _Q[0]
-                            for i in range(1, 9):
-                                p, q = p * x + _P[i], q * x + _Q[i]
-                            tail = 0.5 * bell * p / q
-                        else:
-                            tail = 0.0
-                        if z > 0.0:
-                            tail = 1.0 - tail
-                        part += w * tail
-                        density += w * inverse[t, m] * bell
-                    total += part
-                    if part > largest:
-                        largest, most = part, k
-                total = max(total, _TINY)
-                density /= _ROOT_TWO_PI
-                within = total <= limit
-                if within and here <= level[t]:
-                    level[t], spender[t] = here, most
-                if not within:
-                    below = max(below, here)
-                here = here + math.log(total / aim) * total / max(density, _TINY)
-                if not (here >= below and here <= level[t]):
-                    here = (below + level[t]) / 2.0
-            if not abs(here - level[t]) > _CLOSE * level[t]:
+        aim, here, below, above = allowed * (1.0 - _AIM), highest, 0.0, highest
+        for number in range(_STEPS):
+            for m in range(width):
+                z[m] = (offset[m] - here) * inverse[m]
+            _bells(z, bits, bell)
+            if number == 0:
+                for m in range(width):
+                    x = max(-z[m], 0.0)
+                    near = (1.0 - _MILLS[0]) * x + _MILLS[0] * math.sqrt(x * x + _MILLS[1])
+                    tail[m] = checked[m] * bell[m] / (_ROOT_TWO_PI * near)
+            else:
+                for m in range(width):
+                    beyond = _mills(abs(z[m])) * bell[m] / _ROOT_TWO_PI
+                    tail[m] = checked[m] * (1.0 - beyond if z[m] > 0.0 else beyond)
+            total, slope, bend = 0.0, 0.0, 0.0
+            for kind in range(kinds):
+                ends[kind] = 0.0
+                for m in range(bounds[kind], bounds[kind + 1]):
+                    ends[kind] += tail[m]
+                total += ends[kind]
+            for m in range(width):
+                density = checked[m] * bell[m] * inverse[m]
+                slope += density
+                bend -= density * inverse[m] * z[m]
+            total = max(total, _TINY)
+            slope /= _ROOT_TWO_PI * total
+            bend = bend / (_ROOT_TWO_PI * total) - slope * slope
+            excess = math.log(total / aim)
+            steepest = slope + math.sqrt(max(slope * slope - 2.0 * bend * excess, 0.0))
+            following = min(here + 2.0 * excess / max(steepest, _TINY), highest)
+            if number > 0:
+                spender[t] = np.argmax(ends)
+                if excess > 0.0:
+                    below = here
+                else:
+                    above = here
+            close = number > 0 and abs(following - here) <= _CLOSE * here
+            if not below <= following <= above:
+                following = min(max(following, below), above) if close else (below + above) / 2.0
+            level[t] = following if close else above
+            if close:
                 break
-    return level, spender
+            here = following
+    return level, spender, part, k_of, worst

@@ -24,7 +24,8 @@ class Allocation:
     """Allocation of the risk, T epochs."""
 
     prior: Floats  # (T, M), 0 where not used
-    groups: tuple[tuple[str, Masks], ...]  # constellations with a prior of their own: letter, members (M,)
+    groups: tuple[str, ...]  # letters of the C constellations with a prior of their own
+    members: Masks  # (C, M) of these
     group_prior: Floats  # (T, C), 0 where absent
     beyond: Floats
     fault_free: Floats  # risk of each part
@@ -61,10 +62,10 @@ def allocate(
         [prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max(initial=0.0)], axis=1
     )
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
-    groups = tuple((s, np.array([t == s for t in systems])) for s in letters)
-    group_prior = np.zeros((len(model), len(groups)))
+    of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
+    group_prior = np.zeros((len(model), len(letters)))
     together = np.zeros(len(model))
-    for c, (letter, members) in enumerate(groups):
+    for c, (letter, members) in enumerate(zip(letters, of_letter, strict=True)):
         group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
         # A constellation and two satellites of others: not checked.
         together += group_prior[:, c] * pair_sum(prior * ~members)
@@ -89,7 +90,8 @@ def allocate(
     tests = tests + np.where(triples, n * (n - 1) * (n - 2) // 6, 0)
     return Allocation(
         prior=prior,
-        groups=groups,
+        groups=tuple(letters),
+        members=of_letter,
         group_prior=group_prior,
         beyond=beyond,
         fault_free=risk.fault_free_share * left,

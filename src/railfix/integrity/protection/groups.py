@@ -6,53 +6,53 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Masks
 from railfix.integrity.protection.separation import NO_EFFECT, AllInView, Separations, separations
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 
 
 @dataclass(frozen=True)
 class _Group:
-    """A group of channels left out, T epochs."""
+    """Groups of channels, T epochs, left out member by member as in `separation.without_two`.
 
-    place: Indices  # (T, m) of the group in the compact arrays, and of others where it has fewer
-    inverse: Floats  # (T, m, m) S_JJ^+; 0 for others
-    square: Floats  # (T,) variance of the distance
-    moved: Floats  # (T,)
-    response: Floats  # (T, 2) of the distance to the map error
-    blind: Masks  # (T,)
+    Columns are those of the projector, then gain, residual and response to the map error across and up.
+    """
 
-    def across(self, projector: Floats) -> Floats:
-        """Return what of the rest falls onto the group, ``S S_JJ^+``, shape (T, n, n)."""
-        whole, epoch = np.zeros(projector.shape), np.arange(len(projector))[:, None, None]
-        whole[epoch, self.place[:, :, None], self.place[:, None, :]] = self.inverse
-        return np.asarray(projector @ whole)
+    columns: Floats  # (T, n, n + 4) of all channels
+    rows: Floats  # (T, m, n + 4) of each member, those before it left out
+    scaled: Floats  # (T, m, n + 4) the same over what checks the member
+    gone: Floats  # (T, 4) variance of the distance, -distance, its response to the map error across and up
+    blind: Masks  # (T,) nothing bounds a fault
+
+    def left(self) -> Floats:
+        """Return the columns without the group, shape (T, n, n + 4)."""
+        n = self.columns.shape[1]
+        return np.asarray(self.columns - self.rows[..., :n].swapaxes(1, 2) @ self.scaled)
 
 
 def _group(full: AllInView, members: Masks) -> _Group:
-    """``S_JJ^+`` of a group of channels, and what leaving it out does.
-
-    Where S_JJ is singular (a clock of the group alone), the direction that no residual shows must move nothing.
-    """
-    most = max(1, int(np.count_nonzero(members, axis=1).max(initial=0)))
-    place = np.argsort(~members, axis=1, kind="stable")[:, :most]
-    epoch = np.arange(len(members))[:, None]
-    mask = members[epoch, place].astype(np.float64)
-    both = mask[:, :, None] * mask[:, None, :]
-    gain, residual = full.gain_m[epoch, place] * mask, full.residual[epoch, place]
-    values, vectors = np.linalg.eigh(full.projector[epoch[..., None], place[:, :, None], place[:, None, :]] * both)
-    some = values > LEAST_REDUNDANCY
-    inverse = (vectors * np.where(some, 1.0 / np.where(some, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
-    inverse *= both
-    hidden = np.einsum("tij,ti->tj", vectors, gain) * ~some
-    pull = np.einsum("tij,tj->ti", inverse, gain)
+    epochs, n = members.shape
+    limit = NO_EFFECT * np.sqrt(full.variance_m2)
+    place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
+    columns = np.concatenate(
+        [full.projector, full.gain_m[..., None], full.residual[..., None], full.map_gain_m], axis=2
+    )
+    at = np.arange(epochs)[:, None]
+    rows = columns[at, place] * members[at, place][..., None]
+    scaled, blind = np.empty_like(rows), np.zeros(epochs, dtype=bool)
+    for k in range(place.shape[1]):
+        row, later = rows[:, k], rows[:, k + 1 :]
+        share = row[at[:, 0], place[:, k]]
+        checked = share > LEAST_REDUNDANCY
+        blind |= ~checked & (np.abs(row[:, n]) > limit)
+        scaled[:, k] = row / np.where(checked, share, np.inf)[:, None]
+        later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
     return _Group(
-        place=place,
-        inverse=inverse,
-        square=(pull * gain).sum(axis=1),
-        moved=-(pull * residual).sum(axis=1),
-        response=np.einsum("ti,tij->tj", pull, full.map_gain_m[epoch, place]),
-        blind=np.sqrt((hidden**2).sum(axis=1)) > NO_EFFECT * np.sqrt(full.variance_m2),
+        columns=columns,
+        rows=rows,
+        scaled=scaled,
+        gone=np.einsum("tm,tmc->tc", rows[..., n], scaled[..., n:]),
+        blind=blind,
     )
 
 
@@ -66,43 +66,19 @@ def without_group(full: AllInView, members: Masks) -> Separations:
         Places of the group in the compact arrays; some epochs may have none.
     """
     group = _group(full, members)
-    left = None
-    if full.by_range:
-        left = (full.gain_m - np.einsum("tij,tj->ti", group.across(full.projector), full.gain_m))[:, None]
-    return separations(
-        full, group.square[:, None], group.response[:, None], group.moved[:, None], left, group.blind[:, None]
-    )
+    left = group.left()[:, None, :, -4] if full.by_range else None
+    return separations(full, group.gone[..., None], left, group.blind[:, None])
 
 
-def without_constellation_and_one(full: AllInView, members: Masks) -> Separations:
-    """A whole constellation left out with each channel of the others, K = n.
-
-    What leaving out the constellation J makes of the projector, the residuals and the gains of the rest,
-    ``S - S_.J S_JJ^+ S_J.`` and the like, is what `without_one` needs of it.
-
-    Parameters
-    ----------
-    all_of : Whole
-    members : ndarray of bool, shape (T, n)
-        Places of the constellation in the compact arrays; some epochs may have none.
-    """
-    group = _group(full, members)
-    rest, across = full.used & ~members, group.across(full.projector)
-    projector, gain = full.projector, full.gain_m
-    left_gain = rest * (gain - np.einsum("tij,tj->ti", across, gain))
-    left_residual = rest * (full.residual - np.einsum("tij,tj->ti", across, full.residual))
-    left_map = rest[..., None] * (full.map_gain_m - across @ full.map_gain_m)
-    left_projector = (projector - across @ projector) * (rest[:, :, None] & rest[:, None, :])
-    share = np.einsum("tii->ti", left_projector)
+def without_group_and_one(full: AllInView, members: Masks) -> Separations:
+    """A group of channels left out with each channel of the others, K = n; parameters as `without_group`."""
+    group, rest, n = _group(full, members), full.used & ~members, full.channel.shape[1]
+    left = group.left()
+    share = rest * np.einsum("tii->ti", left[..., :n])
     checked = share > LEAST_REDUNDANCY
-    weight = np.where(checked, left_gain / np.where(checked, share, 1.0), 0.0)
-    left = left_gain[:, None, :] - weight[:, :, None] * left_projector if full.by_range else None
-    alone = ~checked & (np.abs(left_gain) > NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
-    return separations(
-        full,
-        np.maximum(group.square[:, None] + weight * left_gain, 0.0),
-        group.response[:, None] + weight[..., None] * left_map,
-        group.moved[:, None] - weight * left_residual,
-        left,
-        (alone | group.blind[:, None]) & rest,
-    )
+    own = rest[..., None] * left[..., n:]
+    weight = own[..., 0] / np.where(checked, share, np.inf)
+    gone = group.gone[..., None] + (weight[..., None] * own).swapaxes(1, 2)
+    alone = ~checked & (np.abs(own[..., 0]) > NO_EFFECT * np.sqrt(full.variance_m2)[:, None])
+    kept = left[:, None, :, n] - weight[..., None] * left[..., :n] if full.by_range else None
+    return separations(full, gone, kept, (alone | group.blind[:, None]) & rest)

@@ -16,34 +16,33 @@ of three parts, each of which has its share of the risk,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from itertools import combinations
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
 from railfix.integrity.protection.allocation import Allocation, allocate
-from railfix.integrity.protection.groups import without_constellation_and_one, without_group
-from railfix.integrity.protection.risk import RiskBudget, one_sided_k, pair_sum
+from railfix.integrity.protection.groups import without_group, without_group_and_one
+from railfix.integrity.protection.risk import RiskBudget, pair_sum
 from railfix.integrity.protection.separation import (
-    AllInView,
     Separations,
     all_in_view,
-    without_constellation,
     without_map,
     without_one,
     without_three,
     without_two,
 )
-from railfix.integrity.protection.tails import Tails, least_level
+from railfix.integrity.protection.tails import lowered
 from railfix.integrity.raim import LinearModel
+from railfix.kernels import compiled_by
 
 #: Numbers of a pair array that a block of epochs holds.
-_BLOCK_SIZE: Final = 80_000
+_BLOCK_SIZE: Final = 30_000
 #: Number of the tails of three faults among those of all kinds.
 _OF_TRIPLES: Final = 3
 #: Separation, over the sigma of the position, below which the two positions are the same.
@@ -122,18 +121,6 @@ class ProtectionLevel:
     cause: Codes
 
 
-@dataclass(frozen=True)
-class _Part:
-    """One part of the level: T epochs."""
-
-    level_m: Floats
-    k: Floats
-    worst: Indices  # hypothesis; -1
-    separation: Floats
-    tails: Tails  # of what is checked
-    unchecked: Floats  # prior of what is not
-
-
 def along_track_level(
     model: LinearModel,
     systems: Sequence[str],
@@ -192,21 +179,29 @@ def along_track_level(
     if (scale <= 0).any():
         raise ValueError("the noise scale must be positive")
     out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
-    bias = None if bias_m is None else np.broadcast_to(np.asarray(bias_m, dtype=np.float64), (epochs, channels))
-    least = None if least_sigma_m is None else np.broadcast_to(np.asarray(least_sigma_m, float), (epochs, channels))
-    offset = None if map_bias_m is None else np.broadcast_to(np.asarray(map_bias_m, dtype=np.float64), (epochs, 2))
+    groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
+    plan = allocate(model, systems, risk, out, groups, wrong_map=map_seen is not None)
+    given = (
+        scale,
+        _by_epoch(least_sigma_m, epochs, channels),
+        _by_epoch(bias_m, epochs, channels),
+        _by_epoch(0.0 if map_bias_m is None else map_bias_m, epochs, 2),
+        np.zeros((epochs, 2)) if map_seen is None else map_seen[0],
+        np.zeros((epochs, 2, 2)) if map_seen is None else map_seen[1],
+        groups[:, : groups.shape[1] if plan.side_prior.any() else 0],
+    )
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
-    together = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
-    plan = allocate(model, systems, risk, out, together, wrong_map=map_seen is not None)
     result = _empty(epochs, plan)
     for block in _blocks(model, np.flatnonzero(located)):
-        part = model.take(block)
-        some, moved, low = (None if v is None else v[block] for v in (bias, offset, least))
-        seen = None if map_seen is None else (map_seen[0][block], map_seen[1][block])
-        _level_of_block(
-            result, block, part, plan, all_in_view(part, scale[block], some, moved, low), seen, together[block]
-        )
+        _level_of_block(result, block, model.take(block), plan, *(each[block] for each in given))
     return result
+
+
+def _by_epoch(values: ArrayLike | None, epochs: int, width: int) -> Floats:
+    """Values for each epoch, shape (T, width); (T, 0) for none."""
+    if values is None:
+        return np.zeros((epochs, 0))
+    return np.broadcast_to(np.asarray(values, dtype=np.float64), (epochs, width))
 
 
 def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
@@ -245,149 +240,133 @@ def _blocks(model: LinearModel, rows: Indices) -> Iterator[Indices]:
 
 
 def _level_of_block(
-    result: ProtectionLevel,
-    rows: Indices,
-    model: LinearModel,
-    plan: Allocation,
-    full: AllInView,
-    map_seen: tuple[Floats, Floats] | None,
-    sides: Masks,
+    result: ProtectionLevel, rows: Indices, model: LinearModel, plan: Allocation, *given: Floats | Masks
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
-    sigma = full.sigma_m
-    k_fault_free, k_false_alarm = one_sided_k(plan.fault_free[rows] / 2.0), plan.k_false_alarm[rows]
-    fault_free = k_fault_free * sigma + full.bias_m
-    prior = np.take_along_axis(plan.prior[rows], full.channel, axis=1) * full.used
-
-    single_separations, single_prior = [without_one(full)], [prior]
-    for c, (_, members) in enumerate(plan.groups):
-        single_separations.append(without_constellation(model, members, full))
-        single_prior.append(plan.group_prior[rows, c : c + 1])
-    for c in range(sides.shape[1] if plan.side_prior.any() else 0):
-        of_side = np.take_along_axis(sides[:, c], full.channel, axis=1) & full.used
-        single_separations.append(without_group(full, of_side))
-        single_prior.append(plan.side_prior[rows, c : c + 1])
-    wrong_map = None
-    if map_seen is not None and plan.map_prior > 0.0:
-        wrong_map = without_map(full, model, *map_seen)
-        single_separations.append(wrong_map[0])
-        single_prior.append(np.full((len(rows), 1), plan.map_prior))
-    single_fault = _part(
-        _beside(single_separations), np.concatenate(single_prior, axis=1), plan.one[rows], k_false_alarm, sigma
+    arrays: Iterable[Any] = (
+        *(model.root_weight, model.clock, model.clock_covariance_m2, model.design, model.covariance_m2, model.prior),
+        *(model.misfit, *given),
+        *(plan.prior[rows], plan.members, plan.group_prior[rows], plan.side_prior[rows]),
+        *(plan.pairs[rows], plan.triples[rows], plan.k_false_alarm[rows]),
     )
+    arrays = (*map(np.ascontiguousarray, arrays), plan.map_prior)
+    channel, offset, sigma, weight, bounds, separation = hypotheses(*arrays)
+    share = np.stack([plan.fault_free[rows], plan.one[rows], plan.two[rows]], axis=1)
+    share = np.concatenate([share, np.where(plan.triples[rows], share.sum(axis=1) / 3.0, 0.0)[:, None]], axis=1)
+    reserved = np.where(plan.pairs[rows], 0.0, pair_sum(plan.prior[rows]))
+    level, spender, part, k, worst = lowered(offset, sigma, weight, bounds, share, reserved)
 
-    n, pairs = prior.shape[1], plan.pairs[rows]
-    first, second = np.triu_indices(n, 1)
-    double_separations, double_prior = [], []
-    if pairs.any() and n > 1:
-        double_separations.append(without_two(full, first, second))
-        double_prior.append(prior[:, first] * prior[:, second] * pairs[:, None])
-    for c, (_, members) in enumerate(plan.groups):
-        of_group = members[full.channel] & full.used
-        double_separations.append(without_constellation_and_one(full, of_group))
-        double_prior.append(plan.group_prior[rows, c : c + 1] * prior * ~of_group)
-    if wrong_map is not None:
-        double_separations.append(wrong_map[1])
-        double_prior.append(plan.map_prior * prior)
-    double_fault = _nothing(len(rows))
-    if double_separations:
-        every = np.concatenate(double_prior, axis=1)
-        double_fault = _part(_beside(double_separations), every, plan.two[rows], k_false_alarm, sigma)
-
-    triple_fault, of_three = _nothing(len(rows)), np.zeros(len(rows))
-    triples = plan.triples[rows]
-    if triples.any() and n > 2:
-        triple = np.array(list(combinations(range(n), 3)), dtype=np.intp)
-        triple_prior = prior[:, triple].prod(axis=2) * triples[:, None]
-        of_three = np.where(triples, (plan.fault_free[rows] + plan.one[rows] + plan.two[rows]) / 3.0, 0.0)
-        triple_fault = _part(without_three(full, triple), triple_prior, of_three, k_false_alarm, sigma)
-
-    noise = Tails(offset_m=full.bias_m[:, None], sigma_m=sigma[:, None], weight=np.full((len(rows), 1), 2.0))
-    remaining_risk = plan.fault_free[rows] + plan.one[rows] + plan.two[rows] + of_three
-    remaining_risk = remaining_risk - single_fault.unchecked - double_fault.unchecked - triple_fault.unchecked
-    remaining_risk = remaining_risk - np.where(pairs, 0.0, pair_sum(prior))
-    above = np.maximum(
-        np.maximum(fault_free, single_fault.level_m), np.maximum(double_fault.level_m, triple_fault.level_m)
+    n = channel.shape[1]
+    result.level_m[rows], result.sigma_m[rows], result.k_false_alarm[rows] = (
+        level,
+        sigma[:, 0],
+        plan.k_false_alarm[rows],
     )
-    level, spender = least_level(
-        above, [noise, single_fault.tails, double_fault.tails, triple_fault.tails], remaining_risk
-    )
-    result.level_m[rows], result.sigma_m[rows] = level, sigma
-    result.fault_free_m[rows], result.k_fault_free[rows] = fault_free, k_fault_free
-    result.one_fault_m[rows], result.k_one_fault[rows] = single_fault.level_m, single_fault.k
-    result.two_fault_m[rows], result.k_two_faults[rows] = double_fault.level_m, double_fault.k
-    result.k_false_alarm[rows] = k_false_alarm
-    result.separation[rows] = np.maximum(
-        np.maximum(single_fault.separation, double_fault.separation), triple_fault.separation
-    )
-    result.consistent[rows] = result.separation[rows] <= 1.0
-    at = np.arange(len(rows))
-    has_single = (single_fault.worst >= 0) & (single_fault.worst < n)
-    result.worst_one[rows] = np.where(has_single, full.channel[at, np.where(has_single, single_fault.worst, 0)], -1)
-    # The last are the sides, a wrong map, and none.
-    letters = np.array([*(letter for letter, _ in plan.groups), *[""] * (sides.shape[1] + 2)])
-    result.worst_constellation[rows] = letters[np.where(single_fault.worst >= n, single_fault.worst - n, -1)]
-    if n > 1:
-        has_pair = (double_fault.worst >= 0) & (double_fault.worst < len(first)) & bool(pairs.any())
-        places = np.stack([first, second], axis=1)[np.where(has_pair, double_fault.worst, 0)]
-        channels = np.take_along_axis(full.channel, places, axis=1)
-        result.worst_two[rows] = np.where(has_pair[:, None], channels, -1)
+    result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = part.T[:3]
+    result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k.T[:3]
+    result.separation[rows], result.consistent[rows] = separation, separation <= 1.0
+    one, two = worst[:, 1], worst[:, 2]
+    result.worst_one[rows] = _channels(channel, np.where(one < n, one, -1)[:, None])[:, 0]
+    # After the channels: constellations, then the sides, a wrong map, and none.
+    letters = np.array([*plan.groups, *[""] * (plan.side_prior.shape[1] + 2)])
+    result.worst_constellation[rows] = letters[np.where(one >= n, one - n, -1)]
+    pairs = np.stack(np.triu_indices(n if plan.pairs[rows].any() else 0, 1), axis=1)
+    pairs = np.concatenate([pairs, [[-1, -1]]])
+    result.worst_two[rows] = _channels(channel, pairs[np.where(two < len(pairs), two, -1)])
     infinite = np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET)
     spent_on = np.where(spender == _OF_TRIPLES, Cause.THREE_FAULTS, spender)
     result.cause[rows] = np.where(np.isinf(level), infinite, spent_on)
-    result.unchecked_risk[rows] = plan.beyond[rows]
 
 
-def _beside(parts: list[Separations]) -> Separations:
-    """Hypotheses of several kinds, one after the other."""
-    names = [item.name for item in fields(Separations)]
-    return Separations(**{name: np.concatenate([getattr(p, name) for p in parts], axis=1) for name in names})
+def _channels(channel: Indices, place: Indices) -> Indices:
+    """Channels at places side by side, shape (T, k); -1 for -1."""
+    return np.where(place >= 0, np.take_along_axis(channel, np.maximum(place, 0), axis=1), -1)
 
 
-def _nothing(epochs: int) -> _Part:
-    """A part without hypotheses."""
-    zero, empty = np.zeros(epochs), np.zeros((epochs, 0))
-    return _Part(
-        level_m=zero,
-        k=np.full(epochs, -np.inf),
-        worst=np.full(epochs, -1, dtype=np.intp),
-        separation=zero,
-        tails=Tails(offset_m=empty, sigma_m=empty, weight=empty),
-        unchecked=zero,
-    )
+@compiled_by("hypotheses")
+def hypotheses(
+    root_weight: Floats,
+    clock: Indices,
+    clock_covariance_m2: Floats,
+    design: Floats,
+    covariance_m2: Floats,
+    map_prior: Floats,
+    misfit: Floats,
+    scale: Floats,
+    least_sigma_m: Floats,
+    bias_m: Floats,
+    map_bias_m: Floats,
+    map_seen_m: Floats,
+    map_information: Floats,
+    sides: Masks,
+    prior: Floats,
+    groups: Masks,
+    group_prior: Floats,
+    side_prior: Floats,
+    pairs: Masks,
+    triples: Masks,
+    k_false_alarm: Floats,
+    wrong_map: float,
+) -> tuple[Indices, Floats, Floats, Floats, Indices, Floats]:
+    """Return the tails of all hypotheses of a block of epochs: no fault, one, two and three.
 
+    Parameters are fields of `LinearModel` and of `Allocation`, and parameters of `along_track_level`, of these epochs
+    and in C order; `least_sigma_m` and `bias_m` of shape (T, 0) for none, `wrong_map` 0 for no such hypothesis.
 
-def _part(apart: Separations, prior: Floats, budget: Floats, k_false_alarm: Floats, sigma: Floats) -> _Part:
-    """The level that the hypotheses of one part ask for.
-
-    What nothing checks goes into the risk with its whole prior; the rest of it is for what is checked.
+    Returns
+    -------
+    channel : ndarray of int, shape (T, n)
+        Channels in use, side by side.
+    offset_m, sigma_m, weight : ndarray, shape (T, K)
+        As `tails.lowered` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), probability.
+    bounds : ndarray of int, shape (5,)
+    separation : ndarray, shape (T,)
+        `ProtectionLevel.separation`.
     """
-    blind = (prior > 0) & np.isinf(apart.sigma_m)
-    checked = (prior > 0) & ~blind
-    unchecked = (prior * blind).sum(axis=1)
-    total = (prior * checked).sum(axis=1)
-    left = budget - unchecked
-    needed = unchecked + total > budget
-    k = np.where(needed, one_sided_k(left / np.where(total > 0, total, np.inf)), -np.inf)
-    k = np.where(needed & (left > 0) & (total == 0), -np.inf, k)
-    usable = checked & np.isfinite(k)[:, None]
-    threshold = k_false_alarm[:, None] * apart.separation_sigma_m
-    offset = np.where(checked, threshold + apart.bias_m, 0.0)
-    tails = Tails(offset_m=offset, sigma_m=np.where(checked, apart.sigma_m, 1.0), weight=prior * checked)
-    with np.errstate(invalid="ignore"):
-        each = np.where(usable, offset + k[:, None] * tails.sigma_m, -np.inf)
-    spent = needed & (left <= 0)
-    culprits = np.where(np.any(blind, axis=1, keepdims=True), blind, checked)
-    each = np.where(spent[:, None] & culprits, np.inf, each)
-    level = np.maximum(each.max(axis=1), 0.0)
-    worst = np.where(each.max(axis=1) > -np.inf, np.argmax(each, axis=1), -1)
-    moving = checked & (apart.separation_sigma_m > _SAME * sigma[:, None])
-    ratio = np.where(moving, np.abs(apart.moved_m) / np.where(moving, threshold, 1.0), 0.0)
-    return _Part(
-        level_m=level,
-        k=k,
-        worst=np.asarray(worst, dtype=np.intp),
-        separation=ratio.max(axis=1),
-        tails=tails,
-        unchecked=unchecked,
+    model = LinearModel(
+        root_weight=root_weight,
+        clock=clock,
+        clock_covariance_m2=clock_covariance_m2,
+        design=design,
+        covariance_m2=covariance_m2,
+        prior=map_prior,
+        misfit=misfit,
+        freedom=np.zeros(len(scale), dtype=np.int64),
+        interest=1,
     )
+    full = all_in_view(model, scale, least_sigma_m, bias_m, map_bias_m)
+    n, zero = full.channel.shape[1], np.zeros((len(scale), 1))
+    likely = np.take_along_axis(prior, full.channel, axis=1) * full.used
+    none = Separations(
+        sigma_m=full.sigma_m[:, None], separation_sigma_m=zero, moved_m=zero, bias_m=full.bias_m[:, None]
+    )
+    ones, twos, threes = [(without_one(full), likely)], [], []
+    if pairs.any():
+        i, j = np.triu_indices(n, 1)
+        twos.append((without_two(full, i, j), likely[:, i] * likely[:, j] * pairs[:, None]))
+    for c, members in enumerate(groups):
+        of_group, of_all = members[full.channel] & full.used, group_prior[:, c, None]
+        ones.append((without_group(full, of_group), of_all))
+        twos.append((without_group_and_one(full, of_group), of_all * likely * ~of_group))
+    for c in range(sides.shape[1]):
+        of_side = np.take_along_axis(sides[:, c], full.channel, axis=1) & full.used
+        ones.append((without_group(full, of_side), side_prior[:, c, None]))
+    if wrong_map > 0.0:
+        alone, with_one = without_map(full, model, map_seen_m, map_information)
+        ones.append((alone, zero + wrong_map))
+        twos.append((with_one, wrong_map * likely))
+    if triples.any():
+        i, j, k = np.array(list(combinations(range(n), 3)), dtype=np.intp).reshape(-1, 3).T
+        of_three = likely[:, i] * likely[:, j] * likely[:, k] * triples[:, None]
+        threes.append((without_three(full, i, j, k), of_three))
+    kinds = [[(none, zero + 2.0)], ones, twos, threes]  # noise passes on either side
+    apart = [part for kind in kinds for part, _ in kind]
+    weight = np.concatenate([each for kind in kinds for _, each in kind], axis=1)
+    sigma, between, moved, bias = (
+        np.concatenate([getattr(part, item.name) for part in apart], axis=1) for item in fields(Separations)
+    )
+    threshold = k_false_alarm[:, None] * between
+    moving = (weight > 0.0) & (between > _SAME * sigma[:, :1])
+    separation = np.max(np.abs(moved) / np.where(moving, threshold, np.inf), axis=1)
+    bounds = np.cumsum([0, *(sum(each.shape[1] for _, each in kind) for kind in kinds)])
+    return full.channel, threshold + bias, sigma, weight, bounds, separation

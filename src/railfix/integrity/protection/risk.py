@@ -199,17 +199,27 @@ class RiskBudget(Settings):
 
 def pair_sum(prior: Floats) -> Floats:
     """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""
-    return np.asarray((prior.sum(axis=1) ** 2 - (prior**2).sum(axis=1)) / 2.0)
+    one, two = _power_sums(prior, 2)
+    return np.asarray((one * one - two) / 2.0)
+
+
+def _power_sums(prior: Floats, most: int) -> list[Floats]:
+    """Sums of the powers up to `most`, each of shape (T,)."""
+    power, sums = prior, [prior.sum(axis=1)]
+    for _ in range(most - 1):
+        power = power * prior
+        sums.append(power.sum(axis=1))
+    return sums
 
 
 def more_than_three(prior: Floats) -> Floats:
     """Bound of the probability of four faults or more: the sum over sets of four, shape (T, M) to (T,)."""
-    one, two, three, four = (np.sum(prior**k, axis=1) for k in (1, 2, 3, 4))
+    one, two, three, four = _power_sums(prior, 4)
     total = one**4 - 6.0 * one**2 * two + 3.0 * two**2 + 8.0 * one * three - 6.0 * four
     return np.asarray(np.maximum(total / 24.0, 0.0))
 
 
 def more_than_two(prior: Floats) -> Floats:
     """Bound of the probability of three faults or more: the sum over triples of their product, shape (T, M) to (T,)."""
-    one, two, three = (np.sum(prior**k, axis=1) for k in (1, 2, 3))
+    one, two, three = _power_sums(prior, 3)
     return np.asarray(np.maximum((one**3 - 3.0 * one * two + 2.0 * three) / 6.0, 0.0))

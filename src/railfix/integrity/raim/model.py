@@ -196,12 +196,10 @@ def side_by_side(
     used = np.take_along_axis(used, channel, axis=1)
     root = np.take_along_axis(root_weight, channel, axis=1)
     design = np.take_along_axis(design, channel[..., None], axis=1)
-    own = clock[channel]
-    epoch = np.arange(len(root))[:, None, None]
-    projector = clock_covariance_m2[epoch, own[:, :, None], own[:, None, :]]
-    projector *= -root[:, :, None]
-    projector *= root[:, None, :]
-    projector -= (design @ covariance_m2) @ design.swapaxes(1, 2)
+    clocks = root[..., None] * (clock[channel][..., None] == np.arange(clock_covariance_m2.shape[1]))
+    unknowns = np.concatenate([clocks, design], axis=2)
+    spread = np.concatenate([clocks @ clock_covariance_m2, design @ covariance_m2], axis=2)
+    projector = -spread @ unknowns.swapaxes(1, 2)
     projector[:, np.arange(n), np.arange(n)] += used
     return (
         channel,
