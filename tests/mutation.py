@@ -34,7 +34,8 @@ TESTS: Final = {
     "ranges/cn0_curve": "cn0_curve screens_cn0",
     "integrity": "raim_model protection_level stanford",
     "integrity/raim": "raim_model raim_detection raim_exclusion raim_reliability",
-    "integrity/protection": "protection_level protection_risk protection_separation protection_sbas",
+    "integrity/protection": "protection_risk protection_separation protection_sbas protection_level",
+    "positioning/map_offset": "map_offset",
     "pipeline/sensor_epochs": "sensor_epochs",
     "pipeline/received": "received",
     "pipeline/along_track": "train_output tracking",
@@ -94,13 +95,14 @@ def code_nodes(tree: ast.AST, *, inside: bool = False) -> Iterator[tuple[ast.AST
 
 
 def mutants_of(package: str) -> list[Mutant]:
-    """Every possible mutant of the functions of a package."""
-    mutants = []
-    for path in sorted((SOURCE / package).rglob("*.py")):
+    """Every possible mutant of the functions of a package, or of a module."""
+    mutants, module = [], SOURCE / f"{package}.py"
+    for path in [module] if module.is_file() else sorted((SOURCE / package).rglob("*.py")):
         for number, (node, free) in enumerate(code_nodes(ast.parse(path.read_text(encoding="utf-8")))):
             if free and (result := changed(node)) is not None:
-                module = path.relative_to(SOURCE).as_posix()
-                mutants.append(Mutant(module, number, getattr(node, "lineno", 0), result[1]))
+                mutants.append(
+                    Mutant(path.relative_to(SOURCE).as_posix(), number, getattr(node, "lineno", 0), result[1])
+                )
     return mutants
 
 
@@ -133,7 +135,7 @@ def passes(source: Path, files: tuple[str, ...], limit_s: float) -> bool:
 def main() -> None:
     """Draw mutants, run the tests, print survivors and the score."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("package", help="for example ranges, integrity, pipeline or ranges/sbas")
+    parser.add_argument("package", help="for example ranges, integrity, ranges/sbas or positioning/map_offset")
     parser.add_argument("--sample", type=int, default=40, help="mutants to draw (default 40)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=30.0, help="no new mutant is begun after so long (default 30)")
