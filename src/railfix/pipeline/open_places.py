@@ -2,83 +2,38 @@
 
 A level is linear: it bounds the error along the tangent at the position. Where the line turns away, passes itself or
 branches, a satellite left out can move the position to a place that no tangent leads to. Under each hypothesis
-of the level (no fault, one faulty satellite, two) the weighted sum of squared residuals is a quadratic form in the
-place, which is evaluated along the line around the position.
+of the level (no fault, one faulty satellite, two) the sum of squared residuals (`off_tangent.Forms`) is evaluated along
+the line around the position, where a bound does not rule such places out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from itertools import chain
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.special import ndtr
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.protection import RiskBudget
-from railfix.integrity.protection.risk import one_sided_k
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
-from railfix.integrity.raim.model import Compact, compact
-from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import inverse_3x3
+from railfix.integrity.raim.model import Compact
+from railfix.pipeline.off_tangent import Forms, risk_off_tangent, whitened
 from railfix.positioning.section_search import SearchIndex
 
 #: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
 _ALONG: Final = 0.9945
-#: Furthest places looked at [m]: the linear model of a range is off by 0.7 m there.
-_FURTHEST_M: Final = 5000.0
 #: Distance up to which the line is looked over for parts off the tangent before anything else [m].
 _CLEAR_M: Final = 200.0
 #: Points this near to a tangent are not off it beyond any level [m].
 _ON_TANGENT_M: Final = 1e-3
-#: Share of the risk of a sample below which places are not looked for.
-_NEGLIGIBLE: Final = 0.01
 #: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
 _BLOCK_SIZE: Final = 300_000
 #: Numbers that a block of epochs by channels squared holds.
-_BOUND_SIZE: Final = 100_000
-
-
-@dataclass(frozen=True)
-class _Forms:
-    """Sum of squared residuals in variances, over the place d from the position, under K hypotheses, T epochs.
-
-    ``q(d) = constant - 2 d . slope + d^T matrix d``, d along, across and up at the position.
-    """
-
-    prior: Floats  # (T, K)
-    constant: Floats  # (T, K)
-    slope: Floats  # (T, K, 3) [1/m]
-    matrix: Floats  # (T, K, 3, 3) [1/m^2]
-
-    def take(self, epochs: Indices) -> _Forms:
-        """Return the forms of some epochs, by index."""
-        return _Forms(self.prior[epochs], self.constant[epochs], self.slope[epochs], self.matrix[epochs])
-
-    def coefficients(self) -> Floats:
-        """Return the coefficients of the monomials of `_Sections.monomials`, shape (T, 10, K)."""
-        of_squares = [self.matrix[..., i, i] for i in range(3)]
-        of_products = [2.0 * self.matrix[..., i, j] for i, j in ((0, 1), (0, 2), (1, 2))]
-        return np.stack([self.constant, *np.moveaxis(-2.0 * self.slope, 2, 0), *of_squares, *of_products], axis=1)
-
-    def radius_m(self, risk: float) -> Floats:
-        """Return the distance from the position within which all open places lie, shape (T,); `_FURTHEST_M` at most.
-
-        Places further away have a hundredth of the risk at most.
-        """
-        covariance = inverse_3x3(self.matrix)
-        centre = np.einsum("tkij,tkj->tki", covariance, self.slope)
-        form = np.maximum(np.einsum("tki,tki->tk", centre, self.slope), 0.0)
-        # The trace of a covariance is above its largest eigenvalue.
-        widest = np.trace(covariance, axis1=2, axis2=3)
-        total = self.prior.sum(axis=1, keepdims=True)
-        sigmas = np.maximum(one_sided_k(_NEGLIGIBLE * risk / np.where(total > 0, total, 1.0)), 0.0)
-        radius = np.linalg.norm(centre, axis=2) + np.sqrt((form + sigmas**2) * widest)
-        radius = np.where(self.prior > 0, np.nan_to_num(radius, nan=_FURTHEST_M), 0.0)
-        return np.asarray(np.minimum(radius.max(axis=1), _FURTHEST_M))
+_BOUND_SIZE: Final = 30_000
 
 
 @dataclass(frozen=True)
@@ -147,25 +102,21 @@ def places_beyond_the_level(
         return result
     channels = int(np.count_nonzero(model.used[rows], axis=1).max())
     size = max(1, _BOUND_SIZE // channels**2)
+    line, likely = index.trajectory, risk.prior(systems)
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
-        parts, design, none = _whitened(model.take(block), index, np.maximum(scale[block], 1.0))
-        prior = np.where(parts.used, risk.prior(systems)[parts.channel], 0.0)
-        bound = risk_off_tangent(
-            parts.projector,
-            parts.residual,
-            design,
-            prior,
-            none.slope[:, 0],
-            none.matrix[:, 0],
-            _off_tangent_m(index, arc_m[block]),
+        part, noise = model.take(block), np.maximum(scale[block], 1.0)
+        arrays: Iterable[Any] = (
+            *(part.root_weight, part.clock, part.clock_covariance_m2, part.design, part.covariance_m2, part.prior),
+            *(part.misfit, noise, likely, _off_tangent_m(index, arc_m[block])),
         )
-        near = np.flatnonzero(bound > risk.risk_per_sample)
+        arrays = (*map(np.ascontiguousarray, arrays), line.sigma_plan_m, line.sigma_height_m, risk.risk_per_sample)
+        near = np.flatnonzero(risk_off_tangent(*arrays) > risk.risk_per_sample)
         for some in np.array_split(near, 1 + 9 * len(near) // size) if len(near) else ():
             rest = block[some]
-            spent = _risk_of_block(
-                index, arc_m[rest], level_m[rest], parts.take(some), design[some], none.take(some), prior[some], risk
-            )
+            parts, design, none = whitened(part.take(some), line.sigma_plan_m, line.sigma_height_m, noise[some])
+            prior = np.where(parts.used, likely[parts.channel], 0.0)
+            spent = _risk_of_block(index, arc_m[rest], level_m[rest], parts, design, none, prior, risk)
             result[rest] = spent > risk.risk_per_sample
     return result
 
@@ -207,103 +158,13 @@ def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
     return np.asarray(index.off_tangent_m[section])
 
 
-@compiled_by("open_places")
-def risk_off_tangent(
-    projector: Floats,
-    residual: Floats,
-    design: Floats,
-    prior: Floats,
-    slope: Floats,
-    matrix: Floats,
-    clear_m: Floats,
-) -> Floats:
-    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance.
-
-    At a distance D along and across a form exceeds its value at the position by ``(D - |c|)^2 / trace(C) - c . s`` at
-    least: c its lowest place and C the inverse of its matrix, both along and across, and s its slope.
-
-    Parameters
-    ----------
-    projector : ndarray, shape (T, n, n)
-    residual, prior : ndarray, shape (T, n)
-    design : ndarray, shape (T, n, 3)
-    slope : ndarray, shape (T, 3)
-    matrix : ndarray, shape (T, 3, 3)
-        Of the form without a fault.
-    clear_m : ndarray, shape (T,) [m]
-        Distance within which no place is off the tangent.
-
-    Returns
-    -------
-    ndarray, shape (T,)
-        Summed over no fault, one faulty satellite and two.
-    """
-    share = np.einsum("tii->ti", projector)
-    s = [slope[:, a, None] for a in range(3)]
-    entries = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    m = {(a, b): matrix[:, a, b, None] for a, b in entries}
-    f = [design[..., a] for a in range(3)]
-    total = _bounded(np.full((len(clear_m), 1), 2.0), s, m, clear_m)
-
-    checked = share > LEAST_REDUNDANCY
-    inverse = np.where(checked, 1.0 / np.where(checked, share, 1.0), 0.0)
-    own = inverse * residual
-    scaled = [inverse * f[a] for a in range(3)]
-    total += _bounded(
-        prior, [s[a] - own * f[a] for a in range(3)], {(a, b): m[a, b] - scaled[a] * f[b] for a, b in entries}, clear_m
-    )
-
-    n = prior.shape[1]
-    i, j = np.triu_indices(n, 1)
-    a_i, b_ij, c_j = share[:, i], np.take(projector.reshape(-1, n * n), i * n + j, axis=1), share[:, j]
-    product = a_i * c_j
-    determinant = product - b_ij * b_ij
-    checked = (np.minimum(a_i, c_j) > LEAST_REDUNDANCY) & (determinant > LEAST_REDUNDANCY * product)
-    inverse = np.where(checked, 1.0 / np.where(checked, determinant, 1.0), 0.0)
-    a_i, b_ij, c_j = a_i * inverse, b_ij * inverse, c_j * inverse
-    one, two = residual[:, i], residual[:, j]
-    own_one, own_two = c_j * one - b_ij * two, a_i * two - b_ij * one
-    first, second = [f[a][:, i] for a in range(3)], [f[a][:, j] for a in range(3)]
-    move_one = [c_j * first[a] - b_ij * second[a] for a in range(3)]
-    move_two = [a_i * second[a] - b_ij * first[a] for a in range(3)]
-    return total + _bounded(
-        prior[:, i] * prior[:, j],
-        [s[a] - own_one * first[a] - own_two * second[a] for a in range(3)],
-        {(a, b): m[a, b] - move_one[a] * first[b] - move_two[a] * second[b] for a, b in entries},
-        clear_m,
-    )
-
-
-def _bounded(
-    prior: Floats, slope: Sequence[Floats], matrix: Mapping[tuple[int, int], Floats], clear_m: Floats
-) -> Floats:
-    """Return the bound of `risk_off_tangent` over K hypotheses, shape (T,): prior (T, K), parts of slope and matrix."""
-    xx, xy, xz, yy, yz, zz = (matrix[key] for key in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    s, t, u = slope
-    c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-    c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-    determinant = xx * c_xx + xy * c_xy + xz * c_xz
-    regular = determinant > 1e-12 * ((xx + yy + zz) / 3.0) ** 3
-    inverse = 1.0 / np.where(regular, determinant, 1.0)
-    x, y, z = (
-        (c_xx * s + c_xy * t + c_xz * u) * inverse,
-        (c_xy * s + c_yy * t + c_yz * u) * inverse,
-        (c_xz * s + c_yz * t + c_zz * u) * inverse,
-    )
-    gap = np.maximum(clear_m[:, None] - np.sqrt(x * x + y * y), 0.0)
-    spread = np.where(regular, (c_xx + c_yy) * inverse, np.inf)
-    excess = gap * gap / spread - np.maximum(x * s + y * t + z * u, 0.0)
-    tail = np.where(excess > 0.0, ndtr(-np.sqrt(np.maximum(excess, 0.0))), 1.0)
-    return np.asarray((prior * tail).sum(axis=1))
-
-
 def _risk_of_block(
     index: SearchIndex,
     arc_m: Floats,
     level_m: Floats,
     parts: Compact,
     design: Floats,
-    none: _Forms,
+    none: Forms,
     prior: Floats,
     risk: RiskBudget,
 ) -> Floats:
@@ -318,8 +179,8 @@ def _risk_of_block(
     return spent
 
 
-def _beside(first: _Forms, second: _Forms) -> _Forms:
-    return _Forms(
+def _beside(first: Forms, second: Forms) -> Forms:
+    return Forms(
         *(
             np.concatenate([getattr(first, name), getattr(second, name)], axis=1)
             for name in ("prior", "constant", "slope", "matrix")
@@ -327,36 +188,12 @@ def _beside(first: _Forms, second: _Forms) -> _Forms:
     )
 
 
-def _whitened(model: LinearModel, index: SearchIndex, scale: Floats) -> tuple[Compact, Floats, _Forms]:
-    """Return the residuals with the map error in the noise, their change with the place, and the form without fault.
-
-    The map error is taken alike in all horizontal directions: another place has another tangent.
-    """
-    plan, height = index.trajectory.sigma_plan_m, index.trajectory.sigma_height_m
-    normal = np.linalg.inv(model.covariance_m2) - model.prior
-    prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])
-    covariance = np.asarray(np.linalg.inv(normal + prior), dtype=np.float64)
-    whole = replace(model, covariance_m2=covariance)
-    parts = compact(whole)
-    spread = covariance @ prior
-    design = np.take_along_axis(model.design @ spread, parts.channel[..., None], axis=1) / scale[:, None, None]
-    misfit = np.take_along_axis(model.misfit, parts.channel, axis=1) / scale[:, None]
-    parts = replace(parts, residual=parts.residual / scale[:, None])
-    none = _Forms(
-        prior=np.full((len(scale), 1), 2.0),  # noise passes on either side
-        constant=np.einsum("tn,tn->t", misfit, parts.residual)[:, None],
-        slope=np.einsum("tni,tn->ti", design, misfit)[:, None],
-        matrix=(normal @ spread / scale[:, None, None] ** 2)[:, None],
-    )
-    return parts, design, none
-
-
-def _without_one(parts: Compact, design: Floats, none: _Forms, prior: Floats) -> _Forms:
+def _without_one(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:
     """Forms with each channel left out, K = n."""
     share = np.einsum("tii->ti", parts.projector)
     checked = share > LEAST_REDUNDANCY
     inverse = np.where(checked, 1.0 / np.where(checked, share, 1.0), 0.0)
-    return _Forms(
+    return Forms(
         prior=prior,
         constant=none.constant - inverse * parts.residual**2,
         slope=none.slope - (inverse * parts.residual)[..., None] * design,
@@ -364,7 +201,7 @@ def _without_one(parts: Compact, design: Floats, none: _Forms, prior: Floats) ->
     )
 
 
-def _without_two(parts: Compact, design: Floats, none: _Forms, prior: Floats) -> _Forms:
+def _without_two(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:
     """Forms with each pair of channels left out."""
     i, j = np.triu_indices(parts.channel.shape[1], 1)
     share = np.einsum("tii->ti", parts.projector)
@@ -378,7 +215,7 @@ def _without_two(parts: Compact, design: Floats, none: _Forms, prior: Floats) ->
     first, second = design[:, i], design[:, j]
     move_one = (c[..., None] * first - b[..., None] * second) * inverse[..., None]
     move_two = (a[..., None] * second - b[..., None] * first) * inverse[..., None]
-    return _Forms(
+    return Forms(
         prior=prior[:, i] * prior[:, j],
         constant=none.constant - one * own_one - two * own_two,
         slope=none.slope - own_one[..., None] * first - own_two[..., None] * second,
@@ -419,7 +256,7 @@ def _around(index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
     return _Sections(epoch[pair], ends[:, 0], tangent[pair], high - low, beyond).take(turning[epoch[pair]])
 
 
-def _risk_beyond(forms: _Forms, sections: _Sections) -> Floats:
+def _risk_beyond(forms: Forms, sections: _Sections) -> Floats:
     """Probability that the true place lies beyond the level, summed over the hypotheses, shape (T,)."""
     spent = np.zeros(len(forms.prior))
     epochs, starts, count = np.unique(sections.epoch, return_index=True, return_counts=True)

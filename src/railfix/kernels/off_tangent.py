@@ -1,0 +1,220 @@
+"""Compiled function of `railfix.pipeline.off_tangent`: bound of the risk off the tangent."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices
+from railfix.kernels.compiling import kernel
+
+#: `railfix.integrity.raim.exclusion.LEAST_REDUNDANCY`.
+_LEAST_REDUNDANCY = 1e-9
+
+
+@kernel
+def _inverse(matrix: Floats) -> Floats:
+    """Return the inverse of a symmetric 3 x 3 matrix; not finite where it is singular."""
+    inverse = np.empty((3, 3))
+    for a in range(3):
+        i, j = (a + 1) % 3, (a + 2) % 3
+        for b in range(3):
+            k, m = (b + 1) % 3, (b + 2) % 3
+            inverse[a, b] = matrix[i, k] * matrix[j, m] - matrix[i, m] * matrix[j, k]
+    determinant = matrix[0, 0] * inverse[0, 0] + matrix[0, 1] * inverse[0, 1] + matrix[0, 2] * inverse[0, 2]
+    inverse /= determinant
+    return inverse
+
+
+@kernel
+def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
+    """Return the tail of the form that is ``1 - tau`` times that of all at least."""
+    if not tau < 1.0:
+        return 1.0
+    form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
+    gap = max(clear_m - math.sqrt(spread / (1.0 - tau) * form), 0.0)
+    excess = gap * gap * (1.0 - tau) / spread - form
+    return 0.5 * math.erfc(math.sqrt(0.5 * excess)) if excess > 0.0 else 1.0
+
+
+@kernel
+def risk_off_tangent(
+    root_weight: Floats,
+    clock: Indices,
+    clock_covariance_m2: Floats,
+    design: Floats,
+    covariance_m2: Floats,
+    map_prior: Floats,
+    misfit: Floats,
+    scale: Floats,
+    likely: Floats,
+    clear_m: Floats,
+    sigma_plan_m: float,
+    sigma_height_m: float,
+    enough: float,
+) -> Floats:
+    """Return an upper bound of the probability that the true place lies off the tangent beyond a distance."""
+    epochs, channels = root_weight.shape
+    clocks, total = clock_covariance_m2.shape[1], np.empty(epochs)
+    used, prior, leverage = np.empty(channels, dtype=np.intp), np.empty(channels), np.empty(channels)
+    projector, effect, residual = np.empty((channels, channels)), np.empty((channels, channels)), np.empty(channels)
+    rows, spread_of, asked = np.empty((channels, 3)), np.empty((channels, 3)), np.empty(clocks)
+    pull, step, slope, of_map = np.empty(3), np.empty(3), np.empty(3), np.zeros(3)
+    for t in range(epochs):
+        n, noise = 0, scale[t]
+        for m in range(channels):
+            if root_weight[t, m] > 0.0:
+                used[n], prior[n] = m, likely[m]
+                n += 1
+        # The map error alike in all horizontal directions, and the place that the residuals ask for then.
+        normal = _inverse(covariance_m2[t]) - map_prior
+        of_map[0] = of_map[1] = (noise / sigma_plan_m) ** 2
+        of_map[2] = (noise / sigma_height_m) ** 2
+        covariance = _inverse(normal + np.diag(of_map))
+        asked[:] = 0.0
+        pull[:] = 0.0
+        for i in range(n):
+            m = used[i]
+            asked[clock[m]] += root_weight[t, m] * misfit[t, m]
+            for a in range(3):
+                pull[a] += misfit[t, m] * design[t, m, a]
+        for a in range(3):
+            step[a] = pull[0] * covariance[0, a] + pull[1] * covariance[1, a] + pull[2] * covariance[2, a]
+        slope[:] = 0.0
+        constant = 0.0
+        for i in range(n):
+            m = used[i]
+            of_clock = 0.0
+            for g in range(clocks):
+                of_clock += clock_covariance_m2[t, clock[m], g] * asked[g]
+            residual[i] = misfit[t, m] - root_weight[t, m] * of_clock
+            for a in range(3):
+                residual[i] -= design[t, m, a] * step[a]
+                value = 0.0
+                for b in range(3):
+                    value += design[t, m, b] * covariance[b, a]
+                spread_of[i, a] = value
+                rows[i, a] = value * of_map[a] / noise
+                slope[a] += rows[i, a] * misfit[t, m] / noise
+            residual[i] /= noise
+            constant += residual[i] * misfit[t, m] / noise
+            for j in range(i + 1):
+                k = used[j]
+                value = -root_weight[t, m] * root_weight[t, k] * clock_covariance_m2[t, clock[m], clock[k]]
+                for a in range(3):
+                    value -= spread_of[i, a] * design[t, k, a]
+                projector[i, j], projector[j, i] = value, value
+            projector[i, i] += 1.0
+        matrix = np.empty((3, 3))
+        for a in range(3):
+            for b in range(3):
+                value = 0.0
+                for k in range(3):
+                    value += normal[a, k] * covariance[k, b]
+                matrix[a, b] = value * of_map[b] / noise**2
+
+        # The largest tau of one channel and of two.
+        of_all = _inverse(matrix)
+        spread, start, one, two = of_all[0, 0] + of_all[1, 1], 0.0, 0.0, 0.0
+        for a in range(3):
+            for b in range(3):
+                start += slope[a] * of_all[a, b] * slope[b]
+        start = math.sqrt(max(start, 0.0))
+        singles, squares = 0.0, 0.0
+        for i in range(n):
+            x = rows[i, 0] * of_all[0, 0] + rows[i, 1] * of_all[1, 0] + rows[i, 2] * of_all[2, 0]
+            y = rows[i, 0] * of_all[0, 1] + rows[i, 1] * of_all[1, 1] + rows[i, 2] * of_all[2, 1]
+            z = rows[i, 0] * of_all[0, 2] + rows[i, 1] * of_all[1, 2] + rows[i, 2] * of_all[2, 2]
+            for j in range(i + 1):
+                effect[i, j] = x * rows[j, 0] + y * rows[j, 1] + z * rows[j, 2]
+            leverage[i] = effect[i, i]
+            singles += prior[i]
+            squares += prior[i] * prior[i]
+            if projector[i, i] > _LEAST_REDUNDANCY:
+                one = max(one, leverage[i] / projector[i, i])
+        for i in range(n):
+            a = projector[i, i]
+            for j in range(i):
+                b, c = projector[i, j], projector[j, j]
+                det = a * c - b * b
+                tau = (c * leverage[i] + a * leverage[j] - 2.0 * b * effect[i, j]) / det
+                regular = det > _LEAST_REDUNDANCY * a * c and min(a, c) > _LEAST_REDUNDANCY
+                two = max(two, tau if regular else 0.0)
+        root = math.sqrt(max(constant, 0.0))
+        total[t] = 2.0 * _tail(clear_m[t], spread, start, root, 0.0)
+        total[t] += singles * _tail(clear_m[t], spread, start, root, one)
+        total[t] += 0.5 * (singles * singles - squares) * _tail(clear_m[t], spread, start, root, two)
+        if total[t] <= enough:
+            continue
+        s, r, u = slope[0], slope[1], slope[2]
+        m_xx, m_xy, m_xz = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+        m_yy, m_yz, m_zz = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+        spent = 0.0
+        # One hypothesis after the other: none, each channel (j = -1), each pair.
+        for i in range(-1, n):
+            for j in range(-1, i if i >= 0 else 0):
+                if i < 0:
+                    p = 2.0
+                elif j < 0:
+                    p = prior[i]
+                else:
+                    p = prior[i] * prior[j]
+                if p == 0.0:
+                    continue
+                sx, sy, sz = s, r, u
+                xx, xy, xz, yy, yz, zz = m_xx, m_xy, m_xz, m_yy, m_yz, m_zz
+                if i >= 0:
+                    a = projector[i, i]
+                    fx, fy, fz = rows[i, 0], rows[i, 1], rows[i, 2]
+                    if j < 0:
+                        w = 1.0 / a if a > _LEAST_REDUNDANCY else 0.0
+                        own = w * residual[i]
+                        sx -= own * fx
+                        sy -= own * fy
+                        sz -= own * fz
+                        xx -= w * fx * fx
+                        xy -= w * fx * fy
+                        xz -= w * fx * fz
+                        yy -= w * fy * fy
+                        yz -= w * fy * fz
+                        zz -= w * fz * fz
+                    else:
+                        b, c = projector[j, i], projector[j, j]
+                        gx, gy, gz = rows[j, 0], rows[j, 1], rows[j, 2]
+                        det = a * c - b * b
+                        if min(a, c) > _LEAST_REDUNDANCY and det > _LEAST_REDUNDANCY * a * c:
+                            w = 1.0 / det
+                            a, b, c = a * w, b * w, c * w
+                            one, two = residual[i], residual[j]
+                            own_i, own_j = c * one - b * two, a * two - b * one
+                            sx -= own_i * fx + own_j * gx
+                            sy -= own_i * fy + own_j * gy
+                            sz -= own_i * fz + own_j * gz
+                            ix, iy, iz = c * fx - b * gx, c * fy - b * gy, c * fz - b * gz
+                            jx, jy, jz = a * gx - b * fx, a * gy - b * fy, a * gz - b * fz
+                            xx -= ix * fx + jx * gx
+                            xy -= ix * fy + jx * gy
+                            xz -= ix * fz + jx * gz
+                            yy -= iy * fy + jy * gy
+                            yz -= iy * fz + jy * gz
+                            zz -= iz * fz + jz * gz
+                c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+                c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+                det = xx * c_xx + xy * c_xy + xz * c_xz
+                mean = (xx + yy + zz) / 3.0
+                tail = 1.0
+                if det > 1e-12 * mean * mean * mean:
+                    inverse = 1.0 / det
+                    x = (c_xx * sx + c_xy * sy + c_xz * sz) * inverse
+                    y = (c_xy * sx + c_yy * sy + c_yz * sz) * inverse
+                    z = (c_xz * sx + c_yz * sy + c_zz * sz) * inverse
+                    gap = max(clear_m[t] - math.sqrt(x * x + y * y), 0.0)
+                    excess = gap * gap / ((c_xx + c_yy) * inverse) - max(x * sx + y * sy + z * sz, 0.0)
+                    if excess > 1400.0:
+                        tail = 0.0
+                    elif excess > 0.0:
+                        tail = 0.5 * math.erfc(math.sqrt(0.5 * excess))
+                spent += p * tail
+        total[t] = spent
+    return total
