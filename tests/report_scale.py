@@ -21,6 +21,7 @@ from statistics import median
 
 import polars as pl
 
+from railfix.pipeline.config import Config
 from railfix.report import write_report
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
@@ -35,7 +36,8 @@ def laid_end_to_end(table: pl.DataFrame, times: int, span: pl.Expr) -> pl.DataFr
 def long_run(folder: Path, epochs: int) -> tuple[Path, Path]:
     """A run of so many epochs an antenna, and its reference."""
     short = folder / "short"
-    run_files(demo_inputs(), out=short, options=RunOptions(observations="write", chunk_epochs=500))
+    options = RunOptions(observations="write", chunk_epochs=500)
+    run_files(demo_inputs(), Config(filter="track"), out=short, options=options)
     whole = folder / "long"
     whole.mkdir()
     positions = pl.read_parquet(short / "positions.parquet")
@@ -43,7 +45,7 @@ def long_run(folder: Path, epochs: int) -> tuple[Path, Path]:
     times = -(-epochs // each)
     step = positions["time_gpst"].unique().sort().diff().median()
     span = pl.lit(positions["time_gpst"].max() - positions["time_gpst"].min() + step)  # type: ignore[operator]
-    for name in ("positions.parquet", "observations.parquet"):
+    for name in ("positions.parquet", "train.parquet", "observations.parquet"):
         laid_end_to_end(pl.read_parquet(short / name), times, span).write_parquet(whole / name)
     truth = pl.read_csv(demo_truth(), schema_overrides={"time_gpst": pl.Datetime("ns")})
     laid_end_to_end(truth, times, span).write_csv(folder / "truth.csv", datetime_format="%Y-%m-%dT%H:%M:%S%.9f")
@@ -66,7 +68,7 @@ def write(run: Path, truth: Path, page: Path) -> None:
         while not done.wait(0.02):
             own[0] = max(own[0], anonymous_mb())
 
-    watcher = threading.Thread(target=watch)
+    watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
     write_report([run], page, references=[truth])
     took = time.perf_counter() - began

@@ -80,8 +80,16 @@ def test_errors_in_the_page_are_those_of_the_positions(page: Page, folder: Path)
     rows = pl.read_parquet(folder / "positions.parquet").with_columns(pl.col("antenna").cast(pl.String))
     rows = rows.join(truth.select("time_gpst", "antenna", true_m="chainage_m"), on=["time_gpst", "antenna"])
     for at, antenna in enumerate(("front", "rear")):
-        mine = rows.filter(antenna=antenna).sort("time_gpst")
-        for label, column in (("on the map", "chainage_m"), ("conventional", "conventional_chainage_m")):
+        all_rows = rows.filter(antenna=antenna).sort("time_gpst")
+        ok = pl.col("status") == "ok"
+        for label, column, kept in (
+            ("on the map", "chainage_m", ok),
+            ("on the map, failed a check", "chainage_m", ~ok),
+            ("conventional", "conventional_chainage_m", pl.lit(value=True)),
+        ):
+            mine = all_rows.filter(kept)
+            if not mine[column].count():
+                continue
             expected = (mine[column] - mine["true_m"]).drop_nulls().to_numpy()
             over_time = layer_of(chart(page, "error-time", at), label)
             np.testing.assert_allclose(unpacked(over_time["y"]), expected, atol=1e-3)
@@ -315,8 +323,8 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     document = report_page(runs, evaluation)
     assert evaluation is not None
     largest = evaluation.figure("max_m", run="run (train)", antenna="front")
-    assert "Filtered along the track, the train has a position at" in document
-    assert f"and the worst is {largest:.1f} m off." in document
+    assert "The filter along the track, which joins the epochs, has a position at" in document
+    assert f"the worst {largest:.1f} m off." in document
     assert f"filtered {largest:.2f} m</dd>" in document
 
 

@@ -93,6 +93,10 @@ class ByteStream(io.BufferedIOBase):
         except OSError as error:
             raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
 
+    def read1(self, size: int = -1, /) -> bytes:
+        """As `read`."""
+        return self.read(size)
+
     def close(self) -> None:
         """Close the file, end the decoder, remove temporary files."""
         if not self.closed:
@@ -198,6 +202,25 @@ def read_text(path: FilePath) -> str:
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise InputFileError(path, "is not UTF-8 text; save the file as UTF-8", line=line) from None
+
+
+def text_lines(path: FilePath) -> Iterator[str]:
+    """Yield the lines of a decompressed UTF-8 file, without a byte order mark and without their ends.
+
+    Raises
+    ------
+    InputFileError
+        As `open_stream`; not UTF-8.
+    """
+    number = 0
+    with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8-sig") as text:  # type: ignore[type-var]
+        try:
+            for line in text:
+                number += 1
+                yield from line.splitlines()
+        except UnicodeDecodeError:
+            message = "is not UTF-8 text; save the file as UTF-8"
+            raise InputFileError(path, message, line=number + 1) from None
 
 
 def ending(path: FilePath) -> str:

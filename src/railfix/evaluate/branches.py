@@ -14,6 +14,8 @@ from railfix.evaluate.scores import WRONG_PLACE_M
 #: Limits of the classes of probability.
 _EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 
+_USED: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
+
 #: Columns of the table of probabilities beside its keys, with their unit and meaning.
 BRANCH_COLUMNS: Final[dict[str, str]] = {
     "probability": "class of the stated probability of the place; `all` for every epoch",
@@ -36,9 +38,10 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     epochs : polars.DataFrame
         `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs.
     """
-    judged = epochs.filter(OF_FILTER).filter("in_reference", "reference_good", "positioned")
-    if not len(epochs.filter(OF_FILTER)):
+    filtered = epochs.select(*KEYS, *_USED).filter(OF_FILTER)
+    if not len(filtered):
         return None
+    judged = filtered.filter("in_reference", "reference_good", "positioned")
     names = [f"{low:g} to {high:g}" for low, high in pairwise(_EDGES)]
     rank = pl.sum_horizontal((pl.col("branch_probability") >= edge).cast(pl.Int64) for edge in _EDGES[1:-1])
     wrong = pl.col("distance_m") > WRONG_PLACE_M

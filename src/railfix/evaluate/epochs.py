@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -86,6 +87,11 @@ class AntennaEpochs:
     step_s: float
     from_sections: int
 
+    @property
+    def method(self) -> str:
+        """Method of the errors."""
+        return self.errors.method
+
 
 def level_columns(table: pl.DataFrame) -> list[str]:
     """Names of the columns of protection levels."""
@@ -97,6 +103,20 @@ def protection_columns(table: pl.DataFrame) -> list[str]:
     levels = level_columns(table)
     endings = [f"_protection_{name}" for name in (*PARTS, *STATED)]
     return levels + [name for name in table.columns if name.endswith(tuple(endings))]
+
+
+def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Tables one below the other, levels null where one has none. The tables are taken apart column by column."""
+    schema = {name: kind for table in tables for name, kind in table.schema.items()}
+    lengths = [len(table) for table in tables]
+    columns = []
+    for name in (*EPOCH_COLUMNS, *protection_columns(pl.DataFrame(schema=schema))):
+        parts = [
+            table.drop_in_place(name) if name in table.columns else pl.Series(name, dtype=schema[name]).clear(rows)
+            for table, rows in zip(tables, lengths, strict=True)
+        ]
+        columns.append(pl.concat(parts, rechunk=False))
+    return pl.DataFrame(columns)
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:

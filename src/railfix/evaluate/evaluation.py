@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import polars as pl
+import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
 from railfix.core.files import fingerprint
 from railfix.evaluate.branches import branch_table
-from railfix.evaluate.epochs import EPOCH_COLUMNS, AntennaEpochs, antenna_epochs, protection_columns
-from railfix.evaluate.figures import ALL, KEYS, WORDS, classed, figures_by
+from railfix.evaluate.epochs import antenna_epochs, below
+from railfix.evaluate.figures import ALL, KEYS, USED, figures_by
 from railfix.evaluate.integrity import Integrity, LevelledRun, integrity_of
 from railfix.evaluate.intervals import interval_table
 from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.outages import outage_table
 from railfix.evaluate.place import TrackFiles
-from railfix.evaluate.run_folder import POSITIONS_TABLE, UNKNOWN_KIND, RunFolder, read_run
+from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, UNKNOWN_KIND, RunFolder, read_run
 from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, read_reference
 
 #: Names of a reference that is looked for beside the log of a run.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
+#: Columns of the positions that are evaluated beside those of every table.
+_COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
+_FACTS: Final = ("method", "speed_from", "outside", "step_s")
 #: Blocks of one run are numbered apart from those of the next.
 _BLOCKS_APART: Final = 10**9
 
@@ -51,8 +55,6 @@ class RunAndReference:
     conventional : Path or None
         Folder of another run on the same log, whose conventional positions take the place of the run's own: one
         with the screens elevation and C/N0 alone gives those that P1 compares with.
-    folder : RunFolder or None
-        The run, if it has been read already.
     """
 
     run: Path
@@ -60,7 +62,6 @@ class RunAndReference:
     configuration: str | None = None
     table: str = POSITIONS_TABLE
     conventional: Path | None = None
-    folder: RunFolder | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,12 +167,17 @@ class Evaluation:
 
 @dataclass(kw_only=True)
 class _Part:
-    """One run with its reference and the table of its epochs."""
+    """One run with its reference and the epochs of each antenna; `facts` are of each antenna, see `EvaluatedRun`.
+
+    Its folder has no rows, `level` is the kind and the alarm limit of its protection levels.
+    """
 
     folder: RunFolder
+    level: tuple[str, float | None] | None
     reference: str
     configuration: str | None
-    antennas: dict[str, AntennaEpochs]
+    tables: list[pl.DataFrame]
+    facts: dict[str, dict[str, Any]]
     inputs: list[dict[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -227,28 +233,38 @@ def evaluate_runs(
     twice = [path for (path, _), count in counts.items() if count > 1]
     if twice:
         raise SettingsError(f"{twice[0]}: the run is given twice; give each run once")
-    parts = [_part(item, sections=sections, files=files, options=options) for item in runs]
+    read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]] = {}
+    parts = [_part(item, read, sections=sections, files=files, options=options) for item in runs]
+    read.clear()
     names = _names([part.folder for part in parts])
     labels = configurations([_settings(part.folder) for part in parts], [part.configuration for part in parts])
     tables = []
     for number, (part, name, label) in enumerate(zip(parts, names, labels, strict=True)):
-        table = pl.concat([antenna.table for antenna in part.antennas.values()], how="diagonal").with_columns(
-            run=pl.lit(name),
-            configuration=pl.lit(label),
-            line=pl.lit(part.folder.line_name),
-            block=pl.col("block") + number * _BLOCKS_APART,
-        )
-        tables.append(table)
-    epochs = pl.concat(tables, how="diagonal")
-    epochs = epochs.select(*EPOCH_COLUMNS, *protection_columns(epochs))
+        tables += [
+            table.with_columns(
+                run=pl.lit(name),
+                configuration=pl.lit(label),
+                line=pl.lit(part.folder.line_name),
+                block=pl.col("block") + number * _BLOCKS_APART,
+            )
+            for table in part.tables
+        ]
+        part.tables = []
+    epochs = below(tables)
+    del tables
     evaluated = tuple(_evaluated(*item) for item in zip(parts, names, labels, strict=True))
+    levelled = [
+        LevelledRun(name=name, kind=part.level[0], alarm_limit_m=part.level[1])
+        for part, name in zip(parts, names, strict=True)
+        if part.level is not None
+    ]
     return Evaluation(
         runs=evaluated,
         epochs=epochs,
         figures=_figures(epochs, options),
         intervals=_intervals(epochs),
         levels=level_table(epochs, list(KEYS)),
-        integrity=integrity_of(epochs, [run for run in map(_levelled, parts, names) if run is not None], options),
+        integrity=integrity_of(epochs, levelled, options),
         outages=outage_table(epochs),
         branches=branch_table(epochs),
         options=options,
@@ -256,21 +272,22 @@ def evaluate_runs(
     )
 
 
-def _levelled(part: _Part, name: str) -> LevelledRun | None:
-    """A run with its kind of levels; None without levels."""
-    kind = part.folder.level_kind
-    if kind is None or "protection_level_m" not in part.folder.positions.columns:
-        return None
-    return LevelledRun(name=name, kind=kind, alarm_limit_m=part.folder.alarm_limit_m)
-
-
-def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, options: EvaluationOptions) -> _Part:
-    folder = item.folder or read_run(item.run, table=item.table, conventional=item.conventional)
+def _part(
+    item: RunAndReference,
+    read: dict[tuple[Path, tuple[str, ...]], Mapping[str, AntennaReference]],
+    *,
+    sections: Path | None,
+    files: TrackFiles,
+    options: EvaluationOptions,
+) -> _Part:
+    """Epochs of one run; a reference that was read is kept in `read`."""
+    folder = read_run(item.run, table=item.table, conventional=item.conventional, columns=_COLUMNS)
+    kind = folder.level_kind if "protection_level_m" in folder.positions.columns else None
     inputs = [fingerprint("positions", folder.positions_path), fingerprint("record", folder.path / "run.json")]
     notes = []
     if item.conventional is not None:
         notes.append(f"the conventional positions are those of {item.conventional}")
-        inputs.append(fingerprint("conventional", read_run(item.conventional).positions_path))
+        inputs.append(fingerprint("conventional", read_run(item.conventional, columns=NO_MORE).positions_path))
     if isinstance(item.reference, Mapping):
         references, source = item.reference, "given"
         if missing := [name for name in folder.antennas if name not in references]:
@@ -279,7 +296,10 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
         path = item.reference or reference_beside(folder)
         if item.reference is None:
             notes.append(f"the reference was found beside the log: {path}")
-        references, source = read_reference(path, folder.antennas), str(path)
+        key = path, tuple(folder.antennas)
+        if key not in read:
+            read[key] = read_reference(path, folder.antennas)
+        references, source = read[key], str(path)
         inputs.append(fingerprint("reference", path))
     stretches = None
     if sections is not None:
@@ -289,8 +309,8 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
         name: antenna_epochs(folder, name, references[name], sections=stretches, files=files, options=options)
         for name in folder.antennas
     }
-    read = dict.fromkeys(pair for antenna in antennas.values() for pair in antenna.errors.files)
-    entries = [fingerprint(kind, path) for kind, path in read]
+    used = dict.fromkeys(pair for antenna in antennas.values() for pair in antenna.errors.files)
+    entries = [fingerprint(kind, path) for kind, path in used]
     recorded = {entry["sha256"] for entry in folder.record.get("inputs", ())}
     notes += [
         f"{entry['path']}: is not byte for byte the {entry['input']} of the run, but gives the same positions"
@@ -309,10 +329,12 @@ def _part(item: RunAndReference, *, sections: Path | None, files: TrackFiles, op
         notes.append("the run has no protection_status: levels are taken as usable where the status is ok")
     more = [note for antenna in antennas.values() for note in antenna.errors.notes]
     return _Part(
-        folder=folder,
+        folder=replace(folder, positions=folder.positions.clear()),
+        level=None if kind is None else (kind, folder.alarm_limit_m),
         reference=source,
         configuration=item.configuration,
-        antennas=antennas,
+        tables=[antenna.table for antenna in antennas.values()],
+        facts={fact: {name: getattr(antenna, fact) for name, antenna in antennas.items()} for fact in _FACTS},
         inputs=inputs + entries,
         notes=list(dict.fromkeys([*notes, *more])),
     )
@@ -384,10 +406,7 @@ def _evaluated(part: _Part, name: str, label: str) -> EvaluatedRun:
         path=part.folder.path,
         table=part.folder.table,
         reference=part.reference,
-        method={name_of: epochs.errors.method for name_of, epochs in part.antennas.items()},
-        speed_from={name_of: epochs.speed_from for name_of, epochs in part.antennas.items()},
-        outside={name_of: epochs.outside for name_of, epochs in part.antennas.items()},
-        step_s={name_of: epochs.step_s for name_of, epochs in part.antennas.items()},
+        **part.facts,
         protection=part.folder.protection,
         settings=part.folder.settings,
         inputs=tuple(part.inputs),
@@ -400,30 +419,24 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
     Runs of different configurations are never put together: they may be of the same log.
     """
-    both = _with_all(classed(epochs, options))
-    tables = [figures_by(both, ("all", "section", "environment", "speed", "satellites", "signals", "status"), options)]
+    epochs = epochs.select(*KEYS, *USED)
+    groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
+    tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]
     if epochs["run"].n_unique() > 1:
-        named = both.with_columns(
-            pl.col("configuration").alias("configuration_group"),
-            pl.col("line").alias("line_group"),
-            configuration_rank=pl.lit(0),
-            line_rank=pl.lit(0),
-        )
-        tables.append(figures_by(_as_one(named, ["run", "line"]), ("configuration", "environment", "speed"), options))
-        tables.append(figures_by(_as_one(named, ["run"]), ("line",), options))
+        pooled = _parts(epochs, "configuration", ("run", "line"))
+        tables.append(figures_by(pooled, ("configuration", "environment", "speed"), options))
+        tables.append(figures_by(_parts(epochs, "configuration", ("run",)), ("line",), options))
     return pl.concat(tables)
 
 
-def _as_one(epochs: pl.DataFrame, keys: Sequence[str]) -> pl.DataFrame:
-    """The rows with `ALL` in place of what names them apart."""
-    return epochs.with_columns(pl.lit(ALL).cast(WORDS).alias(key) for key in keys)
+def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
+    """Rows of each value of a column, then the same with both antennas as one, where there are two.
 
-
-def _with_all(epochs: pl.DataFrame) -> pl.DataFrame:
-    """The rows, and once more with both antennas as one, where there are two."""
-    if epochs["antenna"].n_unique() < 2:
-        return epochs
-    return pl.concat([epochs, _as_one(epochs, ["antenna"])])
+    The columns `as_one` have `ALL` in place of their values.
+    """
+    for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
+        for value in epochs[by].unique(maintain_order=True):
+            yield epochs.filter(pl.col(by) == value).with_columns(pl.lit(ALL).alias(key) for key in keys)
 
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
@@ -92,7 +92,8 @@ _LIMITS: Final = tuple(
 )
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
-_USED: Final = (
+#: Columns of the epochs that the figures are made of, beside the keys.
+USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
     "error_m", "conventional_error_m", "distance_m", "along_sigma_m", "block",
@@ -114,6 +115,8 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
         "satellites": pl.when(pl.col("n_used").is_null()).then(-1).otherwise(_rank(pl.col("n_used"), sats)),
         "signals": pl.when(AIDED).then(0).otherwise(1),
         "status": pl.col("status").replace_strict({s.text: int(s) for s in Status}, default=len(Status)),
+        "configuration": pl.lit(0),
+        "line": pl.lit(0),
     }
     begins = section * options.section_m
     names = {
@@ -124,8 +127,10 @@ def classed(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
         "satellites": pl.col("satellites_rank").replace_strict(dict(enumerate(_satellite_names(options), start=-1))),
         "signals": pl.when(AIDED).then(pl.lit(WITH_SATELLITES)).otherwise(pl.lit(WITHOUT_SATELLITES)),
         "status": pl.col("status"),
+        "configuration": pl.col("configuration"),
+        "line": pl.col("line"),
     }
-    inside = epochs.filter("in_reference").select(*KEYS, *_USED)
+    inside = epochs.filter("in_reference")
     ranked = inside.with_columns(rank.cast(pl.Int32).alias(f"{name}_rank") for name, rank in ranks.items())
     return ranked.with_columns(
         pl.col(KEYS).cast(WORDS),
@@ -185,13 +190,14 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
     )
 
 
-def figures_by(epochs: pl.DataFrame, groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
+def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
     """Figures, a row for every grouping, group, antenna, kind of position and choice of epochs.
 
     Parameters
     ----------
-    epochs : polars.DataFrame
-        From `classed`; its columns of `KEYS` are kept apart.
+    parts : iterable of polars.DataFrame
+        Epochs, `railfix.evaluate.epochs.EPOCH_COLUMNS`; parts and values of `KEYS` are kept apart. Memory is that of
+        the largest part.
     groupings : sequence of str
         Which classes: ``f"{grouping}_group"``.
     options : EvaluationOptions
@@ -202,17 +208,18 @@ def figures_by(epochs: pl.DataFrame, groupings: Sequence[str], options: Evaluati
         Columns of `FIGURE_COLUMNS`.
     """
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
-    tables: dict[str, list[pl.DataFrame]] = {grouping: [] for grouping in groupings}
-    for position, epochs_of in kinds:
-        part = series(epochs, position, epochs_of)
-        for grouping in groupings:
-            by = [*KEYS, f"{grouping}_rank", f"{grouping}_group"]
-            table = part.group_by(by, maintain_order=True).agg(_figures(options))
-            limited = epochs_of == "own" and grouping in WITH_LIMITS
-            tables[grouping].append(_with_limits(table, part if limited else None, by, options))
-    return pl.concat(
-        [_ordered(pl.concat(parts), grouping, options) for grouping, parts in tables.items()], how="vertical"
-    )
+    tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}
+    for epochs in parts:
+        ranked = classed(epochs, options)
+        for kind, (position, epochs_of) in enumerate(kinds):
+            part = series(ranked, position, epochs_of)
+            for grouping in groupings:
+                by = [*KEYS, f"{grouping}_rank", f"{grouping}_group"]
+                table = part.group_by(by, maintain_order=True).agg(_figures(options))
+                limited = epochs_of == "own" and grouping in WITH_LIMITS
+                tables[grouping][kind].append(_with_limits(table, part if limited else None, by, options))
+    whole = {grouping: pl.concat([table for kind in found for table in kind]) for grouping, found in tables.items()}
+    return pl.concat([_ordered(table, grouping, options) for grouping, table in whole.items()], how="vertical")
 
 
 def _ordered(table: pl.DataFrame, grouping: str, options: EvaluationOptions) -> pl.DataFrame:

@@ -24,9 +24,11 @@ LevelsOf = Literal["usable", "all"]
 #: Choices of levels, see above.
 LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
 #: Parts of a level, and its cause and status, by their names without "protection_".
-PARTS: Final = ("fault_free_m", "one_fault_m", "two_faults_m")
-STATED: Final = ("cause", "status")
+PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
+STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
+#: Columns of the epochs that a Stanford diagram is made of, beside the level and its status.
+_JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
 #: Statuses whose level is a bound: a coasting filter states one and raises no alarm.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
@@ -187,7 +189,13 @@ def epochs_diagram(
     levels_of : {"usable", "all"}
     options : EvaluationOptions
     """
-    spanned = epochs.filter("in_reference")
+    columns = (level_name(kind), f"{kind}_protection_status")
+    spanned = epochs.select(*_JUDGED, *(name for name in columns if name in epochs.columns)).filter("in_reference")
+    return _sorted(spanned, *_judged(spanned, kind, levels_of), alarm_limit_m, options)
+
+
+def _judged(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
+    """Errors and levels as counted of epochs inside the reference, NaN where there is none."""
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
     level = counted_levels(
@@ -197,7 +205,7 @@ def epochs_diagram(
         _words(spanned, f"{kind}_protection_status"),
         levels_of=levels_of,
     )
-    return _sorted(spanned, error, level, alarm_limit_m, options)
+    return error, level
 
 
 def positions_diagram(
@@ -255,11 +263,12 @@ def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: Eva
     for kind in dict.fromkeys(run.kind for run in runs):
         mine = [run for run in runs if run.kind == kind]
         rows: list[dict[str, Any]] = []
+        needed = (*_JUDGED, level_name(kind), f"{kind}_protection_status")
+        slim = epochs.select(*KEYS, "environment", "observed", *(name for name in needed if name in epochs.columns))
         for run in mine:
-            for part in epochs.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
+            for part in slim.filter(pl.col("run") == run.name).partition_by("antenna", maintain_order=True):
                 rows += _counted(part, run, limits, options)
-        names = pl.col("run").is_in([run.name for run in mine])
-        by_kind[kind] = Integrity(stanford=_pooled(rows), beyond=_beyond(epochs.filter(names), kind))
+        by_kind[kind] = Integrity(stanford=_pooled(rows), beyond=_beyond(epochs, [run.name for run in mine], kind))
     return by_kind
 
 
@@ -268,14 +277,15 @@ def _counted(
 ) -> Iterator[dict[str, Any]]:
     """Counts of one antenna of a run: all epochs, then by environment."""
     keys = dict(zip(KEYS, part.select(KEYS).row(0), strict=True))
+    part = part.filter("in_reference")
     groups = [(ALL, ALL, part)]
-    environments = part.filter("in_reference").partition_by("environment", maintain_order=True)
-    groups += [("environment", str(part["environment"][0]), part) for part in environments]
-    for grouping, group, mine in groups:
-        spanned = mine.filter("in_reference")
+    environments = part.partition_by("environment", maintain_order=True)
+    groups += [("environment", str(mine["environment"][0]), mine) for mine in environments]
+    for grouping, group, spanned in groups:
         for levels_of in LEVELS_OF:
+            error, level = _judged(spanned, run.kind, levels_of)
             for limit in limits:
-                diagram = epochs_diagram(mine, run.kind, alarm_limit_m=limit, levels_of=levels_of, options=options)
+                diagram = _sorted(spanned, error, level, limit, options)
                 regions = {name: diagram.counts[region] for region, name in _REGIONS.items()}
                 row = {
                     **keys,
@@ -325,14 +335,17 @@ def _pooled(rows: list[dict[str, Any]]) -> pl.DataFrame:
     return sums.select(*KEYS, *STANFORD_COLUMNS)
 
 
-def _beyond(epochs: pl.DataFrame, kind: str) -> pl.DataFrame:
-    """Epochs whose error exceeds a finite level, the largest excess first."""
+def _beyond(epochs: pl.DataFrame, runs: Sequence[str], kind: str) -> pl.DataFrame:
+    """Epochs of some runs whose error exceeds a finite level, the largest excess first."""
     level = pl.col(level_name(kind))
     columns = {name: f"{kind}_protection_{name}" for name in (*PARTS, *STATED)}
     absent = [name for name in columns.values() if name not in epochs.columns]
     blank = [pl.lit(None, pl.Float64 if name.endswith("_m") else pl.String).alias(name) for name in absent]
     over = epochs.with_columns(blank).filter(
-        "in_reference", "reference_good", "positioned", level.is_finite() & (pl.col("error_m").abs() > level)
+        "in_reference",
+        "reference_good",
+        "positioned",
+        pl.col("run").is_in(runs) & level.is_finite() & (pl.col("error_m").abs() > level),
     )
     excess = pl.col("error_m").abs() - level
     verdict = pl.Series("usable", _usable(_words(over, "status"), _words(over, columns["status"])))

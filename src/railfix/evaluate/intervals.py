@@ -38,20 +38,26 @@ def interval_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame:
     epochs : polars.DataFrame
         `railfix.evaluate.epochs.EPOCH_COLUMNS`; an interval lies within one run and antenna.
     by : list of str
-        Columns whose values are kept apart.
+        Columns whose values are kept apart, ``configuration`` among them.
 
     Returns
     -------
     polars.DataFrame
         `by` and `INTERVAL_COLUMNS`; before_first_s and after_last_s are the largest of the runs.
     """
-    return pl.concat([_of_position(epochs, position, by) for position in POSITIONS])
+    return pl.concat(
+        _of_position(epochs.lazy().filter(configuration=name), position, by)
+        for position in POSITIONS
+        for name in epochs["configuration"].unique(maintain_order=True)
+    )
 
 
-def _of_position(epochs: pl.DataFrame, position: str, by: list[str]) -> pl.DataFrame:
+def _of_position(epochs: pl.LazyFrame, position: str, by: list[str]) -> pl.DataFrame:
     keys = list(dict.fromkeys([*by, *_OF]))
-    spanned = epochs.filter(pl.col("moved_m").is_not_null()).select(
-        *keys, "time_gpst", "chainage_m", "moved_m", has=positioned(position)
+    spanned = (
+        epochs.filter(pl.col("moved_m").is_not_null())
+        .select(*keys, "time_gpst", "chainage_m", "moved_m", has=positioned(position))
+        .collect()
     )
     edges = (
         spanned.group_by(keys, maintain_order=True)
@@ -63,10 +69,10 @@ def _of_position(epochs: pl.DataFrame, position: str, by: list[str]) -> pl.DataF
         .agg(before_first_s=pl.col("before").max(), after_last_s=pl.col("after").max())
     )
     apart = spanned.filter("has").with_columns(
-        interval=pl.col("moved_m").diff().over(keys),
-        gap=_seconds(pl.col("time_gpst").diff().over(keys)),
-        start=pl.col("time_gpst").shift().over(keys),
-        place=pl.col("chainage_m").shift().over(keys),
+        interval=pl.col("moved_m").diff().over(_OF),
+        gap=_seconds(pl.col("time_gpst").diff().over(_OF)),
+        start=pl.col("time_gpst").shift().over(_OF),
+        place=pl.col("chainage_m").shift().over(_OF),
     )
     ran = pl.col("interval").filter(pl.col("interval") > 0)
     found = apart.group_by(by, maintain_order=True).agg(

@@ -41,7 +41,10 @@ def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
         if epochs[level].null_count() == len(epochs):
             continue
         # runs without this level, such as the filter along the track, have no row
-        spanned = epochs.filter("in_reference", pl.col(level).is_not_null().any().over("run"))
+        columns = ("run", *by, "status", "observed", "in_reference", "reference_good", "positioned", "error_m", level)
+        spanned = epochs.select(*dict.fromkeys(columns)).filter(
+            "in_reference", pl.col(level).is_not_null().any().over("run")
+        )
         for position in ("constrained", "constrained_ok"):
             has = positioned(position)
             tables.append(

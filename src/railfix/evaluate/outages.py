@@ -28,6 +28,10 @@ OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "end_sigma_m": "stated standard deviation there",
     "largest_normalised": "largest size of error / along_sigma_m",
 }
+_USED: Final = (
+    "time_gpst", "observed", "n_used", "in_reference", "reference_good", "positioned", "moved_m", "environment",
+    "sources", "error_m", "along_sigma_m", "branch_probability",
+)  # fmt: skip
 
 
 def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
@@ -39,7 +43,7 @@ def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
         `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs; single epochs have no position in these stretches and
         are left out.
     """
-    filtered = epochs.filter(OF_FILTER)
+    filtered = epochs.select(*KEYS, *_USED).filter(OF_FILTER)
     if not len(filtered):
         return None
     keys = list(KEYS)

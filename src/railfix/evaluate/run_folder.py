@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import polars as pl
+import polars.selectors as cs
 from polars.exceptions import PolarsError
 
 from railfix.core.arrays import Floats
@@ -19,6 +20,8 @@ from railfix.run.folder import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
+#: No columns beside those that every table has.
+NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = (
     "conventional_chainage_m",
@@ -166,7 +169,13 @@ def tables_of(path: Path) -> list[str]:
     return [name for name in (POSITIONS_TABLE, "train") if any((path / f"{name}{end}").is_file() for end in _ENDINGS)]
 
 
-def read_run(path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | None = None) -> RunFolder:
+def read_run(
+    path: Path,
+    *,
+    table: str = POSITIONS_TABLE,
+    conventional: Path | None = None,
+    columns: cs.Selector | None = None,
+) -> RunFolder:
     """Read the folder that `railfix run` wrote.
 
     Parameters
@@ -178,6 +187,8 @@ def read_run(path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | N
     conventional : Path, optional
         Folder of another run on the same log, whose conventional positions are compared with instead: a run with
         `screens` elevation and C/N0 alone gives those of P1.
+    columns : polars selector, optional
+        Columns to read beside those that every table of positions has; all without.
 
     Raises
     ------
@@ -187,16 +198,17 @@ def read_run(path: Path, *, table: str = POSITIONS_TABLE, conventional: Path | N
         `conventional` is a run on another log.
     """
     record = read_record(path).record
-    file, rows = _read_table(path, table, (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED)
+    needed = (*NEEDED, *SINGLE_EPOCH) if table == POSITIONS_TABLE else NEEDED
+    file, rows = read_table(path, table, needed, columns)
     if table == POSITIONS_TABLE:
         rows = rows.with_columns(observed=pl.col("status") != Status.NO_OBSERVATION.text)
     else:
-        single = read_run(path).positions
+        single = read_run(path, columns=NO_MORE).positions
         added = [name for name in (*SINGLE_EPOCH, "observed") if name not in rows.columns]
         rows = rows.join(single.select(*_KEYS, *added), on=_KEYS, how="left", maintain_order="left")
         rows = rows.with_columns(pl.col("observed").fill_null(value=False))
     if conventional is not None:
-        other = read_run(conventional)
+        other = read_run(conventional, columns=NO_MORE)
         _check_same_log(path, record, conventional, other.record)
         unscreened = other.positions.select(*_KEYS, *CONVENTIONAL)
         rows = rows.drop(CONVENTIONAL).join(unscreened, on=_KEYS, how="left", maintain_order="left")
@@ -212,30 +224,34 @@ def _check_same_log(path: Path, record: Mapping[str, Any], other: Path, of_other
         raise MismatchError(f"{other}: is not a run on the log of {path}; give one whose observations are the same")
 
 
-def _read_table(path: Path, name: str, needed: Sequence[str]) -> tuple[Path, pl.DataFrame]:
-    """File and rows of one table of a run, in order of time."""
+def read_table(
+    path: Path, name: str, needed: Sequence[str] = NEEDED, columns: cs.Selector | None = None
+) -> tuple[Path, pl.DataFrame]:
+    """File and rows of one table of a run, in order of time: all columns, or those `needed` and `columns`."""
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:
         raise InputFileError(path, f"holds neither {name}.parquet nor {name}.csv; name a folder of railfix run")
-    rows = _table(file)
+    rows = _table(file, None if columns is None else cs.by_name(*needed, require_all=False) | columns)
     missing = [column for column in needed if column not in rows.columns]
     if missing:
         raise InputFileError(file, f"has no column {missing[0]}; expected the {name} of railfix run")
     if not len(rows):
         raise InputFileError(file, "has no rows; there is nothing to evaluate")
     rows = rows if rows["time_gpst"].is_sorted() else rows.sort("time_gpst", maintain_order=True)
-    for (antenna,) in rows.select("antenna").unique().iter_rows():
-        if (np.diff(rows.filter(antenna=antenna)["time_gpst"].to_numpy()) == np.timedelta64(0)).any():
+    times = rows.select("antenna", "time_gpst")
+    for antenna in times["antenna"].unique():
+        if (np.diff(times.filter(antenna=antenna)["time_gpst"].to_numpy()) == np.timedelta64(0)).any():
             raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
     return file, rows
 
 
-def _table(file: Path) -> pl.DataFrame:
+def _table(file: Path, columns: cs.Selector | None) -> pl.DataFrame:
     try:
         if file.suffix == ".parquet":
-            table = read_parquet(file)
+            table = read_parquet(file, columns=columns)
         else:
             table = pl.read_csv(file, schema_overrides={"time_gpst": pl.Datetime("ns")}, infer_schema_length=None)
+            table = table if columns is None else table.select(columns)
     except (PolarsError, OSError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputFileError(file, f"cannot be read as a table ({reason}); run railfix run again") from error

@@ -70,5 +70,5 @@ def read_sections(path: Path) -> Sections:
         path=path,
         from_m=first[order],
         to_m=last[order],
-        environment=tuple(table.cells["environment"][i] for i in order),
+        environment=tuple(table.cells["environment"].gather(order)),
     )

@@ -8,13 +8,19 @@ names the line.
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+import polars as pl
 
 from railfix.core.arrays import Floats, Integers
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, read_text
+from railfix.core.files import FilePath, text_lines
+
+#: Rows that are read before they become compact.
+_BLOCK: Final = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +35,7 @@ class NamedColumns:
     header_line : int
     line : ndarray of int, shape (n,)
         1-based line number of each row.
-    cells : dict of list of str
+    cells : dict of polars.Series of str
         Cells of each column, stripped.
     """
 
@@ -37,7 +43,7 @@ class NamedColumns:
     metadata: dict[str, str]
     header_line: int
     line: Integers
-    cells: dict[str, list[str]]
+    cells: dict[str, pl.Series]
 
     def __len__(self) -> int:
         return len(self.line)
@@ -63,7 +69,8 @@ class NamedColumns:
         InputFileError
             A cell is empty, not a number, or not finite (``inf`` is allowed where `blank` is infinite).
         """
-        cells = self.cells[name]
+        given = self.cells[name].str.len_bytes().to_numpy() > 0
+        cells = self.cells[name].to_list()
         if blank is not None:
             cells = [cell or repr(blank) for cell in cells]
         try:
@@ -72,7 +79,6 @@ class NamedColumns:
             row = next(i for i, cell in enumerate(cells) if not _is_number(cell))
             what = f"'{cells[row]}' is not a number" if cells[row] else "the cell is empty"
             raise self.error(row, f"column {name}: {what}; a number was expected") from None
-        given = np.array([bool(cell) for cell in self.cells[name]], dtype=np.bool_)
         bad = given & np.isinf(values) if blank is None or not np.isinf(blank) else np.zeros_like(given)
         bad |= np.isnan(values) & (blank is None)
         if bad.any():
@@ -102,17 +108,18 @@ def read_named_columns(path: FilePath) -> NamedColumns:
     InputFileError
         The file is not text, has no header or a repeated column name, or a row has another number of cells.
     """
-    return parse_named_columns(read_text(path), path)
+    return parse_named_columns(text_lines(path), path)
 
 
-def parse_named_columns(text: str, path: FilePath) -> NamedColumns:
-    """Parse the text of a file as `read_named_columns` does; `path` is for the messages."""
+def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
+    """Parse the lines of a file as `read_named_columns` does; `path` is for the messages."""
     metadata: dict[str, str] = {}
     header: list[str] = []
     header_line = 0
     rows: list[list[str]] = []
+    blocks: list[pl.DataFrame] = []
     numbers: list[int] = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         if not line.strip():
             continue
         if line.startswith("#"):
@@ -132,14 +139,23 @@ def parse_named_columns(text: str, path: FilePath) -> NamedColumns:
             raise InputFileError(path, message, line=number)
         rows.append(cells)
         numbers.append(number)
+        if len(rows) == _BLOCK:
+            blocks.append(_compact(rows, len(header)))
+            rows = []
     _check_header(path, header, header_line)
+    columns = pl.concat([*blocks, _compact(rows, len(header))]).get_columns()
     return NamedColumns(
         path=str(path),
         metadata=metadata,
         header_line=header_line,
         line=np.array(numbers, dtype=np.int64),
-        cells={name: [row[i] for row in rows] for i, name in enumerate(header)},
+        cells=dict(zip(header, columns, strict=True)),
     )
+
+
+def _compact(rows: list[list[str]], width: int) -> pl.DataFrame:
+    """Rows of cells as columns of text."""
+    return pl.DataFrame([pl.Series(str(i), [row[i] for row in rows], dtype=pl.String) for i in range(width)])
 
 
 def _check_header(path: FilePath, header: list[str], line: int) -> None:

@@ -159,7 +159,7 @@ def positions_times(table: NamedColumns) -> Datetimes:
     """Parse the column ``time_gpst``; NaT where it is blank or absent."""
     if "time_gpst" not in table:
         return np.full(len(table), np.datetime64("NaT", "ns"))
-    cells = table.cells["time_gpst"]
+    cells = table.cells["time_gpst"].to_list()
     for row, cell in enumerate(cells):
         if cell.endswith("Z") or "+" in cell:
             raise table.error(row, f"time_gpst '{cell}' carries a time zone; GPS time without one was expected")

@@ -124,7 +124,7 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
         usable &= log.quality == _FIX
     owner = np.full(len(log), antennas[0])
     if table is not None and "antenna" in table:
-        owner = np.array(table.cells["antenna"])
+        owner = np.array(table.cells["antenna"].to_list(), dtype=np.str_)
     elif len(antennas) > 1:
         raise InputFileError(
             path, f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas"
@@ -147,13 +147,13 @@ def _columns(log: PositionLog, table: NamedColumns | None) -> dict[str, NDArray[
     source = np.full(len(log), "truth" if table is not None and all(n in table for n in _OF_TRUTH) else "rtk")
     environment = np.full(len(log), "")
     if table is not None and "source" in table:
-        source = np.array(table.cells["source"], dtype=np.str_)
+        source = np.array(table.cells["source"].to_list(), dtype=np.str_)
         unknown = ~np.isin(source, SOURCES)
         if unknown.any():
             row = int(np.argmax(unknown))
             raise table.error(row, f"source is '{source[row]}'; {', '.join(SOURCES[:-1])} or blank was expected")
     if table is not None and "environment" in table:
-        environment = np.array(table.cells["environment"], dtype=np.str_)
+        environment = np.array(table.cells["environment"].to_list(), dtype=np.str_)
     return {**columns, "source": source, "environment": environment}
 
 

@@ -152,7 +152,7 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
 def _table(path: str | PathLike[str]) -> NamedColumns:
     if Path(path).suffix == ".parquet":
         try:
-            return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO), path)
+            return parse_named_columns(pl.read_parquet(Path(path)).write_csv(datetime_format=_ISO).splitlines(), path)
         except (OSError, pl.exceptions.PolarsError) as error:
             raise InputFileError(path, f"cannot be read as a Parquet table ({error})") from None
     return read_named_columns(path)

@@ -156,8 +156,8 @@ def _screens(
         return Group(title="Screens", charts=(), start=start, absent=(reason,))
     charts: list[Chart] = []
     for screen in screens_of(run.config, positions, observations):
-        charts.append(screen_over_time(screen.picture, screen.time))
-        charts.append(screen_over_chainage(screen.picture, screen.chainage_m))
+        charts.append(screen_over_time(screen.picture, screen.epoch_time, epoch=screen.epoch))
+        charts.append(screen_over_chainage(screen.picture, screen.epoch_chainage_m, epoch=screen.epoch))
     absent = () if charts else (f"No active screen of the {antenna} antenna tested anything.",)
     return Group(title="Screens: each metric against its limit", charts=_kept(*charts), start=start, absent=absent)
 

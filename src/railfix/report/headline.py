@@ -30,10 +30,11 @@ class KeyFigure:
 
 @dataclass(frozen=True, kw_only=True)
 class Headline:
-    """Verdict, five key figures and remarks on one antenna of a run."""
+    """Verdict, five key figures, what they are of, and remarks on one antenna of a run."""
 
     verdict: str
     figures: tuple[KeyFigure, ...]
+    compared: str
     remarks: tuple[str, ...]
 
 
@@ -102,6 +103,12 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
         f"{number(other_worst, 1)} m)."
     )
     filtered = _filtered(run, antenna)
+    if filtered:
+        verdict += (
+            f" The filter along the track, which joins the epochs, has a position at {share(filtered['rate'], 1)} of "
+            f"all epochs, those without satellites included: 95 % within {number(filtered['p95'], 1)} m, the worst "
+            f"{number(filtered['max'], 1)} m off."
+        )
     lengths = (
         ("median error", "p50", middle, other_middle),
         ("95 % of errors within", "p95", wide, other_wide),
@@ -123,9 +130,9 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     return Headline(
         verdict=verdict,
         figures=(*(_beside(figure) for figure in figures), _integrity_figure(run, antenna, evaluation, own)),
+        compared=_alike(run, compared, filtered),
         remarks=(
-            *_filter_remark(run, antenna, evaluation, filtered),
-            _alike(run, compared),
+            *(_longest_outage(run, antenna, evaluation) if filtered else ()),
             *_larger_error(compared),
             *_marked(compared),
         ),
@@ -168,17 +175,8 @@ def _filtered(run: ReportedRun, antenna: str) -> dict[str, float]:
     return {"p50": p50, "p95": p95, "max": largest, "rate": rate}
 
 
-def _filter_remark(
-    run: ReportedRun, antenna: str, evaluation: Evaluation, filtered: Mapping[str, float]
-) -> Iterator[str]:
-    """Sentences on the filter along the track, and on its stretches without satellites."""
-    if not filtered:
-        return
-    yield (
-        f"Filtered along the track, the train has a position at {share(filtered['rate'], 1)} of all epochs, those "
-        f"without satellites included; 95 % of these are within {number(filtered['p95'], 1)} m, and the worst "
-        f"is {number(filtered['max'], 1)} m off."
-    )
+def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> Iterator[str]:
+    """A sentence on the filter in the longest stretch without satellites."""
     if evaluation.outages is not None:
         passed = evaluation.outages.filter(run=run.name_in(evaluation, "train"), antenna=antenna)
         for row in passed.sort("travelled_m", descending=True, nulls_last=True).head(1).iter_rows(named=True):
@@ -191,12 +189,12 @@ def _filter_remark(
             )
 
 
-def _alike(run: ReportedRun, compared: _Compared) -> str:
+def _alike(run: ReportedRun, compared: _Compared, filtered: Mapping[str, float]) -> str:
     ranges = "unscreened ranges, as in P1" if run.conventional is not None else "the same screened ranges"
     return (
-        f"Errors along the line of the {len(compared.on_map_m):,} epochs at which both positions exist and the one on "
-        f"the map passed every check; conventional: 3-D single point from {ranges}, moved to the nearest point of the "
-        "line."
+        "Errors along the line. Large: positions on the map, each epoch by itself, that passed every check."
+        f"{' Filtered: the filter along the track, at all epochs.' if filtered else ''} Conventional: 3-D single point "
+        f"from {ranges}, moved to the nearest point of the line, at the same {len(compared.on_map_m):,} epochs."
     )
 
 
@@ -263,5 +261,6 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
             ),
             KeyFigure(name="epochs", value=number(facts.get("epochs", len(positions)), 0)),
         ),
-        remarks=("Without a reference (--reference) errors are not known.",),
+        compared="Without a reference (--reference) errors are not known.",
+        remarks=(),
     )

@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import polars as pl
-from polars.exceptions import PanicException, PolarsError
+import polars.selectors as cs
 
 from railfix.core.errors import InputFileError, RailfixError, SettingsError
 from railfix.evaluate import Evaluation, RunAndReference, evaluate_runs
-from railfix.evaluate.evaluation import short_names
+from railfix.evaluate.evaluation import EvaluatedRun, short_names
 from railfix.evaluate.place import track_of
-from railfix.evaluate.run_folder import POSITIONS_TABLE, RunFolder, read_run, tables_of
+from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, RunFolder, read_run, read_table, tables_of
 from railfix.pipeline.config import Config
 from railfix.ranges.cn0_curve import Cn0Curve, read_cn0_curve
+from railfix.run.folder import reading_table
+from railfix.screens import SCREENS
 from railfix.track import Track
 
 _OBSERVATIONS: Final = "observations.parquet"
 _NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
+#: Columns that the report uses beside those of every table: of the positions, of the filter, of the errors.
+_POSITIONS: Final = cs.contains("protection_level", "protection_status", "protection_cause", "_fault") | cs.by_name(
+    "kilometrage_m", "n_rejected", "raim_statistic", "raim_threshold", "raim_level_m", "protection_kind",
+    *(column.name for screen in SCREENS for column in screen.columns if column.table == "positions"),
+    require_all=False,
+)  # fmt: skip
+_TRAIN: Final = ("time_gpst", "antenna", "x_m", "y_m", "z_m", "along_sigma_m")
+_ERRORS: Final = (
+    "time_gpst", "antenna", "status", "observed", "in_reference", "reference_good", "chainage_m", "environment",
+    "n_used", "positioned", "conventional_positioned", "error_m", "conventional_error_m", "along_sigma_m",
+    "interval_m", "conventional_interval_m",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,10 +51,10 @@ class ReportedRun:
     observations : polars.LazyFrame or None
         None where the run wrote none.
     errors, filtered : polars.DataFrame or None
-        `railfix.evaluate.EPOCH_COLUMNS` of the single-epoch positions, and of the filter along the track; None
-        without a reference or without a filter.
+        Of `railfix.evaluate.EPOCH_COLUMNS` those that the report uses, and levels: of the single-epoch positions, and
+        of the filter along the track; None without a reference or without a filter.
     train : polars.DataFrame or None
-        Positions by the filter along the track (`railfix.pipeline.train_table.TRAIN_COLUMNS`), None without.
+        Times, places and sigmas by the filter along the track, None without.
     reference : str
         Path of the reference; empty without one.
     conventional : Path or None
@@ -110,7 +124,7 @@ def read_runs(
     -------
     tuple of ReportedRun
     Evaluation or None
-        None without a reference.
+        None without a reference. Its table of epochs is empty: the runs have the columns that the report uses.
 
     Raises
     ------
@@ -132,53 +146,58 @@ def read_runs(
         twice = next(path for path in resolved if resolved.count(path) > 1)
         raise SettingsError(f"{twice}: the run is given twice; give each run once")
     beside: Sequence[Path | None] = conventional or [None] * len(paths)
-    folders = [read_run(path, conventional=other) for path, other in zip(paths, beside, strict=True)]
     evaluation = None
     if references:
         each = references if len(references) == len(paths) else [references[0]] * len(paths)
         evaluation = evaluate_runs(
             [
-                RunAndReference(
-                    run=folder.path,
-                    reference=reference,
-                    table=table,
-                    conventional=other,
-                    folder=folder if table == POSITIONS_TABLE else None,
-                )
-                for folder, reference, other in zip(folders, each, beside, strict=True)
-                for table in tables_of(folder.path)
+                RunAndReference(run=path, reference=reference, table=table, conventional=other)
+                for path, reference, other in zip(paths, each, beside, strict=True)
+                for table in tables_of(path) or [POSITIONS_TABLE]
             ]
         )
+    evaluated: dict[tuple[Path, str], tuple[EvaluatedRun, pl.DataFrame]] = {}
+    if evaluation is not None:
+        for run in evaluation.runs:
+            used = evaluation.epochs.lazy().filter(run=run.name)
+            epochs = used.select(*_ERRORS, cs.contains("protection_level", "protection_status")).collect()
+            evaluated[run.path.resolve(), run.table] = run, epochs
+        evaluation = replace(evaluation, epochs=evaluation.epochs.clear())
     reported = tuple(
-        _reported(name, folder, evaluation, other)
-        for name, folder, other in zip(short_names(resolved), folders, beside, strict=True)
+        _reported(
+            name,
+            read_run(path, conventional=other, columns=_POSITIONS),
+            {table: evaluated[own, table] for table in tables_of(path) if (own, table) in evaluated},
+            other,
+        )
+        for name, path, own, other in zip(short_names(resolved), paths, resolved, beside, strict=True)
     )
     return reported, evaluation
 
 
-def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None, conventional: Path | None) -> ReportedRun:
+def _reported(
+    name: str,
+    folder: RunFolder,
+    evaluated: Mapping[str, tuple[EvaluatedRun, pl.DataFrame]],
+    conventional: Path | None,
+) -> ReportedRun:
     config = folder.config
     curve, notes = _curve(folder, config)
     track, track_notes = _track(folder)
     notes += track_notes
-    tables: dict[str, pl.DataFrame] = {}
-    reference = ""
-    if evaluation is not None:
-        for run in evaluation.runs:
-            if run.path.resolve() == folder.path.resolve():
-                tables[run.table] = evaluation.epochs.filter(run=run.name)
-                if run.table == POSITIONS_TABLE:
-                    reference = run.reference
-                    notes += run.notes
+    facts, errors = evaluated.get(POSITIONS_TABLE, (None, None))
+    if facts is not None:
+        notes += facts.notes
+    train = "train" in tables_of(folder.path)
     return ReportedRun(
         name=name,
         folder=folder,
         config=config,
         observations=_observations(folder.path / _OBSERVATIONS),
-        errors=tables.get(POSITIONS_TABLE),
-        filtered=tables.get("train"),
-        train=read_run(folder.path, table="train").positions if "train" in tables_of(folder.path) else None,
-        reference=reference,
+        errors=errors,
+        filtered=evaluated["train"][1] if "train" in evaluated else None,
+        train=read_table(folder.path, "train", columns=NO_MORE)[1].select(_TRAIN) if train else None,
+        reference="" if facts is None else facts.reference,
         conventional=conventional,
         track=track,
         curve=curve,
@@ -189,12 +208,9 @@ def _reported(name: str, folder: RunFolder, evaluation: Evaluation | None, conve
 def _observations(path: Path) -> pl.LazyFrame | None:
     if not path.is_file():
         return None
-    try:
+    with reading_table(path):
         table = pl.scan_parquet(path)
         columns = set(table.collect_schema())
-    except (PolarsError, PanicException, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(path, f"cannot be read as a table ({reason}); run railfix run again") from error
     if missing := sorted(_NEEDED - columns):
         raise InputFileError(path, f"has no column {missing[0]}; run railfix run again with this version")
     return table

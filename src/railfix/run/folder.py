@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
+import polars.selectors as cs
 from polars.exceptions import PanicException, PolarsError
 
 from railfix.core.errors import InputFileError, MismatchError, SettingsError
@@ -150,8 +151,8 @@ def read_record(folder: Path) -> RunRecord:
     return RunRecord(path=folder, record=read_json_object(path, what="the record of a run"))
 
 
-def read_parquet(path: Path) -> pl.DataFrame:
-    """Read a table that a run wrote.
+def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFrame:
+    """Read a table that a run wrote: all columns, or those selected.
 
     Raises
     ------
@@ -159,7 +160,9 @@ def read_parquet(path: Path) -> pl.DataFrame:
         It cannot be read as Parquet.
     """
     with reading_table(path):
-        return pl.read_parquet(path)
+        if columns is None:
+            return pl.read_parquet(path)
+        return pl.scan_parquet(path).select(columns).collect()
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.evaluate.figures import PASSED
 from railfix.report.plots.chart import (
     BLACK,
     CONSTRAINED,
@@ -104,16 +105,21 @@ def _errors(
         layers.append(Band(label="± stated sigma", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
         caption.append("Band: the standard deviation that railfix states, the largest of each short piece.")
     levels = []
+    many = len(level_columns(errors))
     for column, colour in zip(level_columns(errors), (PURPLE, GREEN, BLACK, GREY), strict=False):
         level = floats(errors, column)
         at, most = _greatest(x, np.where(np.isfinite(level), level, np.nan))
         if len(at):
             levels.append(most)
-            name_of = column.removesuffix("_m").replace("_", " ")
+            name_of = "protection level" if many == 1 else column.removesuffix("_m").replace("_", " ")
             for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
                 layers.append(Line(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
             caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
-    series = [(*entry, errors) for entry in _SERIES]
+    failed = errors.filter(~pl.col("status").is_in(PASSED)) if "status" in errors.columns else errors.clear()
+    passed = errors.join(failed.select("time_gpst"), on="time_gpst", how="anti") if len(failed) else errors
+    series = [(*entry, table) for entry, table in zip(_SERIES, (errors, passed), strict=True)]
+    if failed["error_m"].is_not_null().any():
+        series.append(("on the map, failed a check", "error_m", BLACK, "cross", failed))
     if filtered is not None:
         series.append(("filtered along the track", "error_m", FILTERED, "dot", filtered))
     shown = total = 0

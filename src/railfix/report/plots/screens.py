@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Masks
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks
 from railfix.core.files import staged_file
 from railfix.core.timescale import seconds
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
@@ -29,6 +29,8 @@ _MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55
 _COLUMNS: Final = 4
 #: Rows of a picture that are looked at together.
 _BLOCK: Final = 100_000
+#: Points of the line of a limit: two a pixel of a wide chart.
+_LINE_POINTS: Final = 1500
 
 
 def draw_screen(
@@ -60,38 +62,50 @@ def draw_screen(
     return _save(figure, path)
 
 
-def screen_over_time(picture: ScreenPicture, time: Datetimes) -> Chart:
+def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: Indices | None = None) -> Chart:
     """Chart of a metric against its limit over time.
 
     Parameters
     ----------
     picture : ScreenPicture
-    time : ndarray of datetime64[ns], shape (T,)
+    time : ndarray of datetime64[ns], shape (T,), or (E,) with `epoch`
+    epoch : ndarray of int, shape (T,), optional
+        Epoch of each row of the picture, where `time` is that of E epochs.
 
     Returns
     -------
     Chart
     """
     start = time.min() if len(time) else np.datetime64(0, "ns")
-    return _screen(picture, seconds(time - start), name="time", x_label="GPS time", start=start)
+    return _screen(picture, seconds(time - start), epoch, name="time", x_label="GPS time", start=start)
 
 
-def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats) -> Chart:
+def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats, *, epoch: Indices | None = None) -> Chart:
     """Chart of a metric against its limit over the place.
 
     Parameters
     ----------
     picture : ScreenPicture
-    chainage_m : ndarray, shape (T,) [m]
+    chainage_m : ndarray, shape (T,), or (E,) with `epoch` [m]
+    epoch : ndarray of int, shape (T,), optional
+        See `screen_over_time`.
 
     Returns
     -------
     Chart
     """
-    return _screen(picture, chainage_m, name="chainage", x_label="chainage [m]", start=None)
+    return _screen(picture, chainage_m, epoch, name="chainage", x_label="chainage [m]", start=None)
 
 
-def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start: np.datetime64 | None) -> Chart:
+def _screen(
+    picture: ScreenPicture,
+    x: Floats,
+    epoch: Indices | None,
+    *,
+    name: str,
+    x_label: str,
+    start: np.datetime64 | None,
+) -> Chart:
     judged = int(np.count_nonzero(np.isfinite(picture.metric)))
     rejected = int(np.count_nonzero(picture.reject))
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
@@ -99,7 +113,7 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
     shown = total = 0
     for reject, colour, label in ((False, _KEPT, "passed"), (True, _REJECTED, "rejected")):
         parts = []
-        for along, metric, rejects, _ in _blocks(picture, x):
+        for along, metric, rejects, _ in _blocks(picture, x, epoch):
             mask = rejects == reject
             along, metric = along[mask], metric[mask]
             total += int(np.count_nonzero(np.isfinite(along + metric)))
@@ -110,13 +124,13 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
         shown += len(rows)
         layers.append(Points(label=label, colour=colour, x=along[rows], y=metric[rows], epoch_s=None))
     limits = [_tightest(*(values[np.isfinite(limit)] for values in (along, limit))) for along, _, _, limit in
-              _blocks(picture, x)]  # fmt: skip
+              _blocks(picture, x, epoch)]  # fmt: skip
     at, least = _tightest(*_joined(limits))
-    edges = [(float(np.nanmin(limit)), float(np.nanmax(limit))) for _, _, _, limit in _blocks(picture, x)
+    edges = [(float(np.nanmin(limit)), float(np.nanmax(limit))) for _, _, _, limit in _blocks(picture, x, epoch)
              if np.isfinite(limit).any()]  # fmt: skip
     finite = bool(edges)
     same = not finite or min(low for low, _ in edges) == max(high for _, high in edges)
-    rows = extremes(at, least)
+    rows = extremes(at, least, points=_LINE_POINTS)
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
         label = "limit" if sign > 0 else ""
         layers.append(Line(label=label, colour=_FLOOR, x=at[rows], y=sign * least[rows], width=1.0))
@@ -138,13 +152,13 @@ def _screen(picture: ScreenPicture, x: Floats, *, name: str, x_label: str, start
     )
 
 
-def _blocks(picture: ScreenPicture, x: Floats) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
+def _blocks(picture: ScreenPicture, x: Floats, epoch: Indices | None) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
     """Give x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
     limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
-    for first in range(0, len(x), _BLOCK):
+    for first in range(0, len(picture.metric), _BLOCK):
         rows = slice(first, first + _BLOCK)
         metric = picture.metric[rows]
-        where = np.broadcast_to(x[rows, None], metric.shape)
+        where = np.broadcast_to((x[rows] if epoch is None else x[epoch[rows]])[:, None], metric.shape)
         yield where.ravel(), metric.ravel(), picture.reject[rows].ravel(), limit[rows].ravel()
 
 

@@ -251,16 +251,12 @@
     return pen;
   }
 
-  // Many points on paper: as a picture, which is smaller than thousands of outlines.
-  function raster(pen, box) {
-    const picture = document.createElement("canvas"), ratio = 1;
-    picture.width = Math.round(box.width * ratio);
-    picture.height = Math.round(box.height * ratio);
-    const dots = picture.getContext("2d");
-    dots.scale(ratio, ratio);
-    pen.raster = (pen.raster || []).concat(picture);
-    pen.drawRaster = function () { for (const one of pen.raster) pen.drawImage(one, 0, 0, box.width, box.height); pen.raster = []; };
-    return dots;
+  // Many points on paper: all of a chart as one picture, which is smaller than thousands of outlines.
+  function raster(box) {
+    const picture = document.createElement("canvas");
+    picture.width = Math.round(box.width);
+    picture.height = Math.round(box.height);
+    return picture.getContext("2d");
   }
   Plot.prototype.draw = function () {
     const chart = this.load(), [pen, box] = this.frame();
@@ -270,9 +266,10 @@
     pen.beginPath();
     pen.rect(box.left, box.top, box.right - box.left, box.bottom - box.top);
     pen.clip();
+    const dots = printing && raster(box);
     let marks = 0;
-    for (const layer of this.shown()) marks += LAYERS[layer.kind](printing && layer.kind === "points" ? raster(pen, box) : pen, box, layer);
-    pen.drawRaster && pen.drawRaster();
+    for (const layer of this.shown()) marks += LAYERS[layer.kind](dots && layer.kind === "points" ? dots : pen, box, layer);
+    if (dots) pen.drawImage(dots.canvas, 0, 0, box.width, box.height);
     pen.restore();
     if (chart.equal) compass(pen, box);
     pen.strokeStyle = theme().axis;
