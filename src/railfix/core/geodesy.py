@@ -104,11 +104,12 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)
     lat, lon, _ = geodetic_from_ecef(receiver)
-    enu = np.einsum("tij,tnj->tni", enu_axes(lat, lon), sat - receiver[:, None, :])
-    horizontal = np.hypot(enu[..., 0], enu[..., 1])
-    elevation = np.degrees(np.arctan2(enu[..., 2], horizontal))
-    azimuth = np.degrees(np.arctan2(enu[..., 0], enu[..., 1])) % 360.0
-    return elevation, azimuth
+    enu = np.matmul(enu_axes(lat, lon), (sat - receiver[:, None, :]).swapaxes(1, 2))
+    east, north, up = enu[:, 0], enu[:, 1], enu[:, 2]
+    azimuth = np.degrees(np.arctan2(east, north))
+    azimuth[azimuth < 0.0] += 360.0
+    azimuth[azimuth == 360.0] = 0.0  # a negative angle below the last digit
+    return np.degrees(np.arctan2(up, np.sqrt(east * east + north * north))), azimuth
 
 
 def range_with_rotation(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:

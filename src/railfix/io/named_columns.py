@@ -128,7 +128,8 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
                 metadata[key] = f"{metadata[key]}; {value}" if key in metadata else value
             continue
         try:
-            cells = [cell.strip() for cell in next(csv.reader([line]))]
+            row = next(csv.reader([line])) if '"' in line else line.split(",")
+            cells = [cell.strip() for cell in row]
         except csv.Error as error:
             raise InputFileError(path, f"is not a row of cells with commas between ({error})", line=number) from None
         if not header:

@@ -143,6 +143,57 @@ def reduced_equations(
 
 
 @kernel
+def misfits(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    place_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    epochs: Indices,
+) -> Floats:
+    """Compute weighted sums of squared residuals at places; place by place."""
+    channels, groups = weight.shape[1], len(starts)
+    tied = len(offset_m) == len(code_m)
+    result, residual = np.zeros(len(epochs)), np.empty(channels)
+    totals, means = np.empty(groups), np.empty(groups)
+    for p in range(len(epochs)):
+        t = epochs[p]
+        x, y, z = place_ecef_m[p, 0], place_ecef_m[p, 1], place_ecef_m[p, 2]
+        mass, common = 0.0, 0.0
+        for g in range(groups):
+            stop = starts[g + 1] if g + 1 < groups else channels
+            total, mean = 0.0, 0.0
+            for m in range(starts[g], stop):
+                w = weight[t, m]
+                if not w > 0.0:
+                    continue
+                sx, sy, sz = sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2]
+                distance = math.sqrt((sx - x) ** 2 + (sy - y) ** 2 + (sz - z) ** 2)
+                residual[m] = code_m[t, m] - (distance + _SAGNAC * (sx * y - sy * x))
+                total += w
+                mean += w * residual[m]
+            if total > 0.0:
+                mean /= total
+                for m in range(starts[g], stop):
+                    if weight[t, m] > 0.0:
+                        result[p] += weight[t, m] * (residual[m] - mean) ** 2
+                if tied:
+                    own = 1.0 / (1.0 / total + sigma_m[t, g] ** 2)
+                    mass += own
+                    common += own * (mean - offset_m[t, g])
+            totals[g], means[g] = total, mean
+        if mass > 0.0:
+            common /= mass
+            for g in range(groups):
+                if totals[g] > 0.0:
+                    own = 1.0 / (1.0 / totals[g] + sigma_m[t, g] ** 2)
+                    result[p] += own * (means[g] - offset_m[t, g] - common) ** 2
+    return result
+
+
+@kernel
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
     """Clocks and residuals of one epoch after a step (`NormalEquations.after`)."""
     for g in range(len(totals)):
@@ -354,7 +405,7 @@ def reweighted(
     solved = np.zeros(epochs, dtype=np.bool_)
     u = np.empty((3, channels))
     misfit, root, base, factor = np.empty(channels), np.empty(channels), np.empty(channels), np.empty(channels)
-    white, ordered, group_of = np.empty(channels), np.empty(channels), np.empty(channels, dtype=np.int64)
+    white, order, group_of = np.empty(channels), np.empty(channels, dtype=np.int64), np.empty(channels, dtype=np.int64)
     channel = np.empty(channels, dtype=np.int64)
     totals, mass, means, apart = np.empty(groups), np.empty(groups), np.empty((4, groups)), np.empty((4, groups))
     common, n, v, row = np.empty(4), np.empty((3, 3)), np.empty(3), np.empty(4)
@@ -374,7 +425,7 @@ def reweighted(
                 u[0, count], u[1, count], u[2, count] = dx / distance, dy / distance, dz / distance
                 misfit[count] = code_m[t, m] - (distance + _SAGNAC * (sx * y - sy * x))
                 base[count], root[count], factor[count] = w, math.sqrt(w), 1.0
-                channel[count], group_of[count] = m, g
+                channel[count], group_of[count], order[count] = m, g, count
                 count += 1
         finite, scale = False, 1.0
         for _ in range(iterations):
@@ -451,13 +502,14 @@ def reweighted(
                     clock = means[3, g] - (s0 * means[0, g] + s1 * means[1, g] + s2 * means[2, g])
                     moved = u[0, k] * s0 + u[1, k] * s1 + u[2, k] * s2
                     white[k] = root[k] * abs(misfit[k] + moved - clock)
-                at = k
-                while at > 0 and ordered[at - 1] > white[k]:
-                    ordered[at] = ordered[at - 1]
+            for k in range(count):  # nearly in order from the second step on
+                at, one = k, order[k]
+                while at > 0 and white[order[at - 1]] > white[one]:
+                    order[at] = order[at - 1]
                     at -= 1
-                ordered[at] = white[k]
+                order[at] = one
             middle = min(count // 2, channels - 1)
-            median = ordered[middle] if middle < count else 0.0
+            median = white[order[middle]] if middle < count else 0.0
             scale = max(median * correction[t], _LEAST_SCALE)
             changed = False
             for k in range(count):

@@ -37,6 +37,7 @@ def satellites_rejected(member: Integers, reason: Bits) -> Integers:
         `Channels.member`.
     reason : ndarray of int64, shape (T, M)
     """
-    seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.int64) @ member > 0
-    used = (reason == 0).astype(np.int64) @ member > 0
+    of_satellite = member.astype(np.float32)  # small counts are exact, and floats are multiplied in blocks
+    seen = ((reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
+    used = (reason == 0).astype(np.float32) @ of_satellite > 0
     return np.asarray(np.count_nonzero(seen & ~used, axis=1), dtype=np.int64)

@@ -296,24 +296,50 @@ def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Flo
     return apart, mass
 
 
-def fit(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Weighted sum of squared residuals at a place, the clocks eliminated, shape (T,).
+def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
+    """Weighted sum of squared residuals at places, the clocks eliminated.
 
     The ``q`` of the section search: `normal_equations(...).wsse` without the derivatives.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        T epochs.
+    place_ecef_m : ndarray, shape (n, 3) [m]
+    epochs : ndarray of int, shape (n,), optional
+        Epoch of each place; by default one place an epoch, in order.
+
+    Returns
+    -------
+    ndarray, shape (n,)
     """
-    distance, _ = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    result = np.zeros(len(ranges))
-    totals, means = np.empty((2, len(ranges), len(ranges.groups)))
-    for g, group in enumerate(ranges.groups):
-        weight = ranges.weight[:, group]
-        residual = ranges.code_m[:, group] - distance[:, group]
-        totals[:, g] = weight.sum(axis=1)
-        means[:, g] = (weight * residual).sum(axis=1) / np.where(totals[:, g] > 0, totals[:, g], 1.0)
-        result += (weight * (residual - means[:, g, None]) ** 2).sum(axis=1)
-    if ranges.ties is not None:
-        apart, mass = _between_clocks(means[:, None], totals, ranges.ties)
+    return misfits(*ranges.arrays(place_ecef_m), np.arange(len(ranges)) if epochs is None else epochs)
+
+
+@compiled_by("ranges")
+def misfits(
+    sat_ecef_m: Floats,
+    code_m: Floats,
+    weight: Floats,
+    place_ecef_m: Floats,
+    starts: Indices,
+    offset_m: Floats,
+    sigma_m: Floats,
+    epochs: Indices,
+) -> Floats:
+    """Compute `fit` of arrays as `reduced_equations` takes them, but for one place for each of `epochs`."""
+    weight = weight[epochs]
+    distance, _ = range_with_rotation(sat_ecef_m[epochs], place_ecef_m[:, None, :])
+    residual = code_m[epochs] - distance
+    totals = np.add.reduceat(weight, starts, axis=1)
+    means = np.add.reduceat(weight * residual, starts, axis=1) / np.where(totals > 0, totals, 1.0)
+    residual -= np.repeat(means, np.diff(np.append(starts, weight.shape[1])), axis=1)
+    result = np.einsum("pm,pm,pm->p", weight, residual, residual)
+    if len(offset_m) == len(code_m):
+        ties = ClockTies(offset_m=offset_m[epochs], sigma_m=sigma_m[epochs])
+        apart, mass = _between_clocks(means[:, None], totals, ties)
         result += (mass * apart[:, 0] ** 2).sum(axis=1)
-    return result
+    return np.asarray(result)
 
 
 def inverse_3x3(matrix: Floats) -> Floats:

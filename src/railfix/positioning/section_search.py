@@ -6,7 +6,8 @@ is eliminated (`normal_equations.fit`), so no reference satellite has to be chos
 point with the least such ``q``, in a time that does not grow with the line:
 
 * where a 3-D position exists, ``q`` grows from it as a quadratic form, so the point lies in a ball
-  whose radius follows from the ``q`` of any one point; a k-d tree returns its points;
+  whose radius follows from the ``q`` of any one point; stretches of line outside it are dropped,
+  long ones first;
 * where it does not (two or three satellites), coarse to fine: the square root of ``q`` cannot
   change faster than the square root of the summed weights times the distance moved, so a stretch
   of line whose middle fits too badly is dropped.
@@ -18,7 +19,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -28,6 +28,7 @@ from scipy.special import chdtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
+from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -36,8 +37,10 @@ from railfix.track.trajectory import Trajectory
 _SHORTEST_RANGE: Final = 1.9e7
 #: Gradient of the Earth-rotation term of a range over the receiver's place, rounded up (see `geodesy`).
 _ROTATION_GRADIENT: Final = 1.1e-5
-#: Children of a stretch of line in the coarse-to-fine search.
+#: Children of a stretch of line.
 _FAN_OUT: Final = 8
+#: Rounding allowed for in the radius of a stretch [m].
+_SLACK_M: Final = 1e-6
 
 
 class SectionLimits(Settings):
@@ -161,16 +164,49 @@ class SearchIndex:
                 break
             size *= _FAN_OUT
 
+    @cached_property
+    def stretches(self) -> tuple[Indices, Floats, Indices]:
+        """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first of each level."""
+        first = np.cumsum([0, *(len(level.middle) for level in self.levels)])
+        middle = np.concatenate([level.middle for level in self.levels])
+        return middle, np.concatenate([level.radius_m for level in self.levels]), first
+
 
 @dataclass
 class _Candidates:
-    """Pairs of epoch and point, sorted by both, with q and its slope there."""
+    """Points looked at, sorted by epoch and point, with q and its slope there; n epochs, p points.
 
-    epoch: Indices
+    Attributes
+    ----------
+    at, count : ndarray of int, shape (n,)
+        The epochs, and how many points each has (at least one).
+    vertex, q, half_gradient : ndarray, shapes (p,), (p,), (p, 3)
+    matrix : ndarray, shape (m, 3, 3)
+        Normal matrices.
+    matrix_of : ndarray of int, shape (p,)
+        Which of them belongs to each point.
+    """
+
+    at: Indices
+    count: Indices
     vertex: Indices
     q: Floats
     half_gradient: Floats
     matrix: Floats
+    matrix_of: Indices
+
+    def keep(self, some: Masks) -> _Candidates:
+        """Return some of the points; every epoch keeps one."""
+        starts = np.cumsum(self.count) - self.count
+        return _Candidates(
+            self.at,
+            np.add.reduceat(some, starts, dtype=np.intp),
+            self.vertex[some],
+            self.q[some],
+            self.half_gradient[some],
+            self.matrix,
+            self.matrix_of[some],
+        )
 
 
 def _searchable(ranges: Ranges) -> Masks:
@@ -221,7 +257,7 @@ def search(
         evaluations[coarse] += tried
         candidates.append(part)
     for part in candidates:
-        np.add.at(evaluations, part.epoch, 1)
+        evaluations[part.at] += part.count
     if predicted is not None:
         candidates = [_near(part, index.trajectory, predicted, limits) for part in candidates]
     return _decide(epochs, candidates, index.trajectory, freedom, limits, evaluations)
@@ -231,19 +267,12 @@ def _near(
     candidates: _Candidates, trajectory: Trajectory, predicted: PredictedPlace, limits: SectionLimits
 ) -> _Candidates:
     """Return the candidates near the predicted place, and all candidates of the epochs that have none there."""
-    epoch = candidates.epoch
+    epoch = np.repeat(candidates.at, candidates.count)
     away = np.abs(trajectory.arc_m[candidates.vertex] - predicted.arc_m[epoch])
     near = away <= limits.predicted_sigmas * predicted.sigma_m[epoch] + trajectory.length_m.max()
     any_near = np.zeros(len(predicted.arc_m), dtype=bool)
     any_near[epoch[near]] = True
-    keep = near | ~any_near[epoch]
-    return _Candidates(
-        epoch[keep],
-        candidates.vertex[keep],
-        candidates.q[keep],
-        candidates.half_gradient[keep],
-        candidates.matrix[keep],
-    )
+    return candidates.keep(near | ~any_near[epoch])
 
 
 def _ball(
@@ -287,24 +316,77 @@ def _in_ball(
     radius: Floats,
 ) -> _Candidates:
     """Points in the ball of each epoch with q from the quadratic form; exact where that leaves a choice."""
-    lists = index.tree.query_ball_point(point.ecef_m[epochs], radius, return_sorted=True)
-    count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
-    vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
+    count, vertex, q, half_gradient, unsure = points_in_balls(
+        index.trajectory.ecef_m,
+        *index.stretches,
+        point.ecef_m[epochs],
+        radius,
+        point.matrix[epochs],
+        point.wsse[epochs],
+        weight_norm[epochs],
+    )
     if not np.all(count):
         raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
-    epoch = np.repeat(epochs, count)
-    delta = index.trajectory.ecef_m[vertex] - point.ecef_m[epoch]
-    matrix = point.matrix[epoch]
-    half_gradient = np.einsum("pij,pj->pi", matrix, delta)
-    q = np.maximum(point.wsse, 0.0)[epoch] + np.einsum("pi,pi->p", delta, half_gradient)
+    if unsure.any():
+        q[unsure] = fit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
+    return _Candidates(epochs, count, vertex, q, half_gradient, point.matrix, np.repeat(epochs, count))
+
+
+@compiled_by("search")
+def points_in_balls(
+    points_m: Floats,
+    middle: Indices,
+    reach_m: Floats,
+    first: Indices,
+    centre_m: Floats,
+    radius_m: Floats,
+    matrix: Floats,
+    least: Floats,
+    weight_norm: Floats,
+) -> tuple[Indices, Indices, Floats, Floats, Masks]:
+    """Find the points of a line in one ball an epoch, and their q by the quadratic form around its centre.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (V, 3) [m]
+    middle, reach_m, first
+        Of `SearchIndex.stretches`.
+    centre_m, radius_m : ndarray, shapes (n, 3), (n,) [m]
+    matrix, least : ndarray, shapes (n, 3, 3), (n,)
+        The quadratic form: normal matrix, and q at the centre.
+    weight_norm : ndarray, shape (n,)
+        Root of the summed weights.
+
+    Returns
+    -------
+    count : ndarray of int, shape (n,)
+    vertex : ndarray of int, shape (p,)
+        Sorted by epoch and point.
+    q, half_gradient : ndarray, shapes (p,), (p, 3)
+    unsure : ndarray of bool, shape (p,)
+        The error of the quadratic form leaves open which point of the epoch is the best, and this may be it.
+    """
+    epochs, top = len(radius_m), len(first) - 2
+    epoch, node = np.divmod(np.arange(epochs * (first[-1] - first[-2])), first[-1] - first[-2])
+    for level in range(top, -1, -1):
+        at = first[level] + node
+        delta = points_m[middle[at]] - centre_m[epoch]
+        reach = radius_m[epoch] + (reach_m[at] + _SLACK_M if level else 0.0)
+        near = np.einsum("pi,pi->p", delta, delta) <= reach**2
+        epoch, node = epoch[near], node[near]
+        if level:
+            epoch, node = np.repeat(epoch, _FAN_OUT), (node[:, None] * _FAN_OUT + np.arange(_FAN_OUT)).ravel()
+            exists = node < first[level] - first[level - 1]
+            epoch, node = epoch[exists], node[exists]
+    count = np.bincount(epoch, minlength=epochs)
+    delta = points_m[node] - centre_m[epoch]
+    half_gradient = np.einsum("pij,pj->pi", matrix[epoch], delta)
+    q = np.maximum(least, 0.0)[epoch] + np.einsum("pi,pi->p", delta, half_gradient)
     bend = weight_norm[epoch] * _bend(np.sqrt(np.einsum("pi,pi->p", delta, delta)))
-    root = np.sqrt(q)
-    starts = np.cumsum(count) - count
-    least = np.repeat(np.minimum.reduceat(root + bend, starts), count)
-    close = root - bend <= least
-    unsure = close & (np.repeat(np.add.reduceat(close, starts), count) > 1)
-    q[unsure] = fit(ranges.take(epoch[unsure]), index.trajectory.ecef_m[vertex[unsure]])
-    return _Candidates(epoch, vertex, q, half_gradient, matrix)
+    root, lowest = np.sqrt(q), np.full(epochs, np.inf)
+    np.minimum.at(lowest, epoch, root + bend)
+    close = root - bend <= lowest[epoch]
+    return count, node, q, half_gradient, close & (np.bincount(epoch[close], minlength=epochs) > 1)[epoch]
 
 
 def _coarse_to_fine(
@@ -324,7 +406,7 @@ def _coarse_to_fine(
     q = np.empty(0)
     for level in reversed(range(len(index.levels))):
         stretches = index.levels[level]
-        q = fit(ranges.take(epoch), points[stretches.middle[node]])
+        q = fit(ranges, points[stretches.middle[node]], epoch)
         np.minimum.at(upper, epoch, q)
         np.add.at(tried, epoch, 1)
         reach = upper + limits.reach * np.maximum(1.0, upper / freedom)
@@ -340,25 +422,9 @@ def _coarse_to_fine(
             exists = node < below
             epoch, node = epoch[exists], node[exists]
     equations = normal_equations(ranges.take(epoch), points[node])
-    return _Candidates(epoch, node, q, -equations.vector, equations.matrix), tried[epochs]
-
-
-def _floor(candidates: _Candidates, trajectory: Trajectory, which: Indices) -> Floats:
-    """Least q on the two sections that meet at a candidate, by its quadratic form."""
-    vertex, q = candidates.vertex[which], candidates.q[which]
-    slope, matrix = candidates.half_gradient[which], candidates.matrix[which]
-    last = len(trajectory.length_m) - 1
-    floor = q.copy()
-    for section, sign, exists in (
-        (np.minimum(vertex, last), 1.0, vertex <= last),
-        (np.maximum(vertex - 1, 0), -1.0, vertex > 0),
-    ):
-        direction = sign * trajectory.tangent[section]
-        along = np.einsum("pi,pi->p", direction, slope)
-        growth = np.einsum("pi,pij,pj->p", direction, matrix, direction)
-        step = np.clip(-along / np.where(growth > 0, growth, np.inf), 0.0, trajectory.length_m[section])
-        floor = np.where(exists, np.minimum(floor, q + 2.0 * step * along + step**2 * growth), floor)
-    return floor
+    count = np.bincount(epoch, minlength=len(ranges))[epochs]
+    found, every = count > 0, np.arange(len(epoch))
+    return _Candidates(epochs[found], count[found], node, q, -equations.vector, equations.matrix, every), tried[epochs]
 
 
 def _decide(
@@ -374,31 +440,90 @@ def _decide(
     other = np.full(epochs, -1, dtype=np.intp)
     q, excess = np.full(epochs, np.nan), np.full(epochs, np.inf)
     for part in parts:
-        starts = np.flatnonzero(np.concatenate([[True], part.epoch[1:] != part.epoch[:-1]]))
-        count = np.diff(np.concatenate([starts, [len(part.epoch)]]))
-        at = part.epoch[starts]
-        least = np.minimum.reduceat(part.q, starts)
-        # First of equals, as argmin picks.
-        is_best = part.q == np.repeat(least, count)
-        best = np.minimum.reduceat(np.where(is_best, np.arange(len(part.q)), len(part.q)), starts)
-        vertex[at], q[at] = part.vertex[best], least
-
-        joined = (part.epoch[1:] == part.epoch[:-1]) & (part.vertex[1:] == part.vertex[:-1] + 1)
-        before = np.concatenate([[np.inf], np.where(joined, part.q[:-1], np.inf)])
-        after = np.concatenate([np.where(joined, part.q[1:], np.inf), [np.inf]])
-        apart = np.abs(trajectory.arc_m[part.vertex] - np.repeat(trajectory.arc_m[part.vertex[best]], count))
-        minimum = np.flatnonzero((part.q <= before) & (part.q <= after) & (apart > limits.separation_m))
-        if not len(minimum):
-            continue
-        floor = np.full(len(part.q), np.inf)
-        floor[minimum] = _floor(part, trajectory, minimum)
-        lowest = np.minimum.reduceat(floor, starts)
-        has = np.isfinite(lowest)
-        second = np.minimum.reduceat(
-            np.where(floor == np.repeat(lowest, count), np.arange(len(floor)), len(floor)), starts
-        )[has]
-        own = _floor(part, trajectory, best[has])
-        variance = np.maximum(1.0, own / freedom[at[has]])
-        excess[at[has]] = (lowest[has] - own) / variance
-        other[at[has]] = part.vertex[second]
+        at = part.at
+        vertex[at], q[at], excess[at], other[at] = best_points(
+            part.count,
+            part.vertex,
+            part.q,
+            part.half_gradient,
+            np.ascontiguousarray(part.matrix),
+            part.matrix_of,
+            freedom[at],
+            trajectory.arc_m,
+            trajectory.tangent,
+            trajectory.length_m,
+            limits.separation_m,
+        )
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)
+
+
+@compiled_by("search")
+def best_points(
+    count: Indices,
+    vertex: Indices,
+    q: Floats,
+    half_gradient: Floats,
+    matrix: Floats,
+    matrix_of: Indices,
+    freedom: Integers,
+    arc_m: Floats,
+    tangent: Floats,
+    length_m: Floats,
+    separation_m: float,
+) -> tuple[Indices, Floats, Floats, Indices]:
+    """Select the best point of each epoch, and the best of the other places.
+
+    Parameters
+    ----------
+    count, vertex, q, half_gradient, matrix, matrix_of
+        Of `_Candidates`.
+    freedom : ndarray of int, shape (n,)
+    arc_m, tangent, length_m
+        Of the trajectory.
+    separation_m : float
+
+    Returns
+    -------
+    vertex, q, excess, other_vertex : ndarray, shape (n,)
+        As in `Section`.
+    """
+    starts, epoch = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
+    least = np.minimum.reduceat(q, starts)
+    every = np.arange(len(q))
+    # First of equals, as argmin picks.
+    best = np.minimum.reduceat(np.where(q == least[epoch], every, len(q)), starts)
+    excess, other = np.full(len(count), np.inf), np.full(len(count), -1, dtype=np.intp)
+    joined = (epoch[1:] == epoch[:-1]) & (vertex[1:] == vertex[:-1] + 1)
+    before = np.concatenate([[np.inf], np.where(joined, q[:-1], np.inf)])
+    after = np.concatenate([np.where(joined, q[1:], np.inf), [np.inf]])
+    apart = np.abs(arc_m[vertex] - arc_m[vertex[best]][epoch])
+    minimum = np.flatnonzero((q <= before) & (q <= after) & (apart > separation_m))
+    if not len(minimum):
+        return vertex[best], least, excess, other
+    line = (tangent, length_m)
+    floor = np.full(len(q), np.inf)
+    floor[minimum] = _floor(vertex[minimum], q[minimum], half_gradient[minimum], matrix[matrix_of[minimum]], *line)
+    lowest = np.minimum.reduceat(floor, starts)
+    has = np.isfinite(lowest)
+    second = np.minimum.reduceat(np.where(floor == lowest[epoch], every, len(q)), starts)[has]
+    some = best[has]
+    own = _floor(vertex[some], q[some], half_gradient[some], matrix[matrix_of[some]], *line)
+    excess[has] = (lowest[has] - own) / np.maximum(1.0, own / freedom[has])
+    other[has] = vertex[second]
+    return vertex[best], least, excess, other
+
+
+def _floor(vertex: Indices, q: Floats, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> Floats:
+    """Least q on the two sections that meet at each point, by its quadratic form."""
+    last = len(length_m) - 1
+    floor = q.copy()
+    for section, sign, exists in (
+        (np.minimum(vertex, last), 1.0, vertex <= last),
+        (np.maximum(vertex - 1, 0), -1.0, vertex > 0),
+    ):
+        direction = sign * tangent[section]
+        along = np.einsum("pi,pi->p", direction, slope)
+        growth = np.einsum("pi,pij,pj->p", direction, matrix, direction)
+        step = np.clip(-along / np.where(growth > 0, growth, np.inf), 0.0, length_m[section])
+        floor = np.where(exists, np.minimum(floor, q + 2.0 * step * along + step**2 * growth), floor)
+    return floor

@@ -75,7 +75,8 @@ def klobuchar_delay_m(
     magnetic = latitude + 0.064 * np.cos((longitude - 1.617) * np.pi)
     _, seconds_of_week = to_week(time)
     local = (43_200.0 * longitude + seconds_of_week[:, None]) % SECONDS_PER_DAY
-    slant = 1.0 + 16.0 * (0.53 - elevation) ** 3
+    low = 0.53 - elevation
+    slant = 1.0 + 16.0 * low * low * low
     amplitude = np.maximum(_cubic(alpha, magnetic), 0.0)
     period = np.maximum(_cubic(beta, magnetic), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period

@@ -57,7 +57,7 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     sigma = noise.zenith_sigma_m / sine
     if noise.model == "cn0_elevation":
         cn0 = np.where(np.isnan(cn0_dbhz), noise.cn0_reference_dbhz, np.minimum(cn0_dbhz, noise.cn0_cap_dbhz))
-        sigma = sigma * 10.0 ** ((noise.cn0_reference_dbhz - cn0) / 20.0)
+        sigma = sigma * np.exp((noise.cn0_reference_dbhz - cn0) * (np.log(10.0) / 20.0))
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 

@@ -118,11 +118,11 @@ class OutputFolder:
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a Parquet file, kept as pieces until `commit`."""
+        """Append rows to a Parquet file, kept as pieces (Arrow IPC) until `commit`."""
         with _writing(self.path / name):
             pieces = self._pieces.setdefault(name, [])
             piece = self.staged(name).with_name(f"{name}.{len(pieces):06d}")
-            table.write_parquet(piece, compression="lz4", statistics=False)
+            table.write_ipc(piece, compression="lz4")
             pieces.append(piece)
 
     def change(self, name: str, widened: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
@@ -134,15 +134,15 @@ class OutputFolder:
         self._csv.pop(f"{name}.csv").close()
         with _writing(self.path / f"{name}.parquet"):
             for piece in self._pieces[f"{name}.parquet"]:
-                table = widened(pl.read_parquet(piece, memory_map=False))
-                table.write_parquet(piece, compression="lz4", statistics=False)
+                table = widened(pl.read_ipc(piece))
+                table.write_ipc(piece, compression="lz4")
                 self.append_csv(f"{name}.csv", rounded(table))
 
     def scan(self, name: str) -> pl.LazyFrame:
         """Return what was appended so far to a Parquet file."""
         import polars as pl
 
-        return pl.scan_parquet(self._pieces[name])
+        return pl.scan_ipc(self._pieces[name])
 
     def by_antenna(self, name: str, columns: Sequence[str], *, where: pl.Expr | None = None) -> dict[str, pl.DataFrame]:
         """Return some columns of what was appended so far, by antenna; read piece by piece, as all rows may be many."""
@@ -150,7 +150,7 @@ class OutputFolder:
 
         parts: dict[str, list[pl.DataFrame]] = {}
         for piece in self._pieces[name]:
-            rows = pl.read_parquet(piece, columns=["antenna", *columns])
+            rows = pl.read_ipc(piece, columns=["antenna", *columns])
             some = rows if where is None else rows.filter(where)
             for key, part in some.partition_by("antenna", as_dict=True, include_key=False).items():
                 parts.setdefault(str(key[0]), []).append(part)

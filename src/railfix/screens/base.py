@@ -132,8 +132,10 @@ def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats
     sigma_m : ndarray, shape (T, M) [m]
         Without the suspicion.
     """
-    extra = np.maximum(np.abs(np.nan_to_num(error_m)), LEAST_SUSPICION * sigma_m)
-    return np.where(reject, np.hypot(sigma_m, extra), sigma_m)
+    at, result = np.nonzero(reject), sigma_m.copy()
+    sigma = sigma_m[at]
+    result[at] = np.hypot(sigma, np.maximum(np.abs(np.nan_to_num(error_m[at])), LEAST_SUSPICION * sigma))
+    return result
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,5 +28,6 @@ def clock_columns(satellite: Strings) -> list[Indices]:
 def enough_satellites(finite: Masks, satellite: Strings, least: int) -> Masks:
     """Whether each row has at least `least` satellites with a finite channel, shape (T, 1)."""
     names, which = np.unique(satellite, return_inverse=True)
-    seen = finite.astype(np.int64) @ (which[:, None] == np.arange(len(names))).astype(np.int64) > 0
+    # small counts are exact as floats, which are multiplied in blocks
+    seen = finite.astype(np.float32) @ (which[:, None] == np.arange(len(names))).astype(np.float32) > 0
     return np.asarray(np.count_nonzero(seen, axis=1) >= least)[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -84,7 +85,7 @@ def number(text: str) -> float:
     if not text:
         return _BLANK
     value = float(text.replace("D", "E").replace("d", "e"))
-    if not np.isfinite(value):
+    if not math.isfinite(value):
         raise ValueError(f"{text!r} is not a finite number")
     return _BLANK if _UNKNOWN < abs(value) < 1.01e9 else value
 
@@ -92,7 +93,7 @@ def number(text: str) -> float:
 def first_fault(record: RawRecord) -> tuple[int, str] | None:
     """Return index and description of the first impossible number; None for a valid record."""
     for k, (name, value) in enumerate(zip(FIELDS[record.system], record.numbers, strict=True)):
-        if name in _NEEDED and np.isnan(value):
+        if name in _NEEDED and math.isnan(value):
             return k, f"{name} is blank"
         low, high = _BETWEEN.get(name, _OTHERS_BETWEEN)
         if value < low or value > high:

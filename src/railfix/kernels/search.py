@@ -1,0 +1,138 @@
+"""Compiled functions of `railfix.positioning.section_search`: points near a position, and the best of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.kernels.compiling import kernel
+
+#: `railfix.positioning.section_search`: error of the linear model of a range, children of a stretch, slack of a radius.
+_CURVATURE, _TURNING, _FAN_OUT, _SLACK_M = 1.0 / (2.0 * 1.9e7), 1.1e-5, 8, 1e-6
+
+
+@kernel
+def points_in_balls(
+    points_m: Floats,
+    middle: Indices,
+    reach_m: Floats,
+    first: Indices,
+    centre_m: Floats,
+    radius_m: Floats,
+    matrix: Floats,
+    least: Floats,
+    weight_norm: Floats,
+) -> tuple[Indices, Indices, Floats, Floats, Masks]:
+    """Return the points in the ball of each epoch with their q by the quadratic form; epoch by epoch."""
+    epochs, top = len(radius_m), len(first) - 2
+    count, found = np.zeros(epochs, dtype=np.intp), 0
+    vertex, values, unsure = np.empty(1024, dtype=np.intp), np.empty((1024, 6)), np.empty(1024, dtype=np.bool_)
+    nodes, below = np.empty(len(points_m) + _FAN_OUT, dtype=np.intp), np.empty(len(points_m) + _FAN_OUT, dtype=np.intp)
+    for t in range(epochs):
+        x, y, z = centre_m[t, 0], centre_m[t, 1], centre_m[t, 2]
+        held = first[top + 1] - first[top]
+        for i in range(held):
+            nodes[i] = i
+        for level in range(top, -1, -1):
+            kept, size = 0, first[level] - first[level - 1] if level else 0
+            for i in range(held):
+                at = first[level] + nodes[i]
+                p = middle[at]
+                dx, dy, dz = points_m[p, 0] - x, points_m[p, 1] - y, points_m[p, 2] - z
+                reach = radius_m[t] + (reach_m[at] + _SLACK_M if level else 0.0)
+                if dx * dx + dy * dy + dz * dz > reach * reach:
+                    continue
+                if not level:
+                    below[kept] = nodes[i]
+                    kept += 1
+                for child in range(_FAN_OUT * nodes[i], min(_FAN_OUT * nodes[i] + _FAN_OUT, size)):
+                    below[kept] = child
+                    kept += 1
+            nodes, below, held = below, nodes, kept
+        count[t] = held
+        while found + held > len(vertex):
+            vertex = np.concatenate((vertex, np.empty_like(vertex)))
+            values = np.concatenate((values, np.empty_like(values)))
+            unsure = np.concatenate((unsure, np.empty_like(unsure)))
+        best, close = math.inf, 0
+        for i in range(held):
+            p, at = nodes[i], found + i
+            dx, dy, dz = points_m[p, 0] - x, points_m[p, 1] - y, points_m[p, 2] - z
+            for k in range(3):
+                values[at, 1 + k] = matrix[t, k, 0] * dx + matrix[t, k, 1] * dy + matrix[t, k, 2] * dz
+            q = max(least[t], 0.0) + dx * values[at, 1] + dy * values[at, 2] + dz * values[at, 3]
+            square = dx * dx + dy * dy + dz * dz
+            bend = weight_norm[t] * (square * _CURVATURE + _TURNING * math.sqrt(square))
+            root = math.sqrt(q)
+            vertex[at], values[at, 0], values[at, 4], values[at, 5] = p, q, root - bend, root + bend
+            best = min(best, root + bend)
+        for at in range(found, found + held):
+            unsure[at] = values[at, 4] <= best
+            close += unsure[at]
+        if close < 2:
+            unsure[found : found + held] = False
+        found += held
+    return count, vertex[:found], values[:found, 0].copy(), values[:found, 1:4].copy(), unsure[:found]
+
+
+@kernel
+def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
+    """Least q on the two sections that meet at a point, by its quadratic form."""
+    floor = q
+    for side in range(2):
+        section, sign = vertex - side, 1.0 - 2.0 * side
+        if section < 0 or section >= len(length_m):
+            continue
+        along, growth = 0.0, 0.0
+        for i in range(3):
+            along += sign * tangent[section, i] * slope[i]
+            for j in range(3):
+                growth += tangent[section, i] * matrix[i, j] * tangent[section, j]
+        step = min(max(-along / growth, 0.0), length_m[section]) if growth > 0.0 else 0.0
+        floor = min(floor, q + 2.0 * step * along + step**2 * growth)
+    return floor
+
+
+@kernel
+def best_points(
+    count: Indices,
+    vertex: Indices,
+    q: Floats,
+    half_gradient: Floats,
+    matrix: Floats,
+    matrix_of: Indices,
+    freedom: Integers,
+    arc_m: Floats,
+    tangent: Floats,
+    length_m: Floats,
+    separation_m: float,
+) -> tuple[Indices, Floats, Floats, Indices]:
+    """Return the best point of each epoch, and the best of the other places; epoch by epoch."""
+    epochs, begin = len(count), 0
+    chosen, other = np.empty(epochs, dtype=np.intp), np.full(epochs, -1, dtype=np.intp)
+    least, excess = np.empty(epochs), np.full(epochs, np.inf)
+    for t in range(epochs):
+        end = begin + count[t]
+        best = begin
+        for p in range(begin, end):
+            if q[p] < q[best]:
+                best = p
+        chosen[t], least[t] = vertex[best], q[best]
+        lowest = math.inf
+        for p in range(begin, end):
+            if not abs(arc_m[vertex[p]] - arc_m[vertex[best]]) > separation_m:
+                continue
+            if p > begin and vertex[p] == vertex[p - 1] + 1 and q[p] > q[p - 1]:
+                continue
+            if p + 1 < end and vertex[p + 1] == vertex[p] + 1 and q[p] > q[p + 1]:
+                continue
+            floor = _floor(vertex[p], q[p], half_gradient[p], matrix[matrix_of[p]], tangent, length_m)
+            if floor < lowest:
+                lowest, other[t] = floor, vertex[p]
+        if lowest < math.inf:
+            own = _floor(vertex[best], q[best], half_gradient[best], matrix[matrix_of[best]], tangent, length_m)
+            excess[t] = (lowest - own) / max(1.0, own / freedom[t])
+        begin = end
+    return chosen, least, excess, other
