@@ -1,4 +1,4 @@
-"""Compiled functions of `railfix.positioning.section_search`: points near a position, and the best of them."""
+"""Compiled functions of `railfix.positioning.line_points`: points near a position, and the best of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import kernel
 
-#: `railfix.positioning.section_search`: error of the linear model of a range, children of a stretch, slack of a radius.
+#: `railfix.positioning.line_points`: error of the linear model of a range, children of a stretch, slack of a radius.
 _CURVATURE, _TURNING, _FAN_OUT, _SLACK_M = 1.0 / (2.0 * 1.9e7), 1.1e-5, 8, 1e-6
 
 

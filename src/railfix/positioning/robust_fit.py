@@ -117,7 +117,7 @@ def robust_fit(
     )
 
 
-@compiled_by("ranges")
+@compiled_by("robust")
 def reweighted(
     sat_ecef_m: Floats,
     code_m: Floats,

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 from pydantic import Field
@@ -28,19 +27,10 @@ from scipy.special import chdtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.kernels import compiled_by
+from railfix.positioning.line_points import FAN_OUT, ROTATION_GRADIENT, bend_m, best_points, points_in_balls
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
-
-#: Shortest range from the Earth's surface to a navigation satellite [m], rounded down (GLONASS at the zenith).
-_SHORTEST_RANGE: Final = 1.9e7
-#: Gradient of the Earth-rotation term of a range over the receiver's place, rounded up (see `geodesy`).
-_ROTATION_GRADIENT: Final = 1.1e-5
-#: Children of a stretch of line.
-_FAN_OUT: Final = 8
-#: Rounding allowed for in the radius of a stretch [m].
-_SLACK_M: Final = 1e-6
 
 
 class SectionLimits(Settings):
@@ -160,9 +150,9 @@ class SearchIndex:
             middle = np.minimum(starts + size // 2, count - 1)
             away = np.linalg.norm(points - points[np.repeat(middle, size)[:count]], axis=1)
             self.levels.append(_Stretches(middle, np.maximum.reduceat(away, starts)))
-            if len(starts) <= _FAN_OUT:
+            if len(starts) <= FAN_OUT:
                 break
-            size *= _FAN_OUT
+            size *= FAN_OUT
 
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
@@ -287,7 +277,7 @@ def _ball(
     distance = np.asarray(nearest_m, dtype=np.float64)
     delta = index.trajectory.ecef_m[vertex] - point.ecef_m[at]
     form = np.einsum("ti,tij,tj->t", delta, point.matrix[at], delta)
-    bend = weight_norm[at] * _bend(distance)
+    bend = weight_norm[at] * bend_m(distance)
     q0 = np.maximum(point.wsse[at], 0.0)
     best = (np.sqrt(q0 + form) + bend) ** 2
     reach = np.sqrt(best + limits.reach * np.maximum(1.0, best / freedom[at]))
@@ -295,16 +285,11 @@ def _ball(
     growth = 1.0 / np.trace(point.covariance_m2[at], axis1=1, axis2=2)
     size = np.maximum(distance, np.sqrt(np.maximum(reach**2 - q0, 0.0) / growth))
     for _ in range(3):
-        size = np.maximum(size, np.sqrt(np.maximum((reach + weight_norm[at] * _bend(size)) ** 2 - q0, 0.0) / growth))
+        size = np.maximum(size, np.sqrt(np.maximum((reach + weight_norm[at] * bend_m(size)) ** 2 - q0, 0.0) / growth))
     # The bound holds where curvature stays small against growth; otherwise the search goes coarse to fine.
-    holds = weight_norm[at] * _bend(2.0 * size) < 0.5 * np.sqrt(growth) * size
+    holds = weight_norm[at] * bend_m(2.0 * size) < 0.5 * np.sqrt(growth) * size
     radius[at] = np.where(holds, 1.001 * size + 1e-3, np.nan)
     return radius
-
-
-def _bend(distance_m: Floats) -> Floats:
-    """Return the largest error of the linear model of a range at a distance from its expansion point [m]."""
-    return np.asarray(distance_m**2 / (2.0 * _SHORTEST_RANGE) + _ROTATION_GRADIENT * distance_m)
 
 
 def _in_ball(
@@ -332,63 +317,6 @@ def _in_ball(
     return _Candidates(epochs, count, vertex, q, half_gradient, point.matrix, np.repeat(epochs, count))
 
 
-@compiled_by("search")
-def points_in_balls(
-    points_m: Floats,
-    middle: Indices,
-    reach_m: Floats,
-    first: Indices,
-    centre_m: Floats,
-    radius_m: Floats,
-    matrix: Floats,
-    least: Floats,
-    weight_norm: Floats,
-) -> tuple[Indices, Indices, Floats, Floats, Masks]:
-    """Find the points of a line in one ball an epoch, and their q by the quadratic form around its centre.
-
-    Parameters
-    ----------
-    points_m : ndarray, shape (V, 3) [m]
-    middle, reach_m, first
-        Of `SearchIndex.stretches`.
-    centre_m, radius_m : ndarray, shapes (n, 3), (n,) [m]
-    matrix, least : ndarray, shapes (n, 3, 3), (n,)
-        The quadratic form: normal matrix, and q at the centre.
-    weight_norm : ndarray, shape (n,)
-        Root of the summed weights.
-
-    Returns
-    -------
-    count : ndarray of int, shape (n,)
-    vertex : ndarray of int, shape (p,)
-        Sorted by epoch and point.
-    q, half_gradient : ndarray, shapes (p,), (p, 3)
-    unsure : ndarray of bool, shape (p,)
-        The error of the quadratic form leaves open which point of the epoch is the best, and this may be it.
-    """
-    epochs, top = len(radius_m), len(first) - 2
-    epoch, node = np.divmod(np.arange(epochs * (first[-1] - first[-2])), first[-1] - first[-2])
-    for level in range(top, -1, -1):
-        at = first[level] + node
-        delta = points_m[middle[at]] - centre_m[epoch]
-        reach = radius_m[epoch] + (reach_m[at] + _SLACK_M if level else 0.0)
-        near = np.einsum("pi,pi->p", delta, delta) <= reach**2
-        epoch, node = epoch[near], node[near]
-        if level:
-            epoch, node = np.repeat(epoch, _FAN_OUT), (node[:, None] * _FAN_OUT + np.arange(_FAN_OUT)).ravel()
-            exists = node < first[level] - first[level - 1]
-            epoch, node = epoch[exists], node[exists]
-    count = np.bincount(epoch, minlength=epochs)
-    delta = points_m[node] - centre_m[epoch]
-    half_gradient = np.einsum("pij,pj->pi", matrix[epoch], delta)
-    q = np.maximum(least, 0.0)[epoch] + np.einsum("pi,pi->p", delta, half_gradient)
-    bend = weight_norm[epoch] * _bend(np.sqrt(np.einsum("pi,pi->p", delta, delta)))
-    root, lowest = np.sqrt(q), np.full(epochs, np.inf)
-    np.minimum.at(lowest, epoch, root + bend)
-    close = root - bend <= lowest[epoch]
-    return count, node, q, half_gradient, close & (np.bincount(epoch[close], minlength=epochs) > 1)[epoch]
-
-
 def _coarse_to_fine(
     ranges: Ranges,
     index: SearchIndex,
@@ -411,14 +339,14 @@ def _coarse_to_fine(
         np.add.at(tried, epoch, 1)
         reach = upper + limits.reach * np.maximum(1.0, upper / freedom)
         nearest = np.maximum(
-            np.sqrt(q) - weight_norm[epoch] * (1.0 + 2.0 * _ROTATION_GRADIENT) * stretches.radius_m[node], 0.0
+            np.sqrt(q) - weight_norm[epoch] * (1.0 + 2.0 * ROTATION_GRADIENT) * stretches.radius_m[node], 0.0
         )
         keep = nearest**2 <= reach[epoch]
         epoch, node, q = epoch[keep], node[keep], q[keep]
         if level:
             below = len(index.levels[level - 1].middle)
-            node = (node[:, None] * _FAN_OUT + np.arange(_FAN_OUT)).ravel()
-            epoch = np.repeat(epoch, _FAN_OUT)
+            node = (node[:, None] * FAN_OUT + np.arange(FAN_OUT)).ravel()
+            epoch = np.repeat(epoch, FAN_OUT)
             exists = node < below
             epoch, node = epoch[exists], node[exists]
     equations = normal_equations(ranges.take(epoch), points[node])
@@ -455,75 +383,3 @@ def _decide(
             limits.separation_m,
         )
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)
-
-
-@compiled_by("search")
-def best_points(
-    count: Indices,
-    vertex: Indices,
-    q: Floats,
-    half_gradient: Floats,
-    matrix: Floats,
-    matrix_of: Indices,
-    freedom: Integers,
-    arc_m: Floats,
-    tangent: Floats,
-    length_m: Floats,
-    separation_m: float,
-) -> tuple[Indices, Floats, Floats, Indices]:
-    """Select the best point of each epoch, and the best of the other places.
-
-    Parameters
-    ----------
-    count, vertex, q, half_gradient, matrix, matrix_of
-        Of `_Candidates`.
-    freedom : ndarray of int, shape (n,)
-    arc_m, tangent, length_m
-        Of the trajectory.
-    separation_m : float
-
-    Returns
-    -------
-    vertex, q, excess, other_vertex : ndarray, shape (n,)
-        As in `Section`.
-    """
-    starts, epoch = np.cumsum(count) - count, np.repeat(np.arange(len(count)), count)
-    least = np.minimum.reduceat(q, starts)
-    every = np.arange(len(q))
-    # First of equals, as argmin picks.
-    best = np.minimum.reduceat(np.where(q == least[epoch], every, len(q)), starts)
-    excess, other = np.full(len(count), np.inf), np.full(len(count), -1, dtype=np.intp)
-    joined = (epoch[1:] == epoch[:-1]) & (vertex[1:] == vertex[:-1] + 1)
-    before = np.concatenate([[np.inf], np.where(joined, q[:-1], np.inf)])
-    after = np.concatenate([np.where(joined, q[1:], np.inf), [np.inf]])
-    apart = np.abs(arc_m[vertex] - arc_m[vertex[best]][epoch])
-    minimum = np.flatnonzero((q <= before) & (q <= after) & (apart > separation_m))
-    if not len(minimum):
-        return vertex[best], least, excess, other
-    line = (tangent, length_m)
-    floor = np.full(len(q), np.inf)
-    floor[minimum] = _floor(vertex[minimum], q[minimum], half_gradient[minimum], matrix[matrix_of[minimum]], *line)
-    lowest = np.minimum.reduceat(floor, starts)
-    has = np.isfinite(lowest)
-    second = np.minimum.reduceat(np.where(floor == lowest[epoch], every, len(q)), starts)[has]
-    some = best[has]
-    own = _floor(vertex[some], q[some], half_gradient[some], matrix[matrix_of[some]], *line)
-    excess[has] = (lowest[has] - own) / np.maximum(1.0, own / freedom[has])
-    other[has] = vertex[second]
-    return vertex[best], least, excess, other
-
-
-def _floor(vertex: Indices, q: Floats, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> Floats:
-    """Least q on the two sections that meet at each point, by its quadratic form."""
-    last = len(length_m) - 1
-    floor = q.copy()
-    for section, sign, exists in (
-        (np.minimum(vertex, last), 1.0, vertex <= last),
-        (np.maximum(vertex - 1, 0), -1.0, vertex > 0),
-    ):
-        direction = sign * tangent[section]
-        along = np.einsum("pi,pi->p", direction, slope)
-        growth = np.einsum("pi,pij,pj->p", direction, matrix, direction)
-        step = np.clip(-along / np.where(growth > 0, growth, np.inf), 0.0, length_m[section])
-        floor = np.where(exists, np.minimum(floor, q + 2.0 * step * along + step**2 * growth), floor)
-    return floor
