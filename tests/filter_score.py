@@ -1,8 +1,9 @@
 """Scores of the filter along the track on the real recordings: ``python tests/filter_score.py [TABLE ...]``.
 
-Tables: ``figures`` (single epochs beside, and smoothed), ``ablation`` (without each kind of measurement), ``gaps``
-(windows without satellites, with and without a wheel), ``levels``, ``faults`` (of each satellite in turn, half an
-hour), ``cost``. One setting for all recordings; distances are straight ones on the map.
+Tables: ``figures`` (single epochs beside, and smoothed), ``codes`` (whether their errors are common), ``ablation``
+(without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``levels``,
+``faults`` (of each satellite in turn, a quarter of an hour; only when asked for), ``cost``. One setting for all
+recordings; distances are straight ones on the map.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 import recordings_score
 import recordings_truth
 from railfix.core.constants import CLOCK_GROUP
+from railfix.core.geodesy import range_with_rotation
 from railfix.core.timescale import seconds
 from railfix.evaluate import interpolate_reference, straight_distance
 from railfix.pipeline import along_track
@@ -144,13 +146,71 @@ def cases(data: Path) -> Iterator[Case]:
         yield rinex_case(name, run, data)
 
 
-def figures_of(error: np.ndarray, sigma: np.ndarray | None = None) -> str:
+def figures_of(error: np.ndarray) -> str:
     known = np.isfinite(error)
-    text = (
+    return (
         f"rate {100 * known.mean():6.2f} %  p50 {np.nanmedian(error):5.2f}  p95 {np.nanpercentile(error, 95):6.2f}  "
         f"max {np.nanmax(error):6.1f}  over 50 m {np.count_nonzero(error > 50.0)}"
     )
-    return text if sigma is None else text + f"  error/sigma p95 {np.nanpercentile(error / sigma, 95):4.1f}"
+
+
+def ratio_of(case: Case, found: Tracked | SmoothedTrack) -> str:
+    """95th percentile of error over sigma, and its 95 % interval by drawing blocks of 60 s with replacement."""
+    ratio = case.error(found) / found.sigma_m
+    known = case.observed & np.isfinite(ratio)
+    block = seconds(case.epochs.time - case.epochs.time[0])[known] // 60.0
+    blocks = [ratio[known][block == k] for k in np.unique(block)]
+    random = np.random.default_rng(0)
+    drawn = [
+        np.percentile(np.concatenate([blocks[k] for k in random.integers(0, len(blocks), len(blocks))]), 95)
+        for _ in range(1000)
+    ]
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    p95 = np.percentile(ratio[known], 95)
+    return f"error/sigma p95 {p95:4.1f} ({low:.1f} to {high:.1f}, {len(blocks)} blocks)"
+
+
+def show_codes(all_cases: list[Case]) -> None:
+    """Codes alone against the reference: whether they share an error, and how long their errors last.
+
+    The place along the line by the codes of one epoch with Student's t errors; its error over the sigma that
+    independent errors of the codes give, beside the residuals over theirs; how both are correlated over time.
+    """
+    lags = (1, 10, 30, 60, 120)
+    for case in all_cases:
+        epochs, line = case.epochs, Line.of(case.trajectory)
+        known = np.isfinite(case.reference[:, 0])
+        arc, _ = case.trajectory.nearest(np.where(known[:, None], case.reference, case.reference[known][0]))
+        distance, sight = range_with_rotation(epochs.sat_ecef_m, case.reference[:, None, :])
+        along = -np.einsum("tki,ti->tk", sight, line.at(arc)[1][:, 0])
+        sigma = epochs.code_sigma_m * np.sqrt(1.0 + TrackingLimits().code_white_share ** 2)
+        groups = epochs.clock[:, None] == np.unique(epochs.clock)
+        ratio, residual = np.full(len(epochs), np.nan), np.full(sigma.shape, np.nan)
+        for t in np.flatnonzero(case.observed):
+            ok = np.isfinite(epochs.code_m[t]) & np.isfinite(sigma[t])
+            design = np.column_stack([along[t, ok], groups[ok][:, groups[ok].any(axis=0)]])
+            if ok.sum() < design.shape[1] + 1:
+                continue
+            value, information = (epochs.code_m - distance)[t, ok], sigma[t, ok] ** -2.0
+            value = value - np.median(value)
+            weight = information
+            for _ in range(8):
+                change = np.linalg.solve(design.T @ (weight[:, None] * design), design.T @ (weight * value))
+                left = value - design @ change
+                weight = 5.0 * information / (4.0 + left**2 * information)
+            spread = np.linalg.inv(design.T @ (information[:, None] * design))[0, 0]
+            ratio[t], residual[t, ok] = change[0] / np.sqrt(spread), left / sigma[t, ok]
+        place, codes = np.clip(ratio, -4.0, 4.0)[:, None], np.clip(residual, -4.0, 4.0)
+        lasting = [
+            " ".join(f"{np.nanmean(x[lag:] * x[:-lag]) / np.nanmean(x**2):5.2f}" for lag in lags)
+            for x in (place, codes)
+        ]
+        print(
+            f"{case.name:9s} error/sigma p95 {np.nanpercentile(np.abs(ratio), 95):.1f}, rms of place "
+            f"{np.sqrt(np.nanmean(place**2)):.2f} and of residuals {np.sqrt(np.nanmean(codes**2)):.2f}; correlation "
+            f"after {lags} s: place {lasting[0]}, residuals {lasting[1]}",
+            flush=True,
+        )
 
 
 def show_figures(all_cases: list[Case]) -> None:
@@ -162,10 +222,10 @@ def show_figures(all_cases: list[Case]) -> None:
             if label == "filter" or sensors is not None:
                 found = case.run(sensors=sensors)
                 error = case.error(found)[case.observed]
-                print(f"{case.name:9s} {label:13s}  {figures_of(error, found.sigma_m[case.observed])}")
+                print(f"{case.name:9s} {label:13s}  {figures_of(error)}  {ratio_of(case, found)}")
                 both = case.smoothed(sensors)
-                text = figures_of(case.error(both)[case.observed], both.sigma_m[case.observed])
-                print(f"{case.name:9s} {'  smoothed':13s}  {text}", flush=True)
+                text = figures_of(case.error(both)[case.observed])
+                print(f"{case.name:9s} {'  smoothed':13s}  {text}  {ratio_of(case, both)}", flush=True)
 
 
 def show_ablation(all_cases: list[Case]) -> None:
@@ -180,10 +240,10 @@ def show_ablation(all_cases: list[Case]) -> None:
         for label, epochs in variants.items():
             found = case.run(epochs)
             error = case.error(found)[case.observed]
-            print(f"{case.name:9s} {label:17s}  {figures_of(error, found.sigma_m[case.observed])}")
+            print(f"{case.name:9s} {label:17s}  {figures_of(error)}  {ratio_of(case, found)}")
         found = case.run(degrees_of_freedom=1e6, late_degrees_of_freedom=1e6)
         error = case.error(found)[case.observed]
-        print(f"{case.name:9s} {'not robust':17s}  {figures_of(error, found.sigma_m[case.observed])}")
+        print(f"{case.name:9s} {'not robust':17s}  {figures_of(error)}  {ratio_of(case, found)}")
 
 
 def show_gaps(all_cases: list[Case]) -> None:
@@ -252,16 +312,16 @@ FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def show_faults(all_cases: list[Case]) -> None:
     """Every satellite faulty in turn, in the 5 min after it is first measured, from 60 s on; errors over the level.
 
-    The code alone is off (multipath), or code, phase and Doppler together (satellite clock). An alarm is an epoch
-    without a level. A vehicle that covers its own course several times has laps as branches, at the same place: levels
-    of the status `several_branches` count, errors over them are listed apart too.
+    The code alone comes late (multipath), or code, phase and Doppler are together too short (satellite clock). An alarm
+    is an epoch without a level. A vehicle that covers its own course several times has laps as branches, at the same
+    place: levels of the status `several_branches` count, errors over them are listed apart too.
     """
     print("| recording | fault | trials | level p50 | largest error | least level less error | alarms % | over it |")
     for whole in all_cases:
         t = seconds(whole.epochs.time - whole.epochs.time[0])
         seen = np.isfinite(whole.epochs.code_m)
         for label, size in FAULTS.items():
-            for whole_channel in (False, True) if label.startswith("ramp") else (False,):
+            for whole_channel in (False, True):
                 level, margin, error, alarms, several, trials = [], [], [], 0, 0, 0
                 for k in np.flatnonzero(seen.sum(axis=0) > 120):
                     first = int(np.argmax(seen[:, k]))
@@ -279,7 +339,7 @@ def show_faults(all_cases: list[Case]) -> None:
                     trials += 1
                 over = np.concatenate(margin)
                 print(
-                    f"| {whole.name} | {label}{', clock' if whole_channel else ''} | {trials} | "
+                    f"| {whole.name} | {label}{', clock' if whole_channel else ', late'} | {trials} | "
                     f"{np.median(np.concatenate(level)):.1f} | {np.concatenate(error).max():.1f} | {over.min():.1f} | "
                     f"{100.0 * alarms / (len(over) + alarms):.1f} | "
                     f"{np.count_nonzero(over < 0.0)} ({several}) of {len(over)} |",
@@ -292,16 +352,17 @@ FAULT_FROM_S, FAULT_WINDOW_S = 60.0, 300.0
 
 
 def with_fault(epochs: GnssEpochs, k: int, size: Callable[[np.ndarray], np.ndarray], *, whole: bool) -> GnssEpochs:
-    """Epochs with one channel's code off from `FAULT_FROM_S` on, or all that it measures."""
+    """Epochs with one channel's code late from `FAULT_FROM_S` on, or all that it measures too short."""
     since = seconds(epochs.time - epochs.time[0]) - FAULT_FROM_S
     bias = np.where(since > 0.0, size(since), 0.0)
-    changed = {"code_m": epochs.code_m.copy()}
-    changed["code_m"][:, k] += bias
-    if whole:
-        changed |= {"phase_m": epochs.phase_m.copy(), "rate_mps": epochs.rate_mps.copy()}
-        changed["phase_m"][:, k] += bias
-        changed["rate_mps"][:, k] += np.where(since > 0.0, size(since + 1.0) - size(since), 0.0)
-    return replace(epochs, **changed)
+    code, phase, rate = epochs.code_m.copy(), epochs.phase_m.copy(), epochs.rate_mps.copy()
+    if not whole:
+        code[:, k] += bias
+        return replace(epochs, code_m=code)
+    code[:, k] -= bias
+    phase[:, k] -= bias
+    rate[:, k] -= np.where(since > 0.0, size(since + 1.0) - size(since), 0.0)
+    return replace(epochs, code_m=code, phase_m=phase, rate_mps=rate)
 
 
 def show_cost(all_cases: list[Case]) -> None:
@@ -316,6 +377,7 @@ def show_cost(all_cases: list[Case]) -> None:
 
 TABLES = {
     "figures": show_figures,
+    "codes": show_codes,
     "ablation": show_ablation,
     "gaps": show_gaps,
     "levels": show_levels,
@@ -333,7 +395,7 @@ def main() -> int:
     listed = list(cases(data))
     for name in asked:
         print(f"\n{name}")
-        TABLES[name]([*listed, smartloc_case(data)] if name in ("figures", "levels", "faults") else listed)
+        TABLES[name]([*listed, smartloc_case(data)] if name in ("figures", "codes", "levels", "faults") else listed)
     return 0
 
 

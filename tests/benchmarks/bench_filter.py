@@ -49,11 +49,13 @@ def filter_alone(rounds: int) -> None:
     one = tracking_cases.part(epochs, slice(1000, 1001))
     levels = TrackingLimits(level="on")
     short = tracking_cases.part(epochs, slice(0, 200))
+    _, levelled = track(tracking_cases.part(epochs, slice(900, 1000)), line, limits=levels)
     track(one, line, state)
     for label, run, count in (
         ("a chunk", lambda: track(epochs, line), len(epochs)),
         ("epoch by epoch", lambda: [track(one, line, state) for _ in range(100)], 100),
         ("a chunk with levels", lambda: track(short, line, limits=levels), len(short)),
+        ("epoch by epoch with levels", lambda: [track(one, line, levelled, limits=levels) for _ in range(100)], 100),
     ):
         print(f"{kernels.CHOSEN:6s} {label:32s} {median_us(run, count, rounds):8.1f} us an antenna-epoch", flush=True)
 

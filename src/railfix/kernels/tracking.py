@@ -981,33 +981,14 @@ def _surviving(
 
 
 @kernel
-def _value_of(
-    epochs: Epochs, t: int, active: Active, work: Work, counts: Indices, codes: Indices, sensors: Indices, best: int,
-    h: int
-) -> None:
-    """Write measured less computed about another mean than that of the equations, `work.mean[h]`."""
-    mean, design, value = work.mean, work.design, work.value
+def _sensor_values(active: Active, work: Work, gnss: int, ns: int, sensors: Indices, best: int, h: int) -> None:
+    """Take over the equations of the sensors, about another mean, `work.mean[h]`."""
+    mean, sensed = work.mean, work.sensed
     n = mean.shape[1] - _EPOCH
-    nc, nph, nd, ns = counts[0], counts[1], counts[2], counts[3]
     place, speed = mean[h, _S] - mean[best, _S], mean[h, _V] - mean[best, _V]
     old, old_speed = mean[h, n + _OLD_S] - mean[best, n + _OLD_S], mean[h, n + _OLD_V] - mean[best, n + _OLD_V]
-    displaced = place + mean[h, _Z] - mean[best, _Z]
-    right, up = mean[h, _RIGHT] - mean[best, _RIGHT], mean[h, _UP] - mean[best, _UP]
-    clock = mean[h, n + _PHASE] - mean[best, n + _PHASE]
-    lasting, drift = speed + mean[h, _W] - mean[best, _W], mean[h, _D] - mean[best, _D]
-    for i in range(nc):
-        k = codes[i]
-        offset, error = active.offset[epochs.offset[k]], active.satellite[epochs.slot[k]]
-        value[h, i] = value[best, i] - (
-            design[best, i, 0] * displaced + design[best, i, 1] * right + design[best, i, 2] * up
-            + mean[h, offset] - mean[best, offset] + epochs.code_sigma_m[t, k] * (mean[h, error] - mean[best, error])
-        )
-    for i in range(nc, nc + nph):
-        value[h, i] = value[best, i] - design[best, i, 0] * (place - old) - clock
-    for i in range(nc + nph, nc + nph + nd):
-        value[h, i] = value[best, i] - design[best, i, 2] * lasting - drift
     for j in range(ns):
-        i, kind = nc + nph + nd + j, sensors[j]
+        i, kind = gnss + j, sensors[j]
         own = 0.0
         if kind == _WHEEL_ROW:
             own = mean[h, active.wheel] - mean[best, active.wheel]
@@ -1015,8 +996,9 @@ def _value_of(
             own = mean[h, active.radar] - mean[best, active.radar]
         elif kind == _FORCE_ROW:
             own = mean[h, active.force] - mean[best, active.force]
-        sensed = work.sensed
-        value[h, i] = value[best, i] - (
+        for c in range(6):
+            sensed[h, j, c] = sensed[best, j, c]
+        work.value[h, i] = work.value[best, i] - (
             sensed[best, j, 0] * place + sensed[best, j, 1] * old + sensed[best, j, 2] * speed
             + sensed[best, j, 3] * old_speed + sensed[best, j, 4] * own
         )
@@ -1026,7 +1008,7 @@ def _value_of(
 def _subfilters(
     epochs: Epochs, t: int, course: Course, numbers: Numbers, active: Active, bank: Subfilters, work: Work,
     variance: Floats, counts: Indices, codes: Indices, phases: Indices, dopplers: Indices, sensors: Indices,
-    anew: Masks, best: int, h: int, map_log_scale: float
+    sight: Floats, anew: Masks, best: int, h: int, map_log_scale: float
 ) -> None:
     """Do an epoch of all sub-filters (`railfix.tracking.bank.levelled`); `best` has the equations, `h` is free."""
     mean, spread = work.mean, work.spread
@@ -1059,12 +1041,6 @@ def _subfilters(
         before = before or bank.running[b]
     before = before and not best
     masked = np.empty(len(variance))
-    for i in range(gnss + ns):
-        for c in range(4):
-            work.design[h, i, c] = work.design[best, i, c]
-    for j in range(ns):
-        for c in range(6):
-            work.sensed[h, j, c] = work.sensed[best, j, c]
     for b in range(sources):
         satellite = b < slots
         if best or (satellite and not epochs.remembered[t, b]):
@@ -1109,7 +1085,11 @@ def _subfilters(
             masked[i] = math.inf if own == b else variance[i]
         for j in range(ns):
             masked[gnss + j] = math.inf if slots + clocks + sensors[j] == b else variance[gnss + j]
-        _value_of(epochs, t, active, work, counts, codes, sensors, best, h)
+        _equations(
+            epochs, t, course, active, numbers, mean, mean[h, _S], mean[h, n + _OLD_S], codes, phases, dopplers, counts,
+            sensors, 1.0, sight, work.design, work.value, work.sensed, work.bend, work.point, work.axes, h
+        )
+        _sensor_values(active, work, gnss, ns, sensors, best, h)
         _combine(
             epochs.offset, epochs.slot, epochs.code_sigma_m, t, active, numbers.sensor_floor, spread, codes, counts,
             sensors, work.design, work.sensed, variance, work.cross, work.root, work.own, work.place, work.share, h
@@ -1150,14 +1130,15 @@ def _subfilters(
 def _level(place: float, sigma: float, bank: Subfilters, numbers: Numbers, answers: Answers, t: int) -> float:
     """Return the level of a place, write its parts (`railfix.tracking.bank.level_m`)."""
     noise, apart = numbers.level_k * sigma, math.nan
-    level = noise
+    level, contradicted = noise, False
     for b in range(len(bank.running)):
         if bank.running[b]:
+            contradicted = contradicted or bank.weak_s[b] > 0.0
             away = abs(bank.mean[b, _S] - place)
             apart = away if math.isnan(apart) else max(apart, away)
             level = max(level, away + bank.k[b] * math.sqrt(bank.covariance[b, _S, _S]))
     answers.level_noise_m[t], answers.separation_m[t] = noise, apart
-    if math.isnan(apart):
+    if math.isnan(apart) or contradicted:
         return math.inf
     for _ in range(numbers.rounds):
         away = level / sigma
@@ -1570,7 +1551,7 @@ def advance(
         if len(bank.running):
             _subfilters(
                 epochs, t, course, numbers, active, bank, shared, variance, counts, codes, phases, dopplers, sensors,
-                anew, best, room, map_scale,
+                sight, anew, best, room, map_scale,
             )
         _finish(
             t, best, nc > 0, True, dt, numbers, active, memory, bank, answers, new_mean, new_covariance, work, ranked,

@@ -15,7 +15,7 @@ modes without a fault.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -23,19 +23,20 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from railfix.core.arrays import Floats, Masks, Strings
-from railfix.tracking.chunk import FORGOTTEN
+from railfix.tracking.chunk import FORGOTTEN, Chunk
 from railfix.tracking.hypotheses import begin, on_the_line
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
 from railfix.tracking.robust import applied, first_weights, prior_of, robust_update
-from railfix.tracking.rows import Kind, Rows
+from railfix.tracking.rows import MOTION, Kind, Rows, SensorRows, rows_of
 from railfix.tracking.state import CLOCKS, SATELLITES, Bank, Unknown
 
 #: Sensors by the kind of their rows.
 SENSORS: Final = {Kind.WHEEL: "wheel", Kind.RADAR: "radar", Kind.FORCE: "force", Kind.PLACE: "place"}
 #: Share of a way that a source without codes may be wrong by: a worn or wrongly entered wheel.
 SCALE_BOUND: Final = 0.02
+_PLACES: Final = [Unknown.PLACE, Unknown.BEFORE]
 #: How long a fault common to a constellation lasts until users are told [s] (ARAIM milestone 3 report: an hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
 #: Sources whose probabilities add up to less than this share of the risk need no sub-filter, if there are so many.
@@ -103,8 +104,10 @@ def levelled(
     stepped: Masks,
     satellite: Strings,
     remembered: frozenset[str],
+    chunk: Chunk,
+    epoch: int,
+    scale: tuple[float, float],
     line: Line,
-    dt: float,
     limits: TrackingLimits,
     map_scale: float,
 ) -> Bank:
@@ -115,7 +118,8 @@ def levelled(
     bank : Bank
         After the epoch before.
     rows : Rows
-        For changes from the mean of the most probable hypothesis, clocks near the epoch's.
+        Of the filter; those of the sensors are taken over, the others made about the place of each sub-filter: where
+        the line bends between the two, the equations of one are none of the other.
     best : int
         Its row.
     before : tuple of ndarray, shapes (N,), (N, N)
@@ -126,11 +130,15 @@ def levelled(
         Of each row, empty for sensors.
     remembered : frozenset of str
         Satellites measured before the epoch, so recently that their errors are in the state.
+    chunk : Chunk
+    epoch : int
+    scale : tuple of float
+        Logarithms of what the variances of Dopplers and phases are multiplied by.
     line : Line
-    dt : float [s]
     limits : TrackingLimits
     map_scale : float
     """
+    dt = float(chunk.interval_s[epoch])
     mean, covariance = before
     if len(bank.without):
         means, covariances = predicted(bank.mean, bank.covariance, line, dt, limits, map_scale)
@@ -156,7 +164,7 @@ def levelled(
     weak_s = np.concatenate([bank.weak_s[kept], np.zeros(len(added))])
     fresh = begin(
         np.full(len(added), mean[Unknown.PLACE]),
-        np.full(len(added), limits.start_sigma_m),
+        np.full(len(added), limits.expired_sigma_m),
         len(mean) - SATELLITES,
         line,
         limits,
@@ -174,9 +182,7 @@ def levelled(
         covariances[:, unknown, :] = covariances[:, :, unknown] = 0.0
         covariances[:, unknown, unknown] = covariance[unknown, unknown]
     means[:, Unknown.CODE_CLOCK] = mean[Unknown.CODE_CLOCK]
-    combine, design = rows.combine[best : best + 1], rows.design[best : best + 1]
-    value = rows.value[best] - (design @ (combine @ (means - mean)[..., None]))[..., 0]
-    own = replace(rows, combine=combine, design=design, value=value)
+    own = rows_of(chunk, epoch, line, means, means[:, _PLACES], scale, _sensor_rows(rows, best, means - mean))
     use = np.stack([~_of(name, rows, satellite) for name in without])
     prior = prior_of(own, covariances)
     weight = first_weights(own, prior, limits.tails)
@@ -185,6 +191,16 @@ def levelled(
     means, covariances = applied(means, covariances, prior, update)
     means = on_the_line(means, covariances, line, limits)
     return Bank(without=without, mean=means, covariance=covariances, weak_s=weak_s)
+
+
+def _sensor_rows(rows: Rows, best: int, change: Floats) -> SensorRows | None:
+    """Rows of the sensors about means that differ from that of the filter by `change`, shape (B, N)."""
+    gnss, first = rows.bounds[2], rows.bounds[0] + 1 + MOTION
+    if gnss == len(rows.variance):
+        return None
+    design = np.repeat(rows.combine[best : best + 1, first:], len(change), axis=0)
+    value = rows.value[best, gnss:] - (design @ change[..., None])[..., 0]
+    return SensorRows(design=design, value=value, variance=rows.variance[gnss:], kind=rows.kind[gnss:])
 
 
 def _contradicted(rows: Rows, weight: Floats, use: Masks, limits: TrackingLimits) -> Masks:
@@ -229,7 +245,11 @@ def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
 
 
 def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) -> tuple[float, float, float]:
-    """Level, what it is without faults, and the largest separation [m]; infinite without a sub-filter."""
+    """Level, what it is without faults, and the largest separation [m].
+
+    Infinite without a sub-filter, and where the measurements of one contradict it: it has settled somewhere else, or
+    began where the fault of its source had led the filter, and bounds nothing.
+    """
     given = budget(limits)
     noise = given.k * sigma_m
     if not bank.without:
@@ -251,4 +271,4 @@ def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) 
         level += step
         if abs(step) < PRECISION_M:
             break
-    return level, noise, float(apart.max())
+    return float("inf") if bank.weak_s.any() else level, noise, float(apart.max())

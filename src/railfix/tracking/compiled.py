@@ -145,7 +145,7 @@ class Compiled:
         if names:
             given, kinds = bank.budget(limits), [bank.kind_of(name) for name in names]
             prior[:], k[:] = np.array(given.prior)[kinds], np.array(given.k_fault)[kinds]
-            start = np.full(1, limits.start_sigma_m)
+            start = np.full(1, limits.expired_sigma_m)
             _, fresh = hypotheses.begin(np.zeros(1), start, len(state.satellite), self.line, limits)
             begun[:] = np.diagonal(fresh[0])[np.concatenate([full, _OF_EPOCH])]
         if names and state.bank is not None:

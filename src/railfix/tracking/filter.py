@@ -207,7 +207,10 @@ def _measure(
         named = np.where(rows.column >= 0, chunk.satellite[rows.column], "")
         remembered = frozenset(state.satellite[chunk.remembered[epoch]].tolist())
         own = (mean[best], covariance[best])
-        state.bank = levelled(bank, settled, best, own, stepped, named, remembered, line, dt, limits, state.map_scale)
+        scale, map_scale = state.log_scale, state.map_scale
+        state.bank = levelled(
+            bank, settled, best, own, stepped, named, remembered, chunk, epoch, scale, line, limits, map_scale
+        )
     learn(state, rows, update, best, dt, limits)
     learn_map(state, 0.0 if best else shift, dt, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
