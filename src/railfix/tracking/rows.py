@@ -38,8 +38,8 @@ _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 GRAVITY_MPS2: Final = 9.80665
 #: Slower than this ranges to ground units are not used [m/s].
 _STILL_MPS: Final = 0.3
-#: Slower than this a speed does not tell the direction [m/s].
-DIRECTION_MPS: Final = 0.5
+#: Slower than this a speed does not tell the direction [m/s]: four sigmas of what a wheel of one hertz leaves of it.
+DIRECTION_MPS: Final = 1.0
 #: Shorter than this the tangent is the direction of a displacement [m].
 CHORD_M: Final = 0.5
 
