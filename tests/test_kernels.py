@@ -143,6 +143,27 @@ def test_levels_of_every_kind_of_hypothesis_are_the_same(systems: str, by_range:
             np.testing.assert_array_equal(given, expected, err_msg=name)
 
 
+@with_numba
+@pytest.mark.requirement("A8")
+def test_all_kernels_are_loaded_before_a_live_session_needs_them(calls: dict[str, list[tuple[Any, ...]]]) -> None:
+    for name, arguments in calls.items():
+        kernels.compiled(name)(*copy.deepcopy(arguments[0]))  # on disk from here on
+    program = """
+from railfix import kernels
+from railfix.pipeline.processor import EpochProcessor
+loaded = kernels.load()
+names = [name for name in kernels.REGISTERED if not kernels.compiled(name).signatures]
+print(loaded, *names)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True, text=True, check=True, env={**os.environ, kernels.VARIABLE: "numba"},
+    )  # fmt: skip
+    loaded, *missing = done.stdout.split()
+    assert int(loaded) >= len(calls)
+    assert not set(missing) & set(calls)
+
+
 @pytest.mark.requirement("A7")
 def test_the_variable_chooses_and_what_cannot_be_is_said() -> None:
     assert kernels.choose("", installed=True) == "numba"

@@ -70,6 +70,19 @@ def compiled(name: str) -> Callable[..., Any]:
     return function
 
 
+def load() -> int:
+    """Load all compiled functions, so that none is loaded while epochs wait; return how many, 0 with numpy.
+
+    Those that have never run on this machine are compiled at their first call.
+    """
+    if CHOSEN == "numpy":
+        return 0
+    for _, module in REGISTERED.values():
+        import_module(f"railfix.kernels.{module}")
+    loaded: int = import_module("railfix.kernels.compiling").load()
+    return loaded
+
+
 def compiled_by(module: str) -> Callable[[Callable[Arguments, Returned]], Callable[Arguments, Returned]]:
     """Return a decorator that runs the function of the same name in a module of this room, where numba is chosen.
 

@@ -18,6 +18,7 @@ from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.io.train_message import TrainMessage
+from railfix.kernels import load
 from railfix.live.message import message_of, no_input_message
 from railfix.live.settings import LiveSettings
 from railfix.pipeline.processor import EpochProcessor
@@ -101,7 +102,7 @@ class _Waiting:
 
 
 class LiveEngine:
-    """Positions of epochs as they arrive.
+    """Positions of epochs as they arrive; compiled kernels are loaded when it is made.
 
     Parameters
     ----------
@@ -119,6 +120,7 @@ class LiveEngine:
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
+        load()
         self.processor = processor
         self.settings = settings
         self.counts: Counter[str] = Counter()

@@ -172,5 +172,4 @@ def _second_attempt(
 def with_p4_level(raim: RaimResult, model: LinearModel, scale: Floats, config: Config) -> RaimResult:
     """Return the RAIM result with P4's protection level, where no fault is left in the position."""
     level = reliability(model, limits=config.raim, scale=scale).protection_level_m
-    faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
-    return replace(raim, protection_level_m=np.where(faulty, np.nan, level))
+    return replace(raim, protection_level_m=np.where(raim.faulty, np.nan, level))

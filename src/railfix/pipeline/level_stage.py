@@ -17,7 +17,7 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
-from railfix.integrity.raim import LinearModel, Outcome
+from railfix.integrity.raim import LinearModel
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.results import ProtectionResult, RaimResult
@@ -27,6 +27,11 @@ from railfix.positioning.map_offset import MapOffset
 #: satellites' own faults as well (ARAIM).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
+
+#: Whether a status raises an alarm, by its number.
+_ALARMING: Final = np.array(
+    [status in (*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET) for status in range(max(Status) + 1)]
+)
 
 #: Standing of a level: whether its priors were measured on the line, or assumed. An indicative level carries no risk
 #: an hour.
@@ -110,8 +115,7 @@ def protection_levels(
     -------
     ProtectionResult
     """
-    faulty = np.isin(raim.outcome, [Outcome.INSEPARABLE, Outcome.UNRESOLVED])
-    covariance = np.where(faulty[:, None, None], np.nan, model.covariance_m2)
+    covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = along_track_level(
         replace(model, covariance_m2=covariance),
         [name[0] for name in corrected.satellite.tolist()],
@@ -164,8 +168,7 @@ def judged(
         values["cause"] = np.where(near, int(Cause.UNBOUNDED), values["cause"]).astype(np.int8)
     level = ProtectionLevel(**values)
     verdict = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
-    alarming = np.isin(status, [*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET])
-    verdict = np.where(alarming, LevelStatus.ALARM, verdict)
+    verdict = np.where(_ALARMING[status], LevelStatus.ALARM, verdict)
     doubtful = status == Status.AMBIGUOUS
     verdict = np.where(doubtful & (verdict == LevelStatus.AVAILABLE), LevelStatus.UNAVAILABLE, verdict)
     return ProtectionResult(level=level, status=verdict.astype(np.int8), kind=protection.kind, basis=protection.basis)

@@ -13,6 +13,7 @@ from railfix.core.display import NotebookTable, plural, time_span_text
 from railfix.core.reasons import Status
 from railfix.gnss.orbits import SatelliteStates
 from railfix.integrity.protection import ProtectionLevel
+from railfix.integrity.raim import Outcome
 from railfix.pipeline.along_track import AlongTrack, FilterState
 from railfix.pipeline.carrier_stage import CarrierState
 from railfix.pipeline.off_map import OffMapState
@@ -56,6 +57,11 @@ class RaimResult:
     excluded: Masks
     own_error_m: Floats
     protection_level_m: Floats
+
+    @property
+    def faulty(self) -> Masks:
+        """Epochs with a fault left in the position, shape (T,)."""
+        return np.asarray((self.outcome == Outcome.INSEPARABLE) | (self.outcome == Outcome.UNRESOLVED))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from scipy.special import chdtri, expit
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
-from railfix.integrity.raim import LinearModel, Outcome, constrained_model
+from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
@@ -118,7 +118,7 @@ def solve(
     ranges, place, raim = fault_free(ranges, index, place, robust, on_line.kept, config, predicted=predicted)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     off_map = _off_map(ranges, trajectory, place, constrained.arc_m, config)
-    teaching = ~off_map & ~np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE])
+    teaching = ~off_map & ~raim.faulty
     if "raim" not in config.screens:
         teaching[:] = False
     scale, stated_sums = stated_scale(
@@ -247,7 +247,7 @@ def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config:
     """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
     if config.sbas:
         return np.zeros(len(model))
-    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.nan_to_num(corrected.nominal_m), 0.0)
+    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(corrected.nominal_m, 0.0), 0.0)
     return np.asarray((share**2).sum(axis=1))
 
 
@@ -314,7 +314,7 @@ def _status(
         (~np.isfinite(arc), Status.NO_CONVERGENCE),
         (off_map, Status.OFF_MAP),
         (beyond_threshold(offset, config.map_offset), Status.MAP_OFFSET),
-        (np.isin(raim.outcome, [Outcome.UNRESOLVED, Outcome.INSEPARABLE]), Status.INCONSISTENT),
+        (raim.faulty, Status.INCONSISTENT),
         (sigma > config.largest_sigma_m, Status.UNCERTAIN),
         (
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,

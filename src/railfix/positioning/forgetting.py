@@ -23,7 +23,7 @@ def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
         Epoch before the first one; NaT where there is none.
     """
     before = np.concatenate([np.asarray([last], dtype="datetime64[ns]"), time])
-    return np.maximum(np.nan_to_num(seconds(np.diff(before)), nan=0.0), 0.0)
+    return np.fmax(seconds(before[1:] - before[:-1]), 0.0)
 
 
 def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: float, least_epochs: float) -> Floats:

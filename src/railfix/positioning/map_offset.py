@@ -186,7 +186,7 @@ def map_offset(
     covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
     equations = normal_equations(ranges, at)
     gain = (axes @ covariance) @ (equations.design * ranges.weight[:, None])
-    nominal = gain * np.where(ranges.weight > 0, np.nan_to_num(nominal_m), 0.0)[:, None]
+    nominal = gain * np.where(ranges.weight > 0, np.fmax(nominal_m, 0.0), 0.0)[:, None]
     bias = nominal @ nominal.swapaxes(1, 2)
     noise = (axes @ covariance @ axes.swapaxes(1, 2)) * variance[:, None, None]
     information = _inverse_2x2(noise)
@@ -239,4 +239,4 @@ def _inverse_2x2(matrix: Floats) -> Floats:
 
 def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:
     """Epochs whose window contradicts the map, shape (T,)."""
-    return np.asarray(np.nan_to_num(offset.statistic) > limits.threshold)
+    return np.asarray(offset.statistic > limits.threshold)

@@ -171,7 +171,7 @@ def epoch_variance(scale: Floats, wsse: Floats, redundancy: Integers, *, limits:
     limits : NoiseScaleLimits
     """
     freedom = np.where(np.isfinite(wsse), np.maximum(redundancy, 0), 0)
-    own = np.where(freedom > 0, np.maximum(np.nan_to_num(wsse), 0.0), 0.0)
+    own = np.where(freedom > 0, np.fmax(wsse, 0.0), 0.0)
     return np.asarray((limits.spread * scale**2 + own) / (limits.spread + freedom))
 
 

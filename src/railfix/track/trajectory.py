@@ -185,7 +185,7 @@ class Trajectory(NotebookTable):
             From the segment's first point; negative before the start; NaN for NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
-        index = np.clip(np.searchsorted(self.arc_m, arc, side="right") - 1, 0, len(self) - 2)
+        index = np.minimum(np.maximum(np.searchsorted(self.arc_m, arc, side="right") - 1, 0), len(self) - 2)
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:

@@ -56,11 +56,10 @@ def allocate(
     wrong_map : bool
         Whether a wrong map is a hypothesis.
     """
-    prior = model.used * risk.prior(systems)
+    of_channel = risk.prior(systems)
+    prior = model.used * of_channel
     # Excluded satellites count among those that may be faulty, with the largest prior.
-    everyone = np.concatenate(
-        [prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * risk.prior(systems).max(initial=0.0)], axis=1
-    )
+    everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * of_channel.max(initial=0.0)], axis=1)
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
     group_prior = np.zeros((len(model), len(letters)))
