@@ -8,9 +8,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import polars as pl
@@ -227,18 +229,31 @@ def test_two_workers_of_a_cluster_give_the_same_data_set(folder: Path, tmp_path:
 
 @pytest.mark.slow
 def test_a_killed_campaign_is_continued(folder: Path, tmp_path: Path) -> None:
+    """At fifty random instants; a campaign that was complete is begun anew."""
     out = tmp_path / "out"
     words = [sys.executable, "-m", "railfix", "campaign", str(folder / "campaign.toml"), "--out", str(out)]
-    for _ in range(3):
-        with subprocess.Popen(words, start_new_session=True, stderr=subprocess.PIPE, text=True) as process:
-            assert process.stderr is not None
-            process.stderr.readline()
-            os.killpg(process.pid, signal.SIGKILL)
-        assert process.returncode == -signal.SIGKILL
-    assert not (out / "campaign.csv").exists()
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert "4 of 4 runs, 1 failed" in done.stderr
-    table = pl.read_csv(out / "campaign.csv")
-    assert table["status"].to_list() == ["done", "done", "failed", "done"]
-    assert table["epochs"].to_list() == [400, 400, None, 200]
-    assert list(out.rglob(".railfix-*")) == []
+
+    def check_whole() -> None:
+        table = pl.read_csv(out / "campaign.csv")
+        assert table["status"].to_list() == ["done", "done", "failed", "done"]
+        assert table["epochs"].to_list() == [400, 400, None, 200]
+        assert list(out.rglob(".railfix-*")) == []
+
+    began = time.perf_counter()
+    assert "4 of 4 runs, 1 failed" in subprocess.run(words, capture_output=True, text=True, check=True).stderr
+    whole_s = time.perf_counter() - began
+    check_whole()
+    shutil.rmtree(out)
+    random, kills = Random(3), 0
+    while kills < 50:
+        with subprocess.Popen(words, start_new_session=True, stderr=subprocess.DEVNULL) as process:
+            try:
+                assert process.wait(random.uniform(0.05, 0.7) * whole_s) == 0
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                kills += 1
+                continue
+        check_whole()
+        shutil.rmtree(out)
+    subprocess.run(words, capture_output=True, text=True, check=True)
+    check_whole()

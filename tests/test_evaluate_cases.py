@@ -543,7 +543,11 @@ def test_the_command_writes_every_table(tmp_path: Path):
     ("change", "code", "told"),
     [
         (["--reference", "absent.csv"], 3, "absent.csv"),
-        (["--reference", "{reference}", "--reference", "{reference}"], 4, "given 2 times for 1 runs"),
+        (
+            ["--reference", "{reference}", "--reference", "{reference}"],
+            4,
+            "2 references for 1 runs; give one for all runs",
+        ),
         (["--reference", "{reference}", "--label", "a", "--label", "b"], 4, "--label is given 2 times"),
         (["--reference", "{late}"], 5, "no time in common"),
         (["--reference", "{reference}", "--speed-classes", "20,x"], 4, "--speed-classes"),

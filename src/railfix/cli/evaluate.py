@@ -122,10 +122,13 @@ def evaluate(
 
 def _paired(runs: list[Path], reference: list[str], label: list[str] | None) -> list[RunAndReference]:
     """Each run with its reference and label."""
-    references: list[str] = reference * len(runs) if reference == ["auto"] else reference
-    for name, given in (("--reference", references), ("--label", label)):
-        if given is not None and len(given) != len(runs):
-            raise SettingsError(f"{name} is given {len(given)} times for {len(runs)} runs; give it once for each run")
+    references: list[str] = reference * len(runs) if len(reference) == 1 else reference
+    if len(references) != len(runs):
+        raise SettingsError(
+            f"{len(references)} references for {len(runs)} runs; give one for all runs, or one for each in order"
+        )
+    if label is not None and len(label) != len(runs):
+        raise SettingsError(f"{len(label)} labels for {len(runs)} runs; give one for each in order")
     labels: list[str | None] = [*label] if label is not None else [None] * len(runs)
     return [
         RunAndReference(run=run, reference=None if file == "auto" else Path(file), configuration=name)

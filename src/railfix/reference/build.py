@@ -221,14 +221,13 @@ class _Builder:
         good = fixes.good
         if len(good) < 2:
             rejected = ", ".join(f"{count} {what}" for what, count in fixes.counts().items() if count)
+            rejected = f" ({rejected})" if rejected else ""
             lacks = (
                 "; without a vehicle file the track itself is taken as the antenna's path"
                 if TRACK_AS_PATH in self.trajectory.notes
                 else ""
             )
-            raise NoPositionError(
-                f"{self.name}: fewer than two good fixes ({rejected}); no reference can be made{lacks}"
-            )
+            raise NoPositionError(f"{self.name}: fewer than two good fixes{rejected}; no reference can be made{lacks}")
         return good
 
     def _sources(self) -> Mapping[str, Dopplers]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +10,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
+from railfix.core.files import read_json_object
 
 #: Depth of the coordinates above a line of points, by type of geometry.
 _DEPTH: Final = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
@@ -27,12 +27,7 @@ def read_background(path: Path) -> tuple[Floats, ...]:
     InputFileError
         The file cannot be read, is not GeoJSON, or has no lines.
     """
-    try:
-        node = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputFileError(path, f"cannot be read ({error.strerror}); check the name") from None
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputFileError(path, f"is not JSON ({error}); expected GeoJSON") from None
+    node = read_json_object(path, what="GeoJSON")
     lines = tuple(_lines(path, node))
     if not lines:
         raise InputFileError(path, "has no lines or polygons; expected GeoJSON with streets, buildings or the like")
