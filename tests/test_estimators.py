@@ -13,7 +13,7 @@ from exhaustive_search import exhaustive_search
 from railfix.core.geodesy import range_with_rotation
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import Ranges, clock_groups, fit, inverse_3x3, normal_equations
-from railfix.positioning.section_search import PredictedPlace, SearchIndex, SectionLimits, search
+from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.positioning.single_point import single_point
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
@@ -111,26 +111,6 @@ def test_search_equals_exhaustive_search(used, sigma_m):
     section = search(ranges, SearchIndex(LINE), point)
     assert section.vertex.tolist() == vertex.tolist()
     assert section.q == pytest.approx(q.min(axis=1), rel=1e-3, abs=1e-3)
-
-
-@pytest.mark.requirement("A3")
-def test_a_predicted_place_chooses_among_places_that_fit():
-    """Two satellites: where another place fits as well, a prediction there is followed, one far from both is not."""
-    ranges = keep(synthetic.ranges(LINE, arcs(60), sigma_m=8.0), [0, 1])
-    index, point = SearchIndex(LINE), single_point(ranges, start(ranges))
-    plain = search(ranges, index, point)
-    two = plain.other_vertex >= 0
-    assert two.any()
-    sigma = np.full(60, 5.0)
-    there = PredictedPlace(arc_m=LINE.arc_m[np.where(two, plain.other_vertex, plain.vertex)], sigma_m=sigma)
-    chosen = search(ranges, index, point, predicted=there)
-    reach = 6.0 * sigma + LINE.length_m.max()
-    assert (np.abs(LINE.arc_m[chosen.vertex] - there.arc_m) <= reach).all()
-    assert (chosen.vertex != plain.vertex)[two].any()
-    nowhere = PredictedPlace(arc_m=np.full(60, 1e7), sigma_m=sigma)
-    unknown = PredictedPlace(arc_m=np.full(60, np.nan), sigma_m=np.full(60, np.nan))
-    for useless in (nowhere, unknown):
-        np.testing.assert_array_equal(search(ranges, index, point, predicted=useless).vertex, plain.vertex)
 
 
 @pytest.mark.requirement("A3")

@@ -548,7 +548,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
             4,
             "2 references for 1 runs; give one for all runs",
         ),
-        (["--reference", "{reference}", "--label", "a", "--label", "b"], 4, "--label is given 2 times"),
+        (["--reference", "{reference}", "--label", "a", "--label", "b"], 4, "2 labels for 1 runs"),
         (["--reference", "{late}"], 5, "no time in common"),
         (["--reference", "{reference}", "--speed-classes", "20,x"], 4, "--speed-classes"),
         (["--reference", "{reference}", "--speed-classes", "60,20"], 4, "--speed-classes: rising numbers expected"),

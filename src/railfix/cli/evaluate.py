@@ -27,8 +27,8 @@ def evaluate(
             "--reference",
             metavar="FILE",
             rich_help_panel=INPUTS,
-            help="Reference positions (reference.csv, truth.csv, .gz, RTKLIB), once for each run in order; "
-            "`auto`: truth.csv or reference.csv beside the log of each run.",
+            help="Reference positions (reference.csv, truth.csv, .gz, RTKLIB), one for all runs or one for each in "
+            "order; `auto`: truth.csv or reference.csv beside the log of each run.",
         ),
     ],
     out: Annotated[

@@ -24,7 +24,7 @@ from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.results import RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.section_search import PredictedPlace, SearchIndex
+from railfix.positioning.section_search import SearchIndex
 from railfix.positioning.single_point import single_point
 
 
@@ -35,8 +35,6 @@ def fault_free(
     scale: Floats,
     agreeing: Masks,
     config: Config,
-    *,
-    predicted: PredictedPlace | None = None,
 ) -> tuple[Ranges, Place, RaimResult]:
     """Return ranges and positions without the satellites that RAIM excludes, and its verdict on each epoch.
 
@@ -57,7 +55,6 @@ def fault_free(
         Ranges that the robust fit on the line keeps.
     config : Config
         Where "raim" is not among its screens nothing is tested.
-    predicted : PredictedPlace, optional
     """
     limits, constrained = config.raim, place.constrained
     test = detect(constrained.wsse, constrained.residual_m, redundancy_of(ranges), limits=limits, scale=scale)
@@ -80,7 +77,7 @@ def fault_free(
     unresolved = np.flatnonzero(exclusion.outcome == Outcome.UNRESOLVED)
     if len(unresolved):
         epochs = failing[unresolved]
-        second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config, predicted)
+        second = _second_attempt(ranges, index, place, epochs, model.take(unresolved), scale, config)
         raim = _with_exclusion(raim, epochs, second, np.flatnonzero(second.excluded.any(axis=1)))
     if limits.mode == "chi_square":
         raim = _by_robust_fit(raim, ranges, agreeing, failing, limits.min_redundancy)
@@ -90,7 +87,7 @@ def fault_free(
     ranges = without(ranges, raim.excluded)
     part = ranges.take(changed)
     point = single_point(part, place.point.ecef_m[changed], limits=config.single_point)
-    solved = place_on_line(part, index, point, config, predicted=None if predicted is None else predicted.take(changed))
+    solved = place_on_line(part, index, point, config)
     # Without the fault another section can fit best: the remaining ranges must be consistent there, too.
     recheck = detect(
         solved.constrained.wsse, solved.constrained.residual_m, redundancy_of(part), limits=limits, scale=scale[changed]
@@ -151,7 +148,6 @@ def _second_attempt(
     model: LinearModel,
     scale: Floats,
     config: Config,
-    predicted: PredictedPlace | None,
 ) -> Exclusion:
     """Return the exclusion of unresolved epochs, linearised at their position without the worst satellite.
 
@@ -163,8 +159,7 @@ def _second_attempt(
     all_ranges = ranges.take(epochs)
     part = without(all_ranges, worst)
     point = single_point(part, place.point.ecef_m[epochs], limits=config.single_point)
-    near = None if predicted is None else predicted.take(epochs)
-    solved = place_on_line(part, index, point, config, predicted=near).constrained
+    solved = place_on_line(part, index, point, config).constrained
     there = constrained_model(all_ranges, index.trajectory, solved.arc_m, section=solved.section)
     return exclude(there, limits=config.raim, scale=scale[epochs])
 

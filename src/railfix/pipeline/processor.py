@@ -29,7 +29,7 @@ from railfix.pipeline.results import AntennaResult, AntennaState, Result, State
 from railfix.pipeline.sensor_epochs import Surroundings
 from railfix.pipeline.solution import Solution, solve
 from railfix.positioning.map_offset import beyond_threshold
-from railfix.positioning.section_search import PredictedPlace, SearchIndex
+from railfix.positioning.section_search import SearchIndex
 from railfix.ranges.cn0_curve import Cn0Curve
 from railfix.ranges.error_model import Conditions, ErrorModel, condition_differences
 from railfix.ranges.sbas import SbasMessages
@@ -364,9 +364,8 @@ class AntennaChunk:
     def solved(self) -> Published:
         """Solve and return what is published of the positions."""
         processor = self._processor
-        predicted: PredictedPlace | None = None  # the filter hands none on: single epochs do not depend on it
         self._ranges, self._solution, self.state = solve(
-            self._ranges, processor._index[self._name], processor.config, self.state, predicted=predicted
+            self._ranges, processor._index[self._name], processor.config, self.state
         )
         return Published(chainage_m=processor.trajectories[self._name].chainage_at(self._solution.arc_m))
 

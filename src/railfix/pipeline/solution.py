@@ -36,7 +36,7 @@ from railfix.positioning.noise_scale import (
 )
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies, Ranges, fit
 from railfix.positioning.robust_fit import RobustFit, map_information, robust_fit
-from railfix.positioning.section_search import PredictedPlace, SearchIndex
+from railfix.positioning.section_search import SearchIndex
 from railfix.positioning.single_point import SinglePoint, single_point
 from railfix.track.trajectory import Trajectory
 
@@ -86,8 +86,6 @@ def solve(
     index: SearchIndex,
     config: Config,
     state: AntennaState,
-    *,
-    predicted: PredictedPlace | None = None,
 ) -> tuple[CorrectedRanges, Solution, AntennaState]:
     """Return the positions of one antenna, its ranges with the reasons of this stage, and its new state.
 
@@ -98,8 +96,6 @@ def solve(
     index : SearchIndex
     config : Config
     state : AntennaState
-    predicted : PredictedPlace, optional
-        Limits the section search.
     """
     trajectory, ranges, time = index.trajectory, corrected.ranges(), corrected.time
     point = single_point(ranges, corrected.anchor_ecef_m, limits=config.single_point)
@@ -112,10 +108,10 @@ def solve(
     if len(corrected.groups) > 1:
         ranges = replace(ranges, ties=ties)
         tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
-    place = place_on_line(ranges, index, tied, config, predicted=predicted)
+    place = place_on_line(ranges, index, tied, config)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
     robust, robust_sums, on_line = _robust_scale(corrected, ranges, trajectory, place, config, state)
-    ranges, place, raim = fault_free(ranges, index, place, robust, on_line.kept, config, predicted=predicted)
+    ranges, place, raim = fault_free(ranges, index, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     off_map = _off_map(ranges, trajectory, place, constrained.arc_m, config)
     teaching = ~off_map & ~raim.faulty

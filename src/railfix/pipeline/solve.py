@@ -10,7 +10,7 @@ from railfix.core.arrays import Integers
 from railfix.pipeline.config import Config
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.normal_equations import Ranges
-from railfix.positioning.section_search import PredictedPlace, SearchIndex, Section, search
+from railfix.positioning.section_search import SearchIndex, Section, search
 from railfix.positioning.single_point import SinglePoint
 
 
@@ -33,9 +33,7 @@ class Place:
     constrained: Constrained
 
 
-def place_on_line(
-    ranges: Ranges, index: SearchIndex, point: SinglePoint, config: Config, *, predicted: PredictedPlace | None = None
-) -> Place:
+def place_on_line(ranges: Ranges, index: SearchIndex, point: SinglePoint, config: Config) -> Place:
     """Return section and constrained position of the epochs that have `Config.min_satellites`.
 
     Parameters
@@ -45,10 +43,8 @@ def place_on_line(
     point : SinglePoint
         3-D position from the same ranges.
     config : Config
-    predicted : PredictedPlace, optional
-        Limits the section search to its neighbourhood.
     """
-    section = search(ranges, index, point, limits=config.section, predicted=predicted)
+    section = search(ranges, index, point, limits=config.section)
     vertex = np.where(ranges.n_used >= config.min_satellites, section.vertex, -1)
     constrained = constrained_position(ranges, index.trajectory, vertex, limits=config.constrained)
     return Place(point=point, section=section, constrained=constrained)

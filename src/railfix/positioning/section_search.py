@@ -50,16 +50,12 @@ class SectionLimits(Settings):
         Ranges beyond the unknowns (clocks and distance) below which a section is doubtful: on real
         recordings of two constellations a quarter of the sections were wrong with one redundant
         range, 3 to 4 % with two.
-    predicted_sigmas : float
-        Points further from a predicted place than this many of its sigmas are left out where nearer ones
-        remain (`PredictedPlace`).
     """
 
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
     reach_risk: float = Field(default=1e-16, gt=0, lt=1)
     separation_m: float = Field(default=30.0, ge=0)
     redundancy: int = Field(default=2, ge=0)
-    predicted_sigmas: float = Field(default=6.0, gt=0)
 
     @cached_property
     def threshold(self) -> float:
@@ -70,24 +66,6 @@ class SectionLimits(Settings):
     def reach(self) -> float:
         """Excess of q up to which other places are found."""
         return float(chdtri(1, min(self.reach_risk, self.ambiguity_risk)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PredictedPlace:
-    """Place on the trajectory predicted without the ranges, by a filter along the track: T epochs.
-
-    Attributes
-    ----------
-    arc_m, sigma_m : ndarray, shape (T,) [m]
-        NaN where there is no prediction.
-    """
-
-    arc_m: Floats
-    sigma_m: Floats
-
-    def take(self, epochs: Indices) -> PredictedPlace:
-        """Return the predictions of some epochs, by index."""
-        return PredictedPlace(arc_m=self.arc_m[epochs], sigma_m=self.sigma_m[epochs])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,19 +163,6 @@ class _Candidates:
     matrix: Floats
     matrix_of: Indices
 
-    def keep(self, some: Masks) -> _Candidates:
-        """Return some of the points; every epoch keeps one."""
-        starts = np.cumsum(self.count) - self.count
-        return _Candidates(
-            self.at,
-            np.add.reduceat(some, starts, dtype=np.intp),
-            self.vertex[some],
-            self.q[some],
-            self.half_gradient[some],
-            self.matrix,
-            self.matrix_of[some],
-        )
-
 
 def _searchable(ranges: Ranges) -> Masks:
     return np.asarray(ranges.n_used > ranges.n_clocks)
@@ -209,7 +174,6 @@ def search(
     point: SinglePoint,
     *,
     limits: SectionLimits | None = None,
-    predicted: PredictedPlace | None = None,
 ) -> Section:
     """Return the point of the trajectory with the least q at each epoch, and the best other place.
 
@@ -221,9 +185,6 @@ def search(
     point : SinglePoint
         3-D position from the same ranges and weights; NaN where there is none.
     limits : SectionLimits, optional
-    predicted : PredictedPlace, optional
-        Of the points that fit as well as noise allows, only those near the predicted place are kept; where none
-        of them is near it, the ranges contradict the prediction and it is not used.
 
     Returns
     -------
@@ -248,21 +209,7 @@ def search(
         candidates.append(part)
     for part in candidates:
         evaluations[part.at] += part.count
-    if predicted is not None:
-        candidates = [_near(part, index.trajectory, predicted, limits) for part in candidates]
     return _decide(epochs, candidates, index.trajectory, freedom, limits, evaluations)
-
-
-def _near(
-    candidates: _Candidates, trajectory: Trajectory, predicted: PredictedPlace, limits: SectionLimits
-) -> _Candidates:
-    """Return the candidates near the predicted place, and all candidates of the epochs that have none there."""
-    epoch = np.repeat(candidates.at, candidates.count)
-    away = np.abs(trajectory.arc_m[candidates.vertex] - predicted.arc_m[epoch])
-    near = away <= limits.predicted_sigmas * predicted.sigma_m[epoch] + trajectory.length_m.max()
-    any_near = np.zeros(len(predicted.arc_m), dtype=bool)
-    any_near[epoch[near]] = True
-    return candidates.keep(near | ~any_near[epoch])
 
 
 def _ball(
