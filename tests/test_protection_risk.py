@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import product
+from dataclasses import replace
+from itertools import combinations, product
+from math import comb, prod
 
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
+import raim_oracle as oracle
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
+from railfix.integrity.protection.allocation import allocate
 from railfix.integrity.protection.risk import more_than_two, pair_sum
 
 pytestmark = pytest.mark.requirement("C2")
@@ -92,3 +96,55 @@ def test_priors_and_what_they_leave():
 def test_budgets_that_are_refused(wrong):
     with pytest.raises(ValueError, match=rf"{next(iter(wrong))}|shares"):
         RiskBudget(**wrong)
+
+
+def products(priors: list[float], size: int) -> float:
+    """Sum of the products over all sets of a size."""
+    return sum(prod(chosen) for chosen in combinations(priors, size))
+
+
+@pytest.mark.parametrize("wrong_map", [False, True])
+@pytest.mark.parametrize("excluded", [0, 1, 2])
+@pytest.mark.parametrize("local", [1e-6, 3e-3])
+def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(local: float, excluded: int, *, wrong_map: bool) -> None:
+    """Faults that no hypothesis covers are taken off; the rest is shared; false alarms among all separations."""
+    systems = "GGGEEECC"
+    ranges = oracle.made(np.array([700.0]), systems, seed=3)
+    weight = ranges.weight.copy()
+    weight[0, 1] = 0.0
+    _, model = oracle.solved(replace(ranges, weight=weight), np.array([700.0]))
+    risk = RiskBudget(
+        risk_per_hour=1e-4,
+        samples_per_hour=100.0,
+        local_prior=local,
+        map_prior=1e-5,
+        side_prior=1e-7,
+        constellation_prior={"E": 1e-6, "C": 3e-6, "R": 1e-5},
+    )
+    # Of the second side one satellite is used: no hypothesis.
+    sides = np.zeros((1, 3, len(systems)), dtype=bool)
+    sides[0, 0, [0, 2, 3]], sides[0, 1, [1, 4]], sides[0, 2, 5:] = True, True, True
+    got = allocate(model, list(systems), risk, np.array([excluded]), sides, wrong_map=wrong_map)
+    every = dict(zip(range(len(systems)), risk.prior(list(systems)).tolist(), strict=True))
+    used = {k: p for k, p in every.items() if k != 1}
+    everyone = [*used.values(), *[max(every.values())] * excluded]
+    groups, side, of_map = [1e-6, 3e-6], [1e-7, 1e-7], 1e-5 if wrong_map else 0.0
+    triples = products(everyone, 3) > risk.unchecked_share * 1e-6
+    assert triples == (local == 3e-3)
+    beyond = products(everyone, 4 if triples else 3)
+    beyond += of_map * (sum(groups) + products(everyone, 2))
+    beyond += sum(
+        p * products([q for k, q in used.items() if systems[k] != s], 2) for s, p in zip("EC", groups, strict=True)
+    )
+    beyond += sum(side) * (sum(everyone) + of_map) + products(side, 2) + products(groups, 2)
+    assert got.beyond[0] == pytest.approx(beyond, rel=1e-9)
+    left = float(risk.sample_risk(7, excluded, beyond)) * (0.75 if triples else 1.0)
+    assert [got.fault_free[0], got.one[0], got.two[0]] == pytest.approx([left / 3.0] * 3, rel=1e-9)
+    pairs = triples or products(list(used.values()), 2) > left / 3.0
+    assert (got.pairs[0], got.triples[0]) == (pairs, triples)
+    tests = 7 + pairs * comb(7, 2) + triples * comb(7, 3) + len(groups) + 7 * len(groups) + len(side)
+    assert got.k_false_alarm[0] == pytest.approx(norm.isf(risk.false_alarm / (2 * tests)), rel=1e-9)
+    assert got.groups == ("E", "C")
+    np.testing.assert_allclose(got.group_prior[0], groups)
+    np.testing.assert_allclose(got.side_prior[0], [1e-7, 0.0, 1e-7])
+    assert got.map_prior == of_map
