@@ -27,7 +27,7 @@ from railfix.ground.reference_curve import ReferenceCurve
 from railfix.ground.relay import Relay, RelaySettings
 from railfix.ground.simulated_triangle import PLAN_M, simulated_fixes
 from railfix.ground.store import Store
-from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.supervision import Supervision, at_start
 from railfix.ground.traffic import Conditions, SimulatedTrain, Traffic, line_with_loops
 from railfix.ground.triangle import TriangleLimits, Verdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
@@ -99,17 +99,7 @@ def _traffic(
         train = trains[number] = SimulatedTrain(
             number=number, front_m=front, tracks={station: track}, on_board=OnBoard(direction=direction, end_m=front)
         )
-        supervised.append(
-            standing_train(
-                number,
-                direction=direction,
-                front_m=front,
-                length_m=train.length_m,
-                bound_m=5.0,
-                station=station,
-                track=track,
-            )
-        )
+        supervised.append(train.at_rest())
     stops = np.array([420.0, 1920.0, 3420.0])
     curves = {
         1: ReferenceCurve.between_stations(stops, speed_mps=22.0),

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, Final
 
 from railfix.ground.authority import Authority
-from railfix.ground.interlocking import ALL_RULES, Interlocking, Rule, interval_of
+from railfix.ground.interlocking import ALL_RULES, Interlocking, Rule, TrainInterval, interval_of
 from railfix.ground.interlocking_text import from_json, to_json
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
 from railfix.ground.on_board import OnBoard
@@ -68,6 +68,19 @@ class SimulatedTrain:
     def rear_m(self) -> float:
         """Rear end [m]."""
         return self.front_m - self.direction * self.length_m
+
+    def at_rest(self) -> TrainInterval:
+        """Return the interval of the train at rest in its only station."""
+        ((station, track),) = self.tracks.items()
+        return standing_train(
+            self.number,
+            direction=self.direction,
+            front_m=self.front_m,
+            length_m=self.length_m,
+            bound_m=self.bound_m,
+            station=station,
+            track=track,
+        )
 
     def message(self, now_s: float) -> TrainMessage:
         """Return the position message of an instant."""
@@ -358,17 +371,7 @@ def traffic(
             length_m=rng.uniform(40.0, 150.0),
         )
         simulated[number] = train
-        supervised.append(
-            standing_train(
-                number,
-                direction=direction,
-                front_m=front,
-                length_m=train.length_m,
-                bound_m=5.0,
-                station=station,
-                track=track,
-            )
-        )
+        supervised.append(train.at_rest())
     return Traffic(
         trains=simulated,
         centre=Supervision(layout=layout, state=at_start(layout, supervised), rules=rules),
