@@ -1,4 +1,4 @@
-"""Compiled function of `railfix.pipeline.off_tangent`: bound of the risk off the tangent."""
+"""Compiled functions of `railfix.pipeline`: distance to parts of a line off a tangent, bound of the risk there."""
 
 from __future__ import annotations
 
@@ -11,6 +11,39 @@ from railfix.kernels.compiling import kernel
 
 #: `railfix.integrity.raim.exclusion.LEAST_REDUNDANCY`.
 _LEAST_REDUNDANCY = 1e-9
+#: Of `railfix.pipeline.open_places`.
+_ALONG, _CLEAR_M, _ON_TANGENT_M = 0.9945, 200.0, 1e-3
+
+
+@kernel
+def clear_of_sections(
+    ecef_m: Floats, tangent: Floats, across: Floats, length_m: Floats, section: Indices, count: Indices, vertex: Indices
+) -> Floats:
+    """Return a distance within which no part of a line lies off the tangents of its sections."""
+    clear, first = np.full(len(section), _CLEAR_M), 0
+    for s in range(len(section)):
+        here, length = section[s], length_m[section[s]]
+        for v in vertex[first : first + count[s]]:
+            if v >= len(length_m) or v == here:
+                continue
+            off, nearest, low, high = False, np.inf, np.inf, -np.inf
+            for end in (v, v + 1):
+                ahead, aside, square = 0.0, 0.0, 0.0
+                for a in range(3):
+                    away = ecef_m[end, a] - ecef_m[here, a]
+                    ahead += away * tangent[here, a]
+                    aside += away * across[here, a]
+                for a in range(3):
+                    square += (ecef_m[end, a] - ecef_m[here, a] - ahead * tangent[here, a]) ** 2
+                beside, least = math.sqrt(square), max(max(ahead - length, -ahead), 0.0)
+                nearest = min(nearest, math.hypot(least, aside))
+                off |= least < _ALONG * math.hypot(least, beside) and beside > _ON_TANGENT_M
+                low, high = min(low, ahead), max(high, ahead)
+            if off or min(high, length) - max(low, 0.0) > _ON_TANGENT_M:
+                clear[s] = min(clear[s], nearest - length_m[v])
+        clear[s] = max(clear[s], 0.0)
+        first += count[s]
+    return clear
 
 
 @kernel

@@ -21,6 +21,7 @@ from railfix.integrity.protection import RiskBudget
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact
+from railfix.kernels import compiled_by
 from railfix.pipeline.off_tangent import Forms, risk_off_tangent, whitened
 from railfix.positioning.section_search import SearchIndex
 
@@ -33,7 +34,7 @@ _ON_TANGENT_M: Final = 1e-3
 #: Numbers that a block of epochs by pairs of satellites, or of sections by hypotheses holds.
 _BLOCK_SIZE: Final = 300_000
 #: Numbers that a block of epochs by channels squared holds.
-_BOUND_SIZE: Final = 30_000
+_BOUND_SIZE: Final = 100_000
 
 
 @dataclass(frozen=True)
@@ -135,27 +136,48 @@ def _off_tangent_m(index: SearchIndex, arc_m: Floats) -> Floats:
         lists = index.tree.query_ball_point(middle, reach)
         count = np.fromiter(map(len, lists), dtype=np.intp, count=len(lists))
         vertex = np.fromiter(chain.from_iterable(lists), dtype=np.intp, count=int(count.sum()))
-        row = np.repeat(np.arange(len(new)), count)
-        other = (vertex < len(line.length_m)) & (vertex != new[row])
-        row, vertex = row[other], vertex[other]
-        own, tangent, across = line.length_m[new[row]], line.tangent[new[row]], line.across[new[row]]
-        along, distance, off = [], [], np.zeros(len(row), dtype=bool)
-        for end in (vertex, vertex + 1):
-            away = line.ecef_m[end] - line.ecef_m[new[row]]
-            ahead = np.einsum("pi,pi->p", away, tangent)
-            # Of all places on the section, the one abeam or nearest sees the end furthest off the tangent.
-            least = np.maximum(np.maximum(ahead - own, -ahead), 0.0)
-            beside = np.linalg.norm(away - ahead[:, None] * tangent, axis=1)
-            distance.append(np.hypot(least, np.einsum("pi,pi->p", away, across)))
-            off |= (least < _ALONG * np.hypot(least, beside)) & (beside > _ON_TANGENT_M)
-            along.append(ahead)
-        # A section that passes by has ends in both directions, and a middle off the tangent.
-        passing = np.minimum(np.maximum(*along), own) - np.maximum(np.minimum(*along), 0.0) > _ON_TANGENT_M
-        near = np.where(off | passing, np.minimum(*distance) - line.length_m[vertex], _CLEAR_M)
-        clear = np.full(len(new), _CLEAR_M)
-        np.minimum.at(clear, row, near)
-        index.off_tangent_m[new] = np.maximum(clear, 0.0)
+        index.off_tangent_m[new] = clear_of_sections(
+            line.ecef_m, line.tangent, line.across, line.length_m, new.astype(np.intp), count, vertex
+        )
     return np.asarray(index.off_tangent_m[section])
+
+
+@compiled_by("off_tangent")
+def clear_of_sections(
+    ecef_m: Floats, tangent: Floats, across: Floats, length_m: Floats, section: Indices, count: Indices, vertex: Indices
+) -> Floats:
+    """Return a distance within which no part of a line lies off the tangents of its sections, shape (S,) [m].
+
+    Parameters
+    ----------
+    ecef_m, tangent, across, length_m : ndarray
+        Of the line: points (P, 3), the others of its sections.
+    section : ndarray of int, shape (S,)
+    count : ndarray of int, shape (S,)
+        Numbers of points around each of them.
+    vertex : ndarray of int, shape (sum of `count`,)
+        These points, section after section.
+    """
+    row = np.repeat(np.arange(len(section)), count)
+    other = (vertex < len(length_m)) & (vertex != section[row])
+    row, vertex = row[other], vertex[other]
+    length, own_tangent, own_across = length_m[section[row]], tangent[section[row]], across[section[row]]
+    along, distance, off = [], [], np.zeros(len(row), dtype=bool)
+    for end in (vertex, vertex + 1):
+        away = ecef_m[end] - ecef_m[section[row]]
+        ahead = np.einsum("pi,pi->p", away, own_tangent)
+        # Of all places on the section, the one abeam or nearest sees the end furthest off the tangent.
+        least = np.maximum(np.maximum(ahead - length, -ahead), 0.0)
+        beside = np.linalg.norm(away - ahead[:, None] * own_tangent, axis=1)
+        distance.append(np.hypot(least, np.einsum("pi,pi->p", away, own_across)))
+        off |= (least < _ALONG * np.hypot(least, beside)) & (beside > _ON_TANGENT_M)
+        along.append(ahead)
+    # A section that passes by has ends in both directions, and a middle off the tangent.
+    passing = np.minimum(np.maximum(*along), length) - np.maximum(np.minimum(*along), 0.0) > _ON_TANGENT_M
+    near = np.where(off | passing, np.minimum(*distance) - length_m[vertex], _CLEAR_M)
+    clear = np.full(len(section), _CLEAR_M)
+    np.minimum.at(clear, row, near)
+    return np.asarray(np.maximum(clear, 0.0))
 
 
 def _risk_of_block(

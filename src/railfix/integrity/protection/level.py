@@ -42,7 +42,7 @@ from railfix.integrity.raim import LinearModel
 from railfix.kernels import compiled_by
 
 #: Numbers of a pair array that a block of epochs holds.
-_BLOCK_SIZE: Final = 30_000
+_BLOCK_SIZE: Final = 80_000
 #: Number of the tails of three faults among those of all kinds.
 _OF_TRIPLES: Final = 3
 #: Separation, over the sigma of the position, below which the two positions are the same.
