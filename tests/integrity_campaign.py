@@ -35,6 +35,7 @@ from railfix.ranges.error_model import (
     ErrorModel,
     ErrorModelFit,
     ErrorSamples,
+    fault_rate,
     fit_bins,
     read_error_model,
     write_error_model,
@@ -147,15 +148,20 @@ def truth_of(found: AntennaResult, piece: Any) -> AntennaReference:
     )
 
 
+def samples_of(runs: list[int], folder: Path) -> ErrorSamples:
+    """Range errors of some runs."""
+    parts = []
+    for run in runs:
+        with np.load(folder / f"samples-{run:03d}.npz") as file:
+            parts.append(ErrorSamples(**{key: file[key] for key in file.files}))
+    return joined(parts)
+
+
 def model_of(runs: list[int], folder: Path, name: str) -> Path:
     """Error model of some runs."""
     path = folder / f"{name}.toml"
     if not path.exists():
-        parts = []
-        for run in runs:
-            with np.load(folder / f"samples-{run:03d}.npz") as file:
-                parts.append(ErrorSamples(**{key: file[key] for key in file.files}))
-        samples, fit = joined(parts), ErrorModelFit(bins=BINS)
+        samples, fit = samples_of(runs, folder), ErrorModelFit(bins=BINS)
         everything = np.ones(len(samples.error_m), dtype=bool)
         model = ErrorModel(
             bins=fit.bins,
@@ -321,6 +327,14 @@ def main() -> None:
         print(
             f"{path.stem}: {int(model.after.count.sum()):,} ranges after the screens, bound sigma "
             f"{np.nanmin(model.after.bound_sigma_m):.2f} to {np.nanmax(model.after.bound_sigma_m):.2f} m"
+        )
+    if options.model is None:
+        rate = fault_rate(samples_of(list(range(count)), options.folder))
+        print(
+            f"without a model: {rate.faulty} of {rate.ranges:,} ranges beyond {rate.beyond_sigma:g} sigma "
+            f"({rate.prior:.1e}, at most {rate.upper:.1e}), two satellites {rate.together:.1f} times as often as "
+            f"independent ones, low ones of one side in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks "
+            f"(at most {rate.side_upper:.1e})"
         )
 
 
