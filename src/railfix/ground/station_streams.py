@@ -15,7 +15,8 @@ from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.ground.station_fixes import FALLEN_DBHZ, StationFixes, no_fixes, rounded, station_fixes
-from railfix.io.receiver.log import StreamState, head_of, is_receiver_log
+from railfix.io.receiver.log import StreamState
+from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.rinex import scan_observations
 from railfix.live.settings import LiveSettings
 from railfix.live.sources import Lost, is_file, read_source

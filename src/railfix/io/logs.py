@@ -17,7 +17,7 @@ from railfix.core.files import BrokenLines, FilePath
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
-from railfix.io.receiver.log import head_of, is_receiver_log, read_receiver_navigation, scan_receiver_log
+from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.rinex.observations import DEFAULT_EPOCHS, in_pieces, with_break_at_gap, without_empty_channels
 
 Paths = FilePath | Sequence[FilePath]
@@ -103,6 +103,8 @@ def _receiver_runs(
     progress: Callable[[float], None] | None,
 ) -> Iterator[Observations]:
     """Blocks of all receiver logs in order of time, cut to constellations and times wanted."""
+    from railfix.io.receiver.log import scan_receiver_log
+
     start, end, date = limits
     letters = None if systems is None else list(systems)
     found, last = 0, None
@@ -132,6 +134,8 @@ def _receiver_runs(
 def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
     if len(paths) == 1:
         return paths
+    from railfix.io.receiver.log import scan_receiver_log
+
     firsts = [next(run.time[0] for run in scan_receiver_log(p, date=date) if len(run)) for p in paths]
     return [paths[k] for k in np.argsort(np.array(firsts), kind="stable")]
 
@@ -172,6 +176,8 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
         files = [name for name, is_log in zip(names, receiver, strict=True) if not is_log]
         parts.append(rinex.read_navigation(files, broken_lines=broken_lines))
     if any(receiver):
+        from railfix.io.receiver.log import read_receiver_navigation
+
         logs = [name for name, is_log in zip(names, receiver, strict=True) if is_log]
         parts.append(read_receiver_navigation(logs, date=_instant(date)))
     return parts[0] if len(parts) == 1 else _joined(parts)

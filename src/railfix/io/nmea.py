@@ -20,8 +20,8 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import utc_to_gpst
 from railfix.gnss.observations import capped_problems
 from railfix.io.position_log import PositionLog, read_positions
-from railfix.io.receiver.log import head_of, is_receiver_log
 from railfix.io.receiver.positions import read_receiver_positions
+from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.text_positions import read_gpx_positions, read_novatel_positions
 
 #: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); others are 0, no position.

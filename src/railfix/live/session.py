@@ -14,7 +14,8 @@ import numpy as np
 
 from railfix.core.files import FilePath
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
-from railfix.io.receiver.log import StreamState, head_of, is_receiver_log
+from railfix.io.receiver.log import StreamState
+from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.rinex import scan_observations
 from railfix.live.channels import TwoChannels
 from railfix.live.engine import LiveEngine, LiveOutput

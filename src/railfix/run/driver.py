@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
-from railfix.io.sp3 import read_sp3
 from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, risk_of
@@ -39,7 +38,6 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
-from railfix.run.route import RouteOfLog, find_route
 from railfix.run.sensor_checks import sensor_notes
 from railfix.run.sensors import check_units, read_sensors, read_units
 from railfix.run.smoothed_columns import add_smoothed
@@ -47,7 +45,10 @@ from railfix.run.sources import TRACK_FILE, Line, Log, open_line
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS
 from railfix.track import check_track, write_track_csv
-from railfix.track.network import Network
+
+if TYPE_CHECKING:
+    from railfix.run.route import RouteOfLog
+    from railfix.track.network import Network
 
 
 class Progress(Protocol):
@@ -213,6 +214,8 @@ def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple
     """
     navigation = read_navigation(inputs.nav, broken_lines=options.broken_lines, date=options.logs.instant)
     if inputs.sp3:
+        from railfix.io.sp3 import read_sp3
+
         navigation = replace(navigation, precise=read_sp3(inputs.sp3))
     at = time_of(navigation)
 
@@ -227,6 +230,8 @@ def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple
         )
 
     def find(network: Network) -> RouteOfLog:
+        from railfix.run.route import find_route
+
         paths = next(iter(inputs.logs.values()))
         if at is None:
             raise MismatchError(f"{inputs.nav[0]}: has no record, so that no route through the network can be found")

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import fingerprint
 from railfix.core.settings import Settings, option
-from railfix.io.receiver.log import head_of, is_receiver_log
+from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.pipeline.config import Config
 
 Antenna = Literal["front", "rear"]

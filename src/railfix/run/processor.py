@@ -11,7 +11,6 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.ranges.cn0_curve import read_cn0_curve
 from railfix.ranges.error_model import read_error_model
-from railfix.ranges.sbas import read_sbas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -46,11 +45,16 @@ def processor_of(
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
+    messages = None
+    if config.sbas and config.sbas != "stream":
+        from railfix.ranges.sbas import read_sbas
+
+        messages = read_sbas(list(config.sbas))
     return EpochProcessor(
         config,
         trajectories,
         navigation=navigation,
-        messages=read_sbas(list(config.sbas)) if config.sbas and config.sbas != "stream" else None,
+        messages=messages,
         error_model=None if config.error_model is None else read_error_model(config.error_model),
         cn0_curve=None if config.cn0_curve is None else read_cn0_curve(config.cn0_curve),
         track=track,

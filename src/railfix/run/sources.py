@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,15 +18,16 @@ from railfix.io.logs import scan_observations
 from railfix.run.inputs import Antenna
 from railfix.run.options import TrackReading
 from railfix.run.prepared import PreparedLines, key_of, track_key
-from railfix.run.route import RouteOfLog
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
-from railfix.track.network import Network
-from railfix.track.network_read import is_route, network_of
 from railfix.track.read import read_segments, track_of_segments
 from railfix.track.segment import Segment
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
+
+if TYPE_CHECKING:
+    from railfix.run.route import RouteOfLog
+    from railfix.track.network import Network
 
 #: Track of a run that is not that of its files as they are, in the folder of results.
 TRACK_FILE: Final = "track.csv"
@@ -145,14 +146,17 @@ def _read_line(
     """Read the track, and find the route in a network."""
     segments = _segments(track, reading)
     route = None
-    if len(track) == 1 and len(segments) > 1 and not is_route(segments):
-        if find is None:
-            raise MismatchError(
-                f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one with "
-                "'railfix map route'"
-            )
-        route = find(network_of(segments, track))
-        segments = [route.network.tracks[k] for k in route.tracks]
+    if len(track) == 1 and len(segments) > 1:
+        from railfix.track.network_read import is_route, network_of
+
+        if not is_route(segments):
+            if find is None:
+                raise MismatchError(
+                    f"{track[0]}: has {len(segments)} tracks that do not join to one route; make the map of one with "
+                    "'railfix map route'"
+                )
+            route = find(network_of(segments, track))
+            segments = [route.network.tracks[k] for k in route.tracks]
     centreline = track_of_segments(
         segments,
         heights=heights,

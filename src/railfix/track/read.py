@@ -12,15 +12,12 @@ from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending, read_text
 from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
-from railfix.track.height_source import with_heights
 from railfix.track.heights import check_height_datum
-from railfix.track.ifc_file import read_ifc_segments
 from railfix.track.route import MAX_GAP_M, join
 from railfix.track.segment import NO_HEIGHTS, Segment
 from railfix.track.track import Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vector_file import geojson_has_heights, read_vector_segments
-from railfix.track.xml_files import read_xml_segments
 
 
 def read_track(
@@ -130,6 +127,8 @@ def track_of_segments(
     )
     if heights is None:
         return track
+    from railfix.track.height_source import with_heights
+
     return with_heights(track, heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 
 
@@ -164,8 +163,12 @@ def read_segments(
     if kind in VECTOR_ENDINGS:
         return read_vector_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
     if kind == ".ifc":
+        from railfix.track.ifc_file import read_ifc_segments
+
         return read_ifc_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
     if kind in (".xml", ".landxml", ".railml"):
+        from railfix.track.xml_files import read_xml_segments
+
         return read_xml_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
     raise InputFileError(
         file,

@@ -21,8 +21,6 @@ from railfix.io.receiver.measurements import Measurements, Tracking, joined, obs
 from railfix.io.receiver.subframes import SbasFrames, joined_subframes, sbas_frames
 
 _BLOCK_BYTES: Final = 1 << 22
-#: Bytes in which a log must show a frame with a valid checksum to be taken for one.
-_HEAD_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,18 +52,6 @@ class StreamState:
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-
-
-def is_receiver_log(head: bytes) -> bool:
-    """Whether bytes from the beginning of a file hold a UBX, RTCM 3 or SBF frame with a valid checksum."""
-    frames = find_frames(np.frombuffer(head, dtype=np.uint8))
-    return bool(np.isin(frames.protocol, ["ubx", "rtcm3", "sbf"]).any())
-
-
-def head_of(path: FilePath) -> bytes:
-    """First bytes of a file, unpacked."""
-    with open_stream(path, content="bytes") as stream:
-        return stream.read(_HEAD_BYTES)
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
