@@ -11,7 +11,7 @@ from scipy.stats import norm
 from railfix.tracking import TrackingLimits, track
 from railfix.tracking.bank import budget, level_m
 from railfix.tracking.state import Bank
-from tracking_cases import part, ride, wheel, without_epochs
+from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
 LIMITS = TrackingLimits(level="on")
 
@@ -126,3 +126,19 @@ def test_off_there_is_no_level() -> None:
     result, state = track(case.epochs, case.line)
     assert np.isnan(result.level_m).all()
     assert state.bank is None
+
+
+@pytest.mark.requirement("C2")
+def test_a_sub_filter_follows_the_line_where_a_fault_has_led_the_filter_away() -> None:
+    """Four codes on a line that bends: a ramp in one takes the filter more than 100 m off, and its tangent with it."""
+    case = ride(110, trajectory=bent_line(1500.0, turn_deg=170.0), noise=1.0, code_sigma_m=3.0, seed=4)
+    code = np.where(np.isin(np.arange(10), (0, 2, 5, 8)), case.epochs.code_m, np.nan)
+    code[30:, 2] += 1.5 * np.arange(80.0)
+    nothing = np.full(code.shape, np.nan)
+    epochs = replace(case.epochs, code_m=code, phase_m=nothing, rate_mps=nothing)
+    result, state = track(epochs, case.line, limits=TrackingLimits(level="on", late_degrees_of_freedom=4.0))
+    assert state.bank is not None
+    assert abs(result.arc_m[-1] - case.arc_m[-1]) > 100.0
+    k = state.bank.without.index(str(case.epochs.satellite[2]))
+    assert abs(state.bank.mean[k, 0] - case.arc_m[-1]) < 3.0
+    assert (np.abs(result.arc_m - case.arc_m) <= result.level_m)[5:].all()
