@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
 
@@ -118,6 +118,9 @@ def test_case_worked_by_hand_against_rows_and_columns():
     risk=st.sampled_from([1e-2, 1e-3, 1e-4]),
     fault=st.floats(-20.0, 20.0),
 )
+@example(
+    seed=675235, system=("GGGGGEEECCC", None), scale=1.0, biased=False, shared=False, risk=1e-4, fault=0.0
+)  # steps between two points
 @settings(max_examples=250, deadline=None)
 def test_level_equals_solving_every_subset_again(seed, system, scale, biased, shared, risk, fault):
     systems, ties = system

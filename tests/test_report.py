@@ -307,7 +307,7 @@ def test_a_background_is_drawn_below_the_plan(folder: Path, tmp_path: Path) -> N
         streets.write_text(wrong)
         result = RUNNER.invoke(app, [*arguments, "--overwrite"])
         assert result.exit_code == 3, result.output
-        assert "GeoJSON" in result.output or "WGS 84" in result.output
+        assert "JSON" in result.output or "WGS 84" in result.output
 
 
 def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tmp_path: Path) -> None:

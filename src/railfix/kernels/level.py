@@ -10,7 +10,7 @@ from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import kernel
 
 #: Of `railfix.integrity.protection.tails`.
-_CLOSE, _STEPS, _AIM, _ALIKE, _MILLS = 5e-4, 60, 0.002, 1e-9, (0.339, 5.510)
+_CLOSE, _STEPS, _HALVING, _AIM, _ALIKE, _MILLS = 5e-4, 60, 8, 0.002, 1e-9, (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 _ROOT_HALF = math.sqrt(0.5)
@@ -163,7 +163,8 @@ def lowered(
                 else:
                     above = here
             close = number > 0 and abs(following - here) <= _CLOSE * here
-            if not below <= following <= above:
+            halved = number >= _HALVING and number % 2 == 1
+            if halved or not below <= following <= above:
                 following = min(max(following, below), above) if close else (below + above) / 2.0
             level[t] = following if close else above
             if close:

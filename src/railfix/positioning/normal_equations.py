@@ -94,7 +94,9 @@ class Ranges:
         if self.ties is not None:
             offset_m, sigma_m = self.ties.offset_m, self.ties.sigma_m
         floats = (self.sat_ecef_m, self.code_m, self.weight, place_ecef_m, offset_m, sigma_m)
-        sat_ecef_m, code_m, weight, place, offset_m, sigma_m = (np.ascontiguousarray(array) for array in floats)
+        sat_ecef_m, code_m, weight, place, offset_m, sigma_m = (
+            np.ascontiguousarray(array, dtype=np.float64) for array in floats
+        )
         return sat_ecef_m, code_m, weight, place, self.starts, offset_m, sigma_m
 
     @cached_property

@@ -18,6 +18,8 @@ from railfix.kernels import compiled_by
 _CLOSE: Final = 5e-4
 #: Steps at most; a level that they do not come close to stays at the lowest one found within the risk.
 _STEPS: Final = 60
+#: From this step on every other one halves the bracket: steps between two points would go on for ever.
+_HALVING: Final = 8
 #: Share of the risk that is left over.
 _AIM: Final = 0.002
 #: Share of the largest part within which two hypotheses ask for the same: the first is named.
@@ -99,7 +101,8 @@ def _root(
     """Levels up to `highest` at which the sum of the tails is `aim`, and the kind that uses most of it.
 
     Newton's method on the logarithm of the sum, to second order: the error of a step goes with its third power. The
-    first one, from the highest level, is taken with approximate tails. A step that leaves the bracket halves it.
+    first one, from the highest level, is taken with approximate tails. A step that leaves the bracket halves it, and
+    after some steps every other one does.
     """
     level, spender = highest.copy(), np.zeros(len(highest), dtype=np.int8)
     rows, here, below, above = np.arange(len(highest)), highest, np.zeros(len(highest)), highest
@@ -129,7 +132,7 @@ def _root(
             spender[rows] = np.argmax(parts, axis=1)
             below, above = np.where(excess > 0.0, here, below), np.where(excess > 0.0, above, here)
         close = (number > 0) & (np.abs(following - here) <= _CLOSE * here)
-        inside = (following >= below) & (following <= above)
+        inside = (following >= below) & (following <= above) & ((number < _HALVING) | (number % 2 == 0))
         following = np.where(
             inside, following, np.where(close, np.clip(following, below, above), (below + above) / 2.0)
         )
