@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import protection_oracle
@@ -105,6 +105,7 @@ def test_every_subset_equals_solving_without_it(seed, system, scale, fault, leas
     scale=st.sampled_from([1.0, 0.5, 3.0]),
     seen=st.sampled_from([(0.0, 0.0), (4.5, -10.0), (-20.0, 37.0), None]),
 )
+@example(seed=193, system=SYSTEMS[3], scale=1.0, seen=None)
 @settings(max_examples=60, deadline=None)
 def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, scale, seen):
     """The offset of the last minutes in place of the map, or nothing; alone and without each satellite."""
@@ -113,13 +114,13 @@ def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, s
     model = constrained_model(ranges, oracle.LINE, ARC)
     case = oracle.problem_on_line(ranges, 0, ARC[0])
     before = protection_oracle.Resolved(case, scale)
-    n, sigma = len(systems), np.array([2.0, 5.0]) if seen is not None else np.array([1e4, 1e4])
-    unit = case.scale_of[1:3]
+    n, sigma = len(systems), np.array([2.0, 5.0])
     design, observed = case.design / scale, case.observed / scale
-    design[[n, n + 1], [1, 2]] = unit / sigma
+    # With nothing in place of the map its rows are gone: a prior of any size, however wide, would bound the place.
+    design[[n, n + 1], [1, 2]] = 0.0 if seen is None else case.scale_of[1:3] / sigma
     observed[n : n + 2] = np.array(seen or (0.0, 0.0)) / sigma
     solved = protection_oracle.Resolved(replace(case, design=design, observed=observed), 1.0)
-    if before.all.sigma_m > 50.0 or not solved.all.determined:
+    if before.all.sigma_m > 50.0:
         return
     bias = np.random.default_rng(seed).uniform(0.0, 1.0, n)
     information = np.zeros((1, 2, 2)) if seen is None else np.diag(sigma**-2.0)[None]
@@ -129,16 +130,42 @@ def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, s
         (alone, 0, solved.all),
         *((with_one, c, solved.without((c,))) for c in range(n)),
     ]:
-        if not answer.determined or answer.sigma_m > 20.0:
+        if not answer.determined:
+            assert got.sigma_m[0, column] == np.inf
             continue
-        if seen is None and np.isinf(got.sigma_m[0, column]):
-            continue  # at the edge of what the ranges alone determine no bound is given
+        if answer.sigma_m > 20.0:
+            continue
         effect = float((np.abs(answer.operator[:n]) * bias / (scale * case.sigma_m)).sum())
         assert got.sigma_m[0, column] == pytest.approx(answer.sigma_m, rel=1e-3)
         assert got.bias_m[0, column] == pytest.approx(
             abs(answer.place_m - before.all.place_m) + effect, rel=1e-3, abs=1e-3
         )
         assert got.moved_m[0, column] == got.separation_sigma_m[0, column] == 0.0
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
+def test_two_clocks_without_one_of_a_pair_leave_a_direction_free(scale):
+    """Three of G, two of E, one of C, without the map: nothing bounds the place without a satellite of G or E.
+
+    E and C tell their own clocks, so G and E give 2 + 1 differences for the three unknowns of the place. Without an E
+    the two differences of G leave the cross product n of their rows free: any place along n fits alike. n is nearly
+    abeam (0.0016 of it along the line), but any error along the line is possible, and sigma is infinite. A prior of
+    10 km across and up gives 10 km times 0.0016, some 16 m, which no observation supports.
+    """
+    ranges = oracle.made(ARC, "GGGEEC", seed=193, faults_m={1: 12.0})
+    model = constrained_model(ranges, oracle.LINE, ARC)
+    whitened = oracle.problem_on_line(ranges, 0, ARC[0])
+    rows = whitened.design[:6, :3] / whitened.scale_of[:3] * whitened.sigma_m[:, None]
+    free = np.cross(rows[1] - rows[0], rows[2] - rows[0])
+    free /= np.linalg.norm(free)
+    assert abs(free[0]) == pytest.approx(0.001557, abs=1e-6)
+    full = all_in_view(model, np.array([scale]), *EXACT)
+    alone, with_one = without_map(full, model, np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    determined = np.linalg.inv(np.stack([rows[1] - rows[0], rows[2] - rows[0], rows[4] - rows[3]]))[0]
+    of_range = np.array([-determined[0] - determined[1], determined[0], determined[1], -determined[2], determined[2]])
+    assert alone.sigma_m[0, 0] == pytest.approx(scale * np.linalg.norm(of_range * whitened.sigma_m[:5]), rel=1e-6)
+    assert with_one.sigma_m[0, :5].tolist() == [np.inf] * 5
+    assert with_one.sigma_m[0, 5] == pytest.approx(alone.sigma_m[0, 0], rel=1e-6)  # C tells its clock alone
 
 
 def test_subsets_that_leave_no_position_are_found():
