@@ -21,7 +21,7 @@ from bad_inputs import Desk, desk_in
 from railfix.cli import app
 from railfix.core.errors import OutputError
 from railfix.run import read_record
-from railfix.run.output import OutputFolder, check_output_file
+from railfix.run.output import FileKind, OutputFolder, check_output_file
 
 RUNNER = CliRunner(env={"COLUMNS": "80", "TERM": "dumb", "NO_COLOR": "1"})
 
@@ -34,6 +34,8 @@ TO_FILE: Final = {
     "error-model {desk}/results --reference {desk}/truth.csv --out {out}": ("truth.csv", "results/run.json"),
     "report {desk}/results --reference {desk}/truth.csv --out {out}": ("truth.csv", "results/positions.parquet"),
 }
+#: Endings of the outputs, by a word of the command.
+ENDINGS: Final = {"map": ".csv", "--plot": ".png", "report": ".html", "": ".toml"}
 TO_FOLDER: Final = {
     f"run {_LOG} --out {{out}}": "positions.csv",
     f"ablate {_LOG} --out {{out}}": "ablation.csv",
@@ -73,7 +75,8 @@ def contents(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize("command", TO_FILE, ids=lambda text: " ".join(text.split()[:2]))
 def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, command: str) -> None:
-    out = desk.folder / "there.out"
+    ending = next(end for word, end in ENDINGS.items() if word in command)
+    out = desk.folder / f"there{ending}"
     out.write_text("mine")
     before = contents(desk.folder)
     code, output = call(desk, command, out)
@@ -83,7 +86,7 @@ def test_an_existing_file_is_refused_and_an_input_never_overwritten(desk: Desk, 
         code, output = call(desk, command, desk.folder / name, "--overwrite")
         assert (code, contents(desk.folder)) == (8, before)
         assert "is an input, which is never overwritten" in " ".join(output.split())
-    link = desk.folder / "hard.link"
+    link = desk.folder / f"hard{ending}"
     link.hardlink_to(desk.folder / TO_FILE[command][0])
     code, output = call(desk, command, link, "--overwrite")
     assert code == 8
@@ -166,6 +169,23 @@ def test_a_file_in_a_folder_that_cannot_be_used_is_refused(tmp_path: Path) -> No
     for target, words in ((tmp_path / "no" / "a", "does not exist"), (tmp_path, "is a folder")):
         with pytest.raises(OutputError, match=words):
             check_output_file(target, overwrite="replace", inputs=[])
+
+
+@pytest.mark.requirement("G1")
+@pytest.mark.parametrize(
+    ("kind", "name", "words"),
+    [
+        ("page", "report.pdf", r"an HTML page is written; name a file that ends in .html or .htm; .* print the page"),
+        ("page", "report", r"name a file that ends in .html"),
+        ("csv", "line.csv.gz", r"name a file that ends in .csv"),
+        ("picture", "network.pdf", r"name a file that ends in .png or .svg"),
+    ],
+)
+def test_the_ending_of_an_output_is_that_of_its_kind(tmp_path: Path, kind: FileKind, name: str, words: str) -> None:
+    with pytest.raises(OutputError, match=words):
+        check_output_file(tmp_path / name, overwrite="refuse", inputs=[], kind=kind)
+    for good in ("a.HTML", "a.htm") if kind == "page" else ():
+        check_output_file(tmp_path / good, overwrite="refuse", inputs=[], kind=kind)
 
 
 def _killed_after(words: list[str], seconds: float, number: signal.Signals, folder: Path) -> int:

@@ -216,7 +216,7 @@ def test_standing_draws_no_loops(seed: int, sigma: float, drift: float, stand: i
 def test_without_times_the_spacing_alone_holds_against_jitter() -> None:
     speed = np.concatenate([np.zeros(2000), np.full(300, 10.0), np.zeros(2000)])
     time, ecef = run_of(speed, 0.3)
-    track = from_positions(np.full_like(time, np.datetime64("NaT")), ecef)
+    track = from_positions(np.full_like(time, np.datetime64("NaT", "ns")), ecef)
     north = ((track.ecef_m - ecef_from_geodetic(*ORIGIN)) @ enu_axes(*ORIGIN[:2]).T)[:, 1]
     assert (np.diff(north) > 0).all()
     assert np.diff(track.chainage_m).min() > 0.9

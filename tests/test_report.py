@@ -414,6 +414,7 @@ def test_the_run_tells_how_long_its_chunks_took(summary: RunSummary, page: Page)
     ("arguments", "code", "said"),
     [
         (["{run}", "--out", "{tmp}/none/report.html"], 8, "does not exist"),
+        (["{run}", "--out", "{tmp}/report.pdf"], 8, "name a file that ends in .html or .htm; for a PDF file, print"),
         (["{tmp}/nowhere", "--out", "{tmp}/report.html"], 3, "there is no such folder"),
         (["{tmp}", "--out", "{tmp}/report.html"], 3, "positions"),
         (["{run}", "{run}", "--out", "{tmp}/report.html"], 4, "given twice"),
@@ -439,6 +440,21 @@ def test_a_record_that_is_none(folder: Path, tmp_path: Path, broken: str) -> Non
     assert result.exit_code in (3, 4)
     assert "run.json" in result.output
     assert not (tmp_path / "report.html").exists()
+
+
+def test_a_record_of_an_earlier_version(folder: Path, tmp_path: Path) -> None:
+    """A removed setting that nothing used is left out; any other is one sentence."""
+    shutil.copy(folder / "positions.parquet", tmp_path)
+    record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    words = ["report", str(tmp_path), "--overwrite", "--out", str(tmp_path / "report.html")]
+    for name, code in (("predicted_sigmas", 0), ("colour", 3)):
+        record["settings_used"]["section"][name] = 6.0
+        (tmp_path / "run.json").write_text(json.dumps(record), encoding="utf-8")
+        result = RUNNER.invoke(app, words)
+        assert result.exit_code == code, result.output
+    assert "run.json: does not fit this version" in " ".join(result.output.split())
+    assert "section.colour" in result.output
+    assert "repeat the run with it" in " ".join(result.output.split())
 
 
 def test_observations_that_are_no_table(folder: Path, tmp_path: Path) -> None:

@@ -244,7 +244,7 @@ def navigation() -> Navigation:
     rng = np.random.default_rng(1)
     toe = np.datetime64("2024-03-03T00:15:18", "ns") + np.arange(3) * np.timedelta64(1800, "s")
     sent = toe - np.timedelta64(600, "s")
-    sent[1] = np.datetime64("NaT")
+    sent[1] = np.datetime64("NaT", "ns")
     glonass = GlonassRecords(
         satellite=np.array(["R01", "R02", "R24"]),
         toe=toe,

@@ -60,7 +60,12 @@ def cn0_curve(
     outputs = [path for path in (out, plot) if path is not None]
     for path in outputs:
         others = [other for other in outputs if other is not path]
-        check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=[*observations, *nav, *others])
+        check_output_file(
+            path,
+            overwrite="replace" if overwrite else "refuse",
+            inputs=[*observations, *nav, *others],
+            kind="png" if path is plot else "any",
+        )
     fitted = cn0_curve_from_log(
         observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"
     )

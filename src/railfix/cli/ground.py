@@ -272,7 +272,7 @@ def demo(
     from railfix.ground.demo import run_demo
 
     if coverage is not None:
-        check_output_file(coverage, overwrite="replace" if overwrite else "refuse", inputs=[])
+        check_output_file(coverage, overwrite="replace" if overwrite else "refuse", inputs=[], kind="picture")
     console, password = console_of_tables(), secrets.token_urlsafe(12)
 
     def announce(url: str) -> None:

@@ -33,7 +33,7 @@ def locate(
 
     Exit codes as `railfix --help` says; 7 where no epoch has a position.
     """
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths), kind="pos")
     settings, _ = settings_of(choices)
     summary = locate_files(inputs, settings, out=out, reading=reading)
     console = console_of_tables()

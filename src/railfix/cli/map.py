@@ -139,7 +139,7 @@ def features(
     from railfix.track.trajectory import Trajectory
 
     if out is not None:
-        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=tracks)
+        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=tracks, kind="csv")
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
     trajectory = Trajectory.from_track(track)
     found = map_features(line_series(trajectory))
@@ -209,7 +209,7 @@ def from_positions_command(
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[positions])
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[positions], kind="csv")
     log = read_positions(positions, columns=columns_of(column)) if column else read_any_positions(positions)
     track, thinned = from_position_log(
         log,

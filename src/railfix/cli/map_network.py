@@ -14,7 +14,7 @@ from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.run.options import TrackReading
-from railfix.run.output import check_output_file
+from railfix.run.output import FileKind, check_output_file
 from railfix.track import write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
@@ -85,9 +85,10 @@ def network(
 
     Exit codes as `railfix --help` says; 6 where the network has gaps, kinks, or connections that do not meet.
     """
-    for target in (out, page):
+    outputs: tuple[tuple[Path | None, FileKind], ...] = ((out, "picture"), (page, "page"))
+    for target, kind in outputs:
         if target is not None:
-            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=maps)
+            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=maps, kind=kind)
     tracks = _network(maps, reading, tolerance)
     quality = check_network(tracks)
     console = console_of_tables()
@@ -155,7 +156,8 @@ def route(
     ways = [w for w in (tracks, via, positions) if w]
     if len(ways) > 1:
         raise SettingsError("give one of --tracks, --via and --positions")
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=maps)
+    read = [path for path in (*maps, positions, heights, reading.jgd_parameters) if path is not None]
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=read, kind="csv")
     net = _network(maps, reading, tolerance)
     notes: list[str] = []
     if tracks:
@@ -244,9 +246,10 @@ def match_command(
     """
     if sigma is not None and not sigma > 0.0:
         raise SettingsError("--sigma must be positive")
-    for target in (out, picture, page):
+    outputs: tuple[tuple[Path | None, FileKind], ...] = ((out, "csv"), (picture, "picture"), (page, "page"))
+    for target, kind in outputs:
         if target is not None:
-            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log])
+            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log], kind=kind)
     net = _network(maps, reading, tolerance)
     positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
     matched = match(net, positions, sigma_m=sigma)

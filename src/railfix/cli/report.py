@@ -66,7 +66,7 @@ def report(
         if path.suffix != ".html"
     ]
     inputs = [*(reference or ()), *in_runs, *([] if background is None else [background])]
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=inputs)
+    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=inputs, kind="page")
     # the observations are read piece by piece while the page is drawn
     with reading_table(runs[0] / "observations.parquet" if len(runs) == 1 else Path("observations.parquet of a RUN")):
         page = write_report(

@@ -12,7 +12,7 @@ from rich.table import Table
 from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
-from railfix.run.output import check_output_file
+from railfix.run.output import FileKind, check_output_file
 from railfix.run.track_prior import write_last_place
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files
 
@@ -43,9 +43,12 @@ def which_track(
 
     Exit codes as `railfix --help` says; 5 where the train moves or no track is near.
     """
-    for target in (out, save_last):
+    outputs: tuple[tuple[Path | None, FileKind], ...] = ((out, "picture"), (save_last, "any"))
+    for target, kind in outputs:
         if target is not None:
-            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths))
+            check_output_file(
+                target, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths), kind=kind
+            )
     settings, _ = settings_of(choices)
     decision = which_track_files(inputs, options, settings)
     console = console_of_tables()

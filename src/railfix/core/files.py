@@ -14,6 +14,7 @@ Hatanaka (CRX)  piped through the compiled ``crx2rnx`` of the `hatanaka` package
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import hashlib
 import importlib.resources
@@ -147,7 +148,8 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
     Returns
     -------
     ByteStream
-        A context manager with `read(size)`. Line ends are as in the file (CR LF stays).
+        A context manager with `read(size)`. Line ends are as in the file (CR LF stays); a byte order mark at the
+        beginning of text is left out.
 
     Raises
     ------
@@ -173,6 +175,8 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
         _reject_content(path, head, content)
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
+        if content == "text" and head.startswith(codecs.BOM_UTF8):
+            source.seek(len(codecs.BOM_UTF8))
         return ByteStream(path, source, held.pop_all())
 
 
@@ -198,7 +202,7 @@ def read_text(path: FilePath) -> str:
     """
     content = read_bytes(path)
     try:
-        return content.decode("utf-8-sig")
+        return content.decode("utf-8")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
         raise InputFileError(path, "is not UTF-8 text; save the file as UTF-8", line=line) from None
@@ -213,7 +217,7 @@ def text_lines(path: FilePath) -> Iterator[str]:
         As `open_stream`; not UTF-8.
     """
     number = 0
-    with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8-sig") as text:  # type: ignore[type-var]
+    with open_stream(path) as stream, io.TextIOWrapper(stream, encoding="utf-8") as text:  # type: ignore[type-var]
         try:
             for line in text:
                 number += 1

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import polars as pl
 import polars.selectors as cs
@@ -19,6 +19,9 @@ from railfix.core.settings import Model, validated
 from railfix.pipeline.config import Config, parse_config
 from railfix.run.inputs import RunInputs, located
 from railfix.run.options import RunOptions
+
+#: Settings, by group and name, that were removed because nothing used them: records of earlier runs have them.
+WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,12 +56,18 @@ class RunRecord:
     def config(self) -> Config:
         """Settings that were used, with the files they name where these are now.
 
+        Settings that earlier versions recorded and that never changed a result are left out.
+
         Raises
         ------
         InputFileError
             The record lacks them, or they are not settings of this version.
         """
-        config = self._this_version(lambda: parse_config(self.part("settings_used"), source="settings_used"))
+        used = dict(self.part("settings_used"))
+        for group, name in WITHOUT_EFFECT:
+            if isinstance(used.get(group), dict):
+                used[group] = {key: value for key, value in used[group].items() if key != name}
+        config = self._this_version(lambda: parse_config(used, source="settings_used"))
         files = {name: self.located(name) for name in ("cn0_curve", "error_model", "sbas")}
         changes = {name: tuple(paths) if name == "sbas" else paths[0] for name, paths in files.items() if paths}
         return config.replaced(**changes) if changes else config
@@ -81,7 +90,7 @@ class RunRecord:
             return read()
         except SettingsError as error:
             path = self.path / "run.json"
-            raise InputFileError(path, f"was not written by this version ({error}); repeat the run") from None
+            raise InputFileError(path, f"does not fit this version ({error}); repeat the run with it") from None
 
     def check_inputs(self) -> None:
         """Check that the input files are there and unchanged.

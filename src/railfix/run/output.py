@@ -19,6 +19,16 @@ if TYPE_CHECKING:
 
 #: What becomes of files that are already there.
 Overwrite = Literal["refuse", "replace"]
+#: What a single file is, for `check_output_file`.
+FileKind = Literal["page", "csv", "pos", "picture", "png", "any"]
+#: Of each kind what it is, how its name ends, and how to come by another form.
+_ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
+    "page": ("an HTML page", (".html", ".htm"), "; for a PDF file, print the page in a browser"),
+    "csv": ("a table in CSV", (".csv",), ""),
+    "pos": ("RTKLIB's format of positions", (".pos",), ""),
+    "picture": ("a picture in PNG or SVG", (".png", ".svg"), ""),
+    "png": ("a picture in PNG", (".png",), ""),
+}
 #: How times are written to CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
 
@@ -218,7 +228,7 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
             raise OutputError(f"{target}: is an input, which is never overwritten; name another output")
 
 
-def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
+def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise where a single file cannot or must not be written.
 
     Parameters
@@ -228,14 +238,20 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
         What to do with a file that is already there.
     inputs : sequence of Path
         Files that are read: they are never overwritten.
+    kind : {"page", "csv", "pos", "picture", "png", "any"}
+        What is written; programs that open the file take it for what the ending of its name says.
 
     Raises
     ------
     OutputError
-        The folder does not exist or cannot be written, the file is there already, or is an input.
+        The folder does not exist or cannot be written, the file is there already, or is an input, or the ending of
+        its name is that of another kind of file.
     """
     with _writing(target):
         check_not_input(target, inputs)
+        what, endings, other = _ENDINGS.get(kind, ("", (), ""))
+        if endings and target.suffix.lower() not in endings:
+            raise OutputError(f"{target}: {what} is written; name a file that ends in {' or '.join(endings)}{other}")
         if not target.parent.is_dir():
             raise OutputError(f"{target}: the folder {target.parent} does not exist; make it, or name another")
         if target.is_dir():

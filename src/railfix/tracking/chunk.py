@@ -96,10 +96,10 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
 
     any_kind = np.asarray(has.any(axis=0), dtype=np.bool_)
     slot = _with_satellites(state, epochs, np.asarray(any_kind.any(axis=0)))
-    seen = np.full((len(epochs) + 1, len(state.satellite)), np.datetime64("NaT"), dtype="datetime64[ns]")
+    seen = np.full((len(epochs) + 1, len(state.satellite)), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
     seen[0] = state.seen
     used = np.flatnonzero(slot >= 0)
-    seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT"))
+    seen[1:, slot[used]] = np.where(any_kind[:, used], epochs.time[:, None], np.datetime64("NaT", "ns"))
     seen = np.fmax.accumulate(seen, axis=0)
     earlier = np.concatenate([np.array([state.time]), epochs.time[:-1]])
     kept = seconds(earlier[:, None] - seen[:-1]) <= FORGOTTEN * limits.code_correlation_s

@@ -233,7 +233,7 @@ class TrackState:
             mean, covariance = _rearranged(self.bank.mean, self.bank.covariance, index, len(new))
             self.bank = replace(self.bank, mean=mean, covariance=covariance)
         self.satellite = np.array([*self.satellite[kept].tolist(), *new], dtype=np.str_)
-        unseen = np.full(len(new), np.datetime64("NaT"), dtype="datetime64[ns]")
+        unseen = np.full(len(new), np.datetime64("NaT", "ns"), dtype="datetime64[ns]")
         self.seen = np.concatenate([self.seen[kept], unseen])
 
 

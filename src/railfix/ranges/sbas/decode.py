@@ -306,7 +306,7 @@ def long_term(messages: SbasMessages) -> Decoded:
                     "velocity_code": np.zeros(len(still), dtype=np.int64),
                     "velocity_mps": np.zeros((len(still), 3)),
                     "clock_rate": np.zeros(len(still)),
-                    "reference": np.full(len(still), np.datetime64("NaT"), dtype="datetime64[ns]"),
+                    "reference": np.full(len(still), np.datetime64("NaT", "ns"), dtype="datetime64[ns]"),
                 }
             )
         part = read_fields(messages.bits[moving], LAYOUTS["moving satellite of type 25"], start)
