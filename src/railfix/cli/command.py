@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import re
 import select
@@ -109,7 +110,12 @@ class LazyCommands(Commands):
 def loaded(name: str) -> Any:
     """Return a command, imported from its module in `railfix.cli`."""
     word = name.replace("-", "_")
-    module = import_module(f"railfix.cli.{word}")
+    gc.disable()  # nothing of what an import makes is garbage: looking for it takes a tenth of the start
+    try:
+        module = import_module(f"railfix.cli.{word}")
+    finally:
+        gc.freeze()
+        gc.enable()
     app = getattr(module, "app", None)
     if app is None:
         app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="markdown")

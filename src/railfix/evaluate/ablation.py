@@ -30,7 +30,7 @@ from railfix.run.inputs import RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import run_record
+from railfix.run.record import package_versions, run_record
 from railfix.run.sensors import until
 from railfix.run.tally import Tally
 from railfix.screens import SCREENS, ScreenSetup
@@ -251,6 +251,7 @@ def ablate_files(
         wall = clock.perf_counter() - began
         record = run_record(
             files=[entry.result() for entry in entries],
+            packages=package_versions(),
             command=sys.argv,
             asked=asked or {},
             used=config.model_copy(update={"screens": screens}).as_dict(),

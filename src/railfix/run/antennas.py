@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -28,10 +28,12 @@ from railfix.pipeline.compared import PlacedRanges, PositionVerdict, Published, 
 from railfix.pipeline.processor import AntennaChunk, EpochProcessor
 from railfix.pipeline.results import State
 from railfix.pipeline.smoothing import Replay, smooth
-from railfix.pipeline.tables import observations_table, positions_table
+from railfix.pipeline.tables import in_time_order, observations_table, positions_table, rounded
 from railfix.pipeline.train_table import smoothed_table, train_table
+from railfix.run import sources
 from railfix.run.chunks import Pieces
 from railfix.run.inputs import Antenna
+from railfix.run.output import OutputFolder
 from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
@@ -61,6 +63,31 @@ class Rows:
     observations: pl.DataFrame | None
     tally: AntennaTally
     notes: tuple[str, ...]
+
+
+def write_rows(rows: Sequence[Rows], line: sources.Line, folder: OutputFolder) -> None:
+    """Write the rows of one chunk of all antennas, in order of time.
+
+    Parameters
+    ----------
+    rows : sequence of Rows
+        By antenna.
+    line : Line
+        Rows get their tracks where it is a route of a network.
+    folder : OutputFolder
+    """
+    tables = {}
+    for table in ("positions", "train", "observations"):
+        if parts := [part for of_antenna in rows if (part := getattr(of_antenna, table)) is not None]:
+            tables[table] = in_time_order(parts)
+    if line.route is not None:
+        tables["positions"], tables["tracks"] = line.route.on_tracks(tables["positions"], line.track)
+        if "train" in tables:
+            tables["train"], _ = line.route.on_tracks(tables["train"], line.track)
+    for name, joined in tables.items():
+        folder.append_parquet(f"{name}.parquet", joined)
+        if name != "observations":
+            folder.append_csv(f"{name}.csv", rounded(joined))
 
 
 class AntennaRun:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time as clock
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -22,8 +22,7 @@ from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, risk_of
 from railfix.pipeline.processor import EpochProcessor
-from railfix.pipeline.tables import in_time_order, rounded
-from railfix.run.antennas import AntennaRun, OtherProcess, processes
+from railfix.run.antennas import AntennaRun, OtherProcess, processes, write_rows
 from railfix.run.checks import (
     RECORD_REACH,
     check_positions,
@@ -37,7 +36,7 @@ from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
-from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, run_record
+from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
 from railfix.run.sensor_checks import sensor_notes
 from railfix.run.sensors import check_units, read_sensors, read_units
 from railfix.run.smoothed_columns import add_smoothed
@@ -134,7 +133,8 @@ def run_files(
             for name in tuple(inputs.logs)[1 : processes(options.workers)]
         ]
         folder = stack.enter_context(OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths))
-        entries = inputs.entries(stack.enter_context(ThreadPoolExecutor(max_workers=1)), out)
+        beside = stack.enter_context(ThreadPoolExecutor(max_workers=1))
+        entries, packages = inputs.entries(beside, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
         sensors, units = sensors_of(inputs)
         processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
@@ -147,7 +147,7 @@ def run_files(
             if name not in {other.name for other in others}
         }
         runs |= {other.name: other.reads(logs[other.name]) for other in others}
-        tally = _position(runs, line, processor, folder, progress)
+        tally = _position(runs, line, processor, folder, beside, progress)
         if smooth:
             add_smoothed(runs, folder)
         check_same_time(tally)
@@ -166,6 +166,7 @@ def run_files(
         wall = clock.perf_counter() - began
         record = run_record(
             files=[entry.result() for entry in entries],
+            packages=packages.result(),
             command=sys.argv,
             asked=asked or {},
             used=config.as_dict(),
@@ -301,10 +302,15 @@ def _position(
     line: Line,
     processor: EpochProcessor,
     folder: OutputFolder,
+    beside: Executor,
     progress: Progress | None,
 ) -> Tally:
-    """Position chunk by chunk: counts and rows. Other processes come last in `runs`, and are asked first."""
+    """Position chunk by chunk: counts and rows. Other processes come last in `runs`, and are asked first.
+
+    The rows of a chunk are written by `beside` while the next one is positioned.
+    """
     tally, after = Tally(min_satellites=processor.config.min_satellites), np.datetime64("NaT", "ns")
+    written: Future[None] | None = None
     for cut in cuts({name: run.more for name, run in runs.items()}):
         began = clock.perf_counter()
         end = max(times[-1] for times in cut.values() if len(times))
@@ -320,20 +326,13 @@ def _position(
             tally.notes.update(dict.fromkeys(of_antenna.notes))
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
-        tables = {}
-        for table in ("positions", "train", "observations"):
-            if parts := [part for of_antenna in rows.values() if (part := getattr(of_antenna, table)) is not None]:
-                tables[table] = in_time_order(parts)
-        if line.route is not None:
-            tables["positions"], tables["tracks"] = line.route.on_tracks(tables["positions"], line.track)
-            if "train" in tables:
-                tables["train"], _ = line.route.on_tracks(tables["train"], line.track)
-        for name, joined in tables.items():
-            folder.append_parquet(f"{name}.parquet", joined)
-            if name != "observations":
-                folder.append_csv(f"{name}.csv", rounded(joined))
+        if written is not None:
+            written.result()
+        written = beside.submit(write_rows, list(rows.values()), line, folder)
         if progress is not None:
             progress(epochs=tally.epochs, fraction=min(run.log.share for run in runs.values()))
+    if written is not None:
+        written.result()
     return tally
 
 

@@ -97,6 +97,7 @@ def filtered(folder: OutputFolder) -> dict[str, Filtered]:
 def run_record(
     *,
     files: Sequence[Mapping[str, Any]],
+    packages: Mapping[str, str],
     command: Sequence[str],
     asked: Mapping[str, Any],
     used: Mapping[str, Any],
@@ -117,6 +118,8 @@ def run_record(
     ----------
     files : sequence of mapping
         Inputs with size and hash.
+    packages : mapping of str to str
+        `package_versions`.
     command : sequence of str
     asked, used : mapping
         Settings as given, and all settings that were in force.
@@ -140,7 +143,7 @@ def run_record(
     dict
     """
     return {
-        "versions": {"railfix": __version__, "python": platform.python_version(), **_versions()},
+        "versions": {"railfix": __version__, "python": platform.python_version(), **packages},
         "platform": platform.platform(),
         "kernels": kernels_in_use(),
         "command": list(command),
@@ -187,7 +190,8 @@ def _overall_ok_rate(tally: Tally) -> float | None:
     return sum(a.status[Status.OK.text] for a in tally.antennas.values()) / observed if observed else None
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Return the versions of `PACKAGES`, "absent" for those that are not installed."""
     versions = {}
     for name in PACKAGES:
         try:
