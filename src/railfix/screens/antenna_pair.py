@@ -31,6 +31,7 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.reasons import Reason
 from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
+from railfix.kernels import compiled_by
 from railfix.screens.base import (
     AntennaRanges,
     PairedEpochs,
@@ -41,7 +42,7 @@ from railfix.screens.base import (
     ScreenPicture,
     Verdict,
 )
-from railfix.screens.medians import clock_columns, enough_satellites, row_median
+from railfix.screens.medians import clock_medians
 from railfix.screens.pairs import on_pairs, pair_channels
 
 #: Treatments of the receiver clocks, as named in the output.
@@ -169,13 +170,21 @@ def ambiguity_m(
     spacing_m : array_like [m]
     elevation_error_deg, azimuth_error_deg : float [deg]
     """
-    elevation = np.radians(np.asarray(elevation_deg, dtype=np.float64))
-    azimuth = np.radians(np.asarray(relative_azimuth_deg, dtype=np.float64))
+    angles = np.broadcast_arrays(np.radians(elevation_deg), np.radians(relative_azimuth_deg))
+    # rows of one element each where they are no table
+    elevation, azimuth = (np.ascontiguousarray(a.reshape(-1, a.shape[-1] if a.ndim > 1 else 1)) for a in angles)
+    errors = np.radians(elevation_error_deg), np.radians(azimuth_error_deg)
+    changes = largest_changes(elevation, azimuth, float(errors[0]), float(errors[1]))
+    return np.asarray(np.asarray(spacing_m, dtype=np.float64) * changes.reshape(angles[0].shape))
+
+
+@compiled_by("screens")
+def largest_changes(elevation: Floats, azimuth: Floats, elevation_error: float, azimuth_error: float) -> Floats:
+    """Largest change of ``cos(elevation) cos(azimuth)`` within the errors of both, shape (T, M); all in radians."""
     exact = np.cos(elevation) * np.cos(azimuth)
     # the product of two cosines is extremal where each of them is
-    ends = _extremes(elevation, np.radians(elevation_error_deg)), _extremes(azimuth, np.radians(azimuth_error_deg))
-    changes = [np.abs(a * b - exact) for a, b in product(*ends)]
-    return np.asarray(np.asarray(spacing_m, dtype=np.float64) * np.max(changes, axis=0))
+    ends = _extremes(elevation, elevation_error), _extremes(azimuth, azimuth_error)
+    return np.asarray(np.max([np.abs(a * b - exact) for a, b in product(*ends)], axis=0))
 
 
 def _extremes(angle: Floats, error: float) -> tuple[Floats, Floats]:
@@ -257,14 +266,8 @@ def antenna_pair_screen(
 
 def _clock_difference(raw: Floats, rate: Floats, satellite: Strings, *, least: int) -> Floats:
     """Median of each constellation, shape (P, C) [m]; the instants that it moves are allowed for."""
-    clock = np.full(raw.shape, np.nan)
-    for columns in clock_columns(satellite):
-        part = raw[:, columns]
-        first = row_median(part)
-        second = row_median(part + rate[:, columns] * first / SPEED_OF_LIGHT)
-        enough = enough_satellites(np.isfinite(part), satellite[columns], least)
-        clock[:, columns] = np.where(enough, second, np.nan)
-    return clock
+    first = clock_medians(raw, satellite)
+    return clock_medians(raw + rate * first / SPEED_OF_LIGHT, satellite, least=least)
 
 
 class AntennaPairScreen(PairScreen[AntennaPairLimits]):

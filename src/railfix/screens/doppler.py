@@ -20,10 +20,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
+from railfix.kernels import compiled_by
 from railfix.screens.base import (
     AntennaRanges,
     ObservationScreen,
@@ -35,7 +36,7 @@ from railfix.screens.base import (
     Verdict,
 )
 from railfix.screens.doppler_limits import DopplerLimits, doppler_limit_m, expected_limit_m, receiver_limit_m
-from railfix.screens.medians import clock_columns, enough_satellites, row_median
+from railfix.screens.medians import clock_medians
 
 _NS: Final = 1e9
 
@@ -178,10 +179,12 @@ def doppler_screen(
     limit, sum_log, weight = _limit_m(interval, metric, sigmas, before, limits)
     metric = np.where(np.isnan(limit), np.nan, metric)
     limit = np.where(np.isnan(metric), np.nan, limit)
-    reject, level, since = _suspicion(when, metric, limit, before, hold_s=limits.hold_s)
+    reject, level, since = suspicions(
+        when.astype(np.int64), metric, limit, before.level_m, before.since.astype(np.int64), int(limits.hold_s * _NS)
+    )
     after = DopplerState(
         time=when[-1], satellite=satellite, signal=signal, code_m=code[-1].copy(), doppler_hz=doppler[-1].copy(),
-        code_sigma_m=sigma[-1].copy(), level_m=level[-1].copy(), since=since,
+        code_sigma_m=sigma[-1].copy(), level_m=level[-1].copy(), since=since.astype("datetime64[ns]"),
         scale_sum=sum_log, scale_epochs=weight,
     )  # fmt: skip
     return DopplerScreened(metric=metric, reject=reject, limit_m=limit, level_m=level), after
@@ -189,6 +192,8 @@ def doppler_screen(
 
 def _aligned(state: DopplerState, satellite: Strings, signal: Strings) -> DopplerState:
     """The state on the channels of this chunk; channels that left have no observation in it anyway."""
+    if state.satellite.tobytes() == satellite.tobytes() and state.signal.tobytes() == signal.tobytes():
+        return state
     row = {key: i for i, key in enumerate(zip(state.satellite.tolist(), state.signal.tolist(), strict=True))}
     found = np.array([row.get(key, -1) for key in zip(satellite.tolist(), signal.tolist(), strict=True)], dtype=int)
     known = found >= 0
@@ -222,15 +227,11 @@ def _intervals(time: Datetimes, last: np.datetime64, break_before: ArrayLike | N
 
 def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *, least: int) -> Floats:
     """Change of the codes against the Dopplers, the clock taken out, shape (T, M) [m]."""
-    metric = np.full(change.shape, np.nan)
-    for columns in clock_columns(satellite):
-        raw = change[:, columns] - rate[:, columns] * interval[:, None]
-        # the receiver clock's step is not elapsed time
-        passed = interval[:, None] - row_median(raw) / SPEED_OF_LIGHT
-        raw = change[:, columns] - rate[:, columns] * passed
-        enough = enough_satellites(np.isfinite(raw), satellite[columns], least)
-        metric[:, columns] = np.where(enough, raw - row_median(raw), np.nan)
-    return metric
+    raw = change - rate * interval[:, None]
+    # the receiver clock's step is not elapsed time
+    passed = interval[:, None] - clock_medians(raw, satellite) / SPEED_OF_LIGHT
+    raw = change - rate * passed
+    return np.asarray(raw - clock_medians(raw, satellite, least=least))
 
 
 def _limit_m(
@@ -247,35 +248,54 @@ def _limit_m(
     return np.broadcast_to(row[:, None], metric.shape), total, epochs
 
 
-def _suspicion(
-    time: Datetimes, metric: Floats, limit: Floats, before: DopplerState, *, hold_s: float
-) -> tuple[Masks, Floats, Datetimes]:
-    """Return rejections, levels, and start of suspicion of the satellites suspected at the end; a loop over jumps only.
+@compiled_by("screens")
+def suspicions(
+    time_ns: Integers, metric: Floats, limit: Floats, level_before: Floats, since_before: Integers, hold_ns: int
+) -> tuple[Masks, Floats, Integers]:
+    """Follow the levels of satellites after jumps; a loop over jumps only.
 
     Levels are summed from the jump on, one after the other, so that a cut between does not show.
+
+    Parameters
+    ----------
+    time_ns : ndarray of int64, shape (T,)
+    metric, limit : ndarray, shape (T, M) [m], in C order
+    level_before : ndarray, shape (M,) [m]
+        Of the satellites that are under suspicion already.
+    since_before : ndarray of int64, shape (M,) [ns]
+        Start of the suspicion; NaT as a number for none.
+    hold_ns : int
+
+    Returns
+    -------
+    reject : ndarray of bool, shape (T, M)
+    level : ndarray, shape (T, M) [m]
+        0 without suspicion, NaN without a metric.
+    since : ndarray of int64, shape (M,) [ns]
+        Start of the suspicions at the end.
     """
-    ns, hold = time.astype(np.int64), int(hold_s * _NS)
+    never = np.iinfo(np.int64).min
     reject = np.zeros(metric.shape, dtype=bool)
     level = np.where(np.isnan(metric), np.nan, 0.0)
-    since = np.full(metric.shape[1], np.datetime64("NaT", "ns"))
+    since = np.full(metric.shape[1], never)
     jumped = np.abs(metric) > limit
-    carried = ~np.isnat(before.since)
+    carried = since_before != never
     for m in np.flatnonzero(jumped.any(axis=0) | carried).tolist():
         starts = np.flatnonzero(jumped[:, m])
         blind = np.flatnonzero(np.isnan(metric[:, m]))
-        k, start, old = 0, before.since[m], float(before.level_m[m])
+        k, start, old = 0, int(since_before[m]), float(level_before[m])
         if not carried[m]:
-            k, start, old = int(starts[0]), time[starts[0]], 0.0
+            k, start, old = int(starts[0]), int(time_ns[starts[0]]), 0.0
         while True:
-            known = int(blind[i]) if (i := int(np.searchsorted(blind, k))) < len(blind) else len(ns)
-            held = int(np.searchsorted(ns, int(start.astype(np.int64)) + hold, side="right"))
+            known = int(blind[i]) if (i := int(np.searchsorted(blind, k))) < len(blind) else len(time_ns)
+            held = int(np.searchsorted(time_ns, start + hold_ns, side="right"))
             end = min(known, held)
             levels = np.cumsum(np.concatenate([[old], metric[k:end, m]]))[1:]
             back = np.flatnonzero(np.abs(levels) <= limit[k:end, m])
             stop = k + int(back[0]) if len(back) else end
             reject[k:stop, m] = True
             level[k:stop, m] = levels[: stop - k]
-            if stop == len(ns):
+            if stop == len(time_ns):
                 since[m] = start
                 break
             # the epoch of coming back is not judged again; the one after the hold is
@@ -283,7 +303,7 @@ def _suspicion(
             if i == len(starts):
                 break
             k, old = int(starts[i]), 0.0
-            start = time[k]
+            start = int(time_ns[k])
     return reject, level, since
 
 
