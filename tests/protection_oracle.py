@@ -46,9 +46,16 @@ class Resolved:
         if least_sigma_m is not None:
             noise[:n] = np.maximum(noise[:n], least_sigma_m[case.channels] / case.sigma_m)
         self.noise = noise
+        self.answers: dict[tuple[int, ...], Answer] = {}
         self.all = self.without(())
 
     def without(self, members: tuple[int, ...]) -> Answer:
+        """Position of what is left, solved once."""
+        if members not in self.answers:
+            self.answers[members] = self.solved(members)
+        return self.answers[members]
+
+    def solved(self, members: tuple[int, ...]) -> Answer:
         out = np.zeros(self.rows, dtype=bool)
         out[: len(self.case.channels)] = np.isin(self.case.channels, members)
         design, observed = self.case.design[~out], self.case.observed[~out]

@@ -77,7 +77,8 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
 
     Without priors noise alone leaves places open beyond too small a level; with large ones mostly two faults do.
     """
-    result, line = pixel.solved(), pixel.trajectory
+    settings = integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-8)})  # smaller levels
+    result, line = pixel.solved(settings), pixel.trajectory
     own = SATELLITE_PRIOR if local_prior else dict.fromkeys(SATELLITE_PRIOR, 0.0)
     risk = RiskBudget(local_prior=local_prior, satellite_prior=dict(own))
     assert result.protection is not None

@@ -103,10 +103,23 @@ def products(priors: list[float], size: int) -> float:
     return sum(prod(chosen) for chosen in combinations(priors, size))
 
 
+def test_measured_priors_are_given():
+    """Nothing else takes the word "assumed" from a level; default values do not count as measured."""
+    with pytest.raises(ValueError, match="local_prior and side_prior not given"):
+        RiskBudget(priors="measured")
+    with pytest.raises(ValueError, match="measured, but side_prior not given"):
+        RiskBudget(priors="measured", local_prior=2e-5)
+    stated = RiskBudget(priors="measured", local_prior=2e-5, side_prior=3e-6)
+    assert stated.replaced(map_prior=0.0).priors == "measured"
+
+
+@pytest.mark.parametrize("of_side", [1e-7, 1e-4, 1e-3])
 @pytest.mark.parametrize("wrong_map", [False, True])
 @pytest.mark.parametrize("excluded", [0, 1, 2])
 @pytest.mark.parametrize("local", [1e-6, 3e-3])
-def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(local: float, excluded: int, *, wrong_map: bool) -> None:
+def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
+    local: float, excluded: int, of_side: float, *, wrong_map: bool
+) -> None:
     """Faults that no hypothesis covers are taken off; the rest is shared; false alarms among all separations."""
     systems = "GGGEEECC"
     ranges = oracle.made(np.array([700.0]), systems, seed=3)
@@ -118,7 +131,7 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(local: float, exc
         samples_per_hour=100.0,
         local_prior=local,
         map_prior=1e-5,
-        side_prior=1e-7,
+        side_prior=of_side,
         constellation_prior={"E": 1e-6, "C": 3e-6, "R": 1e-5},
     )
     # Of the second side one satellite is used: no hypothesis.
@@ -128,7 +141,7 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(local: float, exc
     every = dict(zip(range(len(systems)), risk.prior(list(systems)).tolist(), strict=True))
     used = {k: p for k, p in every.items() if k != 1}
     everyone = [*used.values(), *[max(every.values())] * excluded]
-    groups, side, of_map = [1e-6, 3e-6], [1e-7, 1e-7], 1e-5 if wrong_map else 0.0
+    groups, side, of_map = [1e-6, 3e-6], [of_side, of_side], 1e-5 if wrong_map else 0.0
     triples = products(everyone, 3) > risk.unchecked_share * 1e-6
     assert triples == (local == 3e-3)
     beyond = products(everyone, 4 if triples else 3)
@@ -136,15 +149,25 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(local: float, exc
     beyond += sum(
         p * products([q for k, q in used.items() if systems[k] != s], 2) for s, p in zip("EC", groups, strict=True)
     )
-    beyond += sum(side) * (sum(everyone) + of_map) + products(side, 2) + products(groups, 2)
+    with_one = sum(side) * (sum(everyone) + of_map)
+    sided, both = with_one > risk.unchecked_share * 1e-6, of_side == 1e-3
+    assert got.sides_with_one[0].tolist() == [sided, False, sided] + [False] * 3 * both
+    if sided:
+        with_one = sum(side) * (products(everyone, 2) + of_map * sum(everyone))
+    beyond += with_one + sum(side) * sum(groups) + products(groups, 2)
+    beyond += products(side, 2) * (sum(everyone) + of_map + sum(groups) if both else 1.0)
     assert got.beyond[0] == pytest.approx(beyond, rel=1e-9)
     left = float(risk.sample_risk(7, excluded, beyond)) * (0.75 if triples else 1.0)
     assert [got.fault_free[0], got.one[0], got.two[0]] == pytest.approx([left / 3.0] * 3, rel=1e-9)
     pairs = triples or products(list(used.values()), 2) > left / 3.0
     assert (got.pairs[0], got.triples[0]) == (pairs, triples)
-    tests = 7 + pairs * comb(7, 2) + triples * comb(7, 3) + len(groups) + 7 * len(groups) + len(side)
+    tests = 7 + pairs * comb(7, 2) + triples * comb(7, 3) + len(groups) + 7 * len(groups)
+    tests += len(side) * (8 if sided else 1) + both
     assert got.k_false_alarm[0] == pytest.approx(norm.isf(risk.false_alarm / (2 * tests)), rel=1e-9)
     assert got.groups == ("E", "C")
     np.testing.assert_allclose(got.group_prior[0], groups)
-    np.testing.assert_allclose(got.side_prior[0], [1e-7, 0.0, 1e-7])
+    np.testing.assert_allclose(got.side_prior[0], [of_side, 0.0, of_side] + [0.0, of_side**2, 0.0] * both)
+    np.testing.assert_array_equal(
+        got.sides[0, 3:], [sides[0, a] | sides[0, b] for a, b in [(0, 1), (0, 2), (1, 2)]] if both else sides[0, :0]
+    )
     assert got.map_prior == of_map

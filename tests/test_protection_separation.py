@@ -18,6 +18,7 @@ from railfix.integrity.protection.separation import (
     Separations,
     all_in_view,
     without_map,
+    without_none,
     without_one,
     without_two,
 )
@@ -125,7 +126,8 @@ def test_a_map_left_out_equals_solving_with_what_takes_its_place(seed, system, s
     bias = np.random.default_rng(seed).uniform(0.0, 1.0, n)
     information = np.zeros((1, 2, 2)) if seen is None else np.diag(sigma**-2.0)[None]
     full = all_in_view(model, np.array([scale]), np.zeros((1, 0)), bias[None], np.zeros((1, 2)))
-    alone, with_one = without_map(full, model, np.array([seen or (0.0, 0.0)]), information)
+    free = without_map(full, model, np.array([seen or (0.0, 0.0)]), information)
+    alone, with_one = (free.apart(left_out(free.of_ranges)) for left_out in (without_none, without_one))
     for got, column, answer in [
         (alone, 0, solved.all),
         *((with_one, c, solved.without((c,))) for c in range(n)),
@@ -160,7 +162,8 @@ def test_two_clocks_without_one_of_a_pair_leave_a_direction_free(scale):
     free /= np.linalg.norm(free)
     assert abs(free[0]) == pytest.approx(0.001557, abs=1e-6)
     full = all_in_view(model, np.array([scale]), *EXACT)
-    alone, with_one = without_map(full, model, np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    free_of_map = without_map(full, model, np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    alone, with_one = (free_of_map.apart(left_out(free_of_map.of_ranges)) for left_out in (without_none, without_one))
     determined = np.linalg.inv(np.stack([rows[1] - rows[0], rows[2] - rows[0], rows[4] - rows[3]]))[0]
     of_range = np.array([-determined[0] - determined[1], determined[0], determined[1], -determined[2], determined[2]])
     assert alone.sigma_m[0, 0] == pytest.approx(scale * np.linalg.norm(of_range * whitened.sigma_m[:5]), rel=1e-6)

@@ -24,7 +24,7 @@ from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
-from railfix.pipeline.level_stage import level_facts, protection_levels
+from railfix.pipeline.level_stage import level_facts, protection_levels, standing
 from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.results import AntennaState, State
 from railfix.pipeline.solve import place_on_line
@@ -274,3 +274,18 @@ def test_positions_from_code_and_phase_have_no_level(recording: Recording) -> No
     processor = processor_of(config, recording.navigation, {"front": recording.line})
     assert processor.process({"front": recording.observations[150:170]})[0].antennas["front"].protection is None
     assert any("there is none for positions from code and phase together" in note for note in processor.notes)
+
+
+@pytest.mark.requirement("C2", "C3")
+def test_every_output_names_what_a_level_rests_on() -> None:
+    """Assumed priors, and a prior of one side of the track below what any data supports."""
+    for risk, indicative, unsupported in (
+        ({}, True, False),
+        ({"side_prior": 1e-8}, True, True),
+        ({"priors": "measured", "local_prior": 2e-5, "side_prior": 2e-5}, False, False),
+        ({"priors": "measured", "local_prior": 2e-5, "side_prior": 0.0}, False, True),
+    ):
+        text = standing(level_facts(parse_config({"risk": risk})))
+        assert ("indicative" in text, "no risk an hour" in text) == (indicative, indicative)
+        assert ("no data supports" in text) == unsupported
+    assert standing({}) == "not recorded"

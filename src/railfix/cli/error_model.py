@@ -125,7 +125,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
             f"95 % confidence); two satellites at a time {rate.together:.1f} times as often as independent ones, low "
             f"ones of one side of the track in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at "
             f"most {rate.side_upper:.2g}). For levels of this line: --set risk.local_prior={rate.upper:.2g} --set "
-            "risk.priors=measured",
+            f"risk.side_prior={rate.side_upper:.2g} --set risk.priors=measured",
             markup=False,
             soft_wrap=True,
         )

@@ -9,6 +9,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from railfix.pipeline.level_stage import standing
+
 if TYPE_CHECKING:
     from railfix.evaluate import Evaluation, Integrity
 
@@ -28,8 +30,8 @@ _HEADS: Final = (
 def show_integrity(evaluation: Evaluation, console: Console) -> None:
     """Levels of each kind against the errors."""
     several = len(evaluation.runs) > 1
-    if any(run.protection.get("basis") == "indicative" for run in evaluation.runs):
-        console.print("The protection levels are indicative: their priors are assumed, not measured on this line.")
+    for text in dict.fromkeys(standing(run.protection) for run in evaluation.runs if run.protection):
+        console.print(f"Protection levels: {text}", markup=False, soft_wrap=True)
     for kind, found in evaluation.integrity.items():
         console.print(
             f"Protection levels against errors ({kind}): epochs of each region of the Stanford diagram, availability, "

@@ -159,6 +159,7 @@ def hypotheses(
     groups: Masks,
     group_prior: Floats,
     side_prior: Floats,
+    sides_with_one: Masks,
     pairs: Masks,
     triples: Masks,
     k_false_alarm: Floats,
@@ -173,10 +174,15 @@ def hypotheses(
     clocks, c_groups, c_sides = clock_covariance_m2.shape[1], len(groups), sides.shape[1]
     by_map = 1 if wrong_map > 0.0 else 0
     by_range = bias_m.shape[1] > 0 or least_sigma_m.shape[1] > 0
+    sided = np.zeros(c_sides, dtype=np.bool_)
+    for c in range(c_sides):
+        sided[c] = np.any(sides_with_one[:, c])
+    some_sided = int(np.count_nonzero(sided))
     bounds = np.zeros(5, dtype=np.intp)
     bounds[1] = 1
     bounds[2] = bounds[1] + n + c_groups + c_sides + by_map
     bounds[3] = bounds[2] + (n * (n - 1) // 2 if any_pairs else 0) + (c_groups + by_map) * n
+    bounds[3] += some_sided * (n + by_map)
     bounds[4] = bounds[3] + (n * (n - 1) * (n - 2) // 6 if any_triples else 0)
     channel, width = np.empty((epochs, n), dtype=np.intp), bounds[4]
     offset, sigma, weight = np.empty((epochs, width)), np.empty((epochs, width)), np.empty((epochs, width))
@@ -269,9 +275,11 @@ def hypotheses(
         two = bounds[2] + (n * (n - 1) // 2 if any_pairs else 0)
         for c in range(c_groups + c_sides):
             whole = c < c_groups
+            with_one = whole or sided[c - c_groups]
+            of_all = group_prior[t, c] if whole else side_prior[t, c - c_groups]
             for i in range(n):
                 member[i] = i < count and (groups[c, used[i]] if whole else sides[t, c - c_groups, used[i]])
-            blind = _leave_out(rows, member, whole or by_range, limit, work, gone)
+            blind = _leave_out(rows, member, with_one or by_range, limit, work, gone)
             more = (0.0, 0.0, 0.0)
             if by_range:
                 for m in range(n):
@@ -280,9 +288,10 @@ def hypotheses(
             offset[t, at], sigma[t, at], ratio[at] = _separated(gone[0], gone[1], gone[2], gone[3], more, common)
             if blind:
                 offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
-            weight[t, at] = group_prior[t, c] if whole else side_prior[t, c - c_groups]
+            weight[t, at] = of_all
+            of_all = of_all if whole or sides_with_one[t, c - c_groups] else 0.0
             at += 1
-            for i in range(n if whole else 0):
+            for i in range(n if with_one else 0):
                 rest = i < count and not member[i]
                 checked = rest and work[i, i] > _LEAST_REDUNDANCY
                 w = work[n, i] / work[i, i] if checked else 0.0
@@ -296,10 +305,10 @@ def hypotheses(
                 )  # fmt: skip
                 if rest and (blind or (not checked and abs(work[n, i]) > limit)):
                     offset[t, two], sigma[t, two], ratio[two] = 0.0, np.inf, 0.0
-                weight[t, two] = 0.0 if member[i] else group_prior[t, c] * likely[i]
+                weight[t, two] = 0.0 if member[i] else of_all * likely[i]
                 two += 1
 
-        # A wrong map, alone and with one satellite.
+        # A wrong map, alone, with one satellite, with a side.
         if by_map:
             covariance, determined = _without_map(q, map_prior, map_information[t], scale[t])
             for a in range(1, 3):
@@ -334,15 +343,18 @@ def hypotheses(
                         residual -= design[t, m, a] * shift[a]
                 checked = share > _LEAST_REDUNDANCY
                 w = left[i] / share if checked else 0.0
+                second[n, i], second[n + 1, i], second[n + 2 :, i] = left[i], residual, 0.0
+                for j in range(n if by_range or some_sided > 0 else 0):
+                    k = used[j]
+                    value = 1.0 if i == j and i < count else 0.0
+                    if i < count and j < count:
+                        value -= root[m] * root[k] * clock_covariance_m2[t, clock[m], clock[k]]
+                        for a in range(3):
+                            value -= spread[i, a] * design[t, k, a]
+                    second[i, j] = value
                 if by_range:
                     for j in range(n):
-                        k = used[j]
-                        value = 1.0 if i == j and i < count else 0.0
-                        if i < count and j < count:
-                            value -= root[m] * root[k] * clock_covariance_m2[t, clock[m], clock[k]]
-                            for a in range(3):
-                                value -= spread[i, a] * design[t, k, a]
-                        own[j] = left[j] - w * value
+                        own[j] = left[j] - w * second[i, j]
                     more = _of_ranges(own, left, range_bias, beyond)
                 _, sigma[t, two], _ = _separated(w * left[i], 0.0, 0.0, 0.0, more, free)
                 offset[t, two], ratio[two], weight[t, two] = (
@@ -351,6 +363,20 @@ def hypotheses(
                     wrong_map * likely[i],
                 )
                 if not determined or (not checked and abs(left[i]) > lost):
+                    offset[t, two], sigma[t, two] = 0.0, np.inf
+                two += 1
+            for c in range(c_sides):
+                if not sided[c]:
+                    continue
+                for i in range(n):
+                    member[i] = i < count and sides[t, c, used[i]]
+                blind = _leave_out(second, member, by_range, lost, work, gone)
+                if by_range:
+                    more = _of_ranges(work[n], left, range_bias, beyond)
+                _, sigma[t, two], _ = _separated(gone[0], 0.0, 0.0, 0.0, more, free)
+                offset[t, two], ratio[two] = abs(shift[0] - gone[1]) + more[0], 0.0
+                weight[t, two] = wrong_map * side_prior[t, c] if sides_with_one[t, c] else 0.0
+                if blind or not determined:
                     offset[t, two], sigma[t, two] = 0.0, np.inf
                 two += 1
 

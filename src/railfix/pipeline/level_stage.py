@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any, Final
 
@@ -17,6 +18,7 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
+from railfix.integrity.protection.risk import SUPPORTED_SIDE_PRIOR
 from railfix.integrity.raim import LinearModel
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
@@ -41,6 +43,22 @@ BASES: Final[tuple[str, str]] = ("measured", "indicative")
 def basis_of(config: Config) -> str:
     """Return which of `BASES` the levels of a run are."""
     return BASES[0] if config.risk.priors == "measured" else BASES[1]
+
+
+def standing(facts: Mapping[str, Any]) -> str:
+    """Return whether the priors of the levels of a run were measured, and what no data supports, from `level_facts`."""
+    words = {
+        "indicative": "indicative: priors of faults are assumed, not measured on this line; no risk an hour",
+        "measured": "priors of local faults measured on this line, risk.map_prior assumed",
+    }
+    side = facts.get("side_prior")
+    text = words.get(str(facts.get("basis")), "not recorded")
+    if isinstance(side, int | float) and side < SUPPORTED_SIDE_PRIOR:
+        text += (
+            f"; no data supports that satellites of one side are faulty together with {side:g} at most "
+            f"(risk.side_prior; measured: {SUPPORTED_SIDE_PRIOR:g} at most)"
+        )
+    return text
 
 
 def kind_of(config: Config) -> str:

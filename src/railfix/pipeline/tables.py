@@ -84,7 +84,7 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "protection_kind": "basis: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
     "hypotheses of satellites' own faults as well",
     "protection_basis": "`measured`: the priors of faults were measured on the line; `indicative`: they are assumed, "
-    "and the level carries no risk an hour",
+    "the one of a side of the track without support by data, and the level carries no risk an hour",
     "protection_cause": "what sets the level: "
     "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`, `three_faults`",
     "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "

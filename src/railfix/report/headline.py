@@ -139,6 +139,12 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, compare
     )
 
 
+def _level_name(run: ReportedRun) -> str:
+    """Return what the level of a run is called: indicative unless its priors were measured."""
+    stated: Mapping[str, Any] = run.record.get("protection") or {}
+    return "protection level" if stated.get("basis") == "measured" else "indicative protection level"
+
+
 def _beside(figure: KeyFigure) -> KeyFigure:
     return replace(figure, beside=f"conventional {figure.beside}")
 
@@ -158,7 +164,7 @@ def _integrity_figure(run: ReportedRun, antenna: str, evaluation: Evaluation, ow
     beyond = evaluation.integrity[kind].beyond.filter(pl.col("usable"), run=run.name_in(evaluation), antenna=antenna)
     median = levels["level_p50_m"].item() if len(levels) == 1 else None
     return KeyFigure(
-        name="protection level, median",
+        name=f"{_level_name(run)}, median",
         value=number(median, 1, " m"),
         beside=f"usable errors above their level: {len(beyond):,}",
     )
@@ -256,7 +262,7 @@ def _without_errors(run: ReportedRun, antenna: str) -> Headline:
                 filtered=number(float(np.median(placed)), 2, " m") if len(placed) else "",
             ),
             KeyFigure(
-                name="protection level, median",
+                name=f"{_level_name(run)}, median",
                 value=number(float(np.median(level)) if len(level) else np.nan, 1, " m"),
             ),
             KeyFigure(name="epochs", value=number(facts.get("epochs", len(positions)), 0)),

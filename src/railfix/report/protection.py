@@ -11,6 +11,7 @@ import polars as pl
 from railfix.evaluate import Evaluation, EvaluationOptions, Integrity
 from railfix.evaluate.integrity import LEVELS_OF, positions_diagram
 from railfix.evaluate.run_folder import floats
+from railfix.pipeline.level_stage import standing
 from railfix.report.content import Absent, Block, Folded, Sentence, Table, number, share
 from railfix.report.runs import ReportedRun
 from railfix.report.tables import level_sizes
@@ -56,13 +57,6 @@ def protection(run: ReportedRun, evaluation: Evaluation | None) -> list[Block]:
     ]
 
 
-#: What the basis of a level says of its standing.
-_STANDING: Final = {
-    "indicative": "indicative: the priors of faults are assumed, not measured on this line; no risk an hour",
-    "measured": "the priors of faults were measured on this line",
-}
-
-
 def _assumptions(run: ReportedRun, kind: str) -> Table:
     """Assumptions of the levels of a run."""
     stated: Mapping[str, Any] = run.record.get("protection") or {}
@@ -70,7 +64,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
     sigmas = f"error model {model}" if model is not None else str(stated.get("sigmas", "not recorded"))
     rows = [
         ("kind", f"{kind}: {_KINDS.get(kind, 'not recorded')}"),
-        ("standing", _STANDING.get(str(stated.get("basis")), "not recorded")),
+        ("standing", standing(stated)),
         ("errors without a fault", sigmas),
         ("alarm limit", _value(stated.get("alarm_limit_m"), " m")),
         ("risk per hour", _value(stated.get("risk_per_hour"))),
@@ -79,6 +73,8 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
         ("K of the whole risk", _value(stated.get("k_of_whole_risk"), " sigma, two-sided")),
         ("prior of a satellite fault", _priors(stated.get("satellite_prior"))),
         ("prior of a local fault", _value(stated.get("local_prior"))),
+        ("prior of one side of the track", _value(stated.get("side_prior"))),
+        ("prior of a wrong map", _value(stated.get("map_prior"))),
         ("false alarms", _value(stated.get("false_alarm"))),
     ]
     return Table(name="assumptions", head=["", "assumption of the protection level"], rows=rows)

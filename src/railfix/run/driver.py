@@ -20,7 +20,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.io.logs import read_navigation
 from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.config import Config
-from railfix.pipeline.level_stage import basis_of, level_facts, risk_of
+from railfix.pipeline.level_stage import basis_of, level_facts, risk_of, standing
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.antennas import AntennaRun, OtherProcess, processes, write_rows
 from railfix.run.checks import (
@@ -413,11 +413,10 @@ def _notes_of_levels(config: Config, tally: Tally, levels: Mapping[str, Levels])
                 "at a time, or more satellites excluded, are likelier than the risk allows (settings risk)"
             )
     risk = risk_of(config)
-    if basis_of(config) == "indicative":
-        yield (
-            "protection level: indicative, its priors are assumed and not measured on this line; it carries no risk an "
-            "hour (railfix error-model measures them, risk.local_prior and risk.priors state them)"
-        )
+    yield (
+        f"protection level: {standing(level_facts(config))} (railfix error-model measures priors; risk.local_prior, "
+        "risk.side_prior and risk.priors state them)"
+    )
     if "raim" not in config.screens:
         return
     used = sum(antenna.used for antenna in tally.antennas.values())

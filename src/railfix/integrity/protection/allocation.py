@@ -35,7 +35,9 @@ class Allocation:
     triples: Masks  # three faults are likelier than what may stay unchecked
     k_false_alarm: Floats
     map_prior: float  # of a wrong map; 0: no hypothesis
-    side_prior: Floats  # (T, S), of sets of satellites that fail together; 0 where fewer than two
+    sides: Masks  # (T, S, M) of satellites that fail together; two of these sets at a time where that is likely
+    side_prior: Floats  # (T, S), 0 where fewer than two
+    sides_with_one: Masks  # (T, S) with another fault likelier than what may stay unchecked
 
 
 def allocate(
@@ -68,14 +70,29 @@ def allocate(
         group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
         # A constellation and two satellites of others: not checked.
         together += group_prior[:, c] * pair_sum(prior * ~members)
-    three = more_than_two(everyone)
-    triples = three > risk.unchecked_share * risk.risk_per_sample
+    three, share = more_than_two(everyone), risk.unchecked_share * risk.risk_per_sample
+    triples = three > share
     map_prior = risk.map_prior if wrong_map else 0.0
     # A wrong map with a constellation, or with two satellites.
-    together += map_prior * (group_prior.sum(axis=1) + pair_sum(everyone))
+    of_groups, every = group_prior.sum(axis=1), everyone.sum(axis=1)
+    together += map_prior * (of_groups + pair_sum(everyone))
     side_prior = np.where(np.count_nonzero(sides & model.used[:, None], axis=2) > 1, risk.side_prior, 0.0)
-    # A side with any other fault: not checked.
-    together += side_prior.sum(axis=1) * (everyone.sum(axis=1) + map_prior) + pair_sum(side_prior)
+    # A side with a satellite or a wrong map: not checked, or with two other faults. With a constellation, both sides.
+    if not side_prior.any():
+        sides, side_prior = sides[:, :0], side_prior[:, :0]
+    any_side = side_prior.sum(axis=1)
+    with_one, with_two = any_side * (every + map_prior), any_side * (pair_sum(everyone) + map_prior * every)
+    sides_with_one = (with_one > share)[:, None] & (side_prior > 0.0)
+    together += np.where(with_one > share, with_two, with_one) + any_side * of_groups
+    # Two sides at a time: one more set each, or not checked; with any other fault, or three, not checked.
+    i, j = np.triu_indices(side_prior.shape[1], 1)
+    both_prior = side_prior[:, i] * side_prior[:, j]
+    both = both_prior.sum(axis=1)
+    together += np.where(both > share, both * (every + map_prior + of_groups), both) + more_than_two(side_prior)
+    if (both > share).any():
+        sides = np.concatenate([sides, sides[:, i] | sides[:, j]], axis=1)
+        side_prior = np.concatenate([side_prior, both_prior * (both > share)[:, None]], axis=1)
+        sides_with_one = np.concatenate([sides_with_one, np.zeros(both_prior.shape, dtype=bool)], axis=1)
     beyond = np.where(triples, more_than_three(everyone), three) + together + pair_sum(group_prior)
     n = np.count_nonzero(model.used, axis=1)
     left = risk.sample_risk(n, out, beyond)
@@ -84,7 +101,7 @@ def allocate(
     two = risk.two_fault_share * left
     pairs = (pair_sum(prior) > two) | triples
     tests = n + np.where(pairs, n * (n - 1) // 2, 0) + np.count_nonzero(group_prior, axis=1)
-    tests = tests + np.count_nonzero(side_prior, axis=1)
+    tests = tests + np.count_nonzero(side_prior, axis=1) + n * np.count_nonzero(sides_with_one, axis=1)
     tests = tests + n * np.count_nonzero(group_prior, axis=1)
     tests = tests + np.where(triples, n * (n - 1) * (n - 2) // 6, 0)
     return Allocation(
@@ -100,5 +117,7 @@ def allocate(
         triples=triples,
         k_false_alarm=one_sided_k(risk.false_alarm / (2.0 * np.maximum(tests, 1))),
         map_prior=map_prior,
+        sides=sides,
         side_prior=side_prior,
+        sides_with_one=sides_with_one,
     )

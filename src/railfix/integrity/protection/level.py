@@ -33,6 +33,7 @@ from railfix.integrity.protection.separation import (
     Separations,
     all_in_view,
     without_map,
+    without_none,
     without_one,
     without_three,
     without_two,
@@ -188,7 +189,7 @@ def along_track_level(
         _by_epoch(0.0 if map_bias_m is None else map_bias_m, epochs, 2),
         np.zeros((epochs, 2)) if map_seen is None else map_seen[0],
         np.zeros((epochs, 2, 2)) if map_seen is None else map_seen[1],
-        groups[:, : groups.shape[1] if plan.side_prior.any() else 0],
+        plan.sides,
     )
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     result = _empty(epochs, plan)
@@ -247,7 +248,7 @@ def _level_of_block(
         *(model.root_weight, model.clock, model.clock_covariance_m2, model.design, model.covariance_m2, model.prior),
         *(model.misfit, *given),
         *(plan.prior[rows], plan.members, plan.group_prior[rows], plan.side_prior[rows]),
-        *(plan.pairs[rows], plan.triples[rows], plan.k_false_alarm[rows]),
+        *(plan.sides_with_one[rows], plan.pairs[rows], plan.triples[rows], plan.k_false_alarm[rows]),
     )
     arrays = (*map(np.ascontiguousarray, arrays), plan.map_prior)
     channel, offset, sigma, weight, bounds, separation = hypotheses(*arrays)
@@ -303,6 +304,7 @@ def hypotheses(
     groups: Masks,
     group_prior: Floats,
     side_prior: Floats,
+    sides_with_one: Masks,
     pairs: Masks,
     triples: Masks,
     k_false_alarm: Floats,
@@ -337,9 +339,6 @@ def hypotheses(
     full = all_in_view(model, scale, least_sigma_m, bias_m, map_bias_m)
     n, zero = full.channel.shape[1], np.zeros((len(scale), 1))
     likely = np.take_along_axis(prior, full.channel, axis=1) * full.used
-    none = Separations(
-        sigma_m=full.sigma_m[:, None], separation_sigma_m=zero, moved_m=zero, bias_m=full.bias_m[:, None]
-    )
     ones, twos, threes = [(without_one(full), likely)], [], []
     if pairs.any():
         i, j = np.triu_indices(n, 1)
@@ -348,18 +347,25 @@ def hypotheses(
         of_group, of_all = members[full.channel] & full.used, group_prior[:, c, None]
         ones.append((without_group(full, of_group), of_all))
         twos.append((without_group_and_one(full, of_group), of_all * likely * ~of_group))
-    for c in range(sides.shape[1]):
-        of_side = np.take_along_axis(sides[:, c], full.channel, axis=1) & full.used
+    sided = np.any(sides_with_one, axis=0).tolist()
+    side = [np.take_along_axis(sides[:, c], full.channel, axis=1) & full.used for c in range(sides.shape[1])]
+    for c, of_side in enumerate(side):
         ones.append((without_group(full, of_side), side_prior[:, c, None]))
+        if sided[c]:
+            of_one = (side_prior[:, c] * sides_with_one[:, c])[:, None] * likely * ~of_side
+            twos.append((without_group_and_one(full, of_side), of_one))
     if wrong_map > 0.0:
-        alone, with_one = without_map(full, model, map_seen_m, map_information)
-        ones.append((alone, zero + wrong_map))
-        twos.append((with_one, wrong_map * likely))
+        free = without_map(full, model, map_seen_m, map_information, groups=any(sided))
+        ones.append((free.apart(without_none(free.of_ranges)), zero + wrong_map))
+        twos.append((free.apart(without_one(free.of_ranges)), wrong_map * likely))
+        for c in (number for number, asked in enumerate(sided) if asked):
+            of_both = wrong_map * (side_prior[:, c] * sides_with_one[:, c])[:, None]
+            twos.append((free.apart(without_group(free.of_ranges, side[c])), of_both))
     if triples.any():
         i, j, k = np.array(list(combinations(range(n), 3)), dtype=np.intp).reshape(-1, 3).T
         of_three = likely[:, i] * likely[:, j] * likely[:, k] * triples[:, None]
         threes.append((without_three(full, i, j, k), of_three))
-    kinds = [[(none, zero + 2.0)], ones, twos, threes]  # noise passes on either side
+    kinds = [[(without_none(full), zero + 2.0)], ones, twos, threes]  # noise passes on either side
     apart = [part for kind in kinds for part, _ in kind]
     weight = np.concatenate([each for kind in kinds for _, each in kind], axis=1)
     sigma, between, moved, bias = (

@@ -122,6 +122,37 @@ def all_in_view(
     )
 
 
+@dataclass(frozen=True)
+class WithoutMap:
+    """The position without the map."""
+
+    of_ranges: AllInView
+    shift_m: Floats  # (T,) its distance from the position with the map
+    blind: Masks  # (T,) nothing determines it
+
+    def apart(self, more: Separations) -> Separations:
+        """Return separations of `of_ranges` as those of the position with the map.
+
+        The distance between the two is computed and counts whole, so that nothing is left to be tested.
+        """
+        none, blind = np.zeros(more.moved_m.shape), self.blind[:, None]
+        bias = np.abs(self.shift_m[:, None] + more.moved_m) + more.bias_m
+        return Separations(
+            sigma_m=np.where(blind, np.inf, more.sigma_m),
+            separation_sigma_m=none,
+            moved_m=none,
+            bias_m=np.where(~blind & np.isfinite(more.sigma_m), bias, 0.0),
+        )
+
+
+def without_none(full: AllInView) -> Separations:
+    """No channel left out, K = 1."""
+    zero = np.zeros((len(full.scale), 1))
+    return Separations(
+        sigma_m=full.sigma_m[:, None], separation_sigma_m=zero, moved_m=zero, bias_m=full.bias_m[:, None]
+    )
+
+
 def without_one(full: AllInView) -> Separations:
     """Each channel left out, K = n."""
     return _in_order(full, (np.arange(full.channel.shape[1]),))
@@ -175,13 +206,12 @@ def _in_order(full: AllInView, members: tuple[Indices, ...]) -> Separations:
 
 
 def without_map(
-    full: AllInView, model: LinearModel, seen_m: Floats, information: Floats
-) -> tuple[Separations, Separations]:
-    """The map left out, alone (K = 1) and with each channel (K = n).
+    full: AllInView, model: LinearModel, seen_m: Floats, information: Floats, *, groups: bool = False
+) -> WithoutMap:
+    """The map left out.
 
     What takes the place of the map is its offset as the positions in space of the last minutes show it. Without one
-    the position is that in space. The distance from the position of all is computed and counts whole, so that nothing
-    is left to be tested.
+    the position is that in space.
 
     Parameters
     ----------
@@ -191,6 +221,8 @@ def without_map(
         Place of the antenna across and above the line over minutes; any finite value where nothing is known.
     information : ndarray, shape (T, 2, 2) [1/m^2]
         Inverse covariance of that; 0 where nothing is known.
+    groups : bool
+        Whether groups of channels are left out of the result, for which it needs the projector.
     """
     of_map = np.zeros((len(model), 3, 3))
     of_map[:, 1:, 1:] = full.scale[:, None, None] ** 2 * information
@@ -206,7 +238,7 @@ def without_map(
     nothing = np.zeros((len(model), 2))
     without = replace(
         full,
-        projector=compact(free).projector if full.by_range else full.projector[:, :0, :0],
+        projector=compact(free).projector if full.by_range or groups else full.projector[:, :0, :0],
         share=np.take_along_axis(free.redundancy, full.channel, axis=1),
         residual=full.residual - np.einsum("tni,ti->tn", own, shift),
         gain_m=np.einsum("tni,ti->tn", own, covariance[:, :, 0]),
@@ -215,22 +247,7 @@ def without_map(
         variance_m2=covariance[:, 0, 0],
         map_bias=nothing,
     )
-    one = without_one(without)
-    alone = Separations(
-        sigma_m=np.where(blind, np.inf, without.sigma_m)[:, None],
-        separation_sigma_m=np.zeros((len(model), 1)),
-        moved_m=np.zeros((len(model), 1)),
-        bias_m=np.where(blind, 0.0, np.abs(shift[:, 0]) + without.bias_m)[:, None],
-    )
-    with_one = Separations(
-        sigma_m=np.where(blind[:, None], np.inf, one.sigma_m),
-        separation_sigma_m=np.zeros(one.moved_m.shape),
-        moved_m=np.zeros(one.moved_m.shape),
-        bias_m=np.where(
-            ~blind[:, None] & np.isfinite(one.sigma_m), np.abs(shift[:, :1] + one.moved_m) + one.bias_m, 0.0
-        ),
-    )
-    return alone, with_one
+    return WithoutMap(without, shift[:, 0], blind)
 
 
 def separations(full: AllInView, gone: Floats, left: Floats | None, blind: Masks) -> Separations:
