@@ -108,6 +108,7 @@ def best_points(
     tangent: Floats,
     length_m: Floats,
     separation_m: float,
+    turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
     """Return the best point of each epoch, and the best of the other places; epoch by epoch."""
     epochs, begin = len(count), 0
@@ -122,7 +123,8 @@ def best_points(
         chosen[t], least[t] = vertex[best], q[best]
         lowest = math.inf
         for p in range(begin, end):
-            if not abs(arc_m[vertex[p]] - arc_m[vertex[best]]) > separation_m:
+            apart = abs(arc_m[vertex[p]] - arc_m[vertex[best]])
+            if not (apart > separation_m and abs(turn_m - apart) > separation_m):
                 continue
             if p > begin and vertex[p] == vertex[p - 1] + 1 and q[p] > q[p - 1]:
                 continue

@@ -109,8 +109,8 @@ def constrained_position(
     Newton steps inside a section (P1 2.2(3), algorithm of one unknown after the clocks are
     eliminated); a step that leaves the section stops at its end and goes on from there in the
     neighbouring one. Where both neighbours of a point send the step back to it, the point itself
-    is the answer. At either end of the line the position is clamped and `overshoot_m` is how
-    far beyond it the ranges pull.
+    is the answer. At an open end of the line the position is clamped and `overshoot_m` is how
+    far beyond it the ranges pull; at one where the line is closed it goes on beyond it.
 
     Parameters
     ----------
@@ -127,18 +127,19 @@ def constrained_position(
     Constrained
     """
     limits = limits or ConstrainedLimits()
-    section, solved, clock, residual, iterations = iterated_along(
-        *ranges.arrays(trajectory.ecef_m[:-1]),
-        trajectory.tangent,
-        trajectory.across,
-        trajectory.up,
-        trajectory.length_m,
-        np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1),
-        trajectory.sigma_plan_m,
-        trajectory.sigma_height_m,
-        limits.tolerance_m,
-        limits.max_iterations,
-    )
+    start = np.where(ranges.n_used - ranges.n_clocks >= 1, vertex, -1)
+    section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
+    for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
+        pulled = np.flatnonzero((solved[4] > 0.0) & (section == end))
+        if join == join and len(pulled):
+            there = np.full(len(pulled), np.argmin(np.abs(trajectory.arc_m - join)))
+            other = _from(there, ranges.take(pulled), trajectory, limits)
+            better = other[1][3] < solved[3, pulled]
+            rows = pulled[better]
+            solved[:, rows] = other[1][:, better]
+            for array, new in zip((section, clock, residual), (other[0], *other[2:4]), strict=True):
+                array[rows] = new[better]
+            iterations[pulled] += other[4]
     along, sigma, exact, wsse, overshoot, dilution = solved
     return Constrained(
         arc_m=trajectory.arc_m[np.maximum(section, 0)] + along,
@@ -151,6 +152,24 @@ def constrained_position(
         wsse=wsse,
         residual_m=residual,
         iterations=iterations,
+    )
+
+
+def _from(
+    vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
+) -> tuple[Indices, Floats, Floats, Floats, Integers]:
+    """`iterated_along` of a trajectory, from points of it."""
+    return iterated_along(
+        *ranges.arrays(trajectory.ecef_m[:-1]),
+        trajectory.tangent,
+        trajectory.across,
+        trajectory.up,
+        trajectory.length_m,
+        vertex,
+        trajectory.sigma_plan_m,
+        trajectory.sigma_height_m,
+        limits.tolerance_m,
+        limits.max_iterations,
     )
 
 

@@ -94,6 +94,7 @@ def best_points(
     tangent: Floats,
     length_m: Floats,
     separation_m: float,
+    turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
     """Select the best point of each epoch, and the best of the other places.
 
@@ -105,6 +106,9 @@ def best_points(
     arc_m, tangent, length_m
         Of the trajectory.
     separation_m : float
+        Places nearer than this along the line are one.
+    turn_m : float
+        Once round a closed line; infinite for others.
 
     Returns
     -------
@@ -121,6 +125,7 @@ def best_points(
     before = np.concatenate([[np.inf], np.where(joined, q[:-1], np.inf)])
     after = np.concatenate([np.where(joined, q[1:], np.inf), [np.inf]])
     apart = np.abs(arc_m[vertex] - arc_m[vertex[best]][epoch])
+    apart = np.minimum(apart, np.abs(turn_m - apart))
     minimum = np.flatnonzero((q <= before) & (q <= after) & (apart > separation_m))
     if not len(minimum):
         return vertex[best], least, excess, other

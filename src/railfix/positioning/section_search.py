@@ -328,5 +328,6 @@ def _decide(
             trajectory.tangent,
             trajectory.length_m,
             limits.separation_m,
+            trajectory.turn_m,
         )
     return Section(vertex=vertex, q=q, excess=excess, other_vertex=other, evaluations=evaluations)

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, Indices, freeze_arrays, read_only
 from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.track.closing import joins_m
 from railfix.track.polyline import NearestOnPolyline
 from railfix.track.track import (
     SIGMA_HEIGHT_M,
@@ -125,6 +126,18 @@ class Trajectory(NotebookTable):
     def arc_m(self) -> Floats:
         """Arc length of each point from the first, shape (V,) [m]."""
         return read_only(np.concatenate([[0.0], np.cumsum(self.length_m)]))
+
+    @cached_property
+    def joins_m(self) -> tuple[float, float]:
+        """Arc lengths at which a closed line goes on before its start and after its end [m]; NaN at an open end."""
+        return joins_m(self.arc_m, self.ecef_m)
+
+    @property
+    def turn_m(self) -> float:
+        """Once round a closed line [m]; infinite for others."""
+        before, after = self.joins_m
+        turns = (self.arc_m[-1] - after, before - self.arc_m[0])
+        return float(np.nan_to_num(np.fmin(*turns), nan=np.inf))
 
     @cached_property
     def tangent(self) -> Floats:

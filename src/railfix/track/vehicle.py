@@ -18,6 +18,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.core.settings import Settings, load_settings
+from railfix.track.closing import joins_m
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
@@ -110,7 +111,7 @@ class Body:
 
 
 class _Line:
-    """Centreline and roll of a bogie by cant, as functions of chainage."""
+    """Centreline and roll of a bogie by cant, as functions of chainage; a closed line goes on beyond its ends."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
         self.chainage = track.chainage_m
@@ -126,14 +127,37 @@ class _Line:
                 f"{track.name}: a cant of {np.abs(cant).max():g} m exceeds the width of the track; is it in mm?"
             )
         self.roll = np.arcsin(cant / contact_spacing_m)
+        self.joins = joins_m(self.chainage, self.points)
+
+    @property
+    def open_ends(self) -> tuple[bool, bool]:
+        """Whether the line does not go on before its start, after its end."""
+        return bool(np.isnan(self.joins[0])), bool(np.isnan(self.joins[1]))
 
     def at(self, chainage: Floats) -> Floats:
-        """Return points, shape (n, 3); the first and last segments are extended straight."""
+        """Return points, shape (n, 3); at an open end the last segment is extended straight."""
+        points = self._straight_on(chainage)
+        before, after = self.joins
+        ends = (
+            (chainage < 0.0, before, self.points[0], before + chainage),
+            (chainage > self.chainage[-1], after, self.points[-1], after + chainage - self.chainage[-1]),
+        )
+        for beyond, join, end, there in ends:
+            if join == join and beyond.any():
+                gap = end - self._straight_on(np.array([join]))
+                points[beyond] = self._straight_on(there[beyond]) + gap
+        return points
+
+    def _straight_on(self, chainage: Floats) -> Floats:
         index = np.clip(np.searchsorted(self.chainage, chainage, side="right") - 1, 0, len(self.tangent) - 1)
         return np.asarray(self.points[index] + (chainage - self.chainage[index])[:, None] * self.tangent[index])
 
     def roll_at(self, chainage: Floats) -> Floats:
-        return np.interp(chainage, self.chainage, self.roll)
+        before, after = self.joins
+        last = self.chainage[-1]
+        there = np.where((chainage < 0.0) & (before == before), before + chainage, chainage)
+        there = np.where((chainage > last) & (after == after), after + chainage - last, there)
+        return np.interp(there, self.chainage, self.roll)
 
 
 def _signed_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
@@ -281,11 +305,11 @@ def _refined(line: _Line, track: Track, vehicle: Vehicle, offset: AntennaOffset)
 def _end_halves(line: _Line, track: Track, vehicle: Vehicle) -> tuple[float, float]:
     """Find the distance of the body's middle from either end at which both bogies are on the track."""
     first, last = 0.0, line.chainage[-1]
-    half = np.full(2, vehicle.bogie_distance_m / 2.0)
+    half = np.where(line.open_ends, vehicle.bogie_distance_m / 2.0, 0.0)
     for _ in range(_MAX_ITERATIONS):
         middle = np.array([first + half[0], last - half[1]])
         lower, upper = _bogies(line, middle, vehicle.bogie_distance_m, track)
-        short = np.array([first - lower[0], upper[1] - last])
+        short = np.where(line.open_ends, [first - lower[0], upper[1] - last], 0.0)
         half += short
         if np.abs(short).max() < _CONVERGED_M:
             break
@@ -304,7 +328,8 @@ def antenna_trajectory(
     Both bogie centres are on the centreline at the bogie distance (a chord). At each bogie the track
     rolls by ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean
     of the two (P1 3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the
-    vertical rotated by the roll. The path begins and ends where a bogie reaches the end of the track.
+    vertical rotated by the roll. The path begins and ends where a bogie reaches the end of the track; on a closed
+    track where the body's middle does, so that it is closed too.
 
     Parameters
     ----------
