@@ -1,6 +1,6 @@
 """Size and opening time of a report on a long run: the demonstration, its tables laid end to end.
 
-    python tests/report_scale.py [--epochs 100000] [--keep FOLDER]
+    python tests/report_scale.py [--epochs 100000] [--keep FOLDER] [--run RUN REFERENCE]
 
 Prints rows, size of the page and of its print, time and memory to write it, and the time to open it in a browser: from
 the request to the end of loading, and to the first charts drawn.
@@ -10,11 +10,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 from statistics import median
@@ -22,7 +20,6 @@ from statistics import median
 import polars as pl
 
 from railfix.pipeline.config import Config
-from railfix.report import write_report
 from railfix.run import RunOptions, run_files
 from railfix.simulate.demonstration import demo_inputs, demo_truth
 from report_page import browser, opened, run_browser, timing_ms
@@ -54,27 +51,21 @@ def long_run(folder: Path, epochs: int) -> tuple[Path, Path]:
     return whole, folder / "truth.csv"
 
 
-def anonymous_mb() -> float:
-    """Resident memory of this process that is not pages of files [MB]."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) / 1024 for line in lines if line.startswith("RssAnon"))
-
-
-def write(run: Path, truth: Path, page: Path) -> None:
-    """Write the page; print the time [s], the largest resident memory and its part that is not pages of files [MB]."""
-    began, own, done = time.perf_counter(), [0.0], threading.Event()
-
-    def watch() -> None:
-        while not done.wait(0.02):
-            own[0] = max(own[0], anonymous_mb())
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
-    write_report([run], page, references=[truth])
-    took = time.perf_counter() - began
-    done.set()
-    watcher.join()
-    print(took, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, own[0])
+def written(run: Path, truth: Path, page: Path) -> tuple[float, float, float]:
+    """Time of `railfix report` [s], its largest resident memory, and that without pages of files [MB]."""
+    words = ["report", str(run), "--reference", str(truth), "--out", str(page), "--overwrite"]
+    began, peak_kb, own_kb = time.perf_counter(), 0, 0
+    with subprocess.Popen([sys.executable, "-m", "railfix", *words], stdout=subprocess.DEVNULL) as process:
+        status = Path(f"/proc/{process.pid}/status")
+        while process.poll() is None:
+            values = dict(line.split(":", 1) for line in status.read_text().splitlines())
+            if "VmHWM" in values:
+                peak_kb = max(peak_kb, int(values["VmHWM"].split()[0]))
+                own_kb = max(own_kb, int(values["RssAnon"].split()[0]))
+            time.sleep(0.02)
+    if process.returncode:
+        raise SystemExit(process.returncode)
+    return time.perf_counter() - began, peak_kb / 1024, own_kb / 1024
 
 
 def main() -> None:
@@ -82,20 +73,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--epochs", type=int, default=100_000, help="epochs of each antenna")
     parser.add_argument("--keep", type=Path, help="folder to leave the page in")
-    parser.add_argument("--write", nargs=3, metavar=("RUN", "REFERENCE", "PAGE"), help=argparse.SUPPRESS)
+    parser.add_argument("--run", nargs=2, type=Path, metavar=("RUN", "REFERENCE"), help="these in place of new ones")
     arguments = parser.parse_args()
-    if arguments.write:
-        return write(*(Path(name) for name in arguments.write))
     with tempfile.TemporaryDirectory() as place:
-        run, truth = long_run(Path(place), arguments.epochs)
+        run, truth = arguments.run or long_run(Path(place), arguments.epochs)
         page = (arguments.keep or Path(place)) / "report.html"
-        program = [sys.executable, __file__, "--write", str(run), str(truth), str(page)]
-        took, peak, own = subprocess.run(program, capture_output=True, text=True, check=True).stdout.split()
+        took, peak, own = written(run, truth, page)
         rows = {name: pl.scan_parquet(run / f"{name}.parquet").select(pl.len()).collect().item() for name in
                 ("positions", "observations")}  # fmt: skip
         print(f"{rows['positions']:,} rows of positions, {rows['observations']:,} of observations")
-        memory = f"{float(peak):.0f} MB of memory ({float(own):.0f} without pages of files)"
-        print(f"written in {float(took):.1f} s with {memory}, {page.stat().st_size / 1e6:.2f} MB")
+        memory = f"{peak:.0f} MB of memory ({own:.0f} without pages of files)"
+        print(f"written in {took:.1f} s with {memory}, {page.stat().st_size / 1e6:.2f} MB")
         if browser() is not None:
             paper = Path(place) / "report.pdf"
             run_browser(page, f"--print-to-pdf={paper}")

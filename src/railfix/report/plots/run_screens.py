@@ -28,13 +28,14 @@ class _Rows:
     epoch: Indices
 
     def channels(self, column: str) -> Floats:
-        """One column of the observations, shape (N, 1)."""
-        return floats(self.observations.select(column).collect(), column)[:, None]
+        """One column of the observations in the precision of charts, shape (N, 1)."""
+        values = pl.col(column).cast(pl.Float32).fill_null(float("nan"))
+        return self.observations.select(values).collect()[column].to_numpy()[:, None]
 
     def rejected(self, reason: Reason) -> Masks:
         """Observations with a reason, shape (N, 1)."""
-        bits = self.observations.select("reason").collect()["reason"].to_numpy()
-        return np.asarray((bits & int(reason)) != 0)[:, None]
+        flags = self.observations.select((pl.col("reason") & int(reason)) != 0).collect()
+        return flags["reason"].to_numpy()[:, None]
 
     def epochs(self, column: str) -> Floats:
         """One column of the positions, shape (T, 1)."""
@@ -140,11 +141,14 @@ def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFra
     ------
     RunScreen
     """
-    for antenna in positions["antenna"].unique(maintain_order=True).to_list():
-        mine = positions.filter(pl.col("antenna") == antenna)
+    antennas = positions["antenna"].unique(maintain_order=True).to_list()
+    for antenna in antennas:
+        mine = positions.filter(pl.col("antenna") == antenna) if len(antennas) > 1 else positions
         seen = observations.filter(pl.col("antenna") == antenna)
         time, chainage = mine["time_gpst"].to_numpy(), floats(mine, "chainage_m")
-        epoch = np.searchsorted(time, seen.select("time_gpst").collect()["time_gpst"].to_numpy())
+        seen_at = seen.select("time_gpst").collect()["time_gpst"].to_numpy()
+        epoch = np.searchsorted(time, seen_at).astype(np.int32)
+        del seen_at
         rows = _Rows(positions=mine, observations=seen, epoch=epoch)
         for name, picture in _pictures(antenna, rows, config):
             if np.isfinite(picture.metric).any():

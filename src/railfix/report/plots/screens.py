@@ -154,12 +154,12 @@ def _screen(
 
 def _blocks(picture: ScreenPicture, x: Floats, epoch: Indices | None) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
     """Give x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
-    limit = np.broadcast_to(np.asarray(picture.limit, dtype=np.float64), picture.metric.shape)
+    limit = np.broadcast_to(picture.limit, picture.metric.shape)
     for first in range(0, len(picture.metric), _BLOCK):
         rows = slice(first, first + _BLOCK)
-        metric = picture.metric[rows]
+        metric = picture.metric[rows].astype(np.float64)
         where = np.broadcast_to((x[rows] if epoch is None else x[epoch[rows]])[:, None], metric.shape)
-        yield where.ravel(), metric.ravel(), picture.reject[rows].ravel(), limit[rows].ravel()
+        yield where.ravel(), metric.ravel(), picture.reject[rows].ravel(), limit[rows].astype(np.float64).ravel()
 
 
 def _joined(parts: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.reasons import Reason, first_reason, reason_names
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve
 from railfix.ranges.cn0_curve.curve import satellite_kind
@@ -58,34 +57,32 @@ def cn0_over_elevation(
     """
     taken = observations.lazy().filter(
         pl.col("reason") & int(Reason.OTHER_SIGNAL_TAKEN) == 0,
-        pl.col("cn0_dbhz").is_not_null(),
+        pl.col("cn0_dbhz").is_finite(),
         pl.col("elevation_deg") >= 0.0,
     )
-    groups: dict[tuple[str, str], list[str]] = {}
-    counts_of: Counter[tuple[str, str]] = Counter()
-    for satellite, signal, count in taken.group_by("satellite", "signal").len().collect().sort("satellite").iter_rows():
-        groups.setdefault((satellite_kind(satellite), signal), []).append(satellite)
-        counts_of[satellite_kind(satellite), signal] += count
+    counted = taken.group_by(
+        "satellite",
+        "signal",
+        across=_cell("elevation_deg", _ELEVATION_EDGES),
+        up=_cell("cn0_dbhz", _CN0_EDGES),
+    ).agg(count=pl.len().cast(pl.Int64), total=pl.col("cn0_dbhz").sum())
+    cells_of = counted.collect()
+    kinds = {satellite: satellite_kind(satellite) for satellite in cells_of["satellite"].unique()}
+    cells_of = cells_of.with_columns(kind=pl.col("satellite").replace_strict(kinds, return_dtype=pl.String))
+    of_signal = cells_of.group_by("kind", "signal").agg(pl.col("count").sum())
     charts = []
-    for (kind, signal), satellites in sorted(groups.items(), key=lambda item: (-counts_of[item[0]], item[0])):
-        mine = taken.filter(pl.col("signal") == signal, pl.col("satellite").is_in(satellites))
-        rows = mine.select("elevation_deg", "cn0_dbhz").collect()
-        lines = tuple(_lines(rows, kind, signal, limits, curve, mask_deg))
-        counts, _, _ = np.histogram2d(
-            floats(rows, "elevation_deg"), floats(rows, "cn0_dbhz"), bins=(_ELEVATION_EDGES, _CN0_EDGES)
-        )
-        cells = Cells(
-            label="observations",
-            colour=BLACK,
-            x_edges=_ELEVATION_EDGES,
-            y_edges=_CN0_EDGES,
-            counts=counts.astype(np.int64),
-        )
+    for kind, signal, size in of_signal.sort("count", "kind", "signal", descending=[True, False, False]).iter_rows():
+        mine = cells_of.filter(kind=kind, signal=signal)
+        lines = tuple(_lines(mine, kind, signal, limits, curve, mask_deg))
+        counts = np.zeros((len(_ELEVATION_EDGES) - 1, len(_CN0_EDGES) - 1), dtype=np.int64)
+        drawn = mine.filter(pl.col("up").is_between(0, counts.shape[1] - 1), pl.col("across") < len(counts))
+        np.add.at(counts, (drawn["across"].to_numpy(), drawn["up"].to_numpy()), drawn["count"].to_numpy())
+        cells = Cells(label="observations", colour=BLACK, x_edges=_ELEVATION_EDGES, y_edges=_CN0_EDGES, counts=counts)
         charts.append(
             Chart(
                 name=f"cn0-{kind}-{signal}".lower(),
                 title=f"{title}: {KINDS.get(kind, kind)}, {signal}",
-                caption=f"{len(rows):,} observations, the more the darker.",
+                caption=f"{size:,} observations, the more the darker.",
                 x_label="elevation [deg]",
                 y_label="C/N0 [dB-Hz]",
                 layers=(cells, *lines),
@@ -97,8 +94,15 @@ def cn0_over_elevation(
     return charts
 
 
+def _cell(column: str, edges: Floats) -> pl.Expr:
+    """Number of the cell of a value between edges of equal distance, the last edge in the last cell."""
+    width, last = float(edges[1] - edges[0]), float(edges[-1])
+    number = ((pl.col(column) - float(edges[0])) / width).floor().cast(pl.Int64)
+    return pl.when(pl.col(column) == last).then(len(edges) - 2).otherwise(number)
+
+
 def _lines(
-    rows: pl.DataFrame,
+    cells: pl.DataFrame,
     kind: str,
     signal: str,
     limits: Cn0Limits | None,
@@ -115,7 +119,7 @@ def _lines(
             label = f"{limits.deficit_dbhz:g} dB below"
             yield Line(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
     else:
-        yield from _mean_of(rows)
+        yield from _mean_of(cells)
     if limits is not None and limits.floor_dbhz is not None:
         floor = np.full(2, limits.floor_dbhz)
         yield Line(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
@@ -124,11 +128,10 @@ def _lines(
         yield Line(label=f"mask {mask_deg:g} deg", colour=GREY, x=edge, y=np.array([10.0, 60.0]), dash="dotted")
 
 
-def _mean_of(rows: pl.DataFrame) -> Iterator[Layer]:
-    elevation, cn0 = floats(rows, "elevation_deg"), floats(rows, "cn0_dbhz")
-    piece = np.minimum((elevation / 5.0).astype(np.intp), 17)
-    count = np.bincount(piece, minlength=18)
-    total = np.bincount(piece, weights=cn0, minlength=18)
+def _mean_of(cells: pl.DataFrame) -> Iterator[Layer]:
+    piece = np.minimum(cells["across"].to_numpy() // 5, 17)
+    count = np.bincount(piece, weights=cells["count"].to_numpy(), minlength=18)
+    total = np.bincount(piece, weights=cells["total"].to_numpy(), minlength=18)
     mean = np.where(count >= _LEAST, total / np.maximum(count, 1), np.nan)
     middle = np.arange(2.5, 90.0, 5.0)
     yield Line(label="mean of this run", colour=BLUE, x=middle, y=mean, width=2.0)
