@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -162,6 +165,50 @@ print(loaded, *names)
     loaded, *missing = done.stdout.split()
     assert int(loaded) >= len(calls)
     assert not set(missing) & set(calls)
+
+
+@with_numba
+@pytest.mark.requirement("A7")
+def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None:
+    """numba looks at the file of the function alone; here a change of any file of the room compiles anew."""
+    room = Path(kernels.__file__).parent
+    recursion = import_module("railfix.kernels.tracking.recursion")
+    stamp = import_module("railfix.kernels.compiling").stamp
+    assert recursion.advance._cache._cache_file._source_stamp == stamp(room)
+    copied = tmp_path / "railfix" / "kernels"
+    shutil.copytree(room, copied, ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "railfix" / "core").mkdir()
+    shutil.copy(room.parent / "core" / "constants.py", tmp_path / "railfix" / "core")
+    assert stamp(copied) == stamp(room)
+    for name in ("kernels/tracking/algebra.py", "core/constants.py"):
+        before = stamp(copied)
+        with (tmp_path / "railfix" / name).open("a") as file:
+            file.write("# changed\n")
+        stamp.cache_clear()
+        assert stamp(copied) != before
+
+
+@with_numba
+@pytest.mark.requirement("A7")
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_terminal_is_told_of_compilation_once(terminal: bool) -> None:
+    program = """
+import numba
+import railfix.kernels.compiling
+for value in (1, 2):
+    function = numba.njit(eval(f"lambda: {value}", {"__name__": "railfix.kernels.made"}))
+    function()
+"""
+    pipe = os.openpty() if terminal else os.pipe()
+    reader, writer = pipe
+    subprocess.run([sys.executable, "-c", program], stderr=writer, check=True)
+    os.write(writer, b"end\n")
+    told = ""
+    while not told.endswith("end\n"):
+        told += os.read(reader, 1000).decode().replace("\r", "")
+    assert told == ("compiling for this processor, once: about a minute\n" if terminal else "") + "end\n"
+    for end in pipe:
+        os.close(end)
 
 
 @pytest.mark.requirement("A7")

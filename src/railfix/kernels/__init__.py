@@ -7,8 +7,7 @@ is imported: the compiled ones where numba is installed, unless the environment 
 ``numpy``; ``numba`` asks for them and fails where they cannot run. ``run.json`` names the choice ("kernels").
 
 Modules of this room are imported at the first call of one of their functions, so that numba costs nothing where it is
-not used. They see arrays and numbers alone, import nothing of railfix but this room and `railfix.core`, and call no
-compiled function of another module: numba recompiles a function when its own file changes, not when another one does.
+not used. They see arrays and numbers alone, and import nothing of railfix but this room and `railfix.core`.
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ def load() -> int:
     """
     if CHOSEN == "numpy":
         return 0
-    for _, module in REGISTERED.values():
+    for module in {"tracking.recursion", *(module for _, module in REGISTERED.values())}:
         import_module(f"railfix.kernels.{module}")
     loaded: int = import_module("railfix.kernels.compiling").load()
     return loaded

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
+import multiprocessing
+import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import numba
+from numba.core import event
 
 from railfix.core.errors import SettingsError
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 #: Compiled functions of the modules that are imported.
 COMPILED: Final[list[Any]] = []
+_OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_INNER: Final[dict[str, Any]] = {"no_cpython_wrapper": True}
 
 
 def kernel(function: Function) -> Function:
     """Compile a function of arrays at its first call, without the interpreter lock, and keep the code on disk.
 
     Divisions by zero give infinities and NaN as numpy's do. The code is kept beside the source, or in the user's cache
-    folder where that cannot be written, or in ``NUMBA_CACHE_DIR``.
+    folder where that cannot be written, or in ``NUMBA_CACHE_DIR``. It is compiled anew when any file of this room or
+    the constants change: numba itself looks at the function's own file alone, not at what it calls.
 
     Raises
     ------
@@ -26,14 +35,47 @@ def kernel(function: Function) -> Function:
         None of these folders can be written.
     """
     try:
-        made = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        made = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError as error:
         raise SettingsError(
             f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
             "written, or RAILFIX_KERNELS=numpy"
         ) from error
+    made._cache._cache_file._source_stamp = stamp(Path(__file__).parent)
     COMPILED.append(made)
     return cast(Function, made)
+
+
+def inner(function: Function) -> Function:
+    """Compile a function that kernels alone call: it is part of their code, and python cannot call it."""
+    return cast(Function, numba.njit(**_OPTIONS, **_INNER)(function))
+
+
+class _Announcement(event.Listener):
+    """Says on a terminal, once, why the first run takes so long."""
+
+    def __init__(self) -> None:
+        self.said = False
+
+    def on_start(self, event: Any) -> None:
+        """Hear that a function is compiled that is not on disk."""
+        ours = event.data["dispatcher"].py_func.__module__.startswith("railfix.")
+        if ours and not self.said and sys.stderr.isatty() and multiprocessing.parent_process() is None:
+            sys.stderr.write("compiling for this processor, once: about a minute\n")
+            self.said = True
+
+    def on_end(self, event: Any) -> None:
+        """Hear that it is done."""
+
+
+event.register("numba:compile", _Announcement())
+
+
+@cache
+def stamp(room: Path) -> str:
+    """Return the hash of all that compiled code depends on: the files of this room, and the constants."""
+    files = [*sorted(room.rglob("*.py")), room.parent / "core" / "constants.py"]
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
 def load() -> int:

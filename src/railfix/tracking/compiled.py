@@ -1,9 +1,13 @@
-"""The recursion with compiled kernels: epochs handed to `railfix.kernels.tracking` and what it returns taken back."""
+"""The recursion with compiled kernels: epochs handed to `railfix.kernels.tracking` and what it returns taken back.
+
+`railfix.kernels.tracking.layout` has the arrays, `railfix.kernels.tracking.recursion` the recursion over them.
+"""
 
 from __future__ import annotations
 
 from dataclasses import fields
 from functools import lru_cache
+from importlib import import_module
 from types import ModuleType
 from typing import Any, Final
 
@@ -42,8 +46,6 @@ class Compiled:
 
     Parameters
     ----------
-    kernel : module
-        `railfix.kernels.tracking`.
     chunk : Chunk
     line : Line
     sensors : SensorEpochs
@@ -54,14 +56,14 @@ class Compiled:
 
     def __init__(
         self,
-        kernel: ModuleType,
         chunk: Chunk,
         line: Line,
         sensors: SensorEpochs,
         limits: TrackingLimits,
         result: Tracked,
     ) -> None:
-        self.kernel, self.chunk, self.line, self.limits, self.result = kernel, chunk, line, limits, result
+        layout, self.recursion = _kernels()
+        self.layout, self.chunk, self.line, self.limits, self.result = layout, chunk, line, limits, result
         interval, singers = np.unique(chunk.interval_s, return_inverse=True)
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
         ranged, left = sensors.ranges, chunk.apart | chunk.off_map
@@ -77,15 +79,15 @@ class Compiled:
             "sensor": sensor,
             "sensor_sigma": sigma,
         }
-        for name in kernel.Epochs._fields:
+        for name in layout.Epochs._fields:
             if name not in values and name != "unsigned":
                 values[name] = getattr(chunk, name)
         arrays = {name: _own(array) for name, array in values.items()}
-        self.epochs = kernel.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
-        self.course = kernel.Course(**line.written)
-        self.numbers = _numbers(kernel, limits)
+        self.epochs = layout.Epochs(**arrays, unsigned=sensors.wheel_sign == "unknown")
+        self.course = layout.Course(**line.written)
+        self.numbers = _numbers(layout, limits)
         written = {field.name: getattr(result, field.name) for field in fields(result)}
-        self.answers = kernel.Answers(**{name: written[name] for name in kernel.Answers._fields})
+        self.answers = layout.Answers(**{name: written[name] for name in layout.Answers._fields})
 
     def advance(self, state: TrackState, first: int) -> int:
         """Do epochs from `first` on, change the state, and return the first epoch that is left to numpy."""
@@ -104,7 +106,7 @@ class Compiled:
         full = self._in_use(state, first, last)
         place = np.full(state.mean.shape[1], -1, dtype=np.intp)
         place[full] = np.arange(len(full))
-        active = self.kernel.Active(
+        active = self.layout.Active(
             full=full,
             wheel=int(place[Unknown.WHEEL]),
             force=int(place[Unknown.FORCE_OFFSET]),
@@ -118,7 +120,7 @@ class Compiled:
             count, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m, state.direction,
             seconds(state.measured - origin), *state.code_shift, state.map_log_scale,
         ])  # fmt: skip
-        memory = self.kernel.Memory(
+        memory = self.layout.Memory(
             mean=_own(state.mean[:, full]),
             covariance=_own(state.covariance[:, full[:, None], full]),
             log_probability=_own(state.log_probability),
@@ -127,8 +129,13 @@ class Compiled:
             scalars=scalars,
         )
         sub = self._subfilters(state, full)
+        rows, work = _work_space(
+            self.layout, len(self.epochs.slot), len(full), len(memory.log_probability), len(sub.running)
+        )
         done = int(
-            self.kernel.advance(self.epochs, self.course, self.numbers, active, memory, sub, self.answers, first, last)
+            self.recursion.advance(
+                self.epochs, self.course, self.numbers, active, memory, sub, self.answers, rows, work, first, last
+            )
         )
         if done > first:
             self._take_back(state, full, memory, sub, first, done)
@@ -155,7 +162,7 @@ class Compiled:
             mean[at] = state.bank.mean[kept][:, full]
             covariance[at] = state.bank.covariance[kept][:, full[:, None], full]
         clock = [CLOCKS.index(bank.clock_of(name)) for name in state.satellite.tolist()] if names else []
-        return self.kernel.Subfilters(
+        return self.layout.Subfilters(
             running=running,
             mean=mean,
             covariance=covariance,
@@ -231,6 +238,43 @@ class Compiled:
         state.measured = self.chunk.time[0] + timedelta(measured)
 
 
+def _kernels() -> tuple[ModuleType, ModuleType]:
+    """Layout and recursion, imported where numba is wanted alone."""
+    room = "railfix.kernels.tracking"
+    return import_module(f"{room}.layout"), import_module(f"{room}.recursion")
+
+
+def _work_space(layout: ModuleType, channels: int, unknowns: int, hypotheses: int, sources: int) -> tuple[Any, Any]:
+    """Lists of rows and work space of the kernel for so many channels, compact unknowns and hypotheses."""
+    sensors, width, room = len(bank.SENSORS), unknowns + len(_OF_EPOCH), hypotheses + 1
+    most = 3 * channels + sensors
+    size = channels + layout.COMBINED + sensors
+    shapes = {
+        "mean": (room, width), "spread": (room, width, width), "now": (room,), "before": (room,),
+        "design": (room, most, 4), "value": (room, most), "innovation": (room, most), "sensed": (room, sensors, 6),
+        "cross": (room, size, width), "root": (room, size), "own": (room, size, size),
+        "information": (room, size, size), "after": (room, size, size), "change": (room, size),
+        "weight": (room, most), "residual": (room, most), "fitted": (room, most), "new_mean": (room, unknowns + 1),
+        "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
+        "evidence": (room,), "joined": (2, room), "variance": (most,), "masked": (most,),
+        "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
+        "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),
+        "stepped": (width, unknowns), "faded": (unknowns,), "share": (size, 6), "sight": (channels, 7), "bend": (2,),
+        "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
+    }  # fmt: skip
+    work = layout.Work(
+        **{name: np.empty(shape) for name, shape in shapes.items()},
+        anew=np.zeros((room, 2), dtype=np.bool_),
+        source=np.zeros(sources, dtype=np.bool_),
+        met=np.zeros(sources, dtype=np.bool_),
+        ranked=np.empty(room, dtype=np.intp),
+        kept=np.empty(room, dtype=np.intp),
+        unknown=np.empty((size, 6), dtype=np.intp),
+    )
+    listed = (np.empty(length, dtype=np.intp) for length in (channels, channels, channels, sensors, 4))
+    return layout.Rows(*listed), work
+
+
 def _sources(state: TrackState) -> list[str]:
     """Sources of sub-filters in the order of the kernel."""
     return [*state.satellite.tolist(), *CLOCKS, *bank.SENSORS.values()]
@@ -258,7 +302,7 @@ def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=8)
-def _numbers(kernel: ModuleType, limits: TrackingLimits) -> Any:
+def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
     given = {
         "degrees": tuple(limits.tails),
         "least_step_m2": predict.LEAST_STEP_M2,
@@ -298,6 +342,6 @@ def _numbers(kernel: ModuleType, limits: TrackingLimits) -> Any:
         "several": int(TrackStatus.SEVERAL_BRANCHES),
         "expired": int(TrackStatus.EXPIRED),
     }
-    return kernel.Numbers(
-        **{name: given[name] if name in given else getattr(limits, name) for name in kernel.Numbers._fields}
+    return layout.Numbers(
+        **{name: given[name] if name in given else getattr(limits, name) for name in layout.Numbers._fields}
     )

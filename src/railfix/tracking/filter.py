@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
-from importlib import import_module
 from typing import Final
 
 import numpy as np
@@ -79,7 +78,7 @@ def track(
         anew = np.asarray(chunk.fresh.any(axis=1))
         fast = None
         if kernels.CHOSEN == "numba" and trace is None:
-            fast = Compiled(import_module("railfix.kernels.tracking"), chunk, line, sensors, limits, result)
+            fast = Compiled(chunk, line, sensors, limits, result)
         epoch = 0
         while epoch < len(epochs):
             done = epoch if fast is None else fast.advance(state, epoch)

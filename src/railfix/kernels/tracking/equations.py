@@ -1,0 +1,272 @@
+"""Equations of an epoch's measurements (`railfix.tracking.rows`), and their combinations."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.constants import SPEED_OF_LIGHT
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.course import find_ends, gradient_at
+from railfix.kernels.tracking.layout import (
+    C_CLOCK,
+    C_DRIFT,
+    C_RIGHT,
+    C_SPEED,
+    C_UP,
+    C_WAY,
+    CODE_CLOCK,
+    CODE_PLACE,
+    COMBINED,
+    DOPPLER_SPEED,
+    DRIFT,
+    FORCE_ROW,
+    OF_EPOCH,
+    OLD_PLACE,
+    OLD_SPEED,
+    PHASE_CLOCK,
+    PLACE,
+    RADAR_ROW,
+    RIGHT,
+    SPEED,
+    STEP_ALONG,
+    STEP_RIGHT,
+    STEP_UP,
+    TURN,
+    UP,
+    WHEEL_ROW,
+    Active,
+    Course,
+    Epochs,
+    Numbers,
+    Rows,
+    Work,
+)
+
+
+@inner
+def write_equations(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    active: Active,
+    numbers: Numbers,
+    rows: Rows,
+    direction: float,
+    work: Work,
+    h: int,
+) -> None:
+    """Write the equations of an epoch about the places `work.now[h]` and `work.before[h]`.
+
+    `design` has three coefficients on the axes for each code, four for each phase (way, clock, right, up) and Doppler
+    (right, up, speed, drift). `sensed` has for each sensor the coefficients of the place and the place before, the
+    speed and the speed before, of its own unknown and of the displacement along the map.
+    """
+    mean, sight, design, value, sensed = work.mean, work.sight, work.design, work.value, work.sensed
+    codes, phases, dopplers, sensors, point, axes = (
+        rows.codes,
+        rows.phases,
+        rows.dopplers,
+        rows.sensors,
+        work.point,
+        work.axes,
+    )
+    n, dt = mean.shape[1] - OF_EPOCH, epochs.interval_s[t]
+    nc, nph, nd, ns = rows.counts[0], rows.counts[1], rows.counts[2], rows.counts[3]
+    now, before = work.now[h], work.before[h]
+    find_ends(course, now, before, work)
+    moved, moved_before = mean[h, PLACE] - now, mean[h, n + OLD_PLACE] - before
+    for k in range(epochs.has.shape[2]):
+        if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
+            dx = epochs.sat_ecef_m[t, k, 0] - point[0, 0]
+            dy = epochs.sat_ecef_m[t, k, 1] - point[0, 1]
+            dz = epochs.sat_ecef_m[t, k, 2] - point[0, 2]
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+            ux, uy, uz = dx / distance, dy / distance, dz / distance
+            sight[k, 0] = distance + TURN * (
+                epochs.sat_ecef_m[t, k, 0] * point[0, 1] - epochs.sat_ecef_m[t, k, 1] * point[0, 0]
+            )
+            sight[k, 1], sight[k, 2], sight[k, 3] = ux, uy, uz
+            for c in range(3):
+                sight[k, 4 + c] = ux * axes[0, c, 0] + uy * axes[0, c, 1] + uz * axes[0, c, 2]
+    for i in range(nc):
+        k = codes[i]
+        design[h, i, 0], design[h, i, 1], design[h, i, 2] = -sight[k, 4], -sight[k, 5], -sight[k, 6]
+        rest = (
+            design[h, i, 0] * (moved + mean[h, CODE_PLACE])
+            + design[h, i, 1] * mean[h, RIGHT]
+            + design[h, i, 2] * mean[h, UP]
+        )
+        rest += mean[h, active.offset[epochs.offset[k]]] + mean[h, n + CODE_CLOCK]
+        rest += epochs.code_sigma_m[t, k] * mean[h, active.satellite[epochs.slot[k]]]
+        value[h, i] = epochs.measured[0, t, k] - sight[k, 0] - rest
+    if nph:
+        cx, cy, cz = point[0, 0] - point[1, 0], point[0, 1] - point[1, 1], point[0, 2] - point[1, 2]
+        length = math.sqrt(cx * cx + cy * cy + cz * cz)
+        if length > numbers.chord_m:
+            sign = (1.0 if now >= before else -1.0) / length
+            cx, cy, cz = sign * cx, sign * cy, sign * cz
+        else:
+            cx, cy, cz = axes[0, 0, 0], axes[0, 0, 1], axes[0, 0, 2]
+        for j in range(nph):
+            i, k = nc + j, phases[j]
+            dx = epochs.before_ecef_m[t, k, 0] - point[1, 0]
+            dy = epochs.before_ecef_m[t, k, 1] - point[1, 1]
+            dz = epochs.before_ecef_m[t, k, 2] - point[1, 2]
+            distance = math.sqrt(dx * dx + dy * dy + dz * dz) + TURN * (
+                epochs.before_ecef_m[t, k, 0] * point[1, 1] - epochs.before_ecef_m[t, k, 1] * point[1, 0]
+            )
+            gradient = -(sight[k, 1] * cx + sight[k, 2] * cy + sight[k, 3] * cz)
+            design[h, i, 0], design[h, i, 1], design[h, i, 2], design[h, i, 3] = (
+                gradient,
+                1.0,
+                -sight[k, 5],
+                -sight[k, 6],
+            )
+            computed = sight[k, 0] - distance + gradient * (moved - moved_before)
+            value[h, i] = epochs.measured[1, t, k] - computed - mean[h, n + PHASE_CLOCK]
+    for j in range(nd):
+        i, k = nc + nph + j, dopplers[j]
+        sx, sy = epochs.sat_ecef_m[t, k, 0], epochs.sat_ecef_m[t, k, 1]
+        vx, vy, vz = (
+            epochs.sat_velocity_mps[t, k, 0],
+            epochs.sat_velocity_mps[t, k, 1],
+            epochs.sat_velocity_mps[t, k, 2],
+        )
+        moving = sight[k, 1] * vx + sight[k, 2] * vy + sight[k, 3] * vz + TURN * (vx * point[0, 1] - vy * point[0, 0])
+        stretch = 1.0 + moving / SPEED_OF_LIGHT
+        slope = (-sight[k, 4] + TURN * (sx * axes[0, 0, 1] - sy * axes[0, 0, 0])) / stretch
+        design[h, i, 0], design[h, i, 1], design[h, i, 2], design[h, i, 3] = (
+            -sight[k, 5] / dt,
+            -sight[k, 6] / dt,
+            slope,
+            1.0,
+        )
+        value[h, i] = epochs.measured[2, t, k] - (
+            moving / stretch + slope * (mean[h, SPEED] + mean[h, DOPPLER_SPEED]) + mean[h, DRIFT]
+        )
+    for j in range(ns):
+        i, kind = nc + nph + nd + j, sensors[j]
+        measured = epochs.sensor[t, kind]
+        for c in range(6):
+            sensed[h, j, c] = 0.0
+        if kind in (WHEEL_ROW, RADAR_ROW):
+            if kind == WHEEL_ROW and epochs.unsigned:
+                speed = mean[h, SPEED]
+                measured *= math.copysign(1.0, speed) if abs(speed) > numbers.direction_mps else direction
+            own = active.wheel if kind == WHEEL_ROW else active.radar
+            sensed[h, j, 0], sensed[h, j, 1], sensed[h, j, 4], sensed[h, j, 5] = 1.0, -1.0, -measured, 1.0
+            value[h, i] = measured * (1.0 + mean[h, own]) - (mean[h, PLACE] - mean[h, n + OLD_PLACE])
+        elif kind == FORCE_ROW:
+            slope = gradient_at(course, 0.5 * (mean[h, PLACE] + mean[h, n + OLD_PLACE]))
+            gravity = numbers.gravity_mps2 * slope / math.sqrt(1.0 + slope**2)
+            sensed[h, j, 2], sensed[h, j, 3], sensed[h, j, 4] = 1.0 / dt, -1.0 / dt, 1.0
+            value[h, i] = measured - (mean[h, SPEED] - mean[h, n + OLD_SPEED]) / dt - gravity - mean[h, active.force]
+        else:
+            sensed[h, j, 0] = 1.0
+            value[h, i] = measured - mean[h, PLACE]
+
+
+@inner
+def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: int) -> None:
+    """Take over the equations of the sensors in row `best`, about another mean, `work.mean[h]`."""
+    mean, sensed, sensors = work.mean, work.sensed, rows.sensors
+    n, gnss = mean.shape[1] - OF_EPOCH, rows.counts[0] + rows.counts[1] + rows.counts[2]
+    place, speed = mean[h, PLACE] - mean[best, PLACE], mean[h, SPEED] - mean[best, SPEED]
+    old, old_speed = (
+        mean[h, n + OLD_PLACE] - mean[best, n + OLD_PLACE],
+        mean[h, n + OLD_SPEED] - mean[best, n + OLD_SPEED],
+    )
+    for j in range(rows.counts[3]):
+        i, kind = gnss + j, sensors[j]
+        own = 0.0
+        if kind == WHEEL_ROW:
+            own = mean[h, active.wheel] - mean[best, active.wheel]
+        elif kind == RADAR_ROW:
+            own = mean[h, active.radar] - mean[best, active.radar]
+        elif kind == FORCE_ROW:
+            own = mean[h, active.force] - mean[best, active.force]
+        for c in range(6):
+            sensed[h, j, c] = sensed[best, j, c]
+        work.value[h, i] = work.value[best, i] - (
+            sensed[best, j, 0] * place
+            + sensed[best, j, 1] * old
+            + sensed[best, j, 2] * speed
+            + sensed[best, j, 3] * old_speed
+            + sensed[best, j, 4] * own
+        )
+
+
+@inner
+def combine(epochs: Epochs, t: int, active: Active, floor: float, rows: Rows, work: Work, h: int) -> None:
+    """Write the covariance of the combinations with the unknowns and with each other, in their standard deviations.
+
+    `unknown` and `share` are work space: the unknowns of each combination and their coefficients.
+    """
+    design, sensed, spread, cross, root, own = work.design, work.sensed, work.spread, work.cross, work.root, work.own
+    unknown, share = work.unknown, work.share
+    nc, ns = rows.counts[0], rows.counts[3]
+    width = spread.shape[1]
+    n = width - OF_EPOCH
+    size = nc + COMBINED + ns
+    for i in range(size):
+        for k in range(6):
+            unknown[i, k], share[i, k] = 0, 0.0
+    for i in range(nc):
+        k = rows.codes[i]
+        unknown[i, 0], share[i, 0] = PLACE, design[h, i, 0]
+        unknown[i, 1], share[i, 1] = CODE_PLACE, design[h, i, 0]
+        unknown[i, 2], share[i, 2] = RIGHT, design[h, i, 1]
+        unknown[i, 3], share[i, 3] = UP, design[h, i, 2]
+        unknown[i, 4], share[i, 4] = active.offset[epochs.offset[k]], 1.0
+        unknown[i, 5], share[i, 5] = active.satellite[epochs.slot[k]], epochs.code_sigma_m[t, k]
+    unknown[nc, 0], share[nc, 0] = n + CODE_CLOCK, 1.0
+    unknown[nc + C_WAY, 0], share[nc + C_WAY, 0] = PLACE, 1.0
+    unknown[nc + C_WAY, 1], share[nc + C_WAY, 1] = n + OLD_PLACE, -1.0
+    unknown[nc + C_WAY, 2], share[nc + C_WAY, 2] = n + STEP_ALONG, 1.0
+    unknown[nc + C_CLOCK, 0], share[nc + C_CLOCK, 0] = n + PHASE_CLOCK, 1.0
+    unknown[nc + C_RIGHT, 0], share[nc + C_RIGHT, 0] = n + STEP_RIGHT, 1.0
+    unknown[nc + C_UP, 0], share[nc + C_UP, 0] = n + STEP_UP, 1.0
+    unknown[nc + C_SPEED, 0], share[nc + C_SPEED, 0] = SPEED, 1.0
+    unknown[nc + C_SPEED, 1], share[nc + C_SPEED, 1] = DOPPLER_SPEED, 1.0
+    unknown[nc + C_DRIFT, 0], share[nc + C_DRIFT, 0] = DRIFT, 1.0
+    for j in range(ns):
+        i = nc + COMBINED + j
+        unknown[i, 0], share[i, 0] = PLACE, sensed[h, j, 0]
+        unknown[i, 1], share[i, 1] = n + OLD_PLACE, sensed[h, j, 1]
+        unknown[i, 2], share[i, 2] = SPEED, sensed[h, j, 2]
+        unknown[i, 3], share[i, 3] = n + OLD_SPEED, sensed[h, j, 3]
+        if rows.sensors[j] == WHEEL_ROW:
+            unknown[i, 4] = active.wheel
+        elif rows.sensors[j] == RADAR_ROW:
+            unknown[i, 4] = active.radar
+        elif rows.sensors[j] == FORCE_ROW:
+            unknown[i, 4] = active.force
+        share[i, 4] = sensed[h, j, 4]
+        unknown[i, 5], share[i, 5] = n + STEP_ALONG, sensed[h, j, 5]
+    for i in range(size):
+        for c in range(width):
+            cross[h, i, c] = 0.0
+        for k in range(6):
+            coefficient = share[i, k]
+            if coefficient != 0.0:
+                row = unknown[i, k]
+                for c in range(width):
+                    cross[h, i, c] += coefficient * spread[h, row, c]
+    for i in range(size):
+        for j in range(i, size):
+            total = 0.0
+            for k in range(6):
+                total += share[j, k] * cross[h, i, unknown[j, k]]
+            own[h, i, j] = total
+    gnss = nc + rows.counts[1] + rows.counts[2]
+    for j in range(ns):
+        own[h, nc + COMBINED + j, nc + COMBINED + j] += floor * work.variance[gnss + j]
+    for i in range(size):
+        root[h, i] = math.sqrt(own[h, i, i])
+    for i in range(size):
+        for j in range(i + 1, size):
+            own[h, i, j] /= root[h, i] * root[h, j]
+            own[h, j, i] = own[h, i, j]
+        own[h, i, i] = 1.0
+        for c in range(width):
+            cross[h, i, c] /= root[h, i]

@@ -1,0 +1,98 @@
+"""Probabilities of hypotheses, and which of them go on (`railfix.tracking.hypotheses`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.algebra import log_sum, most_probable
+from railfix.kernels.tracking.course import point_at
+from railfix.kernels.tracking.layout import PLACE, Course, Memory, Numbers, Rows, Work
+from railfix.kernels.tracking.update import evidence_of
+
+
+@inner
+def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int) -> None:
+    """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.hypotheses`)."""
+    log_probability, places, after = memory.log_probability, work.places, work.right
+    best = 0
+    for h in range(count):
+        if log_probability[h] > log_probability[best]:
+            best = h
+        work.evidence[h] = evidence_of(rows, numbers.degrees, work.log_after[h], work, h, h)
+        point_at(course, work.new_mean[h, PLACE], places, work.place_axes, h)
+    for h in range(count):
+        square = 0.0
+        for c in range(3):
+            square += (places[h, c] - places[best, c]) ** 2
+        part = square / (square + numbers.map_branch_m**2)
+        odds = log_probability[h] - log_probability[best]
+        most = numbers.most_odds * square / numbers.map_branch_m**2
+        after[h] = min(max(odds + part * (work.evidence[h] - work.evidence[best]), min(odds, -most)), max(odds, most))
+    total = log_sum(after, count)
+    for h in range(count):
+        log_probability[h] = after[h] - total
+
+
+@inner
+def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) -> int:
+    """Order the hypotheses, join twins, drop the improbable; return how many are left."""
+    mean, covariance, log_probability = memory.mean, memory.covariance, memory.log_probability
+    origin, ranked, kept, joined = memory.origin_m, work.ranked, work.kept, work.joined
+    n = mean.shape[1]
+    first = most_probable(log_probability, count, numbers.switch)
+    ranked[0] = first
+    for k in range(count):
+        if k == first:
+            continue
+        j = k if k > first else k + 1
+        while j > 1 and log_probability[ranked[j - 1]] < log_probability[k]:
+            ranked[j] = ranked[j - 1]
+            j -= 1
+        ranked[j] = k
+    size = 0
+    for k in range(count):
+        joined[0, k], joined[1, k] = log_probability[k], origin[k]
+    for r in range(count):
+        k, twin = ranked[r], -1
+        for j in range(size):
+            other = kept[j]
+            reach = max(2.0, math.sqrt(covariance[k, PLACE, PLACE]) + math.sqrt(covariance[other, PLACE, PLACE]))
+            if abs(mean[k, PLACE] - mean[other, PLACE]) < reach:
+                twin = other
+                break
+        if twin < 0:
+            kept[size] = k
+            size += 1
+        else:
+            one, two = max(joined[0, twin], joined[0, k]), min(joined[0, twin], joined[0, k])
+            joined[0, twin] = one + math.log1p(math.exp(two - one))
+    size = min(size, numbers.most_hypotheses)
+    for j in range(size):
+        log_probability[j] = joined[0, kept[j]]
+    total = log_sum(log_probability, size)
+    for j in range(size):
+        log_probability[j] -= total
+    if abs(mean[kept[0], PLACE] - origin[kept[0]]) >= numbers.decided_travel_m:
+        alive = 0
+        for j in range(size):
+            if log_probability[j] > math.log(numbers.least_probability):
+                kept[alive], log_probability[alive] = kept[j], log_probability[j]
+                alive += 1
+        size = alive
+        total = log_sum(log_probability, size)
+        for j in range(size):
+            log_probability[j] -= total
+    for j in range(size):
+        k = kept[j]
+        origin[j] = joined[1, k]
+        for c in range(n):
+            work.new_mean[j, c] = mean[k, c]
+            for e in range(n):
+                work.new_covariance[j, c, e] = covariance[k, c, e]
+    for j in range(size):
+        for c in range(n):
+            mean[j, c] = work.new_mean[j, c]
+            for e in range(n):
+                covariance[j, c, e] = work.new_covariance[j, c, e]
+    return size

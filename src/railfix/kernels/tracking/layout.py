@@ -1,0 +1,279 @@
+"""Arrays of the recursion: unknowns in use and their order, epochs, settings, state, work space, answers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+
+TURN = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
+#: Compact unknowns that are always there: place, speed, acceleration, drift, error of the map to the right and up,
+#: error of the speed by Dopplers, displacement of the codes.
+PLACE, SPEED, ACCELERATION, DRIFT, RIGHT, UP, DOPPLER_SPEED, CODE_PLACE = 0, 1, 2, 3, 4, 5, 6, 7
+#: Unknowns of one epoch, after the compact ones: place and speed before, clock of the phases, displacement of the map
+#: to the right, up and along, clock of the codes.
+OLD_PLACE, OLD_SPEED, PHASE_CLOCK, STEP_RIGHT, STEP_UP, STEP_ALONG, CODE_CLOCK = 0, 1, 2, 3, 4, 5, 6
+OF_EPOCH = 7
+#: Combinations of phases and Dopplers after the clock of the codes.
+C_WAY, C_CLOCK, C_RIGHT, C_UP, C_SPEED, C_DRIFT = 1, 2, 3, 4, 5, 6
+COMBINED = 7
+SENSORS = 4
+WHEEL_ROW, RADAR_ROW, FORCE_ROW, PLACE_ROW = 0, 1, 2, 3
+
+
+class Epochs(NamedTuple):
+    """T prepared epochs of K channels (`railfix.tracking.chunk.Chunk`) and sensors.
+
+    `left` marks epochs that numpy has to do (after long gaps, with ranges to ground units); `singer` is the row of
+    `step` and `noise` of each interval; columns of `sensor` and `sensor_sigma`: wheel, radar, force, place, NaN
+    without a measurement.
+    """
+
+    time_s: Floats
+    interval_s: Floats
+    left: Masks
+    singer: Indices
+    step: Floats
+    noise: Floats
+    slot: Indices
+    offset: Indices
+    sat_ecef_m: Floats
+    sat_velocity_mps: Floats
+    before_ecef_m: Floats
+    measured: Floats
+    has: Masks
+    variance: Floats
+    code_sigma_m: Floats
+    fresh: Masks
+    remembered: Masks
+    sensor: Floats
+    sensor_sigma: Floats
+    unsigned: bool
+
+
+class Course(NamedTuple):
+    """`railfix.tracking.line.Line`, with the arc lengths of the middles of segments."""
+
+    arc_m: Floats
+    ecef_m: Floats
+    axes: Floats
+    segment: Floats
+    middle_m: Floats
+    gradient: Floats
+    sigma_plan_m: float
+    sigma_height_m: float
+    start_m: float
+    end_m: float
+
+
+class Numbers(NamedTuple):
+    """Settings and constants of the filter, by the names that they have there."""
+
+    degrees: tuple[float, float]
+    passes: int
+    code_correlation_s: float
+    code_correlation_m: float
+    slow_code_m: float
+    slow_code_s: float
+    doppler_error_mps: float
+    doppler_error_share: float
+    doppler_correlation_s: float
+    phase_walk_m: float
+    clock_walk_mps: float
+    offset_walk_m: float
+    map_roughness_m: float
+    map_correlation_m: float
+    map_scale_m: float
+    map_misfit_sigmas: float
+    map_misfit_s: float
+    map_misfit_kept_s: float
+    misfit_codes: int
+    misfit_clipped: float
+    misfit_learnt_s: float
+    misfit_largest: float
+    map_absolute_m: float
+    map_branch_m: float
+    decided_travel_m: float
+    least_probability: float
+    most_hypotheses: int
+    start_sigma_m: float
+    gap_s: float
+    lost_motion_weight: float
+    lost_motion_s: float
+    lost_code_weight: float
+    lost_code_s: float
+    expired_sigma_m: float
+    least_step_m2: float
+    code_clock_sigma_m: float
+    wheel_walk: float
+    force_walk_mps2: float
+    radar_walk: float
+    stepped: float
+    unknown_clock: float
+    scale_s: float
+    least_scale: float
+    largest_scale: float
+    doubtful: float
+    freedom_place: float
+    freedom_speed: float
+    moved_m: float
+    relinearised: int
+    sensor_floor: float
+    direction_mps: float
+    chord_m: float
+    gravity_mps2: float
+    switch: float
+    most_odds: float
+    level_passes: int
+    level_risk: float
+    level_k: float
+    precision_m: float
+    rounds: int
+    scale_bound: float
+    joined: float
+    decided: float
+    tracking: int
+    several: int
+    coasting: int
+    expired: int
+
+
+class Active(NamedTuple):
+    """Compact unknowns that are in use: `full` is the place of each in the state, the others where to find them.
+
+    -1 where there is none; `satellite` and `offset` are by slot and by clock.
+    """
+
+    full: Indices
+    wheel: int
+    force: int
+    radar: int
+    offset: Indices
+    satellite: Indices
+
+
+class Memory(NamedTuple):
+    """State that is read and written: compact means and covariances, and `scalars` (`HYPOTHESES` and following)."""
+
+    mean: Floats
+    covariance: Floats
+    log_probability: Floats
+    origin_m: Floats
+    offset_known: Masks
+    scalars: Floats
+
+
+class Subfilters(NamedTuple):
+    """Sub-filters of the level by their source (`railfix.tracking.bank`): satellites by slot, clocks, sensors.
+
+    None of them where levels are off. `running` marks those that there are; `prior` is the probability of a fault of
+    each source, 0 where it needs no sub-filter, `k` the sigmas that follow from it; `begun` has the variances of the
+    compact unknowns and those of an epoch that one begins with; `clock` is that of each satellite.
+    """
+
+    running: Masks
+    mean: Floats
+    covariance: Floats
+    weak_s: Floats
+    prior: Floats
+    k: Floats
+    begun: Floats
+    clock: Indices
+
+
+class Rows(NamedTuple):
+    """Channels of the codes, phases and Dopplers of an epoch and columns of its sensors, and how many of each."""
+
+    codes: Indices
+    phases: Indices
+    dopplers: Indices
+    sensors: Indices
+    counts: Indices
+
+
+class Work(NamedTuple):
+    """Work space of an epoch of K channels, H hypotheses, N compact unknowns (`railfix.tracking.compiled`).
+
+    The first axis of most arrays is the hypothesis; its last row belongs to sub-filters and second starts.
+    """
+
+    mean: Floats
+    spread: Floats
+    now: Floats
+    before: Floats
+    design: Floats
+    value: Floats
+    innovation: Floats
+    sensed: Floats
+    cross: Floats
+    root: Floats
+    own: Floats
+    information: Floats
+    after: Floats
+    change: Floats
+    weight: Floats
+    residual: Floats
+    fitted: Floats
+    new_mean: Floats
+    new_covariance: Floats
+    log_before: Floats
+    log_after: Floats
+    evidence: Floats
+    anew: Masks
+    ranked: Indices
+    kept: Indices
+    joined: Floats
+    variance: Floats
+    masked: Floats
+    system: Floats
+    factor: Floats
+    lower: Floats
+    right: Floats
+    ordered: Floats
+    part: Floats
+    source: Masks
+    met: Masks
+    gain: Floats
+    less: Floats
+    stepped: Floats
+    faded: Floats
+    unknown: Indices
+    share: Floats
+    sight: Floats
+    bend: Floats
+    point: Floats
+    axes: Floats
+    places: Floats
+    place_axes: Floats
+
+
+HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
+SHIFT, SHIFT_VARIANCE, MAP_SCALE = 8, 9, 10
+
+
+class Answers(NamedTuple):
+    """Arrays of `railfix.tracking.result.Tracked` that are written."""
+
+    status: Codes
+    arc_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats
+    speed_sigma_mps: Floats
+    acceleration_mps2: Floats
+    probability: Floats
+    hypotheses: Integers
+    code_weight: Floats
+    motion_weight: Floats
+    wheel_scale: Floats
+    force_offset_mps2: Floats
+    radar_scale: Floats
+    map_scale: Floats
+    level_m: Floats
+    level_noise_m: Floats
+    separation_m: Floats
+    amount_m: Floats
+    used: Integers
+    innovation: Floats
+    sensed: Floats
+    weight: Floats

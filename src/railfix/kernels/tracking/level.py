@@ -1,0 +1,214 @@
+"""Sub-filters and the level from them (`railfix.tracking.bank`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.algebra import invert, restart
+from railfix.kernels.tracking.course import find_ends, onto_line
+from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
+from railfix.kernels.tracking.layout import (
+    CODE_CLOCK,
+    COMBINED,
+    DRIFT,
+    OF_EPOCH,
+    OLD_PLACE,
+    PHASE_CLOCK,
+    PLACE,
+    SENSORS,
+    Active,
+    Answers,
+    Course,
+    Epochs,
+    Numbers,
+    Rows,
+    Subfilters,
+    Work,
+)
+from railfix.kernels.tracking.prediction import add_bend, predict
+from railfix.kernels.tracking.update import apply_update, first_weights, reweight
+
+
+@inner
+def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, best: int, work: Work) -> None:
+    """Mark the sources that an epoch needs a sub-filter for, and as `met` the clocks of all satellites in view."""
+    clocks = len(bank.running) - SENSORS - slots
+    source, met = work.source, work.met
+    for b in range(len(bank.running)):
+        source[b] = met[b] = False
+    several = 0
+    for i in range(rows.counts[0]):
+        clock = slots + epochs.offset[rows.codes[i]]
+        several += not source[clock]
+        source[clock] = True
+    for k in range(clocks):
+        source[slots + k] = source[slots + k] and several > 1
+    for k in range(epochs.has.shape[2]):
+        if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
+            source[epochs.slot[k]] = True
+    for j in range(rows.counts[3]):
+        source[slots + clocks + rows.sensors[j]] = True
+    for k in range(slots):
+        if epochs.remembered[t, k]:
+            met[slots + bank.clock[k]] = True
+            source[k] = source[k] or best > 0
+
+
+@inner
+def _begin(bank: Subfilters, b: int, copied: bool, best: int, work: Work, h: int) -> None:
+    """Begin a sub-filter with the state of the filter, or with what is known of nothing but the place."""
+    mean, spread = work.mean, work.spread
+    width = mean.shape[1]
+    bank.running[b], bank.weak_s[b] = True, 0.0
+    for c in range(width):
+        mean[h, c] = mean[best, c] if copied else 0.0
+        for e in range(width):
+            spread[h, c, e] = spread[best, c, e] if copied else 0.0
+        if not copied:
+            spread[h, c, c] = bank.begun[c]
+    if not copied:
+        mean[h, PLACE] = mean[h, width - OF_EPOCH + OLD_PLACE] = mean[best, PLACE]
+
+
+@inner
+def _update(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    numbers: Numbers,
+    active: Active,
+    rows: Rows,
+    best: int,
+    work: Work,
+    h: int,
+) -> None:
+    """Update row `h` of the work space without the measurements whose `masked` variance is infinite."""
+    mean, spread, n = work.mean, work.spread, work.mean.shape[1] - OF_EPOCH
+    for kind in range(2):
+        if work.anew[best, kind]:
+            unknown = n + PHASE_CLOCK if kind == 0 else DRIFT
+            mean[h, unknown] = mean[best, unknown]
+            restart(spread, unknown, numbers.unknown_clock**2, h)
+    mean[h, n + CODE_CLOCK] = mean[best, n + CODE_CLOCK]
+    work.now[h], work.before[h] = mean[h, PLACE], mean[h, n + OLD_PLACE]
+    write_equations(epochs, t, course, active, numbers, rows, 1.0, work, h)
+    move_sensor_equations(active, rows, best, work, h)
+    combine(epochs, t, active, numbers.sensor_floor, rows, work, h)
+    invert(work.own, h, rows.counts[0] + COMBINED + rows.counts[3], work, work.information, h)
+    first_weights(rows, work.masked, numbers.degrees, 0.0, 0.0, work, h, h)
+    reweight(rows, work.masked, numbers.degrees, numbers.level_passes, work, h, h, h)
+    apply_update(rows, work, h)
+    onto_line(course, numbers.start_sigma_m, work, h)
+
+
+@inner
+def _contradicted(rows: Rows, numbers: Numbers, work: Work, h: int) -> bool:
+    """Return whether the measurements that a sub-filter uses, codes or phases and Dopplers, have lost their weight."""
+    nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
+    weak = False
+    for part in range(2):
+        first, last = (0, nc) if part == 0 else (nc, gnss)
+        total, used = 0.0, 0
+        for i in range(first, last):
+            if work.masked[i] < math.inf:
+                total += work.weight[h, i]
+                used += 1
+        least = numbers.lost_code_weight if part == 0 else numbers.lost_motion_weight
+        weak = weak or (used > 0 and total < least * used)
+    return weak
+
+
+@inner
+def advance_subfilters(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    numbers: Numbers,
+    active: Active,
+    bank: Subfilters,
+    rows: Rows,
+    best: int,
+    map_log_scale: float,
+    work: Work,
+    h: int,
+) -> None:
+    """Do an epoch of all sub-filters (`railfix.tracking.bank.levelled`); `best` has the equations, `h` is free."""
+    mean, spread = work.mean, work.spread
+    n, dt = mean.shape[1] - OF_EPOCH, epochs.interval_s[t]
+    nc, nph = rows.counts[0], rows.counts[1]
+    gnss = nc + nph + rows.counts[2]
+    slots = len(active.satellite)
+    clocks = len(bank.running) - SENSORS - slots
+    _sources(epochs, t, rows, bank, slots, best, work)
+    source, met = work.source, work.met
+    before = False
+    for b in range(len(bank.running)):
+        before = before or bank.running[b]
+    before = before and not best
+    for b in range(len(bank.running)):
+        satellite = b < slots
+        if best or (satellite and not epochs.remembered[t, b]):
+            bank.running[b] = False
+        if bank.running[b] and bank.weak_s[b] >= numbers.lost_motion_s:
+            bank.running[b], met[b] = False, True
+        if bank.running[b]:
+            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, map_log_scale, work, h)
+            find_ends(course, mean[h, PLACE], mean[h, n + OLD_PLACE], work)
+            add_bend(numbers, work, h)
+            sigma = math.sqrt(spread[h, PLACE, PLACE])
+            near = abs(mean[h, PLACE] - mean[best, PLACE]) < numbers.joined * sigma
+            near = near and sigma < (1.0 + numbers.joined) * math.sqrt(spread[best, PLACE, PLACE])
+            if near and satellite and not source[b]:
+                bank.running[b] = False
+                continue
+        elif source[b] and bank.prior[b] > 0.0:
+            _begin(bank, b, before and not met[b], best, work, h)
+        else:
+            continue
+        for i in range(gnss):
+            k = rows.codes[i] if i < nc else (rows.phases[i - nc] if i < nc + nph else rows.dopplers[i - nc - nph])
+            own = epochs.slot[k] if satellite else slots + epochs.offset[k]
+            work.masked[i] = math.inf if own == b else work.variance[i]
+        for j in range(rows.counts[3]):
+            own = slots + clocks + rows.sensors[j]
+            work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
+        _update(epochs, t, course, numbers, active, rows, best, work, h)
+        bank.weak_s[b] = bank.weak_s[b] + dt if _contradicted(rows, numbers, work, h) else 0.0
+        for c in range(n):
+            bank.mean[b, c] = work.new_mean[h, c]
+            for e in range(n):
+                bank.covariance[b, c, e] = work.new_covariance[h, c, e]
+
+
+@inner
+def level_of(place: float, sigma: float, bank: Subfilters, numbers: Numbers, answers: Answers, t: int) -> float:
+    """Return the level of a place, write its parts (`railfix.tracking.bank.level_m`)."""
+    noise, apart = numbers.level_k * sigma, math.nan
+    level, contradicted = noise, False
+    for b in range(len(bank.running)):
+        if bank.running[b]:
+            contradicted = contradicted or bank.weak_s[b] > 0.0
+            away = abs(bank.mean[b, PLACE] - place)
+            apart = away if math.isnan(apart) else max(apart, away)
+            level = max(level, away + bank.k[b] * math.sqrt(bank.covariance[b, PLACE, PLACE]))
+    answers.level_noise_m[t], answers.separation_m[t] = noise, apart
+    if math.isnan(apart) or contradicted:
+        return math.inf
+    for _ in range(numbers.rounds):
+        away = level / sigma
+        spent = math.erfc(away / math.sqrt(2.0))
+        slope = 2.0 * math.exp(-0.5 * away * away) / sigma
+        for b in range(len(bank.running)):
+            if bank.running[b]:
+                own = math.sqrt(bank.covariance[b, PLACE, PLACE])
+                for side in (-1.0, 1.0):
+                    away = (level + side * abs(bank.mean[b, PLACE] - place)) / own
+                    spent += bank.prior[b] * 0.5 * math.erfc(away / math.sqrt(2.0))
+                    slope += bank.prior[b] * math.exp(-0.5 * away * away) / own
+        slope /= math.sqrt(2.0 * math.pi)
+        step = spent / slope * math.log(spent / numbers.level_risk)
+        level += step
+        if abs(step) < numbers.precision_m:
+            break
+    return level

@@ -1,0 +1,51 @@
+"""Error of the map's lengths learnt from codes that ask for another place (`railfix.tracking.misfit`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.algebra import invert
+from railfix.kernels.tracking.layout import MAP_SCALE, SHIFT, SHIFT_VARIANCE, Numbers, Rows, Work
+
+
+@inner
+def code_shift(rows: Rows, clipped: float, work: Work, h: int) -> float:
+    """Shift of the place that the codes ask for over its standard deviation (`railfix.tracking.misfit`)."""
+    nc, root, own, design, value = rows.counts[0], work.root, work.own, work.design, work.value
+    system, inverse = work.system, work.after
+    clock = root[h, nc]
+    for i in range(nc):
+        for j in range(i, nc):
+            system[h, i, j] = (
+                root[h, i] * root[h, j] * own[h, i, j]
+                + clock * (root[h, i] * own[h, i, nc] + root[h, j] * own[h, j, nc])
+                + clock * clock
+            )
+        system[h, i, i] += work.variance[i] / min(work.weight[h, i], 1.0)
+    invert(system, h, nc, work, inverse, h)
+    score, information = 0.0, 0.0
+    for i in range(nc):
+        for j in range(nc):
+            part = design[h, i, 0] * inverse[h, i, j]
+            score += part * value[h, j]
+            information += part * design[h, j, 0]
+    if not information > 0.0:
+        return 0.0
+    return float(min(max(score / math.sqrt(information), -clipped), clipped))
+
+
+@inner
+def learn_map(scalars: Floats, shift: float, dt: float, numbers: Numbers) -> None:
+    """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
+    dt = min(dt, 1.0)
+    share = 1.0 - math.exp(-dt / numbers.map_misfit_s)
+    mean = (1.0 - share) * scalars[SHIFT] + share * shift
+    variance = (1.0 - share) ** 2 * scalars[SHIFT_VARIANCE] + share**2
+    scalars[SHIFT], scalars[SHIFT_VARIANCE] = mean, variance
+    beyond = abs(mean) / (math.sqrt(variance) * numbers.map_misfit_sigmas)
+    scale = scalars[MAP_SCALE] * math.exp(-dt / numbers.map_misfit_kept_s)
+    if beyond > 1.0:
+        scale += 2.0 * math.log(beyond) * dt / numbers.misfit_learnt_s
+    scalars[MAP_SCALE] = min(scale, numbers.misfit_largest)

@@ -1,0 +1,146 @@
+"""Prediction of the unknowns from one epoch to the next (`railfix.tracking.predict`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.layout import (
+    CODE_CLOCK,
+    CODE_PLACE,
+    DOPPLER_SPEED,
+    DRIFT,
+    OF_EPOCH,
+    OLD_PLACE,
+    OLD_SPEED,
+    PHASE_CLOCK,
+    PLACE,
+    RIGHT,
+    SPEED,
+    STEP_ALONG,
+    STEP_RIGHT,
+    STEP_UP,
+    UP,
+    Active,
+    Course,
+    Epochs,
+    Numbers,
+    Work,
+)
+
+
+@inner
+def predict(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    numbers: Numbers,
+    active: Active,
+    mean: Floats,
+    covariance: Floats,
+    h: int,
+    map_log_scale: float,
+    work: Work,
+    to: int,
+) -> None:
+    """Predict row `h` of the compact unknowns to epoch `t`: row `to` of `work.mean` and `work.spread`."""
+    after, spread, rows, kept = work.mean, work.spread, work.stepped, work.faded
+    dt, step, noise = epochs.interval_s[t], epochs.step[epochs.singer[t]], epochs.noise[epochs.singer[t]]
+    n = mean.shape[1]
+    speed = abs(mean[h, SPEED])
+    travel = speed * dt
+    map_kept = math.exp(-travel / numbers.map_absolute_m)
+    code_kept = math.exp(-dt / numbers.code_correlation_s - travel / numbers.code_correlation_m)
+    doppler_kept = math.exp(-dt / numbers.doppler_correlation_s)
+    slow_kept = math.exp(-dt / numbers.slow_code_s)
+    for i in range(n):
+        kept[i] = 1.0
+    kept[RIGHT] = kept[UP] = map_kept
+    kept[DOPPLER_SPEED], kept[CODE_PLACE] = doppler_kept, slow_kept
+    for i in active.satellite:
+        if i >= 0:
+            kept[i] = code_kept
+    for i in range(3, n):
+        for j in range(n):
+            rows[i, j] = kept[i] * covariance[h, i, j]
+    for i in range(3):
+        for j in range(n):
+            rows[i, j] = (
+                step[i, 0] * covariance[h, 0, j] + step[i, 1] * covariance[h, 1, j] + step[i, 2] * covariance[h, 2, j]
+            )
+    for j in range(n):
+        rows[n + OLD_PLACE, j] = covariance[h, PLACE, j]
+        rows[n + OLD_SPEED, j] = covariance[h, SPEED, j]
+        rows[n + PHASE_CLOCK, j] = dt * covariance[h, DRIFT, j]
+    for i in range(n + 3):
+        for j in range(3, n):
+            spread[to, i, j] = kept[j] * rows[i, j]
+        for j in range(3):
+            spread[to, i, j] = step[j, 0] * rows[i, 0] + step[j, 1] * rows[i, 1] + step[j, 2] * rows[i, 2]
+        spread[to, i, n + OLD_PLACE] = rows[i, PLACE]
+        spread[to, i, n + OLD_SPEED] = rows[i, SPEED]
+        spread[to, i, n + PHASE_CLOCK] = dt * rows[i, DRIFT]
+        for j in range(n + 3, n + OF_EPOCH):
+            spread[to, i, j] = 0.0
+            spread[to, j, i] = 0.0
+    for i in range(n + 3, n + OF_EPOCH):
+        for j in range(n + 3, n + OF_EPOCH):
+            spread[to, i, j] = 0.0
+    for i in range(3):
+        for j in range(3):
+            spread[to, i, j] += noise[i, j]
+    spread[to, PLACE, PLACE] += numbers.least_step_m2
+    spread[to, SPEED, SPEED] += numbers.least_step_m2
+    walk = numbers.clock_walk_mps**2
+    spread[to, DRIFT, DRIFT] += walk * dt
+    spread[to, n + PHASE_CLOCK, n + PHASE_CLOCK] += walk * dt**3 / 3.0 + 1e-6
+    spread[to, n + PHASE_CLOCK, DRIFT] += walk * dt**2 / 2.0
+    spread[to, DRIFT, n + PHASE_CLOCK] += walk * dt**2 / 2.0
+    spread[to, RIGHT, RIGHT] += course.sigma_plan_m**2 * (1.0 - map_kept**2)
+    spread[to, UP, UP] += course.sigma_height_m**2 * (1.0 - map_kept**2)
+    spread[to, CODE_PLACE, CODE_PLACE] += numbers.slow_code_m**2 * (1.0 - slow_kept**2)
+    lasting = numbers.doppler_error_mps + numbers.doppler_error_share * speed
+    spread[to, DOPPLER_SPEED, DOPPLER_SPEED] += lasting**2 * (1.0 - doppler_kept**2)
+    if active.wheel >= 0:
+        spread[to, active.wheel, active.wheel] += numbers.wheel_walk**2 * dt
+    if active.force >= 0:
+        spread[to, active.force, active.force] += numbers.force_walk_mps2**2 * dt
+    if active.radar >= 0:
+        spread[to, active.radar, active.radar] += numbers.radar_walk**2 * dt
+    for i in active.offset:
+        if i >= 0:
+            spread[to, i, i] += numbers.offset_walk_m**2 * dt
+    for i in active.satellite:
+        if i >= 0:
+            spread[to, i, i] += 1.0 - code_kept**2
+    for i in range(3, n):
+        after[to, i] = kept[i] * mean[h, i]
+    for i in range(3):
+        after[to, i] = step[i, 0] * mean[h, 0] + step[i, 1] * mean[h, 1] + step[i, 2] * mean[h, 2]
+    after[to, n + OLD_PLACE], after[to, n + OLD_SPEED], after[to, n + PHASE_CLOCK] = (
+        mean[h, PLACE],
+        mean[h, SPEED],
+        dt * mean[h, DRIFT],
+    )
+    for i in range(n + 3, n + OF_EPOCH):
+        after[to, i] = 0.0
+    rough = 2.0 * numbers.map_roughness_m**2 * (1.0 - math.exp(-travel / numbers.map_correlation_m)) + 1e-8
+    spread[to, n + STEP_RIGHT, n + STEP_RIGHT] = rough
+    spread[to, n + STEP_UP, n + STEP_UP] = rough
+    # The way on the map is the way run less the error of the length: what codes see of it, phases do not.
+    length = numbers.map_scale_m**2 * math.exp(map_log_scale) * travel + numbers.phase_walk_m**2 * dt
+    spread[to, PLACE, PLACE] += length
+    spread[to, n + STEP_ALONG, n + STEP_ALONG] = length + 1e-8
+    spread[to, PLACE, n + STEP_ALONG] = spread[to, n + STEP_ALONG, PLACE] = -length
+    spread[to, n + CODE_CLOCK, n + CODE_CLOCK] = numbers.code_clock_sigma_m**2
+
+
+@inner
+def add_bend(numbers: Numbers, work: Work, h: int) -> None:
+    """Add what the line bends by where the place is uncertain to the displacements across."""
+    spread, bend, n = work.spread, work.bend, work.mean.shape[1] - OF_EPOCH
+    length = spread[h, n + STEP_ALONG, n + STEP_ALONG] - 1e-8
+    vague = min(spread[h, PLACE, PLACE] - length, numbers.start_sigma_m**2)
+    spread[h, n + STEP_RIGHT, n + STEP_RIGHT] += vague * bend[0] ** 2
+    spread[h, n + STEP_UP, n + STEP_UP] += vague * bend[1] ** 2

@@ -1,0 +1,440 @@
+"""Epochs one after the other (`railfix.tracking.filter`): the part of the recursion that is compiled."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.tracking.algebra import invert, median, most_probable, restart
+from railfix.kernels.tracking.course import onto_line
+from railfix.kernels.tracking.equations import combine, write_equations
+from railfix.kernels.tracking.hypotheses import keep_hypotheses, reweigh
+from railfix.kernels.tracking.layout import (
+    ACCELERATION,
+    C_SPEED,
+    C_WAY,
+    CODE_CLOCK,
+    COMBINED,
+    DIRECTION,
+    DRIFT,
+    HYPOTHESES,
+    MAP_SCALE,
+    MEASURED,
+    OF_EPOCH,
+    OLD_PLACE,
+    PHASE_CLOCK,
+    PLACE,
+    SCALE_DOPPLER,
+    SCALE_PHASE,
+    SENSORS,
+    SPEED,
+    UNAIDED,
+    WEAK_CODE,
+    WEAK_MOTION,
+    WHEEL_ROW,
+    Active,
+    Answers,
+    Course,
+    Epochs,
+    Memory,
+    Numbers,
+    Rows,
+    Subfilters,
+    Work,
+)
+from railfix.kernels.tracking.level import advance_subfilters, level_of
+from railfix.kernels.tracking.misfit import code_shift, learn_map
+from railfix.kernels.tracking.prediction import add_bend, predict
+from railfix.kernels.tracking.update import apply_update, evidence_of, first_weights, reweight
+
+
+@inner
+def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, memory: Memory) -> bool:
+    """Return whether numpy has to do an epoch: a restart, a search, or places that go round a closed line."""
+    scalars, count = memory.scalars, int(memory.scalars[HYPOTHESES])
+    left = epochs.left[t]
+    left = left or scalars[WEAK_MOTION] >= numbers.lost_motion_s or scalars[WEAK_CODE] >= numbers.lost_code_s
+    left = left or (scalars[WEAK_MOTION] > 0.0 and count <= numbers.most_hypotheses // 2)
+    # Beyond an end of a closed line numpy lets places go on where it closes.
+    for h in range(count):
+        left = left or (memory.mean[h, PLACE] < course.arc_m[0] and course.start_m == -math.inf)
+        left = left or (memory.mean[h, PLACE] > course.arc_m[-1] and course.end_m == math.inf)
+    return left
+
+
+@inner
+def _choose_rows(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows: Rows) -> bool:
+    """List the channels of each kind of measurement; return False where numpy has to seek places first."""
+    counts = rows.counts
+    for kind in range(4):
+        counts[kind] = 0
+    known = True
+    for k in range(epochs.has.shape[2]):
+        if epochs.has[0, t, k]:
+            known = known and memory.offset_known[epochs.offset[k]]
+            rows.codes[counts[0]] = k
+            counts[0] += 1
+        if epochs.has[1, t, k]:
+            rows.phases[counts[1]] = k
+            counts[1] += 1
+        if epochs.has[2, t, k]:
+            rows.dopplers[counts[2]] = k
+            counts[2] += 1
+    return known and not (counts[0] > 0 and epochs.time_s[t] - memory.scalars[MEASURED] > numbers.gap_s)
+
+
+@inner
+def _choose_sensors(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows: Rows, work: Work) -> None:
+    """List the sensors that have measured; a wheel without a sign needs a direction."""
+    count = int(memory.scalars[HYPOTHESES])
+    for kind in range(SENSORS):
+        known = math.isfinite(epochs.sensor[t, kind])
+        if kind == WHEEL_ROW and epochs.unsigned and memory.scalars[DIRECTION] == 0.0:
+            for h in range(count):
+                known = known and abs(work.mean[h, SPEED]) > numbers.direction_mps
+        if known:
+            rows.sensors[rows.counts[3]] = kind
+            rows.counts[3] += 1
+
+
+@inner
+def _forget(epochs: Epochs, t: int, active: Active, memory: Memory, bank: Subfilters) -> None:
+    """Make the code errors of satellites that come into view independent of all else."""
+    for i in range(epochs.fresh.shape[1]):
+        if epochs.fresh[t, i]:
+            k = active.satellite[i]
+            for h in range(int(memory.scalars[HYPOTHESES])):
+                memory.mean[h, k] = 0.0
+                restart(memory.covariance, k, 1.0, h)
+            for b in range(len(bank.running)):
+                if bank.running[b]:
+                    bank.mean[b, k] = 0.0
+                    restart(bank.covariance, k, 1.0, b)
+
+
+@inner
+def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covariance: Floats, h: int) -> None:
+    """Copy a row of the compact unknowns."""
+    for c in range(mean.shape[1]):
+        mean[to, c] = new_mean[h, c]
+        for e in range(mean.shape[1]):
+            covariance[to, c, e] = new_covariance[h, c, e]
+
+
+@inner
+def _coast(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    numbers: Numbers,
+    active: Active,
+    memory: Memory,
+    bank: Subfilters,
+    work: Work,
+    h: int,
+) -> None:
+    """Take over the prediction of all hypotheses and sub-filters where nothing is measured; row `h` is free."""
+    for k in range(int(memory.scalars[HYPOTHESES])):
+        _take(memory.mean, memory.covariance, k, work.mean, work.spread, k)
+    for b in range(len(bank.running)):
+        if bank.running[b]:
+            scale = memory.scalars[MAP_SCALE]
+            predict(epochs, t, course, numbers, active, bank.mean, bank.covariance, b, scale, work, h)
+            _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
+
+
+@inner
+def _write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, variance: Floats) -> None:
+    """Write the variances of the measurements, with what has been learnt of phases and Dopplers."""
+    nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
+    for i in range(nc):
+        variance[i] = epochs.variance[0, t, rows.codes[i]]
+    for i in range(nph):
+        variance[nc + i] = epochs.variance[1, t, rows.phases[i]] * math.exp(memory.scalars[SCALE_PHASE])
+    for i in range(nd):
+        variance[nc + nph + i] = epochs.variance[2, t, rows.dopplers[i]] * math.exp(memory.scalars[SCALE_DOPPLER])
+    for j in range(rows.counts[3]):
+        variance[nc + nph + nd + j] = epochs.sensor_sigma[t, rows.sensors[j]] ** 2
+
+
+@inner
+def _start_clocks(numbers: Numbers, rows: Rows, work: Work, h: int) -> None:
+    """Take the median of each kind of innovation into its clock; clocks that have stepped begin anew."""
+    mean, spread, value = work.mean, work.spread, work.value
+    n = mean.shape[1] - OF_EPOCH
+    work.anew[h, 0] = work.anew[h, 1] = False
+    begin = 0
+    for kind in range(3):
+        end = begin + rows.counts[kind]
+        if end > begin:
+            middle = median(value, h, begin, end - begin, work.ordered)
+            unknown = n + CODE_CLOCK if kind == 0 else (n + PHASE_CLOCK if kind == 1 else DRIFT)
+            own_variance = spread[h, unknown, unknown]
+            stepped = own_variance > numbers.unknown_clock**2
+            stepped = stepped or abs(middle) > numbers.stepped * math.sqrt(own_variance + 0.25)
+            if kind == 0 or stepped:
+                mean[h, unknown] += middle
+                for i in range(begin, end):
+                    value[h, i] -= middle
+            if kind > 0 and stepped:
+                restart(spread, unknown, numbers.unknown_clock**2, h)
+                work.anew[h, kind - 1] = True
+        begin = end
+
+
+@inner
+def _doubtful(numbers: Numbers, rows: Rows, work: Work, h: int) -> bool:
+    """Return whether codes, or phases and Dopplers, have lost so much weight that a second start is worth trying."""
+    nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
+    doubtful = False
+    for part in range(2):
+        first, last = (0, nc) if part == 0 else (nc, gnss)
+        total = 0.0
+        for i in range(first, last):
+            total += work.weight[h, i]
+        doubtful = doubtful or (last > first and total / (last - first) < numbers.doubtful)
+    return doubtful
+
+
+@inner
+def _second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -> None:
+    """Fit again with weights from innovations with place and speed set free, in row `other`; keep the better fit."""
+    own, root, sensed, share = work.own, work.root, work.sensed, work.right
+    nc, ns = rows.counts[0], rows.counts[3]
+    gnss, size = nc + rows.counts[1] + rows.counts[2], nc + COMBINED + ns
+    for i in range(size):
+        for j in range(i, size):
+            own[other, i, j] = own[h, i, j]
+    for kind in range(2):
+        for i in range(size):
+            coefficient = 0.0
+            if i >= nc + COMBINED:
+                coefficient = sensed[h, i - nc - COMBINED, 0 if kind == 0 else 2]
+            elif kind == 0 and i < nc:
+                coefficient = work.design[h, i, 0]
+            elif i == (nc + C_WAY if kind == 0 else nc + C_SPEED):
+                coefficient = 1.0
+            share[i] = coefficient / root[h, i]
+        freedom = numbers.freedom_place if kind == 0 else numbers.freedom_speed
+        for i in range(size):
+            for j in range(i, size):
+                own[other, i, j] += freedom * share[i] * share[j]
+    invert(own, other, size, work, work.information, other)
+    first_weights(rows, work.variance, numbers.degrees, numbers.freedom_place, numbers.freedom_speed, work, h, other)
+    log_after = 0.0
+    for by in (other, h):
+        log_after = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, by, other)
+    first = evidence_of(rows, numbers.degrees, work.log_after[h], work, h, h)
+    if evidence_of(rows, numbers.degrees, log_after, work, h, other) > first:
+        work.log_after[h] = log_after
+        for i in range(size):
+            work.change[h, i] = work.change[other, i]
+            for j in range(size):
+                work.after[h, i, j] = work.after[other, i, j]
+        for i in range(gnss + ns):
+            work.weight[h, i], work.residual[h, i] = work.weight[other, i], work.residual[other, i]
+            work.fitted[h, i] = work.fitted[other, i]
+
+
+@inner
+def _update(
+    epochs: Epochs,
+    t: int,
+    course: Course,
+    numbers: Numbers,
+    active: Active,
+    memory: Memory,
+    rows: Rows,
+    work: Work,
+) -> float:
+    """Update all hypotheses by the measurements of an epoch; return the shift that codes ask of the one in the lead."""
+    mean, new_mean = work.mean, work.new_mean
+    n, room = mean.shape[1] - OF_EPOCH, mean.shape[0] - 1
+    count, nc = int(memory.scalars[HYPOTHESES]), rows.counts[0]
+    gnss = nc + rows.counts[1] + rows.counts[2]
+    size = nc + COMBINED + rows.counts[3]
+    going = most_probable(memory.log_probability, count, numbers.switch)
+    shift, doubtful = 0.0, False
+    for turn in range(1 + numbers.relinearised):
+        furthest = 0.0
+        for h in range(count):
+            work.now[h] = new_mean[h, PLACE] if turn else mean[h, PLACE]
+            work.before[h] = new_mean[h, n] if turn else mean[h, n + OLD_PLACE]
+            write_equations(epochs, t, course, active, numbers, rows, memory.scalars[DIRECTION], work, h)
+            if turn == 0:
+                add_bend(numbers, work, h)
+                _start_clocks(numbers, rows, work, h)
+                for i in range(gnss + rows.counts[3]):
+                    work.innovation[h, i] = work.value[h, i]
+            combine(epochs, t, active, numbers.sensor_floor, rows, work, h)
+            work.log_before[h] = invert(work.own, h, size, work, work.information, h)
+            if turn == 0:
+                first_weights(rows, work.variance, numbers.degrees, 0.0, 0.0, work, h, h)
+                if h == going and nc >= numbers.misfit_codes:
+                    shift = code_shift(rows, numbers.misfit_clipped, work, h)
+            work.log_after[h] = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, h, h)
+            doubtful = doubtful or (turn == 0 and _doubtful(numbers, rows, work, h))
+        for h in range(count):
+            if turn == 0 and doubtful:
+                _second_start(numbers, rows, work, h, room)
+            apply_update(rows, work, h)
+            furthest = max(furthest, abs(new_mean[h, PLACE] - work.now[h]))
+        if furthest < numbers.moved_m:
+            break
+    if count > 1:
+        reweigh(course, numbers, rows, memory, work, count)
+    for h in range(count):
+        onto_line(course, numbers.start_sigma_m, work, h)
+        _take(memory.mean, memory.covariance, h, new_mean, work.new_covariance, h)
+    return shift
+
+
+@inner
+def _learn(
+    numbers: Numbers,
+    memory: Memory,
+    answers: Answers,
+    rows: Rows,
+    work: Work,
+    t: int,
+    best: int,
+    shift: float,
+    dt: float,
+) -> None:
+    """Learn the noise of phases and Dopplers and the error of the map; write weights and innovations."""
+    scalars, weight, innovation = memory.scalars, work.weight, work.innovation
+    nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
+    gnss = nc + nph + nd
+    share = 1.0 - math.exp(-min(dt, 1.0) / numbers.scale_s)
+    for kind in range(2):
+        begin, end = (nc, nc + nph) if kind == 1 else (nc + nph, gnss)
+        scalar = SCALE_PHASE if kind == 1 else SCALE_DOPPLER
+        if end - begin > 3:
+            total = 0.0
+            for i in range(begin, end):
+                square = work.residual[best, i] ** 2 + work.fitted[best, i]
+                total += weight[best, i] * square / work.variance[i]
+            scalars[scalar] += share * math.log(total / (end - begin))
+        scalars[scalar] = min(max(scalars[scalar], numbers.least_scale), numbers.largest_scale)
+    code, motion = math.nan, math.nan
+    if nc:
+        code = 0.0
+        for i in range(nc):
+            code += weight[best, i] / nc
+    if gnss > nc:
+        motion = 0.0
+        for i in range(nc, gnss):
+            motion += weight[best, i] / (gnss - nc)
+    scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if motion < numbers.lost_motion_weight else 0.0
+    scalars[WEAK_CODE] = scalars[WEAK_CODE] + dt if code < numbers.lost_code_weight else 0.0
+    learn_map(scalars, 0.0 if best else shift, dt, numbers)
+    answers.code_weight[t], answers.motion_weight[t] = code, motion
+    for i in range(gnss):
+        kind = 0 if i < nc else (1 if i < nc + nph else 2)
+        k = rows.codes[i] if kind == 0 else (rows.phases[i - nc] if kind == 1 else rows.dopplers[i - nc - nph])
+        answers.innovation[t, kind, k] = innovation[best, i]
+        answers.weight[t, kind, k] = weight[best, i]
+        answers.used[t, kind] += weight[best, i] > 0.5
+    for j in range(rows.counts[3]):
+        answers.used[t, 3 + rows.sensors[j]] += weight[best, gnss + j] > 0.5
+        answers.sensed[t, rows.sensors[j]] = innovation[best, gnss + j]
+
+
+@inner
+def _finish(
+    t: int,
+    best: int,
+    aided: bool,
+    measured: bool,
+    dt: float,
+    numbers: Numbers,
+    active: Active,
+    memory: Memory,
+    bank: Subfilters,
+    answers: Answers,
+    work: Work,
+) -> None:
+    """End an epoch: direction, way without codes, hypotheses to go on with; write its answer."""
+    scalars = memory.scalars
+    count = int(scalars[HYPOTHESES])
+    speed = memory.mean[best, SPEED]
+    if abs(speed) > numbers.direction_mps:
+        scalars[DIRECTION] = math.copysign(1.0, speed)
+    scalars[UNAIDED] = 0.0 if aided else scalars[UNAIDED] + abs(speed) * dt
+    if count > 1:
+        count = keep_hypotheses(memory, numbers, work, count)
+        scalars[HYPOTHESES] = count
+    probability = math.exp(memory.log_probability[0])
+    sigma = math.sqrt(memory.covariance[0, PLACE, PLACE])
+    answers.hypotheses[t], answers.probability[t] = count, probability
+    if sigma > numbers.expired_sigma_m:
+        answers.status[t] = numbers.expired
+        return
+    answers.arc_m[t], answers.sigma_m[t] = memory.mean[0, PLACE], sigma
+    answers.speed_mps[t] = memory.mean[0, SPEED]
+    answers.speed_sigma_mps[t] = math.sqrt(memory.covariance[0, SPEED, SPEED])
+    answers.acceleration_mps2[t] = memory.mean[0, ACCELERATION]
+    if active.wheel >= 0:
+        answers.wheel_scale[t] = memory.mean[0, active.wheel]
+    if active.force >= 0:
+        answers.force_offset_mps2[t] = memory.mean[0, active.force]
+    if active.radar >= 0:
+        answers.radar_scale[t] = memory.mean[0, active.radar]
+    answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
+    if len(bank.running):
+        level = level_of(memory.mean[0, PLACE], sigma, bank, numbers, answers, t)
+        # Contradicted by its measurements the track itself is in doubt, which no sub-filter beside it bounds.
+        doubtful = answers.code_weight[t] < numbers.lost_code_weight
+        if doubtful or answers.motion_weight[t] < numbers.lost_motion_weight:
+            level = math.inf
+        answers.level_m[t] = level
+        answers.amount_m[t] = max(level, numbers.scale_bound * scalars[UNAIDED])
+    if measured:
+        answers.status[t] = numbers.tracking if probability >= numbers.decided else numbers.several
+    else:
+        answers.status[t] = numbers.coasting
+
+
+@kernel
+def advance(
+    epochs: Epochs,
+    course: Course,
+    numbers: Numbers,
+    active: Active,
+    memory: Memory,
+    bank: Subfilters,
+    answers: Answers,
+    rows: Rows,
+    work: Work,
+    first: int,
+    last: int,
+) -> int:
+    """Do epochs from `first` on; return the first that is left to numpy, or `last`."""
+    scalars, room = memory.scalars, len(memory.log_probability)
+    for t in range(first, last):
+        if _left_to_numpy(epochs, t, course, numbers, memory):
+            return t
+        if not _choose_rows(epochs, t, numbers, memory, rows):
+            return t
+        count, dt, map_scale = int(scalars[HYPOTHESES]), epochs.interval_s[t], scalars[MAP_SCALE]
+        _forget(epochs, t, active, memory, bank)
+        for h in range(count):
+            predict(epochs, t, course, numbers, active, memory.mean, memory.covariance, h, map_scale, work, h)
+        _choose_sensors(epochs, t, numbers, memory, rows, work)
+        measured = rows.counts[0] + rows.counts[1] + rows.counts[2] + rows.counts[3] > 0
+        shift = 0.0
+        if measured:
+            _write_variances(epochs, t, memory, rows, work.variance)
+            shift = _update(epochs, t, course, numbers, active, memory, rows, work)
+            scalars[MEASURED] = epochs.time_s[t]
+        else:
+            _coast(epochs, t, course, numbers, active, memory, bank, work, room)
+        best = most_probable(memory.log_probability, count, numbers.switch)
+        if measured:
+            _learn(numbers, memory, answers, rows, work, t, best, shift, dt)
+            if len(bank.running):
+                advance_subfilters(epochs, t, course, numbers, active, bank, rows, best, map_scale, work, room)
+        aided = rows.counts[0] > 0
+        _finish(t, best, aided, measured, dt, numbers, active, memory, bank, answers, work)
+    return last

@@ -1,0 +1,199 @@
+"""Robust update by the measurements of an epoch (`railfix.tracking.robust`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.arrays import Floats
+from railfix.kernels.compiling import inner
+from railfix.kernels.tracking.algebra import invert, median
+from railfix.kernels.tracking.layout import C_RIGHT, C_WAY, COMBINED, Rows, Work
+
+
+@inner
+def weight_of(square: float, late: bool, degrees: tuple[float, float]) -> float:
+    """Weight of a measurement by its square over its variance: `railfix.tracking.robust.Tails`."""
+    own = degrees[1] if late else degrees[0]
+    return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
+
+
+@inner
+def first_weights(
+    rows: Rows,
+    variance: Floats,
+    degrees: tuple[float, float],
+    freedom_place: float,
+    freedom_speed: float,
+    work: Work,
+    h: int,
+    to: int,
+) -> None:
+    """Weights from innovations, without what clocks take up."""
+    design, value, root, own, weight = work.design, work.value, work.root, work.own, work.weight
+    counts, sensed, part = rows.counts, work.sensed, work.part
+    nc, gnss = counts[0], counts[0] + counts[1] + counts[2]
+    first = 0
+    for kind in range(3):
+        size = counts[kind]
+        if size == 0:
+            continue
+        middle = median(value, h, first, size, work.ordered)
+        for i in range(first, first + size):
+            if kind == 0:
+                spread = root[h, i] * root[h, i] + design[h, i, 0] ** 2 * freedom_place
+            else:
+                base = nc + C_WAY if kind == 1 else nc + C_RIGHT
+                for c in range(4):
+                    part[c] = design[h, i, c] * root[h, base + c]
+                part[1 if kind == 1 else 3] = 0.0
+                spread = 0.0
+                for c in range(4):
+                    for e in range(4):
+                        spread += part[c] * own[h, base + c, base + e] * part[e]
+                spread += design[h, i, 0] ** 2 * freedom_place if kind == 1 else design[h, i, 2] ** 2 * freedom_speed
+            away = value[h, i] - middle
+            weight[to, i] = weight_of(away * away / (spread + variance[i]), away > 0.0 and kind == 0, degrees)
+        first += size
+    for j in range(counts[3]):
+        i = gnss + j
+        spread = (
+            root[h, nc + COMBINED + j] ** 2
+            + sensed[h, j, 0] ** 2 * freedom_place
+            + sensed[h, j, 2] ** 2 * freedom_speed
+        )
+        weight[to, i] = weight_of(value[h, i] * value[h, i] / (spread + variance[i]), False, degrees)
+
+
+@inner
+def reweight(
+    rows: Rows, variance: Floats, degrees: tuple[float, float], passes: int, work: Work, h: int, by: int, to: int
+) -> float:
+    """Rounds of reweighting; return log det of the covariance of the combinations after the epoch."""
+    design, value, root, information, system = work.design, work.value, work.root, work.information, work.system
+    change, after, weight, right = work.change, work.after, work.weight, work.right
+    residual, spread = work.residual, work.fitted
+    nc, nph, ns = rows.counts[0], rows.counts[1], rows.counts[3]
+    gnss, size = nc + nph + rows.counts[2], nc + COMBINED + ns
+    log_determinant = 0.0
+    clock = root[h, nc]
+    part = work.part
+    for turn in range(passes):
+        for i in range(size):
+            right[i] = 0.0
+            for j in range(i, size):
+                system[to, i, j] = information[by, i, j]
+        for i in range(nc):
+            w = weight[to, i] / variance[i]
+            a = root[h, i] * w
+            system[to, i, i] += a * root[h, i]
+            system[to, i, nc] += a * clock
+            system[to, nc, nc] += w * clock * clock
+            right[i] += a * value[h, i]
+            right[nc] += w * clock * value[h, i]
+        for i in range(nc, gnss):
+            base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
+            w = weight[to, i] / variance[i]
+            for c in range(4):
+                part[c] = design[h, i, c] * root[h, base + c]
+            for c in range(4):
+                a = w * part[c]
+                right[base + c] += a * value[h, i]
+                for e in range(c, 4):
+                    system[to, base + c, base + e] += a * part[e]
+        for j in range(ns):
+            i, k = gnss + j, nc + COMBINED + j
+            a = root[h, k] * weight[to, i] / variance[i]
+            system[to, k, k] += a * root[h, k]
+            right[k] += a * value[h, i]
+        log_determinant = -invert(system, to, size, work, after, to)
+        for i in range(size):
+            total = 0.0
+            for j in range(size):
+                total += after[to, i, j] * right[j]
+            change[to, i] = total
+        for i in range(nc):
+            residual[to, i] = value[h, i] - root[h, i] * change[to, i] - clock * change[to, nc]
+            spread[to, i] = (
+                root[h, i] * root[h, i] * after[to, i, i]
+                + 2.0 * root[h, i] * clock * after[to, i, nc]
+                + clock * clock * after[to, nc, nc]
+            )
+        for i in range(nc, gnss):
+            base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
+            fitted, square = 0.0, 0.0
+            for c in range(4):
+                part[c] = design[h, i, c] * root[h, base + c]
+                fitted += part[c] * change[to, base + c]
+            for c in range(4):
+                for e in range(4):
+                    square += part[c] * part[e] * after[to, base + c, base + e]
+            residual[to, i] = value[h, i] - fitted
+            spread[to, i] = square
+        for j in range(ns):
+            i, k = gnss + j, nc + COMBINED + j
+            residual[to, i] = value[h, i] - root[h, k] * change[to, k]
+            spread[to, i] = root[h, k] * root[h, k] * after[to, k, k]
+        if turn < passes - 1:
+            for i in range(gnss + ns):
+                square = (residual[to, i] ** 2 + spread[to, i]) / variance[i]
+                weight[to, i] = weight_of(square, residual[to, i] > 0.0 and i < nc, degrees)
+    return log_determinant
+
+
+@inner
+def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work: Work, h: int, to: int) -> float:
+    """Logarithm of the evidence of the measurements, for the fit in row `to`."""
+    residual, variance, change, information = work.residual, work.variance, work.change, work.information
+    nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
+    size = nc + COMBINED + rows.counts[3]
+    usual, late = degrees
+    fit = 0.0
+    for i in range(gnss + rows.counts[3]):
+        own = late if i < nc and residual[to, i] > 0.0 else usual
+        fit += own * math.log1p(residual[to, i] ** 2 / (own * variance[i]))
+    away = 0.0
+    for i in range(size):
+        total = 0.0
+        for j in range(size):
+            total += information[h, i, j] * change[to, j]
+        away += change[to, i] * total
+    return float(-0.5 * (usual + 1.0) / usual * fit - 0.5 * away + 0.5 * (log_after - work.log_before[h]))
+
+
+@inner
+def apply_update(rows: Rows, work: Work, h: int) -> None:
+    """Write mean and covariance of the compact unknowns after the epoch, and behind them the mean of the old place."""
+    mean, spread, cross, own, information = work.mean, work.spread, work.cross, work.own, work.information
+    after, change, gain, less = work.after, work.change, work.gain, work.less
+    new_mean, new_covariance = work.new_mean, work.new_covariance
+    size, n = rows.counts[0] + COMBINED + rows.counts[3], new_covariance.shape[1]
+    for i in range(size):
+        for c in range(n + 1):
+            gain[i, c] = 0.0
+        for j in range(size):
+            share = information[h, i, j]
+            for c in range(n + 1):
+                gain[i, c] += share * cross[h, j, c]
+    for i in range(size):
+        for c in range(n):
+            less[i, c] = 0.0
+        for j in range(size):
+            share = own[h, i, j] - after[h, i, j]
+            for c in range(n):
+                less[i, c] += share * gain[j, c]
+    for c in range(n + 1):
+        new_mean[h, c] = mean[h, c]
+    for i in range(size):
+        for c in range(n + 1):
+            new_mean[h, c] += gain[i, c] * change[h, i]
+    for c in range(n):
+        for e in range(c + 1):
+            new_covariance[h, c, e] = spread[h, c, e]
+    for i in range(size):
+        for c in range(n):
+            share = gain[i, c]
+            for e in range(c + 1):
+                new_covariance[h, c, e] -= share * less[i, e]
+    for c in range(n):
+        for e in range(c):
+            new_covariance[h, e, c] = new_covariance[h, c, e]
