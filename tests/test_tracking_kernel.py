@@ -45,7 +45,7 @@ def _case(name: str) -> tuple[GnssEpochs, Line, SensorEpochs | None]:
     if name == "branches":
         case = ride(120, trajectory=bent_line(1500.0, turn_deg=190.0), noise=1.0, code_sigma_m=8.0)
         return case.epochs, case.line, None
-    case = ride(300 if name == "10 Hz" else 140, rate_hz=10.0 if name == "10 Hz" else 1.0, noise=1.0, seed=5)
+    case = ride(60 if name == "10 Hz" else 140, rate_hz=10.0 if name == "10 Hz" else 1.0, noise=1.0, seed=5)
     epochs, sensors = case.epochs, None
     if name == "sensors":
         size = len(case.arc_m)

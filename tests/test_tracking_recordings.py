@@ -43,7 +43,7 @@ def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> Non
 
 
 @pytest.mark.requirement("E5", "C2")
-@pytest.mark.parametrize("azimuth_deg", [0.0, 90.0])
+@pytest.mark.parametrize("azimuth_deg", [0.0, pytest.param(90.0, marks=pytest.mark.slow)])
 def test_half_a_day_at_rest_is_not_averaged_away(recordings: Path, azimuth_deg: float) -> None:
     """Errors of orbits and ionosphere last hours: a filter that averages over them states centimetres."""
     folder = recordings / "static" / "ESBC_2020177"
