@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.errors import InputFileError, OutputError
 from railfix.core.reasons import Reason
 from railfix.pipeline.config import Config
@@ -25,7 +26,7 @@ class _Rows:
 
     positions: pl.DataFrame
     observations: pl.LazyFrame
-    epoch: Indices
+    epoch: NDArray[np.int32]
 
     def channels(self, column: str) -> Floats:
         """One column of the observations in the precision of charts, shape (N, 1)."""
@@ -111,7 +112,7 @@ class RunScreen:
     antenna: str
     name: str
     picture: ScreenPicture
-    epoch: Indices | None
+    epoch: NDArray[np.int32] | None
     epoch_time: Datetimes
     epoch_chainage_m: Floats
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from railfix.core.arrays import Datetimes, Floats, Indices, Masks
+from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.files import staged_file
 from railfix.core.timescale import seconds
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
@@ -62,7 +63,7 @@ def draw_screen(
     return _save(figure, path)
 
 
-def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: Indices | None = None) -> Chart:
+def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
     """Chart of a metric against its limit over time.
 
     Parameters
@@ -80,7 +81,9 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: Indices 
     return _screen(picture, seconds(time - start), epoch, name="time", x_label="GPS time", start=start)
 
 
-def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats, *, epoch: Indices | None = None) -> Chart:
+def screen_over_chainage(
+    picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
+) -> Chart:
     """Chart of a metric against its limit over the place.
 
     Parameters
@@ -100,7 +103,7 @@ def screen_over_chainage(picture: ScreenPicture, chainage_m: Floats, *, epoch: I
 def _screen(
     picture: ScreenPicture,
     x: Floats,
-    epoch: Indices | None,
+    epoch: NDArray[np.integer] | None,
     *,
     name: str,
     x_label: str,
@@ -152,7 +155,9 @@ def _screen(
     )
 
 
-def _blocks(picture: ScreenPicture, x: Floats, epoch: Indices | None) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
+def _blocks(
+    picture: ScreenPicture, x: Floats, epoch: NDArray[np.integer] | None
+) -> Iterator[tuple[Floats, Floats, Masks, Floats]]:
     """Give x, metric, reject and limit of a picture, `_BLOCK` rows at a time, flat: long runs need little memory."""
     limit = np.broadcast_to(picture.limit, picture.metric.shape)
     for first in range(0, len(picture.metric), _BLOCK):
