@@ -9,7 +9,9 @@ without the stages inside it, the least of the rounds; ``RAILFIX_KERNELS`` choos
 from __future__ import annotations
 
 import argparse
+import compileall
 import importlib
+import os
 import sys
 import tempfile
 import time
@@ -22,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import bench_run
 
+import railfix
 from railfix.kernels import kernels_in_use
 
 #: Stages: name, module in which the function is looked up when it is called, function.
@@ -113,6 +116,9 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="folder of a simulated run, made with --plain")
     parser.add_argument("--rounds", type=int, default=3)
     options = parser.parse_args()
+    if "PYTHONDONTWRITEBYTECODE" in os.environ:  # an installed package has its compiled modules
+        compileall.compile_dir(Path(railfix.__file__).parent, quiet=1)
+        os.execve(sys.executable, [sys.executable, *sys.argv], bench_run.as_installed())
     from railfix.pipeline.config import Config
     from railfix.run import RunInputs, RunOptions, run_files
 

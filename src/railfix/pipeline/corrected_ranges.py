@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings
+from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, changed
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -18,7 +19,7 @@ from railfix.pipeline.received import Received
 from railfix.positioning.carrier import Slips
 from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.section_search import SearchIndex, search
-from railfix.positioning.single_point import single_point
+from railfix.positioning.single_point import SinglePointLimits, single_point
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
@@ -126,7 +127,7 @@ class CorrectedRanges:
     def rejected(self, mask: Masks, reason: Reason) -> CorrectedRanges:
         """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
         hit = mask & ((self.reason & Reason.NOT_OBSERVED) == 0)
-        return replace(self, reason=np.where(hit, self.reason | int(reason), self.reason))
+        return changed(self, reason=np.where(hit, self.reason | int(reason), self.reason))
 
     def judged(self, verdicts: Iterable[Verdict]) -> CorrectedRanges:
         """Return the ranges with the verdicts of a screen: what fails is rejected, or weighted down."""
@@ -136,8 +137,8 @@ class CorrectedRanges:
             if verdict.error_m is None:
                 ranges = ranges.rejected(reject, verdict.reason)
             else:
-                ranges = replace(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
-            ranges = replace(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
+                ranges = changed(ranges, sigma_m=suspicion_sigma_m(reject, verdict.error_m, ranges.sigma_m))
+            ranges = changed(ranges, screens={**ranges.screens, verdict.name: verdict.screened})
         return ranges
 
     def ranges(self) -> Ranges:
@@ -261,8 +262,7 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
     """
     trajectory = index.trajectory
     middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
-    rough = config.single_point.replaced(tolerance_m=max(ANCHOR_TOLERANCE_M, config.single_point.tolerance_m))
-    point = single_point(ranges, middle, limits=rough)
+    point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
     found = np.flatnonzero(np.isfinite(anchor[:, 0]))
     distance, vertex = index.tree.query(anchor[found])
@@ -273,6 +273,11 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
         best = search(ranges.take(rest), index, point.take(rest), limits=config.section).vertex
         anchor[rest] = np.where((best >= 0)[:, None], trajectory.ecef_m[best], middle[rest])
     return anchor
+
+
+@lru_cache
+def _rough(limits: SinglePointLimits) -> SinglePointLimits:
+    return limits.replaced(tolerance_m=max(ANCHOR_TOLERANCE_M, limits.tolerance_m))
 
 
 def _reasons_of_codes(satellite: Strings, code: Floats) -> Bits:

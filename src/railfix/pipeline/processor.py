@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from railfix.core.arrays import changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
@@ -377,8 +378,8 @@ class AntennaChunk:
             doubtful = verdict.screened.reject & self._processor._has_coordinates[status]
             status = np.where(doubtful, verdict.status, status).astype(np.int8)
             screens = {**self._ranges.screens, verdict.name: verdict.screened}
-            self._ranges = replace(self._ranges, screens=screens)
-            self._solution = replace(self._solution, status=status)
+            self._ranges = changed(self._ranges, screens=screens)
+            self._solution = changed(self._solution, status=status)
 
     def finished(self) -> AntennaResult:
         """Return the result of the chunk."""

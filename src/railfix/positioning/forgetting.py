@@ -6,8 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.timescale import seconds
+from railfix.kernels import compiled_by
 
 #: Windows that one running sum spans; exp(50) = 5e21, so that it overflows nowhere and keeps all digits of its terms.
 _SPAN: Final = 50.0
@@ -22,8 +23,14 @@ def steps_s(time: Datetimes, last: np.datetime64) -> Floats:
     last : datetime64[ns]
         Epoch before the first one; NaT where there is none.
     """
-    before = np.concatenate([np.asarray([last], dtype="datetime64[ns]"), time])
-    return np.fmax(seconds(before[1:] - before[:-1]), 0.0)
+    return steps_of(time.astype(np.int64), int(np.asarray(last, dtype="datetime64[ns]").astype(np.int64)))
+
+
+@compiled_by("forgetting")
+def steps_of(time_ns: Integers, last_ns: int) -> Floats:
+    """Compute `steps_s` of instants as numbers of nanoseconds."""
+    time = np.concatenate([[last_ns], time_ns]).astype("datetime64[ns]")
+    return np.fmax(seconds(np.diff(time)), 0.0)
 
 
 def ages(time: Datetimes, last: np.datetime64, last_age: float, *, window_s: float, least_epochs: float) -> Floats:
@@ -69,8 +76,14 @@ def decayed_sums(age: Floats, values: Floats, start: Floats, last_age: float) ->
     after : ndarray, shape (K,)
         Running sums after the last epoch: `start` of the next chunk.
     """
+    return decayed(age, np.ascontiguousarray(values), np.asarray(start, dtype=np.float64), float(last_age))
+
+
+@compiled_by("forgetting")
+def decayed(age: Floats, values: Floats, start: Floats, last_age: float) -> tuple[Floats, Floats]:
+    """Compute `decayed_sums`; arrays in C order."""
     span = np.floor(age / _SPAN)
-    current, of_current = np.asarray(start, dtype=np.float64), np.floor(last_age / _SPAN)
+    current, of_current = start, np.floor(last_age / _SPAN)
     before = np.empty(values.shape)
     edges = np.flatnonzero(np.concatenate([[True], span[1:] != span[:-1], [True]])) if len(span) else np.zeros(1, int)
     for first, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Floats, Indices, freeze_arrays, read_only
 from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.kernels import compiled_by
 from railfix.track.closing import joins_m
 from railfix.track.polyline import NearestOnPolyline
 from railfix.track.track import (
@@ -202,13 +203,10 @@ class Trajectory(NotebookTable):
         return np.asarray(index, dtype=np.intp), arc - self.arc_m[index]
 
     def _interpolate(self, arc_m: ArrayLike, values: Floats) -> Floats:
-        index, along = self.segment_at(arc_m)
-        share = along / self.length_m[index]
-        beyond = _END_TOLERANCE_M / self.length_m[index]
-        share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)
-        shape = share.shape + (1,) * (values.ndim - 1)
-        # exact at both ends of a segment
-        return np.asarray((1.0 - share.reshape(shape)) * values[index] + share.reshape(shape) * values[index + 1])
+        arc = np.array(arc_m, dtype=np.float64)
+        rows = values.reshape(len(values), -1)
+        result = interpolated(arc.reshape(-1), self.arc_m, self.length_m, rows, _END_TOLERANCE_M)
+        return result.reshape(arc.shape + values.shape[1:])
 
     def at_arc(self, arc_m: ArrayLike) -> Floats:
         """Interpolate the point at an arc length, shape (..., 3) [m]; NaN beyond the ends and for NaN."""
@@ -264,3 +262,26 @@ class Trajectory(NotebookTable):
         known = index >= 0
         arc = np.where(known, self.arc_m[np.maximum(index, 0)] + along, np.nan)
         return arc, offset
+
+
+@compiled_by("trajectory")
+def interpolated(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, tolerance_m: float) -> Floats:
+    """Interpolate values of points of a line, shape (V, C), at arc lengths, shape (n, C); NaN beyond the ends.
+
+    Parameters
+    ----------
+    arc : ndarray, shape (n,) [m]
+    arc_m : ndarray, shape (V,) [m]
+        Of the points.
+    length_m : ndarray, shape (V - 1,) [m]
+        Of the segments.
+    values : ndarray, shape (V, C)
+    tolerance_m : float
+        By which an arc length may lie beyond an end.
+    """
+    index = np.minimum(np.maximum(np.searchsorted(arc_m, arc, side="right") - 1, 0), len(arc_m) - 2)
+    share = (arc - arc_m[index]) / length_m[index]
+    beyond = tolerance_m / length_m[index]
+    share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)[:, None]
+    # exact at both ends of a segment
+    return np.asarray((1.0 - share) * values[index] + share * values[index + 1])
