@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
-from railfix.integrity.raim import constrained_model, point_model
+from railfix.integrity.raim import LinearModel, constrained_model, point_model
 from railfix.positioning.normal_equations import UNTIED_M
 
 pytestmark = pytest.mark.requirement("C2")
@@ -200,6 +201,94 @@ def test_batch_equals_epoch_by_epoch_and_gaps_stay_empty():
     assert len(along_track_level(model.take(np.zeros(0, dtype=int)), list("GGGGGGEEEECC")).level_m) == 0
 
 
+def kinds_of_faults(systems: str) -> tuple[LinearModel, dict[str, Any]]:
+    """Twelve epochs with every kind of hypothesis: some with sides, pairs of sides, triples, a known map offset."""
+    arc, n, rng = np.linspace(200.0, 1800.0, 12), len(systems), np.random.default_rng(4)
+    ranges = oracle.made(arc, systems, seed=8, faults_m={1: 9.0})
+    weight = ranges.weight * (rng.random(ranges.weight.shape) > 0.15)
+    model = constrained_model(replace(ranges, weight=weight), oracle.LINE, arc)
+    sides = rng.random((12, 2, n)) > 0.7
+    sides[::3] = False
+    options: dict[str, Any] = {
+        "risk": RiskBudget(
+            risk_per_hour=1e-3, local_prior=1e-3, side_prior=1e-3, constellation_prior={"E": 1e-7, "C": 1e-6}
+        ),
+        "scale": np.linspace(0.6, 2.0, 12),
+        "least_sigma_m": rng.uniform(0.0, 4.0, (12, n)),
+        "bias_m": rng.uniform(0.0, 1.0, (12, n)),
+        "map_bias_m": rng.normal(size=(12, 2)),
+        "map_seen": (
+            rng.normal(size=(12, 2)),
+            np.tile(np.diag([0.1, 0.01]), (12, 1, 1)) * (rng.random(12) > 0.3)[:, None, None],
+        ),
+        "sides": sides,
+        "n_excluded": np.arange(12) % 3,
+    }
+    return model, options
+
+
+def at(options: dict[str, Any], t: int) -> dict[str, Any]:
+    """Options of one epoch."""
+    one = {name: value[t : t + 1] for name, value in options.items() if isinstance(value, np.ndarray)}
+    seen, known = options["map_seen"]
+    return {**options, **one, "map_seen": (seen[t : t + 1], known[t : t + 1])}
+
+
+@pytest.mark.parametrize("systems", ["GGGGEEEECCCR", "GGGGGGGEEEEEECCCC"])
+def test_epochs_have_the_same_levels_together_and_alone(systems):
+    """Hypotheses that only some epochs of a block ask for have no effect on the others."""
+    model, options = kinds_of_faults(systems)
+    whole, finite = along_track_level(model, list(systems), **options), 0
+    for t in range(12):
+        alone = along_track_level(model.take(np.array([t])), list(systems), **at(options, t))
+        for name in ProtectionLevel.__dataclass_fields__:
+            mine, own = getattr(whole, name)[t : t + 1], getattr(alone, name)
+            if mine.dtype == float:
+                np.testing.assert_allclose(mine, own, rtol=1e-9, err_msg=name)
+            else:
+                np.testing.assert_array_equal(mine, own, err_msg=name)
+        finite += int(np.isfinite(whole.level_m[t]))
+    assert finite > 2
+
+
+@pytest.mark.parametrize("systems", ["GGGGEEEECCCR", "GGE", "GGGGEC"])
+@pytest.mark.parametrize("factor", [1e-4, 1e5])
+def test_levels_have_the_unit_of_the_sigmas(systems, factor):
+    """Ranges and map in another unit: the same levels in that unit, and what nothing checks stays so."""
+    model, options = kinds_of_faults(systems)
+    other = replace(
+        model,
+        root_weight=model.root_weight / factor,
+        clock_covariance_m2=model.clock_covariance_m2 * factor**2,
+        design=model.design / factor,
+        covariance_m2=model.covariance_m2 * factor**2,
+        prior=model.prior / factor**2,
+    )
+    seen, known = options["map_seen"]
+    metres = {name: factor * options[name] for name in ("least_sigma_m", "bias_m", "map_bias_m")}
+    one = along_track_level(model, list(systems), **options)
+    two = along_track_level(
+        other, list(systems), **{**options, **metres, "map_seen": (factor * seen, known / factor**2)}
+    )
+    for name in ("level_m", "fault_free_m", "one_fault_m", "two_fault_m", "sigma_m"):
+        np.testing.assert_allclose(getattr(two, name), factor * getattr(one, name), rtol=1e-6, err_msg=name)
+    np.testing.assert_allclose(two.separation, one.separation, rtol=1e-6)
+    np.testing.assert_array_equal(two.cause, one.cause)
+
+
+def test_the_worst_hypothesis_is_named_by_its_channels_or_its_constellation():
+    few = constrained_model(oracle.made(ARC, "GGGGGCCEE", seed=5), oracle.LINE, ARC)
+    of_one = along_track_level(few, list("GGGGGCCEE"), risk=RiskBudget(constellation_prior={"C": 1e-12, "E": 1e-12}))
+    assert of_one.worst_one[0] >= 0
+    assert of_one.worst_constellation[0] == ""
+    model = constrained_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    many = constrained_model(oracle.made(ARC, "GGGGGGGEEE", seed=5), oracle.LINE, ARC)
+    of_all = along_track_level(many, list("GGGGGGGEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
+    assert (of_all.worst_one[0], of_all.worst_constellation[0]) == (-1, "G")
+    rare = RiskBudget(satellite_prior=dict.fromkeys("GE", 1e-8), local_prior=0.0)
+    assert along_track_level(model, list("GGGGGEEEEE"), risk=rare).worst_two[0].tolist() == [-1, -1]
+
+
 def test_satellite_that_nothing_checks_makes_the_level_infinite_unless_negligible():
     # Two satellites of one clock fix the position: either fault is invisible.
     ranges = oracle.only(oracle.made(ARC, "GGGEEE", seed=2), [0, 3])
@@ -288,5 +377,6 @@ def test_status():
         "ALARM",
         "UNAVAILABLE",
     ]
+    assert availability(0.5, 0.5) == LevelStatus.AVAILABLE
     with pytest.raises(ValueError, match="positive"):
         availability(level, 0.0)
