@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -58,16 +59,56 @@ def allocate(
     wrong_map : bool
         Whether a wrong map is a hypothesis.
     """
+    used = model.used
+    if len(used) == 1:  # live, where the same satellites are used epoch after epoch
+        return _of_one_epoch(
+            _Same(risk), tuple(systems), used.tobytes(), int(out[0]), sides.tobytes(), sides.shape[1], wrong_map
+        )
+    return _allocated(used, systems, risk, out, sides, wrong_map=wrong_map)
+
+
+class _Same:
+    """A budget that is equal to itself alone: its contents are not hashed."""
+
+    def __init__(self, risk: RiskBudget) -> None:
+        self.risk = risk
+
+    def __hash__(self) -> int:
+        return id(self.risk)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.risk is self.risk
+
+
+@lru_cache(maxsize=64)
+def _of_one_epoch(
+    risk: _Same, systems: tuple[str, ...], used: bytes, out: int, sides: bytes, count: int, wrong_map: bool
+) -> Allocation:
+    """Allocation of one epoch, kept: nobody writes into it."""
+    channels = len(systems)
+    return _allocated(
+        np.frombuffer(used, dtype=bool).reshape(1, channels),
+        systems,
+        risk.risk,
+        np.array([out]),
+        np.frombuffer(sides, dtype=bool).reshape(1, count, channels),
+        wrong_map=wrong_map,
+    )
+
+
+def _allocated(
+    used: Masks, systems: Sequence[str], risk: RiskBudget, out: Integers, sides: Masks, *, wrong_map: bool
+) -> Allocation:
     of_channel = risk.prior(systems)
-    prior = model.used * of_channel
+    prior = used * of_channel
     # Excluded satellites count among those that may be faulty, with the largest prior.
     everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * of_channel.max(initial=0.0)], axis=1)
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
-    group_prior = np.zeros((len(model), len(letters)))
-    together = np.zeros(len(model))
+    group_prior = np.zeros((len(used), len(letters)))
+    together = np.zeros(len(used))
     for c, (letter, members) in enumerate(zip(letters, of_letter, strict=True)):
-        group_prior[:, c] = (model.used & members).any(axis=1) * risk.constellation_prior[letter]
+        group_prior[:, c] = (used & members).any(axis=1) * risk.constellation_prior[letter]
         # A constellation and two satellites of others: not checked.
         together += group_prior[:, c] * pair_sum(prior * ~members)
     three, share = more_than_two(everyone), risk.unchecked_share * risk.risk_per_sample
@@ -76,7 +117,7 @@ def allocate(
     # A wrong map with a constellation, or with two satellites.
     of_groups, every = group_prior.sum(axis=1), everyone.sum(axis=1)
     together += map_prior * (of_groups + pair_sum(everyone))
-    side_prior = np.where(np.count_nonzero(sides & model.used[:, None], axis=2) > 1, risk.side_prior, 0.0)
+    side_prior = np.where(np.count_nonzero(sides & used[:, None], axis=2) > 1, risk.side_prior, 0.0)
     # A side with a satellite or a wrong map: not checked, or with two other faults. With a constellation, both sides.
     if not side_prior.any():
         sides, side_prior = sides[:, :0], side_prior[:, :0]
@@ -94,7 +135,7 @@ def allocate(
         side_prior = np.concatenate([side_prior, both_prior * (both > share)[:, None]], axis=1)
         sides_with_one = np.concatenate([sides_with_one, np.zeros(both_prior.shape, dtype=bool)], axis=1)
     beyond = np.where(triples, more_than_three(everyone), three) + together + pair_sum(group_prior)
-    n = np.count_nonzero(model.used, axis=1)
+    n = np.count_nonzero(used, axis=1)
     left = risk.sample_risk(n, out, beyond)
     # With triples every part gives up a quarter to them.
     left = np.where(triples, 0.75, 1.0) * left
