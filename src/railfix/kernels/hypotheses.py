@@ -7,13 +7,13 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 #: `LEAST_REDUNDANCY` of `railfix.integrity.raim.exclusion`, `NO_EFFECT` of `separation`, `_SAME` of `level`.
 _LEAST_REDUNDANCY, _NO_EFFECT, _SAME = 1e-9, 1e-6, 1e-9
 
 
-@kernel
+@inner
 def _of_ranges(left: Floats, gain: Floats, range_bias: Floats, beyond: Floats) -> tuple[float, float, float]:
     """Return what the gains of single ranges add to bias, variance of the distance, and variance."""
     bias, apart, total = 0.0, 0.0, 0.0
@@ -24,7 +24,7 @@ def _of_ranges(left: Floats, gain: Floats, range_bias: Floats, beyond: Floats) -
     return bias, apart, total
 
 
-@kernel
+@inner
 def _separated(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
@@ -39,7 +39,7 @@ def _separated(
     return threshold + bias, math.sqrt(max(total, 0.0) + more[2]), ratio
 
 
-@kernel
+@inner
 def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, gone: Floats) -> bool:
     """Leave out channels one after the other; return whether nothing bounds a fault of them.
 
@@ -66,7 +66,7 @@ def _leave_out(rows: Floats, member: Masks, every: bool, limit: float, work: Flo
     return blind
 
 
-@kernel
+@inner
 def _with_each_later(
     rows: Floats,
     i: int,
@@ -413,7 +413,7 @@ def hypotheses(
     return channel, offset, sigma, weight, bounds, separation
 
 
-@kernel
+@inner
 def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: float) -> tuple[Floats, bool]:
     """Return the covariance of the place with other information in place of the map, and whether there is one."""
     normal, regular = _inverse(covariance)
@@ -427,7 +427,7 @@ def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: 
     return inverse, True
 
 
-@kernel
+@inner
 def _inverse(matrix: Floats) -> tuple[Floats, bool]:
     """Return the inverse of a symmetric 3 x 3 matrix scaled to a unit diagonal, and whether it is regular."""
     inverse, unit = np.empty((3, 3)), np.empty(3)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Codes, Floats, Indices
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 #: Of `railfix.integrity.protection.tails`.
 _CLOSE, _STEPS, _HALVING, _AIM, _ALIKE, _MILLS = 5e-4, 60, 8, 0.002, 1e-9, (0.339, 5.510)
@@ -30,7 +30,7 @@ _SHIFT = 6755399441055744.0 + 1023.0
 _E = tuple(1.0 / math.factorial(k) for k in range(12))
 
 
-@kernel
+@inner
 def _mills(x: float) -> float:
     """Return the Gaussian tail beyond x >= 0 over the density there."""
     y = x * _ROOT_HALF
@@ -39,7 +39,7 @@ def _mills(x: float) -> float:
     return 0.5 * _ROOT_TWO_PI * (p + _P[8]) / (q + _Q[8])
 
 
-@kernel
+@inner
 def _bells(z: Floats, bits: Indices, out: Floats) -> None:
     """Write exp(-z^2/2) into `out`; `bits` is a view of another array of the same length. Loops of vectors."""
     scratch = bits.view(np.float64)
@@ -57,7 +57,7 @@ def _bells(z: Floats, bits: Indices, out: Floats) -> None:
         out[m] *= scratch[m]
 
 
-@kernel
+@inner
 def _quantile(probability: float) -> float:
     """Return the sigmas that noise exceeds on one side with a probability, as `one_sided_k`."""
     if probability >= 1.0:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 #: `railfix.integrity.raim.exclusion.LEAST_REDUNDANCY`.
 _LEAST_REDUNDANCY = 1e-9
@@ -46,7 +46,7 @@ def clear_of_sections(
     return clear
 
 
-@kernel
+@inner
 def _inverse(matrix: Floats) -> Floats:
     """Return the inverse of a symmetric 3 x 3 matrix; not finite where it is singular."""
     inverse = np.empty((3, 3))
@@ -60,7 +60,7 @@ def _inverse(matrix: Floats) -> Floats:
     return inverse
 
 
-@kernel
+@inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
     """Return the tail of the form that is ``1 - tau`` times that of all at least."""
     if not tau < 1.0:

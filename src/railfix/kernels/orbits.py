@@ -6,14 +6,14 @@ import math
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 #: `railfix.gnss.orbits.kepler._GEO_TILT`.
 _COS_X, _SIN_X = math.cos(math.radians(-5.0)), math.sin(math.radians(-5.0))
 _SECOND = 1_000_000_000
 
 
-@kernel
+@inner
 def _sine_cosine(angle: float) -> tuple[float, float]:
     """Return both to the last digit but one, below 1e5 rad; polynomials of fdlibm (Sun Microsystems, 1993).
 
@@ -36,7 +36,7 @@ def _sine_cosine(angle: float) -> tuple[float, float]:
     return (sine, cosine) if quarter < 2 else (-sine, -cosine)
 
 
-@kernel
+@inner
 def _rotated(sine: float, cosine: float, angle: float) -> tuple[float, float]:
     square = angle * angle
     small_sine, small_cosine = angle * (1.0 - square / 6.0), 1.0 - square * (0.5 - square / 24.0)

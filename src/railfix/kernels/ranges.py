@@ -7,13 +7,11 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.kernels.compiling import kernel
-
-_SAGNAC = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
+from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.sight import sight
 
 
-@kernel
+@inner
 def _reduce(
     sat_ecef_m: Floats,
     code_m: Floats,
@@ -39,16 +37,13 @@ def _reduce(
             w = weight[m]
             if not w > 0.0:
                 continue
-            sx, sy, sz = sat_ecef_m[m, 0], sat_ecef_m[m, 1], sat_ecef_m[m, 2]
-            dx, dy, dz = sx - x, sy - y, sz - z
-            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-            ux, uy, uz = -dx / distance, -dy / distance, -dz / distance
-            residual = code_m[m] - (distance + _SAGNAC * (sx * y - sy * x))
-            rows[0, m], rows[1, m], rows[2, m], rows[3, m] = ux, uy, uz, residual
+            distance, ux, uy, uz = sight(sat_ecef_m[m, 0], sat_ecef_m[m, 1], sat_ecef_m[m, 2], x, y, z)
+            residual = code_m[m] - distance
+            rows[0, m], rows[1, m], rows[2, m], rows[3, m] = -ux, -uy, -uz, residual
             total += w
-            mean_x += w * ux
-            mean_y += w * uy
-            mean_z += w * uz
+            mean_x -= w * ux
+            mean_y -= w * uy
+            mean_z -= w * uz
             mean_r += w * residual
         totals[g] = total
         if total > 0.0:
@@ -73,7 +68,7 @@ def _reduce(
             system[i, j] = system[j, i]
 
 
-@kernel
+@inner
 def _tie(
     weight: Floats,
     starts: Indices,
@@ -167,9 +162,8 @@ def misfits(
                 w = weight[t, m]
                 if not w > 0.0:
                     continue
-                sx, sy, sz = sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2]
-                distance = math.sqrt((sx - x) ** 2 + (sy - y) ** 2 + (sz - z) ** 2)
-                residual[m] = code_m[t, m] - (distance + _SAGNAC * (sx * y - sy * x))
+                distance = sight(sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2], x, y, z)[0]
+                residual[m] = code_m[t, m] - distance
                 total += w
                 mean += w * residual[m]
             if total > 0.0:
@@ -191,7 +185,7 @@ def misfits(
     return result
 
 
-@kernel
+@inner
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
     """Clocks and residuals of one epoch after a step (`NormalEquations.after`)."""
     for g in range(len(totals)):
@@ -201,7 +195,7 @@ def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: 
         residual_m[m] = rows[3, m] - (step[0] * rows[0, m] + step[1] * rows[1, m] + step[2] * rows[2, m])
 
 
-@kernel
+@inner
 def _invert(matrix: Floats, inverse: Floats) -> None:
     """Invert a symmetric matrix by its cofactors (`inverse_3x3`)."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
@@ -267,7 +261,7 @@ def iterated_points(
     return place, clock, matrix, covariance, wsse, residual
 
 
-@kernel
+@inner
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 _U = np.uint64
 #: As in `railfix.io.rinex.observations_fields`.
@@ -22,14 +22,14 @@ _LINE_FEEDS, _EACH_1, _EACH_128 = _U(0x0A0A0A0A0A0A0A0A), _U(0x0101010101010101)
 _LOW_PAIR, _HIGH_PAIR = _U(100 + (1_000_000 << 32)), _U(1 + (10_000 << 32))
 
 
-@kernel
+@inner
 def _eight_digits(word: np.uint64) -> np.uint64:
     """See the reference."""
     word = word * _10 + (word >> _8)
     return ((word & _PAIRS) * _LOW_PAIR + ((word >> _16) & _PAIRS) * _HIGH_PAIR) >> _32
 
 
-@kernel
+@inner
 def _word(data: Bytes, at: np.uintp) -> np.uint64:
     """Return eight characters, the first the lowest byte; compiled to one load."""
     word = _U(data[at])

@@ -7,10 +7,9 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.kernels.compiling import kernel
+from railfix.kernels.sight import sight
 
-_SAGNAC = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: `railfix.positioning.robust_fit._LEAST_SCALE`.
 _LEAST_SCALE = 0.05
 
@@ -52,11 +51,10 @@ def reweighted(
                 w = weight[t, m]
                 if not w > 0.0:
                     continue
-                sx, sy, sz = sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2]
-                dx, dy, dz = sx - x, sy - y, sz - z
-                distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-                u[0, count], u[1, count], u[2, count] = dx / distance, dy / distance, dz / distance
-                misfit[count] = code_m[t, m] - (distance + _SAGNAC * (sx * y - sy * x))
+                distance, u[0, count], u[1, count], u[2, count] = sight(
+                    sat_ecef_m[t, m, 0], sat_ecef_m[t, m, 1], sat_ecef_m[t, m, 2], x, y, z
+                )
+                misfit[count] = code_m[t, m] - distance
                 base[count], root[count], factor[count] = w, math.sqrt(w), 1.0
                 channel[count], group_of[count], order[count] = m, g, count
                 count += 1

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
-from railfix.kernels.compiling import kernel
+from railfix.kernels.compiling import inner, kernel
 
 #: `railfix.positioning.line_points`: error of the linear model of a range, children of a stretch, slack of a radius.
 _CURVATURE, _TURNING, _FAN_OUT, _SLACK_M = 1.0 / (2.0 * 1.9e7), 1.1e-5, 8, 1e-6
@@ -77,7 +77,7 @@ def points_in_balls(
     return count, vertex[:found], values[:found, 0].copy(), values[:found, 1:4].copy(), unsure[:found]
 
 
-@kernel
+@inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
     """Least q on the two sections that meet at a point, by its quadratic form."""
     floor = q

@@ -6,6 +6,7 @@ import math
 
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.kernels.compiling import inner
+from railfix.kernels.sight import TURN, sight
 from railfix.kernels.tracking.course import find_ends, gradient_at
 from railfix.kernels.tracking.layout import (
     C_CLOCK,
@@ -31,7 +32,6 @@ from railfix.kernels.tracking.layout import (
     STEP_ALONG,
     STEP_RIGHT,
     STEP_UP,
-    TURN,
     UP,
     WHEEL_ROW,
     Active,
@@ -61,7 +61,7 @@ def write_equations(
     (right, up, speed, drift). `sensed` has for each sensor the coefficients of the place and the place before, the
     speed and the speed before, of its own unknown and of the displacement along the map.
     """
-    mean, sight, design, value, sensed = work.mean, work.sight, work.design, work.value, work.sensed
+    mean, seen, design, value, sensed = work.mean, work.sight, work.design, work.value, work.sensed
     codes, phases, dopplers, sensors, point, axes = (
         rows.codes,
         rows.phases,
@@ -77,20 +77,16 @@ def write_equations(
     moved, moved_before = mean[h, PLACE] - now, mean[h, n + OLD_PLACE] - before
     for k in range(epochs.has.shape[2]):
         if epochs.has[0, t, k] or epochs.has[1, t, k] or epochs.has[2, t, k]:
-            dx = epochs.sat_ecef_m[t, k, 0] - point[0, 0]
-            dy = epochs.sat_ecef_m[t, k, 1] - point[0, 1]
-            dz = epochs.sat_ecef_m[t, k, 2] - point[0, 2]
-            distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-            ux, uy, uz = dx / distance, dy / distance, dz / distance
-            sight[k, 0] = distance + TURN * (
-                epochs.sat_ecef_m[t, k, 0] * point[0, 1] - epochs.sat_ecef_m[t, k, 1] * point[0, 0]
+            sat = epochs.sat_ecef_m
+            distance, ux, uy, uz = sight(
+                sat[t, k, 0], sat[t, k, 1], sat[t, k, 2], point[0, 0], point[0, 1], point[0, 2]
             )
-            sight[k, 1], sight[k, 2], sight[k, 3] = ux, uy, uz
+            seen[k, 0], seen[k, 1], seen[k, 2], seen[k, 3] = distance, ux, uy, uz
             for c in range(3):
-                sight[k, 4 + c] = ux * axes[0, c, 0] + uy * axes[0, c, 1] + uz * axes[0, c, 2]
+                seen[k, 4 + c] = ux * axes[0, c, 0] + uy * axes[0, c, 1] + uz * axes[0, c, 2]
     for i in range(nc):
         k = codes[i]
-        design[h, i, 0], design[h, i, 1], design[h, i, 2] = -sight[k, 4], -sight[k, 5], -sight[k, 6]
+        design[h, i, 0], design[h, i, 1], design[h, i, 2] = -seen[k, 4], -seen[k, 5], -seen[k, 6]
         rest = (
             design[h, i, 0] * (moved + mean[h, CODE_PLACE])
             + design[h, i, 1] * mean[h, RIGHT]
@@ -98,7 +94,7 @@ def write_equations(
         )
         rest += mean[h, active.offset[epochs.offset[k]]] + mean[h, n + CODE_CLOCK]
         rest += epochs.code_sigma_m[t, k] * mean[h, active.satellite[epochs.slot[k]]]
-        value[h, i] = epochs.measured[0, t, k] - sight[k, 0] - rest
+        value[h, i] = epochs.measured[0, t, k] - seen[k, 0] - rest
     if nph:
         cx, cy, cz = point[0, 0] - point[1, 0], point[0, 1] - point[1, 1], point[0, 2] - point[1, 2]
         length = math.sqrt(cx * cx + cy * cy + cz * cz)
@@ -109,20 +105,16 @@ def write_equations(
             cx, cy, cz = axes[0, 0, 0], axes[0, 0, 1], axes[0, 0, 2]
         for j in range(nph):
             i, k = nc + j, phases[j]
-            dx = epochs.before_ecef_m[t, k, 0] - point[1, 0]
-            dy = epochs.before_ecef_m[t, k, 1] - point[1, 1]
-            dz = epochs.before_ecef_m[t, k, 2] - point[1, 2]
-            distance = math.sqrt(dx * dx + dy * dy + dz * dz) + TURN * (
-                epochs.before_ecef_m[t, k, 0] * point[1, 1] - epochs.before_ecef_m[t, k, 1] * point[1, 0]
-            )
-            gradient = -(sight[k, 1] * cx + sight[k, 2] * cy + sight[k, 3] * cz)
+            sat = epochs.before_ecef_m
+            distance = sight(sat[t, k, 0], sat[t, k, 1], sat[t, k, 2], point[1, 0], point[1, 1], point[1, 2])[0]
+            gradient = -(seen[k, 1] * cx + seen[k, 2] * cy + seen[k, 3] * cz)
             design[h, i, 0], design[h, i, 1], design[h, i, 2], design[h, i, 3] = (
                 gradient,
                 1.0,
-                -sight[k, 5],
-                -sight[k, 6],
+                -seen[k, 5],
+                -seen[k, 6],
             )
-            computed = sight[k, 0] - distance + gradient * (moved - moved_before)
+            computed = seen[k, 0] - distance + gradient * (moved - moved_before)
             value[h, i] = epochs.measured[1, t, k] - computed - mean[h, n + PHASE_CLOCK]
     for j in range(nd):
         i, k = nc + nph + j, dopplers[j]
@@ -132,12 +124,12 @@ def write_equations(
             epochs.sat_velocity_mps[t, k, 1],
             epochs.sat_velocity_mps[t, k, 2],
         )
-        moving = sight[k, 1] * vx + sight[k, 2] * vy + sight[k, 3] * vz + TURN * (vx * point[0, 1] - vy * point[0, 0])
+        moving = seen[k, 1] * vx + seen[k, 2] * vy + seen[k, 3] * vz + TURN * (vx * point[0, 1] - vy * point[0, 0])
         stretch = 1.0 + moving / SPEED_OF_LIGHT
-        slope = (-sight[k, 4] + TURN * (sx * axes[0, 0, 1] - sy * axes[0, 0, 0])) / stretch
+        slope = (-seen[k, 4] + TURN * (sx * axes[0, 0, 1] - sy * axes[0, 0, 0])) / stretch
         design[h, i, 0], design[h, i, 1], design[h, i, 2], design[h, i, 3] = (
-            -sight[k, 5] / dt,
-            -sight[k, 6] / dt,
+            -seen[k, 5] / dt,
+            -seen[k, 6] / dt,
             slope,
             1.0,
         )

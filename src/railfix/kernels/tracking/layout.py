@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from railfix.core.arrays import Codes, Floats, Indices, Integers, Masks
-from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 
-TURN = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
 #: Compact unknowns that are always there: place, speed, acceleration, drift, error of the map to the right and up,
 #: error of the speed by Dopplers, displacement of the codes.
 PLACE, SPEED, ACCELERATION, DRIFT, RIGHT, UP, DOPPLER_SPEED, CODE_PLACE = 0, 1, 2, 3, 4, 5, 6, 7

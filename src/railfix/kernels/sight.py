@@ -1,0 +1,18 @@
+"""Distance and direction to a satellite, with the turning of the earth (`railfix.core.geodesy.range_with_rotation`)."""
+
+from __future__ import annotations
+
+import math
+
+from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
+from railfix.kernels.compiling import inner
+
+TURN = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
+
+
+@inner
+def sight(sx: float, sy: float, sz: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Return the range of a signal sent at (sx, sy, sz) and received at (x, y, z) [m], and the unit vector to there."""
+    dx, dy, dz = sx - x, sy - y, sz - z
+    distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return distance + TURN * (sx * y - sy * x), dx / distance, dy / distance, dz / distance
