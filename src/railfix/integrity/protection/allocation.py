@@ -87,11 +87,11 @@ def _of_one_epoch(
     """Allocation of one epoch, kept: nobody writes into it."""
     channels = len(systems)
     return _allocated(
-        np.frombuffer(used, dtype=bool).reshape(1, channels),
+        np.frombuffer(used, dtype=bool).reshape(1, channels).copy(),
         systems,
         risk.risk,
         np.array([out]),
-        np.frombuffer(sides, dtype=bool).reshape(1, count, channels),
+        np.frombuffer(sides, dtype=bool).reshape(1, count, channels).copy(),
         wrong_map=wrong_map,
     )
 
