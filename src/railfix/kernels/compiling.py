@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import multiprocessing
+import re
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -26,8 +27,8 @@ def kernel(function: Function) -> Function:
     """Compile a function of arrays at its first call, without the interpreter lock, and keep the code on disk.
 
     Divisions by zero give infinities and NaN as numpy's do. The code is kept beside the source, or in the user's cache
-    folder where that cannot be written, or in ``NUMBA_CACHE_DIR``. It is compiled anew when any file of this room or
-    the constants change: numba itself looks at the function's own file alone, not at what it calls.
+    folder where that cannot be written, or in ``NUMBA_CACHE_DIR``. It is compiled anew when a file changes that
+    it imports functions from, or the constants: numba itself looks at the function's own file alone.
 
     Raises
     ------
@@ -41,7 +42,8 @@ def kernel(function: Function) -> Function:
             f"compiled kernels cannot be kept on disk ({error}); set NUMBA_CACHE_DIR to a folder that can be "
             "written, or RAILFIX_KERNELS=numpy"
         ) from error
-    made._cache._cache_file._source_stamp = stamp(Path(__file__).parent)
+    module = function.__module__.removeprefix("railfix.kernels.")
+    made._cache._cache_file._source_stamp = stamp(Path(__file__).parent, module)
     COMPILED.append(made)
     return cast(Function, made)
 
@@ -68,13 +70,20 @@ class _Announcement(event.Listener):
         """Hear that it is done."""
 
 
-event.register("numba:compile", _Announcement())
+event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
+
+
+def _files(room: Path, module: str) -> set[Path]:
+    """Return the file of a module of this room and those of all that it imports from the room."""
+    path = room / f"{module.replace('.', '/')}.py"
+    imported = re.findall(r"^from railfix\.kernels\.([\w.]+) import", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {path}.union(*(_files(room, name) for name in imported))
 
 
 @cache
-def stamp(room: Path) -> str:
-    """Return the hash of all that compiled code depends on: the files of this room, and the constants."""
-    files = [*sorted(room.rglob("*.py")), room.parent / "core" / "constants.py"]
+def stamp(room: Path, module: str) -> str:
+    """Return the hash of all that the compiled code of a module depends on: its files, and the constants."""
+    files = [*sorted(_files(room, module)), room.parent / "core" / "constants.py"]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 
