@@ -1,7 +1,7 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/bounds.md``: faults, maps, sigmas, starts, priors, sides.
+``docs/bounds.md``: faults, maps, sigmas, starts, priors, sides, late.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +19,7 @@ import polars as pl
 
 import recordings_truth
 from conftest import ROOT
+from integrity_recordings import ranges_of
 from railfix.core.arrays import Floats, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.reasons import Status
@@ -27,6 +28,7 @@ from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.integrity.protection import LevelStatus
+from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.processor import EpochProcessor
@@ -37,7 +39,8 @@ from railfix.simulate.demo_data import demo_files
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
-from recordings_score import trajectory_of
+from railfix.tracking.tails import Tails
+from recordings_score import smartloc, trajectory_of
 
 DATA: Final = ROOT.parent / "shared" / "data" / "kinematic"
 SETTINGS: Final = parse_config({"elevation": {"mask_deg": 15.0}})
@@ -45,6 +48,8 @@ SIZES_M: Final = (20.0, 50.0, 100.0)
 #: Offsets of the map: right of the line and up [m].
 OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
 _NORMAL_MEDIAN: Final = 0.6745
+#: Degrees of freedom of Student's t: none, as of late codes for both sides, heavier for late codes, as the filter.
+TAILS: Final = (None, Tails(4.0, 4.0), Tails(4.0, 2.0), Tails(4.0, 1.0), Tails(8.0, 1.0), Tails(1e9, 1.0))
 
 
 @dataclass(frozen=True)
@@ -329,6 +334,55 @@ def side_rows() -> Iterator[str]:
             )
 
 
+def reweighted(ranges: Ranges, line: Trajectory, arc: Floats, section: Floats, scale: Floats, tails: Tails) -> Floats:
+    """Movement along the line by Student's t weights of the residuals, in sigmas of the level, shape (T,) [m]."""
+    section = np.maximum(section, 0)
+    residual = np.nan_to_num(
+        constrained_model(ranges, line, arc, section=section).residual / np.maximum(scale, 1.0)[:, None]
+    )
+    weight = ranges.weight * tails.weight(residual, residual**2, residual.shape[1])
+    return np.nan_to_num(constrained_model(replace(ranges, weight=weight), line, arc, section=section).step_m[:, 0])
+
+
+def late_rows() -> Iterator[str]:
+    """Single epochs reweighted once with heavier tails for late codes; levels take the movement whole."""
+    yield "            degrees of    straight distance [m]     error over sigma  level  over"
+    yield "log      freedom, late     p50     p95    max            68 %   95 %  median"
+    for name, case in cases().items():
+        result = case.solved()
+        assert result.protection is not None
+        for tails in TAILS:
+            fixed, movement = result.constrained, np.zeros(len(result))
+            if tails is not None:
+                arc = np.where(np.isfinite(result.arc_m), fixed.arc_m, np.nan)
+                movement = reweighted(ranges_of(result), case.trajectory, arc, fixed.section, result.noise_scale, tails)
+            moved = replace(result, arc_m=np.clip(result.arc_m + movement, 0.0, case.trajectory.arc_m[-1]))
+            straight, along = case.errors(moved)
+            level = np.where(result.protection.level.consistent, result.protection.level.level_m, np.inf)
+            level, known = level + np.abs(movement), np.isfinite(along) & np.isfinite(level)
+            ratio = along / result.along_sigma_m
+            yield (
+                _late_row(name, tails, straight)
+                + f" {np.percentile(ratio[np.isfinite(ratio)], 68.0):15.2f}"
+                + f" {np.percentile(ratio[np.isfinite(ratio)], 95.0):6.2f} {np.median(level[known]):7.1f}"
+                + f" {int((along[known] > level[known]).sum()):5d}"
+            )
+    for tails in TAILS:
+        found = smartloc(DATA.parent, SETTINGS, None if tails is None else partial(reweighted, tails=tails))
+        assert found.straight is not None
+        sizes = np.array([found.straight.p50_m, found.straight.p95_m, found.straight.max_m])
+        yield f"{'smartLoc':9s}{_named(tails):>13s} {sizes[0]:7.3f} {sizes[1]:7.3f} {sizes[2]:6.1f}"
+
+
+def _late_row(name: str, tails: Tails | None, straight: Floats) -> str:
+    sizes = np.percentile(straight[np.isfinite(straight)], (50.0, 95.0, 100.0))
+    return f"{name:9s}{_named(tails):>13s} {sizes[0]:7.3f} {sizes[1]:7.3f} {sizes[2]:6.1f}"
+
+
+def _named(tails: Tails | None) -> str:
+    return "-" if tails is None else f"{tails.usual:g}, {tails.late:g}"
+
+
 PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "faults": fault_rows,
     "maps": map_rows,
@@ -336,6 +390,7 @@ PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "starts": start_rows,
     "priors": prior_rows,
     "sides": side_rows,
+    "late": late_rows,
 }
 
 
