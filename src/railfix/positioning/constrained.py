@@ -17,7 +17,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.settings import Settings
 from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import Ranges, after_step, inverse_3x3, reduced_equations
 from railfix.track.trajectory import Trajectory
 
 
@@ -27,7 +27,7 @@ class ConstrainedLimits(Settings):
     Attributes
     ----------
     tolerance_m : float
-        Last step inside a section: one of 5 m leaves 0.03 mm (`NormalEquations.after`).
+        Last step inside a section: one of 5 m leaves 0.03 mm (`after_step`).
     max_iterations : int
         Steps, walks into a neighbouring section included.
     """
@@ -250,9 +250,8 @@ def iterated_along(
         chosen[done] = np.where(np.isfinite(final), section, -1)[settled]
         results = (final, deviation, exact, least, np.where(ended, np.abs(step), 0.0))
         solved[:5, done] = np.stack(results)[:, settled]
-        last_step = (np.where(inside, step, 0.0)[:, None] * tangent[section])[settled, None]
-        clock[done] = np.where(seen, means[:, 3], np.nan)[settled] - np.matmul(last_step, means[settled, :3])[:, 0]
-        residual[done] = rows[settled, 3] - np.matmul(last_step, rows[settled, :3])[:, 0]
+        last_step = (np.where(inside, step, 0.0)[:, None] * tangent[section])[settled]
+        clock[done], residual[done] = after_step(means[settled], rows[settled], seen[settled], last_step)
 
         down, upward = below & (section > 0), above & (section < last)
         section = section - down + upward

@@ -149,25 +149,6 @@ class NormalEquations:
     clock_slope: Floats
     design: Floats
 
-    def after(self, step_m: Floats, epochs: Masks | Indices) -> tuple[Floats, Floats]:
-        """Clocks and residuals of some epochs after a step from their places, to first order.
-
-        A step of 5 m leaves 0.03 mm (the gradient of the Earth's turning, which the design leaves out).
-
-        Parameters
-        ----------
-        step_m : ndarray, shape (n, 3) [m]
-        epochs : ndarray of bool, shape (T,), or of int, shape (n,)
-
-        Returns
-        -------
-        clock_m : ndarray, shape (n, G) [m]
-        residual_m : ndarray, shape (n, M) [m]
-        """
-        step = step_m[:, None, :]
-        clock = self.clock_m[epochs] - np.matmul(step, self.clock_slope[epochs])[:, 0]
-        return clock, self.residual_m[epochs] - np.matmul(step, self.design[epochs])[:, 0]
-
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
     """Slices of channels that share a receiver clock.
@@ -270,6 +251,28 @@ def reduced_equations(
         means -= shift
         rows += np.repeat(shift, sizes, axis=2) * used
     return system, means, rows, seen
+
+
+def after_step(means: Floats, rows: Floats, seen: Masks, step_m: Floats) -> tuple[Floats, Floats]:
+    """Return clocks and residuals after a step from the places of `reduced_equations`, to first order.
+
+    A step of 5 m leaves 0.03 mm (the gradient of the Earth's turning, which the design leaves out).
+
+    Parameters
+    ----------
+    means, rows, seen
+        From `reduced_equations`, n epochs.
+    step_m : ndarray, shape (n, 3) [m]
+
+    Returns
+    -------
+    clock_m : ndarray, shape (n, G) [m]
+        NaN where the group has no satellite.
+    residual_m : ndarray, shape (n, M) [m]
+    """
+    step = step_m[:, None]
+    clock = np.where(seen, means[:, 3], np.nan) - np.matmul(step, means[:, :3])[:, 0]
+    return clock, rows[:, 3] - np.matmul(step, rows[:, :3])[:, 0]
 
 
 def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Floats, Floats]:

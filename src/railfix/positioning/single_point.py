@@ -14,7 +14,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.settings import Settings
 from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import Ranges, after_step, inverse_3x3, reduced_equations
 
 
 class SinglePointLimits(Settings):
@@ -23,7 +23,7 @@ class SinglePointLimits(Settings):
     Attributes
     ----------
     tolerance_m : float
-        The last step: one of 1 m leaves 0.01 mm (`NormalEquations.after`).
+        The last step: one of 1 m leaves 0.01 mm (`after_step`).
     max_iterations : int
     """
 
@@ -135,10 +135,9 @@ def iterated_points(
         step = np.einsum("tij,tj->ti", inverse, vector)
         length = np.sqrt(np.einsum("ti,ti->t", step, step))
         settled = length < tolerance_m
-        done, last = active[settled], step[settled][:, None]
+        done = active[settled]
         place[done] = current[settled] + step[settled]
-        clock[done] = np.where(seen, means[:, 3], np.nan)[settled] - np.matmul(last, means[settled, :3])[:, 0]
-        residual[done] = rows[settled, 3] - np.matmul(last, rows[settled, :3])[:, 0]
+        clock[done], residual[done] = after_step(means[settled], rows[settled], seen[settled], step[settled])
         matrix[done], covariance[done] = system[settled, :3, :3], inverse[settled]
         wsse[done] = system[settled, 3, 3] - np.einsum("ti,ti->t", step, vector)[settled]
         going = ~settled & (length < 1e8)

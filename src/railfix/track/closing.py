@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats
 
 #: A line goes on where its end comes this close to another place of it [m]: no other track is as near.
-CLOSED_M: Final = 3.0
+_CLOSED_M: Final = 3.0
 #: In the same direction: cosine of the angle between them.
 _SAME_WAY: Final = 0.9
 #: Places this near along the line are the end itself [m].
@@ -38,5 +38,5 @@ def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
     apart = np.linalg.norm(from_end - along[:, None] * segment, axis=1)
     arc = arc_m[:-1] + along
     other = np.abs(arc - arc_m[end]) > _END_M
-    other &= (apart < CLOSED_M) & (segment @ segment[end] > _SAME_WAY)
+    other &= (apart < _CLOSED_M) & (segment @ segment[end] > _SAME_WAY)
     return float(arc[other][np.argmin(apart[other])]) if other.any() else float("nan")

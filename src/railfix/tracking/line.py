@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Floats
+from railfix.track.closing import joins_m
 from railfix.track.trajectory import Trajectory
-
-#: A line goes on where its end comes this close to another place of it [m]: no other track is as near.
-_CLOSED_M: Final = 3.0
-#: In the same direction: cosine of the angle between them.
-_SAME_WAY: Final = 0.9
-#: Places this near along the line are the end itself [m].
-_END_M: Final = 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,18 +79,7 @@ class Line:
     @cached_property
     def joins_m(self) -> tuple[float, float]:
         """Arc lengths at which a closed line goes on before its start and after its end; NaN at an open end."""
-        return self._beside(0), self._beside(-1)
-
-    def _beside(self, end: int) -> float:
-        """Arc length of the nearest other place of the line to one of its ends, in the same direction; NaN without."""
-        from_end = self.ecef_m[end] - self.ecef_m[:-1]
-        length = np.diff(self.arc_m)
-        along = np.clip((from_end * self.segment).sum(axis=1), 0.0, length)
-        apart = np.linalg.norm(from_end - along[:, None] * self.segment, axis=1)
-        arc = self.arc_m[:-1] + along
-        other = np.abs(arc - self.arc_m[end]) > _END_M
-        other &= (apart < _CLOSED_M) & (self.segment @ self.segment[end] > _SAME_WAY)
-        return float(arc[other][np.argmin(apart[other])]) if other.any() else float("nan")
+        return joins_m(self.arc_m, self.ecef_m)
 
     @cached_property
     def bounds_m(self) -> tuple[float, float]:

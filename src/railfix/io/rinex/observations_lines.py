@@ -10,7 +10,6 @@ import numpy as np
 from railfix.core.arrays import Bytes, Integers, Masks
 from railfix.kernels import compiled_by
 
-_DAY_NS: Final = 86_400_000_000_000
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
 
