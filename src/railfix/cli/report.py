@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import sys
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -86,10 +87,9 @@ def report(
 
 
 def _free_arrays_at_once() -> None:
-    """Have the GNU C library return an array's memory as soon as it is freed; other systems decide themselves.
+    """Have the GNU C library return an array's memory as soon as it is freed; other libraries are left as they are.
 
     By itself it keeps freed arrays of up to 32 MB for later ones, between those in use: of a long run 50 MB.
     """
-    library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):
+    if sys.platform == "linux" and hasattr(library := ctypes.CDLL(None), "mallopt"):
         library.mallopt(*_THRESHOLD)

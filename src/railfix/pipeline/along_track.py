@@ -68,7 +68,7 @@ class Fixed:
 
 @dataclass(frozen=True, kw_only=True)
 class SingleEpochs:
-    """What each epoch by itself says to the filter, shape (T,) each.
+    """Results of single epochs that the filter along the track uses, shape (T,) each.
 
     Attributes
     ----------

@@ -137,8 +137,8 @@ class Config(ScreenSettings):
         A position is off the map where its ranges fit the line worse than the 3-D position by more than noise explains
         with this probability, the noise judged by the residuals of the 3-D fit.
     off_map_s : float [s]
-        The filter along the track gives up its place once every position for so long was off the map, and begins
-        anew once none was for so long. On the recordings, with a right map, no two positions in a row are off it.
+        The filter along the track gives up its place once every position of this time was off the map, and begins
+        anew once none of this time was. On the recordings, with a right map, no two positions in a row are off it.
     ionosphere : {"klobuchar", "off"}
     troposphere : {"saastamoinen", "off"}
     max_ephemeris_age_s : float or None

@@ -46,7 +46,13 @@ def basis_of(config: Config) -> str:
 
 
 def standing(facts: Mapping[str, Any]) -> str:
-    """Return whether the priors of the levels of a run were measured, and what no data supports, from `level_facts`."""
+    """Return a sentence on the priors of a run's levels: measured or assumed, and supported by data or not.
+
+    Parameters
+    ----------
+    facts : mapping
+        `level_facts`, or the member ``protection`` of a ``run.json``.
+    """
     words = {
         "indicative": "indicative: priors of faults are assumed, not measured on this line; no risk an hour",
         "measured": "priors of local faults measured on this line, risk.map_prior assumed",
@@ -55,8 +61,8 @@ def standing(facts: Mapping[str, Any]) -> str:
     text = words.get(str(facts.get("basis")), "not recorded")
     if isinstance(side, int | float) and side < SUPPORTED_SIDE_PRIOR:
         text += (
-            f"; no data supports that satellites of one side are faulty together with {side:g} at most "
-            f"(risk.side_prior; measured: {SUPPORTED_SIDE_PRIOR:g} at most)"
+            f"; no data supports a probability as small as {side:g} that the satellites of one side of the track are "
+            f"faulty together (risk.side_prior; hours in simulated cities support {SUPPORTED_SIDE_PRIOR:g})"
         )
     return text
 

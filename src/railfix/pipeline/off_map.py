@@ -1,4 +1,4 @@
-"""Whether the train is on the map at all: the verdicts of single epochs over some seconds."""
+"""Epochs at which the train is away from the line, by the verdicts of single epochs over some seconds."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class OffMapState:
-    """What one chunk leaves to the next.
+    """State of the test after a chunk.
 
     Attributes
     ----------
     off : bool
         The train was off the map at the last epoch.
     known : bool
-        A position has been on the map, or off it for long enough: before, the first position decides.
+        A position has been tested; the first one of a log decides alone.
     since : datetime64[ns]
-        First of the positions in a row that say the contrary of `off`; NaT where the last one says the same.
+        First of the last positions in a row that contradict `off`; NaT where the last one agrees with it.
     """
 
     off: bool = False
@@ -37,17 +37,18 @@ def off_map_epochs(
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
 
-    It is once all positions for `longest_s` are off the map, and is not any more once all for so long are on it: one
-    position with reflected signals leaves no line, and one that the ranges of a train far away happen to fit is no
-    return. The first position of a log decides alone.
+    It leaves the map once all positions of the last `longest_s` are off it, and returns once all of that time are on
+    it: a single position can be off the map by reflected signals, or on it by chance. The first position of a log
+    decides alone.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     on_map, off_map : ndarray of bool, shape (T,)
-        Positions of each epoch by itself that its ranges fit, or contradict; neither where there is none.
+        Single-epoch positions that the ranges fit, and those that they contradict; both False without a position.
     state : OffMapState
     longest_s : float [s]
+        How long positions contradict the state before it changes.
     """
     off, known, since = state.off, state.known, state.since
     result = np.full(len(time), off)

@@ -44,7 +44,7 @@ class Forms:
         return Forms(self.prior[epochs], self.constant[epochs], self.slope[epochs], self.matrix[epochs])
 
     def coefficients(self) -> Floats:
-        """Return the coefficients of the monomials of `_Sections.monomials`, shape (T, 10, K)."""
+        """Return the coefficients of `open_places._Sections.monomials`, shape (T, 10, K)."""
         of_squares = [self.matrix[..., i, i] for i in range(3)]
         of_products = [2.0 * self.matrix[..., i, j] for i, j in ((0, 1), (0, 2), (1, 2))]
         return np.stack([self.constant, *np.moveaxis(-2.0 * self.slope, 2, 0), *of_squares, *of_products], axis=1)

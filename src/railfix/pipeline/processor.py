@@ -400,7 +400,7 @@ class AntennaChunk:
         return result
 
     def _single_epochs(self, result: AntennaResult) -> SingleEpochs:
-        """What each epoch by itself says to the filter along the track."""
+        """Results of single epochs that the filter along the track uses."""
         assert self._solution is not None
         found, limits = self._solution, self._processor.config.map_offset
         return SingleEpochs(

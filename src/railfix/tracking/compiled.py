@@ -239,7 +239,7 @@ class Compiled:
 
 
 def _kernels() -> tuple[ModuleType, ModuleType]:
-    """Layout and recursion, imported where numba is wanted alone."""
+    """Layout and recursion; imported only where numba is used."""
     room = "railfix.kernels.tracking"
     return import_module(f"{room}.layout"), import_module(f"{room}.recursion")
 

@@ -91,7 +91,7 @@ class Line:
         )
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """How far back along the line places beyond an end of a closed line are, shape as given [m]; 0 for others.
+        """Shift of places beyond an end of a closed line to where it goes on [m]; 0 for others.
 
         Parameters
         ----------

@@ -6,7 +6,7 @@ hypotheses together use up the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
-Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. It is found from above: from the largest
+Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. The level is found from above: from the largest
 of three parts, each of which has its share of the risk,
 
 - no fault: ``K_ff sigma_0 + b_0``;
@@ -55,9 +55,9 @@ class Cause(IntEnum):
 
     #: The noise of the position without a fault.
     FAULT_FREE = 0
-    #: A fault of one satellite, or of a constellation.
+    #: A fault of one satellite, of a constellation, of a side of the track, or of the map.
     ONE_FAULT = 1
-    #: Faults of two satellites, or of a constellation and a satellite of another.
+    #: Faults of two satellites, or of one satellite and what else `ONE_FAULT` names, or of a side and the map.
     TWO_FAULTS = 2
     #: Infinite: a fault that nothing checks is likelier than its share of the risk.
     UNCHECKED = 3
@@ -93,7 +93,7 @@ class ProtectionLevel:
     consistent : ndarray of bool, shape (T,)
         It is at most 1. Where not the level does not hold. False where there is no position.
     worst_one : ndarray of int, shape (T,)
-        Channel that sets `one_fault_m`; -1 where none does (a constellation: `worst_constellation`).
+        Channel that sets `one_fault_m`; -1 where none does (a constellation: `worst_constellation`; a side, the map).
     worst_two : ndarray of int, shape (T, 2)
         Channels that set `two_fault_m`; -1 where none do.
     worst_constellation : ndarray of str, shape (T,)

@@ -78,8 +78,9 @@ class RiskBudget(Settings):
         SBAS corrections within minutes (DO-229D appendix J counts 10 samples an hour). More samples are
         the safe side; from 10 to 3600 the fault-free K grows by 0.9.
     fault_free_share, one_fault_share, two_fault_share : float
-        Shares of the risk of an epoch; together at most 1. The level is the largest of the three parts, and a
-        share twice as large lowers a K of 6 by 0.1, one of 3 by 0.2: thirds.
+        Shares of the risk of an epoch; together at most 1. They decide the three parts, from the largest of which the
+        level is lowered until all tails together use their sum; a share twice as large lowers a K of 6 by 0.1, one
+        of 3 by 0.2: thirds.
     unchecked_share : float
         Of the risk, that faults which are not hypotheses may have together: where three at a time are likelier than
         this, they become hypotheses too, and four at a time are what is left unchecked.
@@ -97,15 +98,15 @@ class RiskBudget(Settings):
         the geoid, another reference frame. An assumption; 0: no such hypothesis.
     side_prior : float
         Probability that one reflection makes the low satellites of one side of the track faulty together:
-        `SUPPORTED_SIDE_PRIOR`. Below that no data supports a level, which every output of it then says; 0: no such
+        `SUPPORTED_SIDE_PRIOR`. No data supports a smaller one, and every output of the levels then says so; 0: no such
         hypothesis. Where a side together with a satellite or a wrong map is likelier than `unchecked_share` of the
         risk, these are hypotheses too, and so are both sides at a time.
     side_elevation_deg : float
         Elevation up to which satellites count as low: of a wall as high as it is away.
     priors : {"assumed", "measured"}
         Whether the priors were measured on this line (``railfix error-model``). Levels of assumed priors are
-        called indicative in every output: they carry no risk an hour. "measured" asks for a `local_prior` and a
-        `side_prior` that are given.
+        called indicative in every output: they carry no risk an hour. "measured" needs `local_prior` and
+        `side_prior` to be given.
     constellation_prior : mapping of str to float
         Probability of a fault that many satellites of a constellation share; a constellation that is not
         named has none, and the level does not cover one.
@@ -195,7 +196,7 @@ class RiskBudget(Settings):
         return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
 
     def require(self, systems: Sequence[str]) -> None:
-        """Raise where more than two faults among these satellites already exceed the risk.
+        """Raise where more than three faults among these satellites already exceed the risk.
 
         Raises
         ------
