@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from railfix.cli.error_model import priors_text
 from railfix.core.errors import InputFileError
+from railfix.pipeline.config import parse_config
 from railfix.ranges.error_model import (
     POOLED,
     BinStatistics,
@@ -338,3 +340,14 @@ def test_low_satellites_of_one_side_are_counted_together() -> None:
     assert (high.side_blocks, high.side_faulty_blocks, high.side_upper) == (0, 0, 1.0)
     unused = fault_rate(replace(samples, used=satellite != 0))
     assert (unused.side_blocks, unused.side_faulty_blocks) == (blocks, 5)
+
+
+def test_measured_priors_are_printed_as_settings_that_a_run_takes() -> None:
+    samples = samples_of(np.zeros(4000), 30.0, 0.0, 45.0)
+    rate = fault_rate(replace(samples, block=np.arange(4000) // 4 * 1_000_000 + np.arange(4000) % 4))
+    words = priors_text(rate).split("--set ")[1:]
+    given = dict(word.strip().removeprefix("risk.").split("=") for word in words)
+    assert parse_config({"risk": given}).risk.side_prior == pytest.approx(rate.side_upper, rel=0.05)
+    short = fault_rate(samples_of(np.zeros(4000), 60.0, 0.0, 45.0))
+    assert short.side_upper == 1.0
+    assert "stay indicative" in priors_text(short)

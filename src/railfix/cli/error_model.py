@@ -19,6 +19,7 @@ from railfix.ranges.error_model import (
     ErrorModel,
     ErrorModelFit,
     ErrorSamples,
+    FaultRate,
     faulty_stretches,
     summary,
     write_error_model,
@@ -102,6 +103,17 @@ def _edges(text: str) -> tuple[float, ...]:
     return tuple(float(part) for part in text.split(","))
 
 
+def priors_text(rate: FaultRate) -> str:
+    """Return how to state the measured priors as settings, which are probabilities below 1."""
+    local, side = f"{rate.upper:.2g}", f"{rate.side_upper:.2g}"
+    if "1" in (local, side):
+        return "Too few blocks to bound both priors: the levels of this line stay indicative"
+    return (
+        f"For levels of this line: --set risk.local_prior={local} --set risk.side_prior={side} "
+        "--set risk.priors=measured"
+    )
+
+
 def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     console = console_of_tables()
     base = model.source.base or "none: errors of satellites and atmosphere are in the model"
@@ -124,8 +136,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
             f"level ({rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} blocks; at most {rate.upper:.2g} with "
             f"95 % confidence); two satellites at a time {rate.together:.1f} times as often as independent ones, low "
             f"ones of one side of the track in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at "
-            f"most {rate.side_upper:.2g}). For levels of this line: --set risk.local_prior={rate.upper:.2g} --set "
-            f"risk.side_prior={rate.side_upper:.2g} --set risk.priors=measured",
+            f"most {rate.side_upper:.2g}). {priors_text(rate)}",
             markup=False,
             soft_wrap=True,
         )

@@ -227,7 +227,24 @@ def _check_same_log(path: Path, record: Mapping[str, Any], other: Path, of_other
 def read_table(
     path: Path, name: str, needed: Sequence[str] = NEEDED, columns: cs.Selector | None = None
 ) -> tuple[Path, pl.DataFrame]:
-    """File and rows of one table of a run, in order of time: all columns, or those `needed` and `columns`."""
+    """Return the file and the rows of one table of a run, in order of time.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the run.
+    name : str
+        Of the table, without its ending.
+    needed : sequence of str
+        Columns that it must have.
+    columns : polars selector, optional
+        Columns to read beside those; all without.
+
+    Raises
+    ------
+    InputFileError
+        The table is absent or cannot be read, lacks a column, has no rows, or an antenna twice at one time.
+    """
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:
         raise InputFileError(path, f"holds neither {name}.parquet nor {name}.csv; name a folder of railfix run")

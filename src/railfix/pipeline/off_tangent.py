@@ -70,6 +70,24 @@ def whitened(model: LinearModel, plan: float, height: float, scale: Floats) -> t
     """Return the residuals with the map error in the noise, their change with the place, and the form without fault.
 
     The map error is taken alike in all horizontal directions: another place has another tangent.
+
+    Parameters
+    ----------
+    model : LinearModel
+        T epochs, on the line.
+    plan, height : float [m]
+        Sigmas of the map.
+    scale : ndarray, shape (T,)
+        Noise scale of the ranges.
+
+    Returns
+    -------
+    parts : Compact
+        n channels side by side.
+    design : ndarray, shape (T, n, 3) [1/m]
+        Decrease of their residuals by a step along, across and up.
+    none : Forms
+        K = 1.
     """
     normal = np.linalg.inv(model.covariance_m2) - model.prior
     prior = scale[:, None, None] ** 2 * np.diag([plan**-2.0, plan**-2.0, height**-2.0])

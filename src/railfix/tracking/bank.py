@@ -73,7 +73,7 @@ class Budget:
 
 @lru_cache(maxsize=8)
 def budget(limits: TrackingLimits) -> Budget:
-    """Risk of an independent error and what the sources have of it.
+    """Return the risk of an independent error, and the probabilities of faults of the sources.
 
     The filter remembers a source for as long as its errors stay in the state, `FORGOTTEN` correlation times after a
     fault that lasts for one independent error, or `CONSTELLATION_FAULT_S` for one of a constellation.
@@ -249,6 +249,13 @@ def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) 
 
     Infinite without a sub-filter, and where the measurements of one contradict it: it has settled somewhere else, or
     began where the fault of its source had led the filter, and bounds nothing.
+
+    Parameters
+    ----------
+    bank : Bank
+    place_m, sigma_m : float [m]
+        Of the filter.
+    limits : TrackingLimits
     """
     given = budget(limits)
     noise = given.k * sigma_m

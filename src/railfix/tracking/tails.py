@@ -24,17 +24,27 @@ class Tails(NamedTuple):
     late: float
 
     def degrees(self, residual: Floats, codes: int) -> Floats:
-        """Degrees of freedom of each row, by the side that its residual is on, shape (H, M)."""
+        """Return the degrees of freedom of each row, by the sign of its residual; shapes as for `weight`."""
         degrees = np.full(residual.shape, self.usual)
         degrees[:, :codes][residual[:, :codes] > 0.0] = self.late
         return degrees
 
     def weight(self, residual: Floats, square: Floats, codes: int) -> Floats:
-        """Weights of rows, the first of them codes, by their squares over their variances, shape (H, M)."""
+        """Return the weights of rows, shape (H, M).
+
+        Parameters
+        ----------
+        residual : ndarray, shape (H, M)
+            Only its sign is used; positive: longer than expected.
+        square : ndarray, shape (H, M)
+            Its mean square over the variance.
+        codes : int
+            How many rows are of codes; they come first.
+        """
         degrees = self.degrees(residual, codes)
         return np.asarray((self.usual + 1.0) / self.usual * degrees / (degrees + square))
 
     def log_density(self, residual: Floats, square: Floats, codes: int) -> Floats:
-        """Logarithm of the density of which `weight` is the weight, 0 at its maximum, shape (H, M)."""
+        """Return the logarithm of the density whose weights are `weight`, 0 at its maximum; parameters the same."""
         degrees = self.degrees(residual, codes)
         return np.asarray(-0.5 * (self.usual + 1.0) / self.usual * degrees * np.log1p(square / degrees))
