@@ -40,7 +40,7 @@ class MessageStatus(IntEnum):
     NO_POSITION = 3
     #: Nothing received in this period.
     NO_INPUT = 4
-    #: Satellite positioning is suspended by order of the ground side.
+    #: Satellite positioning is suspended by order of the ground side; railfix itself sends no such message.
     SUSPENDED = 5
 
 

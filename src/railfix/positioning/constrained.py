@@ -131,7 +131,7 @@ def constrained_position(
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
         pulled = np.flatnonzero((solved[4] > 0.0) & (section == end))
-        if join == join and len(pulled):
+        if not np.isnan(join) and len(pulled):
             there = np.full(len(pulled), np.argmin(np.abs(trajectory.arc_m - join)))
             other = _from(there, ranges.take(pulled), trajectory, limits)
             better = other[1][3] < solved[3, pulled]

@@ -1,4 +1,4 @@
-"""Where a line closes on itself: a ring, a loop at a terminus, a course that is run again and again."""
+"""Joins of lines that close on themselves: rings, loops at a terminus, courses run several times."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ class _Line:
             (chainage > self.chainage[-1], after, self.points[-1], after + chainage - self.chainage[-1]),
         )
         for beyond, join, end, there in ends:
-            if join == join and beyond.any():
+            if not np.isnan(join) and beyond.any():
                 gap = end - self._straight_on(np.array([join]))
                 points[beyond] = self._straight_on(there[beyond]) + gap
         return points
@@ -153,10 +153,12 @@ class _Line:
         return np.asarray(self.points[index] + (chainage - self.chainage[index])[:, None] * self.tangent[index])
 
     def roll_at(self, chainage: Floats) -> Floats:
+        """Return the roll by cant, shape (n,) [rad]; that of the end beyond an open end."""
         before, after = self.joins
         last = self.chainage[-1]
-        there = np.where((chainage < 0.0) & (before == before), before + chainage, chainage)
-        there = np.where((chainage > last) & (after == after), after + chainage - last, there)
+        open_start, open_end = self.open_ends
+        there = np.where((chainage < 0.0) & (not open_start), before + chainage, chainage)
+        there = np.where((chainage > last) & (not open_end), after + chainage - last, there)
         return np.interp(there, self.chainage, self.roll)
 
 
