@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from bad_inputs import CASES, COMMANDS, FAULTS, Desk, desk_in
+from bad_inputs import CASES, COMMANDS, FAULTS, MISTAKES, Desk, desk_in
 from railfix.cli import app
 
 #: Faults that leave nothing to be read.
@@ -68,3 +68,18 @@ def test_one_sentence_and_nothing_destroyed(desk: Desk, kind: str, fault: str) -
         assert result.exit_code == 0, result.output
     if fault in UNREADABLE and (kind, fault) not in HARMLESS:
         assert result.exit_code == 3, result.output
+
+
+@pytest.mark.requirement("G1")
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_of_the_user_is_one_sentence_with_its_remedy(desk: Desk, name: str) -> None:
+    files, command, code, words = MISTAKES[name]
+    for file, text in files.items():
+        (desk.folder / file).write_text(text)
+    before = contents(desk.folder)
+    result = RUNNER.invoke(app, desk.words(command))
+    assert result.exit_code == code, result.output
+    assert result.stderr.startswith("railfix: error: ")
+    assert result.stderr.count("\n") == 1
+    assert words in result.stderr
+    assert contents(desk.folder) == before

@@ -107,7 +107,7 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
         ('start = "yesterday"', "start: must be a time"),
         ("start = 5", "start: must be a time"),
         ("run = 3", "run: .*valid dictionary"),
-        ("[run]\nstations = 3", "run.stations: .*valid tuple"),
+        ("[run]\nstations = 3", "run.stations: .*a list"),
         ("[run]\nstations = [{at_m = 30}, {dwell_s = 3}]", "run.stations.1.at_m is missing"),
         ("[run]\nstations = [{at_m = 30}, {at_m = 990}]", "990.0 m lies within"),
         ('[line]\nkind = "wiggly"', "setting line.kind: Input should be 'pattern', 'elements', 'generated' or 'file'"),

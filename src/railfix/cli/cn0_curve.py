@@ -13,6 +13,7 @@ from railfix.cli.options import LenientOption, OverwriteOption
 from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
+from railfix.core.settings import validated
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, cn0_curve_from_log, write_cn0_curve
 from railfix.run.output import check_output_file
 
@@ -52,10 +53,7 @@ def cn0_curve(
 
     Exit codes as `railfix --help` says; 5 where the position or the navigation files do not fit the log.
     """
-    try:
-        fit = CurveFit(bin_deg=bin_deg)
-    except ValueError as error:
-        raise SettingsError(f"--bin: {error}") from None
+    fit = validated(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else place_of(position, "--position")
     outputs = [path for path in (out, plot) if path is not None]
     for path in outputs:

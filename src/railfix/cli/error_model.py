@@ -13,6 +13,7 @@ from railfix.cli.cn0_curve import place_of
 from railfix.cli.console import console_of_tables
 from railfix.cli.options import OverwriteOption
 from railfix.core.errors import SettingsError
+from railfix.core.settings import validated
 from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
 from railfix.ranges.error_model import (
     ErrorBins,
@@ -83,11 +84,9 @@ def error_model(
         raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")
     in_runs = [path for run in runs if run.is_dir() for path in run.iterdir()]
     check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[*reference, *(base or ()), *in_runs])
-    try:
-        bins = ErrorBins(elevation_deg=_edges(elevations), sectors=sectors, cn0_dbhz=_edges(cn0))
-        fit = ErrorModelFit(bins=bins, least_blocks=least_blocks)
-    except ValueError as error:
-        raise SettingsError(f"bins of the model: {error}") from None
+    edges = {"elevation_deg": _edges("--elevations", elevations), "cn0_dbhz": _edges("--cn0", cn0)}
+    bins = validated(ErrorBins, {**edges, "sectors": sectors}, source="bins of the model")
+    fit = validated(ErrorModelFit, {"bins": bins, "least_blocks": least_blocks}, source="--least-blocks")
     place = None if base_position is None else np.asarray(place_of(base_position, "--base-position"))
     inputs = [
         ModelInputs(run=run, reference=file, base=tuple(base or ()), base_position_ecef_m=place)
@@ -99,8 +98,11 @@ def error_model(
     typer.echo(f"wrote {out}")
 
 
-def _edges(text: str) -> tuple[float, ...]:
-    return tuple(float(part) for part in text.split(","))
+def _edges(option: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError:
+        raise SettingsError(f"{option} {text!r}: expected numbers with commas, for example 10,20,40") from None
 
 
 def priors_text(rate: FaultRate) -> str:

@@ -12,7 +12,7 @@ from railfix.cli.evaluate_tables import show_evaluation
 from railfix.cli.options import OverwriteOption, Without, from_models
 from railfix.core.errors import SettingsError
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
-from railfix.evaluate.run_folder import POSITIONS_TABLE, tables_of
+from railfix.evaluate.run_folder import POSITIONS_TABLE, TABLES, tables_of
 from railfix.run.inputs import INPUTS
 from railfix.run.output import OutputFolder
 
@@ -103,6 +103,8 @@ def evaluate(
     4 a setting is wrong; 5 run, reference and line do not match each other; 8 DIR cannot be written;
     1 a defect of railfix.
     """
+    if unknown := [name for name in table or () if name not in TABLES]:
+        raise SettingsError(f"--table {unknown[0]}: no such table; known are {', '.join(TABLES)}")
     pairs = [
         replace(pair, table=name, conventional=conventional)
         for pair in _paired(runs, reference, label)

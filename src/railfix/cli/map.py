@@ -280,7 +280,11 @@ def _print_thinned(track: Track, thinned: Thinned, rows: int, out: Path) -> None
     quality = check_track(track)
     console.print(f"map check: {len(quality.errors)} error(s), {len(quality.warnings)} warning(s)")
     for finding in quality.errors[:_SHOWN]:
-        console.print(f"error: {finding.sentence}; a larger --spacing smooths noisy positions", markup=False)
+        console.print(f"error: {finding.sentence}", markup=False)
+    if quality.errors:
+        console.print(
+            "a larger --spacing smooths noisy positions; a road turns more sharply than the checks allow a line"
+        )
     for reason, count in thinned.dropped.items():
         if count:
             console.print(f"dropped {count} {reason}")

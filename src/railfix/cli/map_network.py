@@ -253,6 +253,8 @@ def match_command(
     net = _network(maps, reading, tolerance)
     positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
     matched = match(net, positions, sigma_m=sigma)
+    if not (matched.track >= 0).any():
+        raise MismatchError(f"{log}: no position lies near a track of the network; is it the map of this region?")
     write_whole(out, _matched_csv(net, positions, matched))
     console = console_of_tables()
     on = matched.track >= 0

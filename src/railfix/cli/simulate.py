@@ -172,6 +172,8 @@ def _changes(setting: list[str], seconds: float | None, seed: int | None) -> dic
     changes: dict[str, Any] = {}
     for text in setting:
         set_value(changes, text)
+    if seconds is not None and not seconds > 0.0:
+        raise SettingsError(f"--seconds must be positive, got {seconds:g}")
     if seconds is not None:
         changes["duration_s"] = seconds
     if seed is not None:

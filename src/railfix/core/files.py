@@ -283,7 +283,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
     except RecursionError:
         raise InputFileError(path, f"is nested too deeply; expected {what}") from None
     except json.JSONDecodeError as error:
-        raise InputFileError(path, f"is not valid JSON: {error}") from None
+        raise InputFileError(path, f"is not valid JSON ({error}); expected {what}") from None
     if not isinstance(content, dict):
         raise InputFileError(path, f"is not {what}; expected a JSON object")
     return content

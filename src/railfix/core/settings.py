@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, get_args, get_origin
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import FilePath, write_whole
@@ -23,6 +23,16 @@ class Settings(BaseModel):
     """Base of all settings: frozen, validated on construction, unknown names rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_switch_for_a_number(cls, value: Any, info: ValidationInfo) -> Any:
+        """Reject true and false where a number is expected; pydantic takes them for 1 and 0."""
+        kind = cls.model_fields[str(info.field_name)].annotation
+        parts = (kind, *get_args(kind))
+        if isinstance(value, bool) and bool not in parts and (int in parts or float in parts):
+            raise ValueError("a number was expected")
+        return value
 
     def replaced(self, **changes: Any) -> Self:
         """Return a validated copy with some settings changed.
@@ -91,15 +101,26 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
         where = ".".join(str(part) for part in first["loc"] if part != "[key]")
         if first["type"] == "extra_forbidden":
             known = sorted(_fields_at(model, first["loc"][:-1]))
-            close = misspelt([str(first["loc"][-1])], known).values()
+            close = [*misspelt([str(first["loc"][-1])], known).values()] or _in_groups(model, str(first["loc"][-1]))
             hint = "".join(f"; is {name!r} meant?" for name in close)
             raise SettingsError(f"{source}: unknown setting {where}; known are {', '.join(known)}{hint}") from None
         if first["type"] == "missing":
             raise SettingsError(f"{source}: setting {where} is missing") from None
-        message = first["msg"].removeprefix("Value error, ")
+        message = first["msg"].removeprefix("Value error, ").replace("a valid tuple", "a list")
         given = "" if isinstance(first["input"], (Mapping, BaseModel)) else f", got {first['input']!r}"
         place = f"setting {where}: " if where else ""
         raise SettingsError(f"{source}: {place}{message}{given}") from None
+
+
+def _in_groups(model: type[BaseModel], name: str) -> list[str]:
+    """Return the settings of this name in the groups of a model, dotted: at most one, lest the message is a list."""
+    groups = {key: field.annotation for key, field in model.model_fields.items()}
+    found = [
+        f"{key}.{name}"
+        for key, kind in groups.items()
+        if isinstance(kind, type) and issubclass(kind, BaseModel) and name in kind.model_fields
+    ]
+    return found if len(found) == 1 else []
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
@@ -140,7 +161,7 @@ def read_toml(path: FilePath, *, what: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputFileError(path, f"is not valid TOML: {error}") from None
+        raise InputFileError(path, f"is not valid TOML ({error}); {what} was expected") from None
 
 
 def load_settings(model: type[Model], path: FilePath, *, what: str = "a settings file") -> Model:

@@ -22,7 +22,7 @@ from railfix.evaluate.levels import level_table
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.outages import outage_table
 from railfix.evaluate.place import TrackFiles
-from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, UNKNOWN_KIND, RunFolder, read_run
+from railfix.evaluate.run_folder import NO_MORE, POSITIONS_TABLE, TABLES, UNKNOWN_KIND, RunFolder, read_run
 from railfix.evaluate.sections import read_sections
 from railfix.io.reference_log import AntennaReference, read_reference
 
@@ -296,6 +296,8 @@ def _part(
         path = item.reference or reference_beside(folder)
         if item.reference is None:
             notes.append(f"the reference was found beside the log: {path}")
+        if path.resolve().parent == item.run.resolve() and path.name.split(".")[0] in TABLES:
+            raise MismatchError(f"{path}: is a table of the run itself; give a reference that was measured otherwise")
         key = path, tuple(folder.antennas)
         if key not in read:
             read[key] = read_reference(path, folder.antennas)

@@ -31,6 +31,7 @@ CONVENTIONAL: Final = (
 )
 #: Table of single-epoch positions. Another table of the same run, such as ``train``, takes `SINGLE_EPOCH` from it.
 POSITIONS_TABLE: Final = "positions"
+TABLES: Final = (POSITIONS_TABLE, "train")
 SINGLE_EPOCH: Final = ("n_used", *CONVENTIONAL)
 #: Kind of protection levels where neither positions nor ``run.json`` name it.
 UNKNOWN_KIND: Final = "unknown"
@@ -166,7 +167,7 @@ def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def tables_of(path: Path) -> list[str]:
     """Names of the tables of positions in the folder of a run, the single-epoch positions first."""
-    return [name for name in (POSITIONS_TABLE, "train") if any((path / f"{name}{end}").is_file() for end in _ENDINGS)]
+    return [name for name in TABLES if any((path / f"{name}{end}").is_file() for end in _ENDINGS)]
 
 
 def read_run(

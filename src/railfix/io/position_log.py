@@ -98,7 +98,11 @@ def _read_csv(path: str | PathLike[str], columns: dict[str, str]) -> PositionLog
     unknown = sorted(set(columns) - set(CSV_COLUMNS))
     if unknown:
         raise SettingsError(f"{path}: column {unknown[0]!r} is unknown; expected one of {', '.join(CSV_COLUMNS)}")
-    return positions_of_table(renamed(read_named_columns(path), columns))
+    table = renamed(read_named_columns(path), columns)
+    antennas = table.cells["antenna"].unique().sort().to_list() if "antenna" in table else []
+    if len(antennas) > 1:
+        raise InputFileError(path, f"has positions of {' and '.join(antennas)}; give those of one antenna")
+    return positions_of_table(table)
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:

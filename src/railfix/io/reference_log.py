@@ -127,7 +127,9 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
         owner = np.array(table.cells["antenna"].to_list(), dtype=np.str_)
     elif len(antennas) > 1:
         raise InputFileError(
-            path, f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas"
+            path,
+            f"a column antenna ({', '.join(antennas)}) is needed for the reference of two antennas; give a CSV file "
+            "with one (railfix reference makes it of a log of one antenna)",
         )
     columns = _columns(log, table)
     return {name: _of_antenna(path, name, owner, usable, columns) for name in antennas}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Final, Literal
 
 import numpy as np
 
 from railfix.core.errors import MismatchError, NoPositionError
 from railfix.gnss.navigation import Navigation
+from railfix.motion.samples import SensorSamples
 from railfix.ranges.sbas import SbasCorrections
 from railfix.run.tally import AntennaTally, Tally
 
@@ -117,6 +119,23 @@ def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
             raise MismatchError(
                 f"the SBAS messages of {_period(first, last)} and the {name} log of "
                 f"{_period(antenna.first, antenna.last)} (GPS time) have no time in common; give those of that day"
+            )
+
+
+def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
+    """Raise where a sensor has not one sample during the logs.
+
+    Raises
+    ------
+    MismatchError
+    """
+    spans = [(a.first, a.last) for a in tally.antennas.values() if a.first is not None and a.last is not None]
+    for sensor in fields(sensors):
+        time = getattr(sensors, sensor.name).time
+        if len(time) and spans and not any(first <= time[-1] and time[0] <= last for first, last in spans):
+            raise MismatchError(
+                f"the samples of --{sensor.name} of {_period(time[0], time[-1])} and the logs of "
+                f"{_period(*spans[0])} (GPS time) have no time in common; give those of that day"
             )
 
 

@@ -30,6 +30,7 @@ from railfix.run.checks import (
     check_same_place,
     check_same_time,
     check_sbas_time,
+    check_sensor_time,
 )
 from railfix.run.chunks import cuts
 from railfix.run.inputs import Antenna, RunInputs
@@ -154,6 +155,7 @@ def run_files(
         check_same_day(navigation, tally, reach=RECORD_REACH)
         check_same_place(tally)
         check_sbas_time(processor.received.sbas, tally)
+        check_sensor_time(sensors, tally)
         check_positions(tally)
         sigma, found_levels = along_sigma(folder), levels(folder)
         tracks = filtered(folder) if config.filter == "track" else {}
@@ -292,6 +294,8 @@ def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     samples = read_sensors(
         tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging
     )
+    if inputs.ranging is None and inputs.ranging_units is not None:
+        raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
     units = None if inputs.ranging_units is None else read_units(inputs.ranging_units)
     check_units(samples, units, inputs.ranging_units)
     return samples, units

@@ -249,13 +249,13 @@ def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Pa
     """
     with _writing(target):
         check_not_input(target, inputs)
-        what, endings, other = _ENDINGS.get(kind, ("", (), ""))
-        if endings and target.suffix.lower() not in endings:
-            raise OutputError(f"{target}: {what} is written; name a file that ends in {' or '.join(endings)}{other}")
         if not target.parent.is_dir():
             raise OutputError(f"{target}: the folder {target.parent} does not exist; make it, or name another")
         if target.is_dir():
             raise OutputError(f"{target}: is a folder, expected the name of a file to write")
+        what, endings, other = _ENDINGS.get(kind, ("", (), ""))
+        if endings and target.suffix.lower() not in endings:
+            raise OutputError(f"{target}: {what} is written; name a file that ends in {' or '.join(endings)}{other}")
         if target.exists() and overwrite == "refuse":
             raise OutputError(f"{target}: the file exists already; name another one, or give --overwrite")
         if not os.access(target.parent, os.W_OK):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 import polars as pl
@@ -54,8 +54,8 @@ def read_sensors(
         direction = table["direction"] if "direction" in table.columns else pl.Series([0]).new_from_index(0, len(table))
         values["tachometer"] = TachometerPulses(
             time=_times(table),
-            pulse=table["pulse"].cast(pl.Int64).to_numpy(),
-            direction=direction.cast(pl.Int64).to_numpy(),
+            pulse=table["pulse"].to_numpy(),
+            direction=direction.cast(pl.Int64).fill_null(0).to_numpy(),
         )
     if inertial is not None:
         table = _table(inertial, "inertial")
@@ -134,6 +134,8 @@ def _table(path: Path, kind: str) -> pl.DataFrame:
     table = _columns(path, kind)
     if not table["time_gpst"].dtype.is_temporal():
         raise InputFileError(path, "time_gpst is no time; expected GPS time as 2024-03-05T03:10:00.000000000")
+    if (unknown := table["time_gpst"].is_null()).any():
+        raise InputFileError(path, f"row {int(unknown.arg_max() or 0) + 2}: time_gpst is empty; remove the row")
     falling = np.flatnonzero(np.diff(_times(table)) < np.timedelta64(0, "ns"))
     if len(falling):
         raise InputFileError(path, f"row {int(falling[0]) + 3}: time_gpst falls; sort the table by time")
@@ -156,4 +158,21 @@ def _columns(path: Path, kind: str) -> pl.DataFrame:
     missing = [name for name in needed if name not in table.columns]
     if missing:
         raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
-    return table
+    if not len(table):
+        raise InputFileError(path, f"has no rows; expected those of the {kind}, or leave the file out")
+    return table.with_columns(
+        _numbers(path, table[name], empty="refuse" if name == "pulse" else "keep")
+        for name in (column.strip("[]") for column in COLUMNS[kind])
+        if name != "unit" and name in table.columns
+    )
+
+
+def _numbers(path: Path, column: pl.Series, *, empty: Literal["refuse", "keep"]) -> pl.Series:
+    """A column as numbers; those of pulses and directions are whole."""
+    numbers = column.cast(pl.Int64 if column.name in ("pulse", "direction") else pl.Float64, strict=False)
+    wrong = numbers.is_null() & (column.is_not_null() | (empty == "refuse"))
+    if wrong.any():
+        row = int(wrong.arg_max() or 0)
+        message = f"row {row + 2}: {column.name} is {column[row]!r}, a number was expected; correct the row"
+        raise InputFileError(path, message)
+    return numbers

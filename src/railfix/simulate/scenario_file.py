@@ -98,6 +98,7 @@ class Recipe:
             del table["duration_s"]
         name = self.names[number]
         source = f"{self.path}, run {name}" if name else str(self.path)
+        source += " with the settings of the command line" if changes else ""
         scenario = validated(Scenario, table, source=source)
         if not to_the_end:
             return scenario

@@ -106,7 +106,9 @@ def _version(path: FilePath, first: str) -> tuple[float, str]:
         raise InputFileError(path, f"RINEX version {first[:9].strip()!r} is not a number", line=1) from None
     kind = first[20:21].upper()
     if kind == "O":
-        raise InputFileError(path, "is a RINEX observation file, a navigation file was expected", line=1)
+        raise InputFileError(
+            path, "is a RINEX observation file; give it with --front or --rear (a navigation file was expected)", line=1
+        )
     if not 2.0 <= version < 5.0:
         raise InputFileError(path, f"RINEX version {version:g} is not supported; 2, 3 and 4 are", line=1)
     if kind != "N" and not (kind in ("G", "H") and version < 3.0):
