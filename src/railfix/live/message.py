@@ -63,13 +63,13 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     values: dict[str, object] = {}
     level = _level_m(antenna)
     single = float(antenna.chainage_m[-1])
+    amount = math.nan if track is None or not len(track) else float(track.tracked.amount_m[-1])
     if math.isfinite(place):
         front = place + settings.facing * settings.front_offset_m
         values["chainage_cm"] = round(front * 100.0)
         if math.isfinite(sigma_m):
             values["sigma_cm"] = _up_cm(sigma_m)
         bound = level + abs(place - single) + 0.01 if math.isfinite(single) else math.inf
-        amount = math.nan if track is None or not len(track) else float(track.tracked.amount_m[-1])
         if math.isfinite(amount):  # the filter has a level of its own
             bound, level = amount + 0.01, float(track.tracked.level_m[-1]) if track is not None else level
         if math.isfinite(bound):
@@ -77,7 +77,8 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
             values["protection_level_cm"] = _up_cm(level)
         elif status is MessageStatus.POSITION:
             status = MessageStatus.DOUBTFUL
-    if status is MessageStatus.COASTING and "over_cm" not in values:
+    # The bound of a position that failed a check is none for the place that the sensors carry.
+    if status is MessageStatus.COASTING and not ("over_cm" in values and (math.isfinite(amount) or _passed(antenna))):
         status = MessageStatus.DOUBTFUL
     if track is not None and len(track):
         speed, sigma = float(track.tracked.speed_mps[-1]), float(track.tracked.speed_sigma_mps[-1])
@@ -122,21 +123,25 @@ def _filtered(track: AlongTrack | None) -> TypeGuard[AlongTrack]:
 
 def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple[float, MessageStatus]:
     """Place [m], NaN without one, and what it is worth."""
-    single = Status(int(antenna.status[-1]))
     place = float(antenna.chainage_m[-1])
-    available = antenna.protection is None or antenna.protection.status[-1] != LevelStatus.ALARM
     if not _filtered(track):
         if not math.isfinite(place):
             return place, MessageStatus.NO_POSITION
         on_map = track is None or not len(track) or track.tracked.status[-1] != TrackStatus.OFF_MAP
-        good = single is Status.OK and available and on_map
+        good = _passed(antenna) and on_map
         return place, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
     filtered = float(track.chainage_m[-1])
     status = TrackStatus(int(track.tracked.status[-1]))
     if status is TrackStatus.COASTING:
         return filtered, MessageStatus.COASTING
-    good = status is TrackStatus.TRACKING and single is Status.OK and available
+    good = status is TrackStatus.TRACKING and _passed(antenna)
     return filtered, MessageStatus.POSITION if good else MessageStatus.DOUBTFUL
+
+
+def _passed(antenna: AntennaResult) -> bool:
+    """Whether the last single epoch passed every check and raises no alarm."""
+    alarm = antenna.protection is not None and antenna.protection.status[-1] == LevelStatus.ALARM
+    return int(antenna.status[-1]) == Status.OK and not alarm
 
 
 def _level_m(antenna: AntennaResult) -> float:
