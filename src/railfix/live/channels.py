@@ -6,6 +6,7 @@ messages with digests of its stages. At the first difference the output stops an
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import multiprocessing
 from collections import Counter, deque
@@ -62,6 +63,7 @@ def _digest(arrays: list[Any]) -> str:
 def _second_channel(connection: Connection, processor: EpochProcessor, settings: LiveSettings) -> None:
     """The second process: carries out calls until the connection closes."""
     engine = LiveEngine(processor, settings)
+    gc.freeze()  # as the first channel's
     while True:
         try:
             name, arguments, keywords = connection.recv()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import signal
 import sys
 from collections.abc import Mapping
@@ -101,6 +102,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
         if inputs.metrics is not None:
             held.callback((await serve_metrics(metrics, inputs.metrics)).close)
         hooks, streams = _hooks(inputs, live, engine, log, held, full="wait" if replay else "drop")
+        gc.freeze()  # what is loaded stays: looking through it for garbage would hold an epoch up for 0.1 s
         session = asyncio.create_task(
             run_session(
                 engine,
