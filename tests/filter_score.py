@@ -2,8 +2,8 @@
 
 Tables: ``figures`` (single epochs beside, and smoothed), ``codes`` (whether their errors are common), ``ablation``
 (without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``levels``,
-``faults`` (of each satellite in turn, a quarter of an hour; only when asked for), ``cost``. One setting for all
-recordings; distances are straight ones on the map.
+``terms`` (what decides them), ``faults`` (of each satellite in turn, a quarter of an hour; only when asked for),
+``cost``. One setting for all recordings; distances are straight ones on the map.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+from scipy.special import ndtr
 
 import recordings_score
 import recordings_truth
@@ -29,6 +30,7 @@ from railfix.pipeline.smoothing import Replay, SmoothedTrack, smooth
 from railfix.ranges.weights import code_sigma_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackStatus, track
+from railfix.tracking.bank import budget, kind_of
 
 CONFIG = parse_config({"filter": "track", "elevation": {"mask_deg": 15.0}})
 #: Noise of the smartLoc receiver's codes against the weights, as a variance (docs/recordings: about 8).
@@ -302,6 +304,39 @@ def show_levels(all_cases: list[Case]) -> None:
         )
 
 
+def show_terms(all_cases: list[Case]) -> None:
+    """Which hypothesis spends most of the risk at the level, and how it differs; levels by other priors."""
+    for case in all_cases:
+        limits, line = TrackingLimits(level="on"), Line.of(case.trajectory)
+        given, state = budget(limits), None
+        named: dict[str, list[tuple[float, float, float]]] = {}
+        for t in range(len(case.epochs)):
+            found, state = track(case.epochs.part(t, t + 1), line, state, limits=limits)
+            if state.bank is None or not len(state.bank.without) or not np.isfinite(found.level_m[0]):
+                continue
+            apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
+            sigma = np.sqrt(state.bank.covariance[:, 0, 0])
+            prior = np.array([given.prior[kind_of(name)] for name in state.bank.without])
+            spent = prior * (ndtr((apart - found.level_m) / sigma) + ndtr((-apart - found.level_m) / sigma))
+            own = 2.0 * ndtr(-found.level_m[0] / found.sigma_m[0])
+            k = int(np.argmax(spent))
+            name = state.bank.without[k] if spent[k] > own else "noise"
+            named.setdefault(name, []).append((max(float(spent[k]), own) / given.risk, sigma[k], apart[k]))
+        for name, rows in sorted(named.items(), key=lambda item: -len(item[1]))[:2]:
+            share, sigma_m, apart_m = np.median(rows, axis=0)
+            print(
+                f"{case.name:9s} {name:5s} at {len(rows)} of {sum(map(len, named.values()))} epochs: "
+                f"{100 * share:.0f} % of the risk, sigma {sigma_m:.1f} m, {apart_m:.1f} m apart"
+            )
+        for label, changes in (
+            ("without faults of constellations", {"level_constellation_prior": 0.0}),
+            ("6 independent errors an hour", {"level_samples_per_hour": 6.0}),
+        ):
+            found = case.run(level="on", **changes)
+            ok = case.observed & _levelled(found)
+            print(f"{case.name:9s} {label}: level p50 {np.median(found.level_m[ok]):.1f} m", flush=True)
+
+
 #: Faults by name: metres of a range so many seconds after they began.
 FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     **{f"ramp {rate:g} m/s": (lambda t, rate=rate: rate * t) for rate in (0.02, 0.1, 0.5, 1.0)},
@@ -381,6 +416,7 @@ TABLES = {
     "ablation": show_ablation,
     "gaps": show_gaps,
     "levels": show_levels,
+    "terms": show_terms,
     "faults": show_faults,
     "cost": show_cost,
 }
@@ -395,7 +431,7 @@ def main() -> int:
     listed = list(cases(data))
     for name in asked:
         print(f"\n{name}")
-        TABLES[name]([*listed, smartloc_case(data)] if name in ("figures", "codes", "levels", "faults") else listed)
+        TABLES[name](listed if name in ("ablation", "gaps", "cost") else [*listed, smartloc_case(data)])
     return 0
 
 

@@ -24,6 +24,7 @@ from railfix.simulate import Scenario, Simulation
 from railfix.simulate.run import vehicle_table
 from railfix.simulate.scenario_file import load_recipe
 from railfix.simulate.sensors.tables import sensor_tables
+from railfix.track import Track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
 #: The inertial unit of `commercial-run`.
@@ -63,16 +64,17 @@ class Ride:
         observations: Observations | None = None,
         samples: SensorSamples | None = None,
         cuts: Sequence[int] = (),
+        track: Track | None = None,
         **settings: object,
     ) -> AlongTrack:
-        """Through the filter, in chunks that end at `cuts`."""
-        line = self.simulation.line
+        """Through the filter on a map (of the whole line without one), in chunks that end at `cuts`."""
+        track = track or self.simulation.line.track()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "vehicle.toml"
             write_toml(path, vehicle_table(self.simulation.scenario.vehicle))
-            trajectories = {"front": antenna_trajectory(line.track(), read_vehicle(path), "front")}
+            trajectories = {"front": antenna_trajectory(track, read_vehicle(path), "front")}
         config = parse_config({"filter": "track", "protection": "off", **settings})
-        processor = processor_of(config, self.simulation.navigation, trajectories, track=line.track(), units=self.units)
+        processor = processor_of(config, self.simulation.navigation, trajectories, track=track, units=self.units)
         whole = self.observations if observations is None else observations
         samples = self.samples if samples is None else samples
         state, received = State(), np.datetime64("NaT", "ns")

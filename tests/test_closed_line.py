@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import synthetic
 from railfix import kernels
 from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.core.timescale import timedelta
+from railfix.pipeline.return_gate import ReturnState, refused_codes
+from railfix.pipeline.smoothing import Replay, smooth
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.section_search import SearchIndex, SectionLimits, search
 from railfix.positioning.single_point import single_point
+from railfix.simulate.scenario_file import load_recipe
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory
-from railfix.tracking import Line, TrackStatus, track
-from tracking_cases import LATITUDE, LONGITUDE, bent_line, ride
+from railfix.tracking import Kind, Line, SensorEpochs, TrackingLimits, TrackStatus, track
+from sensed_ride import UNIT, Ride, made
+from tracking_cases import LATITUDE, LONGITUDE, START, bent_line, part, ride, wheel, without_epochs
 
 RADIUS_M = 400.0
 POINTS = 250
@@ -73,6 +80,80 @@ def round_the_ring(found_m: np.ndarray, true_m: np.ndarray, length_m: float) -> 
     return np.asarray(np.mod(found_m - true_m + 0.5 * length_m, length_m) - 0.5 * length_m)
 
 
+@pytest.mark.requirement("E5")
+def test_beyond_the_end_the_ring_goes_on() -> None:
+    line, laps = Line.of(ring(1.0)), Line.of(ring(3.0))
+    length = float(line.arc_m[-1])
+    arc = np.array([-0.4, 0.3, 1.001, 1.2, 2.7]) * length
+    for given, expected in zip(line.at(arc), laps.at(np.mod(arc, length)), strict=True):
+        np.testing.assert_allclose(given, expected, atol=2e-3)
+    both = np.array([3.0, length - 3.0])
+    np.testing.assert_allclose(line.nearest_m(both, np.array(length)), [length + 3.0, length - 3.0])
+    np.testing.assert_allclose(
+        line.nearest_m(both, np.array(2.0 * length + 5.0)), [2.0 * length + 3.0, 2.0 * length - 3.0]
+    )
+    open_line = Line.of(bent_line())
+    np.testing.assert_array_equal(open_line.nearest_m(np.array([3.0]), np.array(5000.0)), [3.0])
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("kernel", ["numpy", "numba"])
+@pytest.mark.parametrize("kind", ["no sensor", "wheel", "nothing logged"])
+def test_an_outage_across_the_join_changes_nothing(kind: str, kernel: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The places are those on a map of two laps, which has no join there."""
+    if kernel == "numba":
+        pytest.importorskip("numba", reason="railfix[fast] is not installed")
+    monkeypatch.setattr(kernels, "CHOSEN", kernel)
+    closed, laps = ring(1.0), ring(2.0)
+    length = float(closed.arc_m[-1])
+    case = ride(85, trajectory=laps, start_m=length - 400.0, noise=1.0)
+    cross = int(np.argmax(case.arc_m > length))
+    out = np.zeros(len(case.epochs), dtype=bool)
+    epochs, sensors = case.epochs, None
+    if kind == "nothing logged":  # 24 s: places are sought again, on both sides of the join
+        kept = np.flatnonzero(np.abs(np.arange(len(epochs)) - cross) >= 12)
+        epochs = part(epochs, kept)
+        joined = epochs.phase_joined.copy()
+        joined[np.argmax(kept > cross)] = False
+        epochs = replace(epochs, phase_joined=joined)
+        true = case.arc_m[kept]
+    else:
+        out[cross - 8 : cross + 8] = True
+        epochs, true = without_epochs(epochs, out), case.arc_m
+        sensors = wheel(case) if kind == "wheel" else None
+    found, _ = track(epochs, Line.of(closed), sensors=sensors)
+    same, _ = track(epochs, Line.of(laps), sensors=sensors)
+    np.testing.assert_allclose(round_the_ring(found.arc_m, same.arc_m, length)[30:], 0.0, atol=0.05)
+    assert set(found.status[30:].tolist()) <= {TrackStatus.TRACKING, TrackStatus.COASTING}
+    assert np.abs(round_the_ring(found.arc_m, true, length)[~out[: len(true)]][30:]).max() < 1.0
+
+
+@pytest.mark.requirement("E5")
+def test_smoothed_places_go_round() -> None:
+    closed, laps = ring(1.0), ring(2.0)
+    length = float(closed.arc_m[-1])
+    case = ride(60, trajectory=laps, start_m=length - 250.0, noise=1.0)
+    both = smooth([Replay(epochs=case.epochs, sensors=SensorEpochs(), before=None)], Line.of(closed), TrackingLimits())
+    assert case.arc_m[-1] > length + 100.0
+    assert (both.arc_m >= 0.0).all()
+    assert (both.arc_m <= length).all()
+    assert np.abs(round_the_ring(both.arc_m, case.arc_m, length)).max() < 1.0
+
+
+@pytest.mark.requirement("E5")
+def test_codes_that_come_back_beyond_the_join_count() -> None:
+    line = Line.of(ring(1.0))
+    length = float(line.arc_m[-1])
+    time = START + timedelta(np.arange(8.0))
+    observed = np.arange(8) >= 3
+    state = ReturnState(time=time[0], place_m=length - 20.0, sigma_m=1.0)
+    place = np.mod(length - 20.0 + 10.0 * np.arange(1, 9), length)
+    refused, _ = refused_codes(
+        time, observed, np.full(8, 10.0), place, np.ones(8), state, line, sigmas=4.0, longest_s=60.0
+    )
+    np.testing.assert_array_equal(np.flatnonzero(refused), [3, 4])
+
+
 @pytest.mark.requirement("C1")
 def test_a_vehicle_on_a_ring_has_closed_paths() -> None:
     axes = enu_axes(np.array(LATITUDE), np.array(LONGITUDE))
@@ -106,3 +187,60 @@ def test_single_epochs_at_the_join_are_placed_and_have_one_place() -> None:
     noisy = synthetic.ranges(closed, true, sigma_m=5.0)
     point = single_point(noisy, closed.ecef_m[:4])
     assert (search(noisy, SearchIndex(closed), point).excess > SectionLimits().threshold).all()
+
+
+@pytest.fixture(scope="module")
+def ring_ride() -> Ride:
+    """One and a half times round, a tunnel over the quarter at which the map begins and ends, the wheel slips in it."""
+    scenario = load_recipe("demo").scenario()
+    lap = 2.0 * np.pi * 150.0
+    tunnel = (1.25 * lap - 75.0, 1.25 * lap + 75.0)
+    return made(
+        scenario.replaced(
+            duration_s=110.0,
+            rate_hz=2.0,
+            line=scenario.line.replaced(
+                kind="elements",
+                elements=({"kind": "curve", "length_m": 1.5 * lap, "radius_m": 150.0, "cant_m": 0.05},),
+                gradients=tuple({"from_m": 0.5 * k * lap, "permille": 8.0 * (-1.0) ** k} for k in range(3)),
+                length_m=1.5 * lap,
+                curve_spacing_m=lap / 400.0,
+            ),
+            environment=scenario.environment.replaced(
+                sections=({"from_m": tunnel[0], "to_m": tunnel[1], "kind": "tunnel"},)
+            ),
+            run=scenario.run.replaced(cruise_mps=15.0),
+            sensors={
+                "tachometer": {
+                    "jitter_s": 2e-6,
+                    "lowest_mps": 0.3,
+                    "slips": [{"start_s": 97.0, "end_s": 99.0, "ratio": 0.25}],
+                },
+                "inertial": UNIT,
+                "radar": {},
+            },
+        )
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("sensors", [("wheel", "force"), ("radar",), ("wheel", "force", "feature")])
+def test_sensors_carry_round_the_join_of_a_ring(sensors: tuple[str, ...], ring_ride: Ride) -> None:
+    whole = ring_ride.simulation.line.track()
+    lap = 2.0 * np.pi * 150.0
+    first, last = (int(np.argmin(np.abs(whole.chainage_m - turn * lap))) for turn in (0.25, 1.25))
+    found = ring_ride.run(
+        track=Track.from_ecef(whole.ecef_m[first : last + 1]), filter_sources=("code", "phase", "doppler", *sensors)
+    )
+    error = round_the_ring(found.chainage_m, ring_ride.chainage_m - whole.chainage_m[first], lap)
+    known = np.isfinite(ring_ride.observations.code_m).any(axis=1)
+    inside = ~known & (ring_ride.time_s > 60.0)
+    assert (found.chainage_m[inside] < 60.0).any()
+    assert (found.chainage_m[inside] > lap - 60.0).any()
+    print(np.abs(error[inside]).max(), np.abs(error[ring_ride.time_s > 30.0]).max())
+    assert np.abs(error[inside]).max() < 1.5
+    assert np.abs(error[ring_ride.time_s > 30.0]).max() < 2.5
+    # codes count again 1.5 s after the tunnel
+    after = np.flatnonzero(known & (ring_ride.time_s > ring_ride.time_s[inside][-1] + 2.0))
+    assert (found.tracked.used[after, Kind.CODE] > 0).all()

@@ -36,6 +36,25 @@ def test_the_level_spends_the_risk_over_all_hypotheses() -> None:
 
 
 @pytest.mark.requirement("C2")
+def test_only_a_contradiction_that_lasts_takes_the_level_away() -> None:
+    mean, covariance = np.zeros((1, 30)), np.ones((1, 30, 30))
+    for weak_s, told in ((0.0, True), (1.0, True), (LIMITS.level_doubt_s, True), (LIMITS.level_doubt_s + 0.1, False)):
+        bank = Bank(without=("G01",), mean=mean, covariance=covariance, weak_s=np.array([weak_s]))
+        assert np.isfinite(level_m(bank, 0.0, 1.0, LIMITS)[0]) == told
+    # half of the codes 60 m late: the filter's own weights are those of a lost track, for 2 s and for 5 s
+    case = ride(60, noise=1.0, seed=5)
+    code = case.epochs.code_m.copy()
+    for begin, end in ((20, 22), (40, 45)):
+        code[begin:end, ::2] += 60.0
+    result, _ = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS)
+    assert (result.code_weight[[20, 21, 40, 44]] < LIMITS.lost_code_weight).all()
+    assert np.isfinite(result.level_m[15:40]).all()
+    assert not np.isfinite(result.level_m[43:45]).any()
+    told = np.isfinite(result.level_m)
+    assert (np.abs(result.arc_m - case.arc_m) <= result.level_m)[told][5:].all()
+
+
+@pytest.mark.requirement("C2")
 def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
     case = ride(20, noise=1.0)
     limits = TrackingLimits(level="on", level_constellation_prior=0.0)

@@ -252,7 +252,7 @@ def _tracked(
         if sensors.ranges is not None:
             sensors = replace(sensors, ranges=_gated_ranges(sensors.ranges, part.time, line, state, config))
         if sensing and len(part):
-            part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], state, config)
+            part, gate = _gated(part, sensors, alone[0][first:last], alone[1][first:last], line, state, config)
             state = replace(state, gate=gate)
         replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
         tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
@@ -263,7 +263,13 @@ def _tracked(
 
 
 def _gated(
-    epochs: GnssEpochs, sensors: SensorEpochs, place_m: Floats, sigma_m: Floats, state: FilterState, config: Config
+    epochs: GnssEpochs,
+    sensors: SensorEpochs,
+    place_m: Floats,
+    sigma_m: Floats,
+    line: Line,
+    state: FilterState,
+    config: Config,
 ) -> tuple[GnssEpochs, ReturnState]:
     """Epochs without the codes that an outage makes doubtful."""
     way = np.full(len(epochs), np.nan)
@@ -272,7 +278,7 @@ def _gated(
             way = np.where(np.isfinite(other), other, way)
     observed = np.asarray(np.isfinite(epochs.code_m).any(axis=1))
     refused, gate = refused_codes(
-        epochs.time, observed, way, place_m, sigma_m, state.gate,
+        epochs.time, observed, way, place_m, sigma_m, state.gate, line,
         sigmas=config.sensors.return_sigmas, longest_s=config.sensors.return_s,
     )  # fmt: skip
     return (

@@ -12,6 +12,7 @@ from railfix.core.timescale import seconds
 from railfix.motion.features import Feature, FeatureLimits, LineSeries, Located, line_series, locate, map_features
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line
 
 #: Slower than this the rates say nothing of the line [m/s].
 _SLOWEST_MPS: Final = 1.0
@@ -29,12 +30,15 @@ class LineFeatures:
     features : tuple of Feature
     antenna_m, body_m : ndarray, shape (V,) [m]
         Arc lengths of the antenna's trajectory, and of the body's middle on the line then: the body turns about it.
+    line : Line
+        Tells whether it is closed.
     """
 
     series: LineSeries
     features: tuple[Feature, ...]
     antenna_m: Floats
     body_m: Floats
+    line: Line
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory, limits: FeatureLimits) -> LineFeatures:
@@ -48,6 +52,7 @@ class LineFeatures:
             features=tuple(map_features(series, limits=limits)),
             antenna_m=np.asarray(trajectory.arc_m),
             body_m=line.arc_at_chainage(inside) + body - inside,
+            line=Line.of(line),
         )
 
     def body_at(self, antenna_m: Floats) -> Floats:
@@ -271,7 +276,11 @@ def _compared(
         gradient=np.tan(pitch[1:-1]),
         curvature_1pm=0.5 * (heading[2:] - heading[:-2]),
     )
-    since = None if last is None else (last[0], last[1], feature.arc_m - shift_m - last[2])
+    since = None
+    if last is not None:
+        way = feature.arc_m - shift_m - last[2]
+        # on a closed line the last feature may lie before the join
+        since = (float(line.line.nearest_m(np.array(last[0]), np.array(feature.arc_m - way))), last[1], way)
     return locate(
         measured, line.series, feature.arc_m, sigma_m, quantity=feature.quantity, noise=noise, last=since, limits=limits
     )

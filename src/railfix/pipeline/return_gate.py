@@ -9,6 +9,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
+from railfix.tracking import Line
 
 #: Without codes for so long the place is that of the sensors [s].
 _OUTAGE_S: Final = 2.0
@@ -54,6 +55,7 @@ def refused_codes(
     place_m: Floats,
     sigma_m: Floats,
     state: ReturnState,
+    line: Line,
     *,
     sigmas: float,
     longest_s: float,
@@ -75,13 +77,14 @@ def refused_codes(
         Position of each epoch by itself; NaN where there is none.
     state : ReturnState
         With the place of the filter at the epoch before the first.
+    line : Line
     sigmas, longest_s : float
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     ways = state.way_m + np.cumsum(way_m)
     coasted = state.place_m + np.cumsum(way_m)
     spread = np.sqrt(state.sigma_m**2 + (_WAY_SHARE * ways) ** 2 + np.maximum(sigma_m, _LEAST_SIGMA_M) ** 2)
-    fits = np.abs(place_m - coasted) <= sigmas * spread
+    fits = np.abs(line.nearest_m(place_m, coasted) - coasted) <= sigmas * spread
     last, returned, agreeing = state.time, state.returned, state.agreeing
     steps = seconds(np.diff(time, prepend=last if not np.isnat(last) else time[:1]))
     if np.isnat(returned) and observed.all() and steps.max(initial=0.0) < _OUTAGE_S:

@@ -66,9 +66,8 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
             trace: list[Step] = []
             track(epochs, line, before, limits=limits, sensors=replay.sensors, trace=trace)
             found, later = smoothed(trace, before or TrackState.empty(), later, limits)
-            parts.append(
-                SmoothedTrack(time=epochs.time, arc_m=found.arc_m, sigma_m=found.sigma_m, speed_mps=found.speed_mps)
-            )
+            arc = found.arc_m + line.round_m(found.arc_m)
+            parts.append(SmoothedTrack(time=epochs.time, arc_m=arc, sigma_m=found.sigma_m, speed_mps=found.speed_mps))
     parts.reverse()
     empty = {"time": np.empty(0, dtype="datetime64[ns]")}
     return SmoothedTrack(

@@ -247,8 +247,9 @@ def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
 def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) -> tuple[float, float, float]:
     """Level, what it is without faults, and the largest separation [m].
 
-    Infinite without a sub-filter, and where the measurements of one contradict it: it has settled somewhere else, or
-    began where the fault of its source had led the filter, and bounds nothing.
+    Infinite without a sub-filter, and where the measurements of one have contradicted it for longer than
+    `TrackingLimits.level_doubt_s`: it has settled somewhere else, or began where the fault of its source had led the
+    filter, and bounds nothing.
 
     Parameters
     ----------
@@ -278,4 +279,5 @@ def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) 
         level += step
         if abs(step) < PRECISION_M:
             break
-    return float("inf") if bank.weak_s.any() else level, noise, float(apart.max())
+    contradicted = (bank.weak_s > limits.level_doubt_s).any()
+    return float("inf") if contradicted else level, noise, float(apart.max())

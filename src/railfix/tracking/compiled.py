@@ -68,6 +68,8 @@ class Compiled:
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
         ranged, left = sensors.ranges, chunk.apart | chunk.off_map
         sensor, sigma = _columns(sensors, len(chunk.time))
+        if line.closed:
+            left = left | np.isfinite(sensor[:, 3])
         self.sensed = [bool(column.any()) for column in np.isfinite(sensor).T]
         values = {
             "time_s": seconds(chunk.time - chunk.time[0]),

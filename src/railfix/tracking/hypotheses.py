@@ -72,7 +72,8 @@ def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> tupl
     order = order[likelihood[order] > likelihood[order[0]] - _WORSE]
     chosen: list[int] = []
     for candidate in order.tolist():
-        if all(abs(arc[candidate] - arc[other]) > limits.start_separation_m for other in chosen):
+        apart = np.abs(line.nearest_m(arc[chosen], arc[candidate]) - arc[candidate])
+        if (apart > limits.start_separation_m).all():
             chosen.append(candidate)
         if len(chosen) == limits.most_hypotheses:
             break

@@ -96,6 +96,9 @@ class TrackingLimits(Settings):
         Probability that a sensor on board is faulty at such a sample. An assumption.
     level_passes : int
         Rounds of reweighting of the sub-filters.
+    level_doubt_s : float
+        A filter that its own measurements contradict (mean weights as of a lost track) for longer bounds nothing. A
+        contradiction of single epochs is noise, which the weights have in the standard deviation.
     expired_sigma_m : float
         Standard deviation from which on a predicted place is no position.
     """
@@ -147,6 +150,7 @@ class TrackingLimits(Settings):
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_passes: int = Field(default=3, ge=1)
+    level_doubt_s: float = Field(default=3.0, ge=0)
     expired_sigma_m: float = Field(default=200.0, gt=0)
 
     @property

@@ -57,7 +57,7 @@ class Line:
         )
 
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
-        """Points and axes at arc lengths, straight on beyond the ends.
+        """Points and axes at arc lengths, beyond the ends of a closed line where it goes on, of others straight on.
 
         Parameters
         ----------
@@ -69,6 +69,7 @@ class Line:
         axes : ndarray, shape (H, 3, 3)
             Rows: tangent, right, up; interpolated between vertices.
         """
+        arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         index = np.searchsorted(self.arc_m[1:-1], arc_m, side="right")
         along = arc_m - self.arc_m[index]
         share = np.minimum(np.maximum(along / (self.arc_m[index + 1] - self.arc_m[index]), 0.0), 1.0)[:, None, None]
@@ -90,6 +91,11 @@ class Line:
             float(self.arc_m[-1]) if np.isnan(after) else np.inf,
         )
 
+    @cached_property
+    def closed(self) -> bool:
+        """Whether the line goes on at one of its ends."""
+        return bool(np.isfinite(self.joins_m).any())
+
     def round_m(self, arc_m: Floats) -> Floats:
         """Shift of places beyond an end of a closed line to where it goes on [m]; 0 for others.
 
@@ -97,13 +103,35 @@ class Line:
         ----------
         arc_m : ndarray [m]
         """
-        before, after = np.nan_to_num(self.joins_m, nan=np.inf)
+        back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
-        return np.where(
-            (arc_m > last) & np.isfinite(after),
-            after - last,
-            np.where((arc_m < first) & np.isfinite(before), before - first, 0.0),
-        )
+        for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):
+            if turn == turn:
+                back -= np.maximum(np.ceil(np.nan_to_num(excess) / abs(turn)), 0.0) * turn
+        return back
+
+    def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
+        """Arc lengths of the same places that are nearest to others, beyond an end of a closed line if need be [m].
+
+        Parameters
+        ----------
+        arc_m : ndarray [m]
+            On the line.
+        to_m : ndarray [m]
+            May lie beyond an end.
+        """
+        if not self.closed:
+            return arc_m
+        back = self.round_m(to_m)
+        inside = to_m + back
+        (before, after), first, last = self.joins_m, self.arc_m[0], self.arc_m[-1]
+        nearest = arc_m
+        for other in (
+            np.where(arc_m >= after, arc_m + (last - after), np.nan),
+            np.where(arc_m <= before, arc_m - (before - first), np.nan),
+        ):
+            nearest = np.where(np.abs(other - inside) < np.abs(nearest - inside), other, nearest)
+        return np.asarray(nearest - back)
 
     @cached_property
     def middle_m(self) -> Floats:
@@ -122,8 +150,11 @@ class Line:
             "sigma_height_m": float(self.sigma_height_m),
             "start_m": start,
             "end_m": end,
+            "start_turn_m": float(np.nan_to_num(self.joins_m[0] - self.arc_m[0])),
+            "end_turn_m": float(np.nan_to_num(self.arc_m[-1] - self.joins_m[1])),
         }
 
     def gradient_at(self, arc_m: Floats) -> Floats:
         """Climb over horizontal length, between the middles of segments, shape (H,)."""
+        arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         return np.interp(arc_m, self.middle_m, self.gradient)

@@ -161,9 +161,8 @@ def write_place(
     result.map_scale[epoch] = state.map_scale
     if state.bank is not None:
         level, noise, apart = level_m(state.bank, float(mean[Unknown.PLACE]), sigma, limits)
-        # Contradicted by its measurements the track itself is in doubt, which no sub-filter beside it bounds.
-        doubtful = result.code_weight[epoch] < limits.lost_code_weight
-        doubtful |= result.motion_weight[epoch] < limits.lost_motion_weight
+        # Contradicted by its measurements for long the track itself is in doubt, which no sub-filter beside it bounds.
+        doubtful = max(state.weak_code_s, state.weak_motion_s) > limits.level_doubt_s
         level = float("inf") if doubtful else level
         result.level_m[epoch], result.level_noise_m[epoch], result.separation_m[epoch] = level, noise, apart
         result.amount_m[epoch] = max(level, SCALE_BOUND * state.unaided_m)

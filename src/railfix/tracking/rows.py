@@ -275,7 +275,8 @@ def sensor_rows(
         listed.append((coefficients, value, float(sigma[epoch]), Kind.FORCE))
     place, sigma = sensors.place_m, sensors.place_sigma_m
     if place is not None and sigma is not None and np.isfinite(place[epoch]):
-        listed.append(({Unknown.PLACE: 1.0}, place[epoch] - state[Unknown.PLACE], float(sigma[epoch]), Kind.PLACE))
+        there = line.nearest_m(place[epoch] + line.round_m(place[epoch]), state[Unknown.PLACE])
+        listed.append(({Unknown.PLACE: 1.0}, there - state[Unknown.PLACE], float(sigma[epoch]), Kind.PLACE))
     if sensors.ranges is not None:
         listed += _range_rows(sensors.ranges, epoch, line, mean)
     if not listed:

@@ -39,17 +39,19 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     narrowed: list[Narrowed | None] = [None] * len(mean)
     for one in np.flatnonzero(wide) if not lost else []:
         reach = 5.0 * np.sqrt(covariance[one, Unknown.PLACE, Unknown.PLACE])
-        near = np.abs(arc - mean[one, Unknown.PLACE]) < reach
+        there = line.nearest_m(arc, mean[one, Unknown.PLACE])
+        near = np.abs(there - mean[one, Unknown.PLACE]) < reach
         if near.any():
-            new = split(mean[one], covariance[one], float(state.log_probability[one]), arc[near], sigma[near])
-            parts.append((*new, arc[near]))
+            new = split(mean[one], covariance[one], float(state.log_probability[one]), there[near], sigma[near])
+            parts.append((*new, there[near]))
             narrowed += [
                 Narrowed(parent=int(one), mean=mean[one], covariance=covariance[one], place_m=at, sigma_m=wide_m)
-                for at, wide_m in zip(arc[near].tolist(), sigma[near].tolist(), strict=True)
+                for at, wide_m in zip(there[near].tolist(), sigma[near].tolist(), strict=True)
             ]
     if lost:
         best = int(np.argmax(state.log_probability))
-        away = np.abs(arc - mean[best, Unknown.PLACE]) > limits.start_separation_m
+        there = line.nearest_m(arc, mean[best, Unknown.PLACE])
+        away = np.abs(there - mean[best, Unknown.PLACE]) > limits.start_separation_m
         # The old place goes on too, free to be pulled to where the codes are.
         arc = np.concatenate([mean[best : best + 1, Unknown.PLACE], arc[away]])
         sigma = np.full(len(arc), limits.start_sigma_m)

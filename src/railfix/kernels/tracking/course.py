@@ -10,8 +10,20 @@ from railfix.kernels.tracking.layout import PLACE, Course, Work
 
 
 @inner
+def _on_course(course: Course, arc: float) -> float:
+    """Arc length on the line of a place beyond an end of a closed one (`railfix.tracking.line.Line.round_m`)."""
+    first, last = course.arc_m[0], course.arc_m[-1]
+    if arc > last and course.end_turn_m > 0.0:
+        return float(arc - math.ceil((arc - last) / course.end_turn_m) * course.end_turn_m)
+    if arc < first and course.start_turn_m > 0.0:
+        return float(arc + math.ceil((first - arc) / course.start_turn_m) * course.start_turn_m)
+    return arc
+
+
+@inner
 def point_at(course: Course, arc: float, point: Floats, axes: Floats, p: int) -> None:
     """Write point and axes of the line at an arc length into row `p`."""
+    arc = _on_course(course, arc)
     low, high = 1, len(course.arc_m) - 1
     while low < high:
         half = (low + high) // 2
@@ -49,6 +61,7 @@ def find_ends(course: Course, now: float, before: float, work: Work) -> None:
 def gradient_at(course: Course, arc: float) -> float:
     """Gradient of the line, linear between the middles of segments."""
     middle_m, gradient = course.middle_m, course.gradient
+    arc = _on_course(course, arc)
     low, high = 0, len(middle_m)
     while low < high:
         half = (low + high) // 2

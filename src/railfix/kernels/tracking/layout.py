@@ -63,6 +63,8 @@ class Course(NamedTuple):
     sigma_height_m: float
     start_m: float
     end_m: float
+    start_turn_m: float
+    end_turn_m: float
 
 
 class Numbers(NamedTuple):
@@ -101,6 +103,7 @@ class Numbers(NamedTuple):
     lost_motion_s: float
     lost_code_weight: float
     lost_code_s: float
+    level_doubt_s: float
     expired_sigma_m: float
     least_step_m2: float
     code_clock_sigma_m: float

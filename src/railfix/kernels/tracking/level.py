@@ -188,7 +188,7 @@ def level_of(place: float, sigma: float, bank: Subfilters, numbers: Numbers, ans
     level, contradicted = noise, False
     for b in range(len(bank.running)):
         if bank.running[b]:
-            contradicted = contradicted or bank.weak_s[b] > 0.0
+            contradicted = contradicted or bank.weak_s[b] > numbers.level_doubt_s
             away = abs(bank.mean[b, PLACE] - place)
             apart = away if math.isnan(apart) else max(apart, away)
             level = max(level, away + bank.k[b] * math.sqrt(bank.covariance[b, PLACE, PLACE]))

@@ -384,9 +384,8 @@ def _finish(
     answers.map_scale[t] = math.exp(0.5 * scalars[MAP_SCALE])
     if len(bank.running):
         level = level_of(memory.mean[0, PLACE], sigma, bank, numbers, answers, t)
-        # Contradicted by its measurements the track itself is in doubt, which no sub-filter beside it bounds.
-        doubtful = answers.code_weight[t] < numbers.lost_code_weight
-        if doubtful or answers.motion_weight[t] < numbers.lost_motion_weight:
+        # Contradicted by its measurements for long the track itself is in doubt, which no sub-filter beside it bounds.
+        if max(scalars[WEAK_CODE], scalars[WEAK_MOTION]) > numbers.level_doubt_s:
             level = math.inf
         answers.level_m[t] = level
         answers.amount_m[t] = max(level, numbers.scale_bound * scalars[UNAIDED])
