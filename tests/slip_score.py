@@ -90,7 +90,7 @@ def scored(simulation: Simulation, scores: dict[str, Score]) -> None:
         kept: list[SlipResult] = []
 
         def keeping(*args: object, gyro: bool = gyro, kept: list[SlipResult] = kept, **words: object) -> object:
-            found = find_slips(*args, **(words if gyro else words | {"pitch_rate": None}))  # type: ignore[arg-type]
+            found = find_slips(*args, **(words if gyro else words | {"body": None}))  # type: ignore[arg-type]
             kept.append(found[0])
             return found
 

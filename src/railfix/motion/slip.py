@@ -197,7 +197,7 @@ def find_slips(
     force_mps2: Floats,
     line_sine: Floats,
     *,
-    pitch_rate: Floats | None = None,
+    body: Floats | None = None,
     since_pulse_s: Floats | None = None,
     limits: SlipLimits | None = None,
     state: SlipState | None = None,
@@ -214,8 +214,10 @@ def find_slips(
         Specific force along the vehicle.
     line_sine : ndarray, shape (N,)
         Sine of the line's gradient at the vehicle, + up forward; NaN where it is not known.
-    pitch_rate : ndarray, shape (N,), optional [rad/s]
-        `pitch_rate_radps`; NaN where there is none.
+    body : ndarray, shape (N, 3), optional [m/s2, rad/s, rad/s]
+        Specific force to the right, pitch rate and yaw rate of the body, for the rate of the pitch
+        (`pitch_rate_radps`) at the speed carried through a slip: that of the wheel would lean the body. NaN where
+        there is none.
     since_pulse_s : ndarray, shape (N,), optional [s]
         Time since the last pulse: a vehicle that creeps has pulses without a speed. Without it that of the last speed.
     limits : SlipLimits, optional
@@ -238,9 +240,9 @@ def find_slips(
         ), state  # fmt: skip
     automaton = _Automaton(limits) if state is None else state.automaton.copied(limits)
     steps = np.diff(time_s, prepend=time_s[0] if state is None else state.time_s).tolist()
-    rates = np.full(size, np.nan) if pitch_rate is None else pitch_rate
+    turning = np.full((size, 3), np.nan) if body is None else body
     since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
-    columns = (wheel_mps, wheel_mps2, force_mps2, line_sine, rates, since)
+    columns = (wheel_mps, wheel_mps2, force_mps2, line_sine, turning, since)
     rows = np.empty((size, 8))
     for k, (dt, *values) in enumerate(zip(steps, *(column.tolist() for column in columns), strict=True)):
         automaton.step(dt, *values)
@@ -286,9 +288,10 @@ class _Automaton:
         )  # fmt: skip
 
     def step(
-        self, dt: float, wheel: float, acceleration: float, force: float, sine: float, rate: float, since: float
+        self, dt: float, wheel: float, acceleration: float, force: float, sine: float, body: list[float], since: float
     ) -> None:
         limits, heard = self.limits, wheel == wheel
+        rate = self._pitch_rate(wheel, *body)
         self._age += dt
         self._silent = 0.0 if heard else self._silent + dt
         if since == since:
@@ -316,6 +319,13 @@ class _Automaton:
         if self.speed == self.speed:
             self.way += self.speed * dt
         self._past.append((self._age, self.speed, inertial))
+
+    def _pitch_rate(self, wheel: float, right: float, pitching: float, yawing: float) -> float:
+        """`pitch_rate_radps` of a sample at the speed of the train."""
+        slips = self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)
+        speed = self.speed if slips or wheel != wheel else wheel
+        lean = min(max(((speed if speed == speed else 0.0) * yawing - right) / GRAVITY_MPS2, -0.5), 0.5)
+        return float(pitching * (1.0 - lean * lean) ** 0.5 - yawing * lean)
 
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float) -> None:
         """The reference pitch: the line's, with the gyro what is fast; without a line that by the wheel, slowly."""

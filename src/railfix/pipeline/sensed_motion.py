@@ -164,7 +164,7 @@ def sensed_motion(
         acceleration,
         force[:, 0],
         line_sine,
-        pitch_rate=turning,
+        body=np.stack([force[:, 1], rates[:, 1], rates[:, 2]], axis=1),
         since_pulse_s=since,
         limits=limits,
         state=state.slip,
