@@ -124,7 +124,8 @@ class SlipResult:
     speed_mps : ndarray, shape (N,) [m/s]
         Of the wheel where it rolls, else carried; NaN in INIT and EXPIRED.
     way_m : ndarray, shape (N,) [m]
-        Integral of the speed from the first sample, each slip corrected from its look-back on.
+        Integral of the speed from the first sample, each slip corrected from its look-back on; at its end by what wheel
+        and inertia differ by then, which has grown evenly since.
     metric : ndarray, shape (N,)
         Sine of the pitch by wheel and accelerometer less the reference pitch; NaN without pulses.
     smooth : ndarray, shape (N,)
@@ -209,7 +210,7 @@ def find_slips(
     time_s : ndarray, shape (N,) [s]
         Rising, 10 to 100 samples a second.
     wheel_mps, wheel_mps2 : ndarray, shape (N,) [m/s], [m/s2]
-        Speed and acceleration of the wheel; NaN where pulses say nothing.
+        Speed of the wheel at the samples, and its acceleration; NaN where pulses say nothing.
     force_mps2 : ndarray, shape (N,) [m/s2]
         Specific force along the vehicle.
     line_sine : ndarray, shape (N,)
@@ -270,7 +271,7 @@ class _Automaton:
         self.speed, self.way, self.metric, self.offset = float("nan"), 0.0, float("nan"), 0.0
         self.pitch, self.bias = float("nan"), 0.0
         self._smooth, self._limit, self._square = 0.0, limits.map_limit, 0.0
-        self._over = self._fits = self._silent = self._carried = self._apart = self._age = 0.0
+        self._over = self._fits = self._gap = self._silent = self._carried = self._apart = self._age = 0.0
         self._rest = float("nan")
         #: Time since a sample, speed and acceleration by inertia: what a detection looks back on.
         self._past: deque[tuple[float, float, float]] = deque(maxlen=200)
@@ -362,8 +363,11 @@ class _Automaton:
             return
         near = max(limits.latch_mps, limits.latch_share * abs(self.speed))
         fits = heard and abs(wheel - self.speed) < near and abs(self._smooth) < self._limit
+        self._gap = self._gap + (wheel - self.speed) * dt if fits else 0.0
         self._fits = self._fits + dt if fits else 0.0
         if self._fits >= limits.latch_s:
+            lasted = self._carried + limits.look_back_s + limits.confirm_s + limits.smoothing_s
+            self.way += 0.5 * lasted * (self._gap / self._fits if self._fits else 0.0)
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
@@ -385,7 +389,7 @@ class _Automaton:
             self.offset += share * GRAVITY_MPS2 * self._smooth
         if self._over > 0.0 and self._over >= limits.confirm_s:
             self.state = MotionState.INERTIAL_SPIN if value < 0 else MotionState.INERTIAL_SLIDE
-            self._fits = self._over = 0.0
+            self._fits = self._gap = self._over = 0.0
             if limits.rule == "map":
                 self._look_back(inertial, dt)
 
