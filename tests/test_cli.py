@@ -130,3 +130,11 @@ def test_the_manual_comes_at_once() -> None:
     began = time.perf_counter()
     subprocess.run([sys.executable, "-m", "railfix", "--help"], capture_output=True, check=True)
     assert time.perf_counter() - began < 3.0
+
+
+@pytest.mark.requirement("G1")
+def test_a_package_of_an_extra_that_is_missing_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cbor2", None)
+    result = RUNNER.invoke(app, ["live", "--front", "a.ubx", "--track", "line.csv", "--channels", "2"])
+    assert result.exit_code == 4
+    assert result.stderr == ("railfix: error: this needs cbor2, which is not installed; pip install 'railfix[live]'\n")

@@ -23,6 +23,18 @@ from railfix.core.errors import InputFileError, OutputError, RailfixError, Setti
 
 #: Words that are given to switches by mistake.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
+#: Packages that commands import when they are called, and the extra of railfix that installs each.
+EXTRAS: Final = {
+    "cbor2": "live",
+    "serial": "live",
+    "paho": "mqtt",
+    "aioquic": "ground",
+    "cryptography": "ground",
+    "starlette": "ground",
+    "uvicorn": "ground",
+    "sqlalchemy": "ground",
+    "distributed": "cluster",
+}
 #: A signal ends the program with this exit code plus its number, as in a shell.
 SIGNALLED: Final = 128
 #: What `pathlib` reports of a link that leads to itself.
@@ -71,6 +83,11 @@ class Commands(TyperGroup):
             return super().invoke(ctx)
         except RailfixError as error:
             _end(error)
+        except ModuleNotFoundError as error:
+            extra = EXTRAS.get(str(error.name).partition(".")[0])
+            if extra is None:
+                raise
+            _end(SettingsError(f"this needs {error.name}, which is not installed; pip install 'railfix[{extra}]'"))
         except MemoryError:
             _end(SettingsError("this needs more memory than there is; give a shorter time or fewer epochs at a time"))
         except RuntimeError as error:

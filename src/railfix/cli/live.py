@@ -96,6 +96,9 @@ def live(
     """
     from railfix.live.command import LiveInputs, run_live
 
+    if channels == "2" or any(text.startswith("cbor@") for text in send or ()):
+        import cbor2  # noqa: F401  a missing one is reported before anything is opened
+
     sources: dict[Literal["front", "rear"], str] = {"front": front}
     if rear is not None:
         sources["rear"] = rear

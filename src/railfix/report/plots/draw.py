@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from inspect import signature
+from inspect import cleandoc, signature
 from typing import TYPE_CHECKING, Any, Final, ParamSpec
 
 import numpy as np
@@ -41,8 +41,9 @@ def drawn(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
 
 def _returning_figure(text: str) -> str:
     """Documentation of a function that returns a chart, for one that returns a figure of it."""
-    head, heading, _ = text.partition("    Returns\n    -------\n")
-    return f"{head}{heading}    matplotlib.figure.Figure\n" if heading else text
+    # without indentation, as Python keeps the documentation itself from 3.13 on
+    head, heading, _ = cleandoc(text).partition("Returns\n-------\n")
+    return f"{head}{heading}matplotlib.figure.Figure\n" if heading else text
 
 
 def draw_figure(chart: Chart) -> Figure:
