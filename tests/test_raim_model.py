@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import raim_oracle as oracle
 import synthetic
 from railfix.integrity.raim import constrained_model, point_model
-from railfix.integrity.raim.model import compact
+from railfix.integrity.raim.model import compact, regular_inverse
 from railfix.positioning.constrained import constrained_position
 from railfix.positioning.normal_equations import UNTIED_M, ClockTies
 from railfix.positioning.single_point import single_point
@@ -151,3 +151,10 @@ def test_ties_of_some_epochs_go_with_them():
     model = constrained_model(tied, oracle.LINE, got.arc_m)
     assert model.freedom.tolist() == [4, 4, 4, 3, 3, 3]
     assert np.array_equal(model.take(np.array([4, 1])).wsse, model.wsse[[4, 1]])
+
+
+def test_an_inverse_does_not_depend_on_the_unit_of_an_axis():
+    """A map of a millimetre beside a place known to kilometres is regular; two axes that are one are not."""
+    matrix = np.diag([1e-8, 1.0, 1e8])[None]
+    np.testing.assert_allclose(regular_inverse(matrix)[0], np.diag([1e8, 1.0, 1e-8]), rtol=1e-12)
+    assert np.isnan(regular_inverse(np.ones((1, 3, 3)))).all()
