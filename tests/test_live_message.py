@@ -39,3 +39,4 @@ def test_no_bound_of_a_position_that_failed_a_check_goes_out_as_coasting() -> No
         )
         message = message_of(changed, LiveSettings(), sequence=0, sent_ns=0)
         assert message.status is expected
+        assert (message.over_cm is None) == (expected is MessageStatus.DOUBTFUL)

@@ -17,7 +17,7 @@ from railfix.pipeline.off_map import OffMapState, off_map_epochs
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.simulate.demo_data import demo_files
-from railfix.tracking import TrackStatus, track
+from railfix.tracking import Tracked, TrackStatus, track
 from test_wrong_map import moved
 from tracking_cases import part, ride
 
@@ -80,30 +80,33 @@ def test_the_filter_begins_anew_when_the_train_comes_back() -> None:
 
 
 @cache
-def on_moved_map(across_m: float = 0.0, up_m: float = 0.0, risk: float = 1e-3) -> tuple[AntennaResult, np.ndarray]:
-    """The demonstration, one epoch a second, on a line moved aside or up, with statuses of the filter."""
+def on_moved_map(across_m: float = 0.0, up_m: float = 0.0, risk: float = 1e-3) -> tuple[AntennaResult, Tracked]:
+    """The demonstration, one epoch a second, on a line moved aside or up, with the filter's answer."""
     line = moved(clean_trajectories()["front"], across_m=across_m, up_m=up_m)
-    config = parse_config({"filter": "track", "map_offset": {"risk": risk}})
+    config = parse_config({"filter": "track", "tracking": {"level": "on"}, "map_offset": {"risk": risk}})
     processor = EpochProcessor(config, {"front": line}, navigation=read_navigation(demo_files()["nav"]))
     result, _ = processor.process({"front": demo_observations()["front"][::10]})
-    return result.antennas["front"], result.fusion["front"].tracked.status
+    return result.antennas["front"], result.fusion["front"].tracked
 
 
 @pytest.mark.requirement("B6")
 def test_the_filter_has_no_place_far_from_the_line() -> None:
-    _, status = on_moved_map(across_m=200.0)
-    assert (status == TrackStatus.OFF_MAP).all()
+    _, tracked = on_moved_map(across_m=200.0)
+    assert (tracked.status == TrackStatus.OFF_MAP).all()
 
 
 @pytest.mark.requirement("B6")
 def test_the_filter_says_that_the_map_lies_aside() -> None:
     """16 m too low no epoch by itself finds anything; at a risk of 0.2 the mean of minutes does."""
-    antenna, status = on_moved_map(up_m=16.0, risk=0.2)
+    antenna, tracked = on_moved_map(up_m=16.0, risk=0.2)
     beside = antenna.status == Status.MAP_OFFSET
     assert beside.sum() > 50
-    assert (status[beside] == TrackStatus.MAP_OFFSET).all()
+    assert (tracked.status[beside] == TrackStatus.MAP_OFFSET).all()
+    assert np.isinf(tracked.level_m[beside]).all()
+    assert np.isinf(tracked.amount_m[beside]).all()
     _, right = on_moved_map()
-    assert not np.isin(right, [TrackStatus.MAP_OFFSET, TrackStatus.OFF_MAP]).any()
+    assert np.isfinite(right.level_m).mean() > 0.9
+    assert not np.isin(right.status, [TrackStatus.MAP_OFFSET, TrackStatus.OFF_MAP]).any()
 
 
 @pytest.mark.requirement("B6")

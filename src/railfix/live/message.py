@@ -18,6 +18,7 @@ from railfix.tracking import TrackStatus
 
 #: Sigmas that the speed's bound stands for: 1e-7 two-sided, as the protection level's starting point (P1 2.4).
 _SPEED_K = 5.33
+_BOUNDS = ("over_cm", "under_cm", "protection_level_cm")
 _SOURCE_OF_ANTENNA = {"front": Source.FRONT_RECEIVER, "rear": Source.REAR_RECEIVER}
 
 
@@ -41,7 +42,7 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     The place is that of the filter along the track where it runs, else that of the single epoch, of the antenna that
     `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it
     has a level (`tracking.level`); else the protection level of the single epoch, widened by the distance of the
-    filter's place from it, so that they hold for both.
+    filter's place from it, so that they hold for both. A doubtful place has none.
 
     Parameters
     ----------
@@ -80,6 +81,8 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     # The bound of a position that failed a check is none for the place that the sensors carry.
     if status is MessageStatus.COASTING and not ("over_cm" in values and (math.isfinite(amount) or _passed(antenna))):
         status = MessageStatus.DOUBTFUL
+    if status is MessageStatus.DOUBTFUL:  # no bound is promised, so none is sent
+        values = {key: value for key, value in values.items() if key not in _BOUNDS}
     if track is not None and len(track):
         speed, sigma = float(track.tracked.speed_mps[-1]), float(track.tracked.speed_sigma_mps[-1])
         if math.isfinite(speed):

@@ -43,6 +43,8 @@ _END_M: Final = 30.0
 _STRETCH_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
+#: Statuses whose level bounds the error.
+_BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +193,11 @@ def along_track(
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
-    tracked = replace(tracked, status=np.where(beside, np.int8(TrackStatus.MAP_OFFSET), tracked.status))
+    status = np.where(beside, np.int8(TrackStatus.MAP_OFFSET), tracked.status)
+    # Beside the map, on one of several branches or on a track in doubt, no sub-filter bounds the error.
+    unbounded = np.isfinite(tracked.level_m) & ~np.isin(status, _BOUNDED)
+    level, amount = (np.where(unbounded, np.inf, values) for values in (tracked.level_m, tracked.amount_m))
+    tracked = replace(tracked, status=status, level_m=level, amount_m=amount)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
