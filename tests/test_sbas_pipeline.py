@@ -283,6 +283,7 @@ def test_every_output_names_what_a_level_rests_on() -> None:
         ({}, True, False),
         ({"side_prior": 1e-8}, True, True),
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 2e-5}, False, False),
+        ({"priors": "measured", "local_prior": 2e-5, "side_prior": 5e-6}, False, False),  # measured there
         ({"priors": "measured", "local_prior": 2e-5, "side_prior": 0.0}, False, True),
     ):
         text = standing(level_facts(parse_config({"risk": risk})))

@@ -187,7 +187,7 @@ def misfits(
 
 @inner
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
-    """Clocks and residuals of one epoch after a step (`NormalEquations.after`)."""
+    """Clocks and residuals of one epoch after a step (`railfix.positioning.normal_equations.after_step`)."""
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
         clock_m[g] = moved if totals[g] > 0.0 else math.nan

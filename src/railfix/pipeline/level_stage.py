@@ -59,7 +59,8 @@ def standing(facts: Mapping[str, Any]) -> str:
     }
     side = facts.get("side_prior")
     text = words.get(str(facts.get("basis")), "not recorded")
-    if isinstance(side, int | float) and side < SUPPORTED_SIDE_PRIOR:
+    measured = facts.get("basis") == "measured" and side != 0
+    if isinstance(side, int | float) and side < SUPPORTED_SIDE_PRIOR and not measured:
         text += (
             f"; no data supports a probability as small as {side:g} that the satellites of one side of the track are "
             f"faulty together (risk.side_prior; hours in simulated cities support {SUPPORTED_SIDE_PRIOR:g})"
