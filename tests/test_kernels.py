@@ -208,7 +208,7 @@ for value in (1, 2):
     told = ""
     while not told.endswith("end\n"):
         told += os.read(reader, 1000).decode().replace("\r", "")
-    assert told == ("compiling for this processor, once: about a minute\n" if terminal else "") + "end\n"
+    assert told == ("compiling for this processor, once: one to two minutes\n" if terminal else "") + "end\n"
     for end in pipe:
         os.close(end)
 

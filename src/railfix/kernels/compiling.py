@@ -63,7 +63,7 @@ class _Announcement(event.Listener):
         """Hear that a function is compiled that is not on disk."""
         ours = event.data["dispatcher"].py_func.__module__.startswith("railfix.")
         if ours and not self.said and sys.stderr.isatty() and multiprocessing.parent_process() is None:
-            sys.stderr.write("compiling for this processor, once: about a minute\n")
+            sys.stderr.write("compiling for this processor, once: one to two minutes\n")
             self.said = True
 
     def on_end(self, event: Any) -> None:

@@ -99,7 +99,7 @@ class Compiled:
             or np.isnat(state.measured)
             or (state.bank is None and limits.level == "on")
             or self.epochs.left[first]
-            or (state.weak_motion_s > 0.0 and state.hypotheses <= limits.most_hypotheses // 2)
+            or (state.weak_motion_s >= hypotheses.BESIDE_AFTER_S and state.hypotheses <= limits.most_hypotheses // 2)
             or state.weak_motion_s >= limits.lost_motion_s
             or state.weak_code_s >= limits.lost_code_s
         ):
@@ -330,6 +330,7 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "direction_mps": rows.DIRECTION_MPS,
         "chord_m": rows.CHORD_M,
         "gravity_mps2": rows.GRAVITY_MPS2,
+        "beside_after_s": hypotheses.BESIDE_AFTER_S,
         "switch": hypotheses.SWITCH,
         "most_odds": hypotheses.MOST_ODDS,
         "level_risk": bank.budget(limits).risk,

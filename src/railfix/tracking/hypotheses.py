@@ -34,6 +34,8 @@ MOST_ODDS: Final = 2.25
 #: Standard deviation of the speed beyond a bend [m/s], and the share of probability that places beside get.
 _BEND_SPEED_MPS: Final = 10.0
 _BESIDE_SHARE: Final = 0.01
+#: Places beside are tried once motion has been contradicted for so long [s]: shorter it is a reflection, at any rate.
+BESIDE_AFTER_S: Final = 0.9
 #: What a new hypothesis takes over from a lost track: its error has gone into everything else.
 _KEPT: Final = np.array([Unknown.WHEEL, Unknown.FORCE_OFFSET, Unknown.RADAR])
 

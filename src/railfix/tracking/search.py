@@ -6,7 +6,7 @@ import numpy as np
 
 from railfix.core.timescale import seconds
 from railfix.tracking.chunk import Chunk
-from railfix.tracking.hypotheses import begin, beside, places, split
+from railfix.tracking.hypotheses import BESIDE_AFTER_S, begin, beside, places, split
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
@@ -29,7 +29,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     gap = bool(seconds(chunk.time[epoch] - state.measured) > limits.gap_s)
     wide = covariance[:, Unknown.PLACE, Unknown.PLACE] > limits.start_sigma_m**2
     if not (lost or (gap and wide.any())):
-        if state.weak_motion_s > 0.0:
+        if state.weak_motion_s >= BESIDE_AFTER_S:
             _try_beside(state, limits)
         return False
     arc, sigma = places(chunk, epoch, line, limits)

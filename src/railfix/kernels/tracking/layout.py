@@ -124,6 +124,7 @@ class Numbers(NamedTuple):
     direction_mps: float
     chord_m: float
     gravity_mps2: float
+    beside_after_s: float
     switch: float
     most_odds: float
     level_passes: int

@@ -55,7 +55,7 @@ def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, mem
     scalars, count = memory.scalars, int(memory.scalars[HYPOTHESES])
     left = epochs.left[t]
     left = left or scalars[WEAK_MOTION] >= numbers.lost_motion_s or scalars[WEAK_CODE] >= numbers.lost_code_s
-    left = left or (scalars[WEAK_MOTION] > 0.0 and count <= numbers.most_hypotheses // 2)
+    left = left or (scalars[WEAK_MOTION] >= numbers.beside_after_s and count <= numbers.most_hypotheses // 2)
     # Beyond an end of a closed line numpy lets places go on where it closes.
     for h in range(count):
         left = left or (memory.mean[h, PLACE] < course.arc_m[0] and course.start_m == -math.inf)
