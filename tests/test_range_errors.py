@@ -237,7 +237,7 @@ def test_the_command_writes_a_model_and_says_what_it_lacks(done_run: Path, tmp_p
     [
         (["--out", "nodir/m.toml"], 8, "the folder nodir does not exist"),
         (["--out", "m.toml", "--elevations", "0,90,45"], 4, "rising edges"),
-        (["--out", "m.toml", "--cn0", "x"], 4, "bins of the model"),
+        (["--out", "m.toml", "--cn0", "x"], 4, "expected numbers with commas"),
         (["--out", "m.toml", "--reference", "b"], 4, "1 runs and 2 references"),
         (["--out", "m.toml", "--base-position", "1,2"], 4, "--base-position '1,2'"),
     ],
@@ -263,7 +263,7 @@ def test_a_run_of_another_version_is_refused(done_run: Path, tmp_path: Path) -> 
     record = json.loads((done_run / "run.json").read_text())
     record["options"]["novelty"] = 1
     (tmp_path / "run.json").write_text(json.dumps(record))
-    with pytest.raises(InputFileError, match=r"not written by this version .*unknown setting novelty"):
+    with pytest.raises(InputFileError, match=r"does not fit this version .*unknown setting novelty"):
         _ = read_record(tmp_path).options
 
 
