@@ -113,7 +113,7 @@ def validated(model: type[Model], values: Mapping[str, Any], *, source: str) -> 
 
 
 def _in_groups(model: type[BaseModel], name: str) -> list[str]:
-    """Return the settings of this name in the groups of a model, dotted: at most one, lest the message is a list."""
+    """Return the settings of this name in the groups of a model, dotted; at most one, for a short message."""
     groups = {key: field.annotation for key, field in model.model_fields.items()}
     found = [
         f"{key}.{name}"

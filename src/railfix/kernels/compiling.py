@@ -54,20 +54,20 @@ def inner(function: Function) -> Function:
 
 
 class _Announcement(event.Listener):
-    """Says on a terminal, once, why the first run takes so long."""
+    """Writes a line to a terminal when the first function is compiled that is not on disk."""
 
     def __init__(self) -> None:
         self.said = False
 
     def on_start(self, event: Any) -> None:
-        """Hear that a function is compiled that is not on disk."""
+        """Write the line, once, for functions of railfix."""
         ours = event.data["dispatcher"].py_func.__module__.startswith("railfix.")
         if ours and not self.said and sys.stderr.isatty() and multiprocessing.parent_process() is None:
             sys.stderr.write("compiling for this processor, once: one to two minutes\n")
             self.said = True
 
     def on_end(self, event: Any) -> None:
-        """Hear that it is done."""
+        """Nothing is written at the end of a compilation."""
 
 
 event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]

@@ -34,7 +34,7 @@ SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
 #: Prior of one reflection off a side of the track that the largest data set supports: 2 of 30 943 blocks of 30 s of 70
-#: simulated hours in a city, 95 % (docs/integrity-campaign.md); recordings support 1e-2, for none is longer.
+#: simulated hours in a city, 95 % (docs/integrity-campaign.md); recordings, which are shorter, support 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5
 #: Exclusions after which a level is still given (P1 2.3(4) excludes up to two satellites).
 MOST_EXCLUDED: Final = 2
