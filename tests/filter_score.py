@@ -50,11 +50,15 @@ class Case:
     wheel: SensorEpochs | None = None
 
     def run(self, epochs: GnssEpochs | None = None, **changes: object) -> Tracked:
-        sensors = changes.pop("sensors", None)
+        sensors, levels = changes.pop("sensors", None), bool(changes.pop("levels", False))
         assert sensors is None or isinstance(sensors, SensorEpochs)
         limits = TrackingLimits.model_validate(changes)
         return track(
-            self.epochs if epochs is None else epochs, Line.of(self.trajectory), limits=limits, sensors=sensors
+            self.epochs if epochs is None else epochs,
+            Line.of(self.trajectory),
+            limits=limits,
+            sensors=sensors,
+            levels=levels,
         )[0]
 
     def smoothed(self, sensors: SensorEpochs | None = None) -> SmoothedTrack:
@@ -290,7 +294,7 @@ def _levelled(found: Tracked) -> np.ndarray:
 def show_levels(all_cases: list[Case]) -> None:
     """Levels without a fault put in, and errors over them."""
     for whole in all_cases:
-        found = whole.run(level="on")
+        found = whole.run(levels=True)
         told = _levelled(found)
         ok = whole.observed & told
         level, error, noise = found.level_m[ok], whole.error(found)[ok], np.median(found.level_noise_m[ok])
@@ -307,11 +311,11 @@ def show_levels(all_cases: list[Case]) -> None:
 def show_terms(all_cases: list[Case]) -> None:
     """Which hypothesis spends most of the risk at the level, and how it differs; levels by other priors."""
     for case in all_cases:
-        limits, line = TrackingLimits(level="on"), Line.of(case.trajectory)
+        limits, line = TrackingLimits(), Line.of(case.trajectory)
         given, state = budget(limits), None
         named: dict[str, list[tuple[float, float, float]]] = {}
         for t in range(len(case.epochs)):
-            found, state = track(case.epochs.part(t, t + 1), line, state, limits=limits)
+            found, state = track(case.epochs.take(slice(t, t + 1)), line, state, limits=limits, levels=True)
             if state.bank is None or not len(state.bank.without) or not np.isfinite(found.level_m[0]):
                 continue
             apart = np.abs(state.bank.mean[:, 0] - state.mean[0, 0])
@@ -332,7 +336,7 @@ def show_terms(all_cases: list[Case]) -> None:
             ("without faults of constellations", {"level_constellation_prior": 0.0}),
             ("6 independent errors an hour", {"level_samples_per_hour": 6.0}),
         ):
-            found = case.run(level="on", **changes)
+            found = case.run(levels=True, **changes)
             ok = case.observed & _levelled(found)
             print(f"{case.name:9s} {label}: level p50 {np.median(found.level_m[ok]):.1f} m", flush=True)
 
@@ -361,7 +365,7 @@ def show_faults(all_cases: list[Case]) -> None:
                 for k in np.flatnonzero(seen.sum(axis=0) > 120):
                     first = int(np.argmax(seen[:, k]))
                     case = whole.part(first, int(np.searchsorted(t, t[first] + FAULT_WINDOW_S)))
-                    found = case.run(with_fault(case.epochs, k, size, whole=whole_channel), level="on")
+                    found = case.run(with_fault(case.epochs, k, size, whole=whole_channel), levels=True)
                     faulty = case.observed & (seconds(case.epochs.time - case.epochs.time[0]) > FAULT_FROM_S)
                     told = faulty & _levelled(found)
                     off = case.error(found)
@@ -402,9 +406,9 @@ def with_fault(epochs: GnssEpochs, k: int, size: Callable[[np.ndarray], np.ndarr
 
 def show_cost(all_cases: list[Case]) -> None:
     for case in all_cases:
-        for label in ("off", "on"):
+        for label, levels in (("off", False), ("on", True)):
             began = clock.process_time()
-            found = case.run(level=label)
+            found = case.run(levels=levels)
             spent = clock.process_time() - began
             counts = {s.text: int((found.status == s).sum()) for s in TrackStatus if (found.status == s).any()}
             print(f"{case.name:9s} level {label:3s} {1e3 * spent / len(found):5.2f} ms an epoch  {counts}")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from importlib.util import find_spec
-from typing import Literal
 
 import numpy as np
 import pytest
 
 from railfix import kernels
-from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackingLimits, TrackState, track
+from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackState, track
 from tracking_cases import bent_line, part, ride, without_epochs
 
 pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (railfix[fast])")
@@ -23,11 +22,11 @@ def _with(
     state: TrackState | None = None,
     sensors: SensorEpochs | None = None,
     *,
-    level: Literal["on", "off"] = "on",
+    levels: bool = True,
 ) -> tuple[Tracked, TrackState]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels, "CHOSEN", chosen)
-        return track(epochs, line, state, sensors=sensors, limits=TrackingLimits(level=level))
+        return track(epochs, line, state, sensors=sensors, levels=levels)
 
 
 def _assert_equal(given: Tracked, expected: Tracked, tolerance: float) -> None:

@@ -13,7 +13,7 @@ from railfix.tracking.bank import budget, level_m
 from railfix.tracking.state import Bank
 from tracking_cases import bent_line, part, ride, wheel, without_epochs
 
-LIMITS = TrackingLimits(level="on")
+LIMITS = TrackingLimits()
 
 
 @pytest.mark.requirement("C2")
@@ -46,7 +46,7 @@ def test_only_a_contradiction_that_lasts_takes_the_level_away() -> None:
     code = case.epochs.code_m.copy()
     for begin, end in ((20, 22), (40, 45)):
         code[begin:end, ::2] += 60.0
-    result, _ = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS)
+    result, _ = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS, levels=True)
     assert (result.code_weight[[20, 21, 40, 44]] < LIMITS.lost_code_weight).all()
     assert np.isfinite(result.level_m[15:40]).all()
     assert not np.isfinite(result.level_m[43:45]).any()
@@ -57,8 +57,8 @@ def test_only_a_contradiction_that_lasts_takes_the_level_away() -> None:
 @pytest.mark.requirement("C2")
 def test_a_source_that_is_never_faulty_needs_no_sub_filter() -> None:
     case = ride(20, noise=1.0)
-    limits = TrackingLimits(level="on", level_constellation_prior=0.0)
-    _, state = track(case.epochs, case.line, limits=limits)
+    limits = TrackingLimits(level_constellation_prior=0.0)
+    _, state = track(case.epochs, case.line, limits=limits, levels=True)
     assert state.bank is not None
     assert set(state.bank.without) == set(case.epochs.satellite)
     rare = budget(TrackingLimits(level_constellation_prior=1e-13, level_fault_prior=1e-3))
@@ -77,7 +77,7 @@ def test_a_satellite_behind_a_bridge_keeps_its_sub_filter_and_one_long_gone_has_
     code = blank["code_m"]
     code[20:40, 2] += 25.0
     code[45:, 2] += 25.0
-    result, state = track(replace(case.epochs, **blank), case.line, limits=LIMITS)
+    result, state = track(replace(case.epochs, **blank), case.line, limits=LIMITS, levels=True)
     assert state.bank is not None
     assert str(case.epochs.satellite[2]) in state.bank.without
     assert str(case.epochs.satellite[5]) not in state.bank.without
@@ -96,7 +96,7 @@ def test_no_error_over_the_level_with_a_faulty_satellite(fault: str) -> None:
     for satellite in (2, 5):
         code, rate = case.epochs.code_m.copy(), case.epochs.rate_mps.copy()
         code[:, satellite] += bias
-        result, _ = track(replace(case.epochs, code_m=code, rate_mps=rate), case.line, limits=LIMITS)
+        result, _ = track(replace(case.epochs, code_m=code, rate_mps=rate), case.line, limits=LIMITS, levels=True)
         error = np.abs(result.arc_m - case.arc_m)
         assert (error <= result.level_m)[5:].all(), fault
         worst = max(worst, float(np.median(result.level_m[40:])))
@@ -108,7 +108,7 @@ def test_the_sub_filter_without_the_faulty_satellite_keeps_the_place() -> None:
     case = ride(100, noise=1.0, seed=2)
     code = case.epochs.code_m.copy()
     code[20:, 3] += 0.3 * np.arange(80.0)
-    _, state = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS)
+    _, state = track(replace(case.epochs, code_m=code), case.line, limits=LIMITS, levels=True)
     assert state.bank is not None
     k = state.bank.without.index(str(case.epochs.satellite[3]))
     sigma = np.sqrt(state.bank.covariance[k, 0, 0])
@@ -118,10 +118,10 @@ def test_the_sub_filter_without_the_faulty_satellite_keeps_the_place() -> None:
 @pytest.mark.requirement("C2")
 def test_cutting_changes_no_level() -> None:
     case = ride(50, noise=1.0)
-    whole, _ = track(case.epochs, case.line, limits=LIMITS)
+    whole, _ = track(case.epochs, case.line, limits=LIMITS, levels=True)
     state, levels = None, []
     for begin, end in ((0, 1), (1, 20), (20, 50)):
-        result, state = track(part(case.epochs, slice(begin, end)), case.line, state, limits=LIMITS)
+        result, state = track(part(case.epochs, slice(begin, end)), case.line, state, limits=LIMITS, levels=True)
         levels.append(result.level_m)
     np.testing.assert_array_equal(np.concatenate(levels), whole.level_m)
 
@@ -131,7 +131,7 @@ def test_amounts_grow_with_the_way_since_codes_and_sensors_are_left_out_too() ->
     case = ride(120, noise=1.0)
     gap = np.zeros(120, dtype=bool)
     gap[80:] = True
-    result, state = track(without_epochs(case.epochs, gap), case.line, limits=LIMITS, sensors=wheel(case))
+    result, state = track(without_epochs(case.epochs, gap), case.line, limits=LIMITS, sensors=wheel(case), levels=True)
     assert state.bank is not None
     assert "wheel" in state.bank.without
     error = np.abs(result.arc_m - case.arc_m)
@@ -155,7 +155,7 @@ def test_a_sub_filter_follows_the_line_where_a_fault_has_led_the_filter_away() -
     code[30:, 2] += 1.5 * np.arange(80.0)
     nothing = np.full(code.shape, np.nan)
     epochs = replace(case.epochs, code_m=code, phase_m=nothing, rate_mps=nothing)
-    result, state = track(epochs, case.line, limits=TrackingLimits(level="on", late_degrees_of_freedom=4.0))
+    result, state = track(epochs, case.line, limits=TrackingLimits(late_degrees_of_freedom=4.0), levels=True)
     assert state.bank is not None
     assert abs(result.arc_m[-1] - case.arc_m[-1]) > 100.0
     k = state.bank.without.index(str(case.epochs.satellite[2]))

@@ -25,7 +25,8 @@ from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
-from railfix.tracking import TrackingLimits, track
+from railfix.tracking import GnssEpochs, Line, SensorEpochs, TrackingLimits, track
+from railfix.tracking.levels import LevelState, with_levels
 
 EPOCHS = 2000
 
@@ -40,6 +41,11 @@ def median_us(action: object, epochs: int, rounds: int) -> float:
     return float(np.median(spent))
 
 
+def once_a_second(epochs: GnssEpochs, line: Line) -> None:
+    tracked, _ = track(epochs, line)
+    with_levels(tracked, epochs, line, LevelState(), TrackingLimits(), SensorEpochs())
+
+
 def filter_alone(rounds: int) -> None:
     ride = tracking_cases.ride(EPOCHS // 10, rate_hz=10.0, noise=1.0)
     line, epochs = ride.line, tracking_cases.part(ride.epochs, slice(0, EPOCHS))
@@ -47,17 +53,17 @@ def filter_alone(rounds: int) -> None:
     assert np.isfinite(first.arc_m[10:]).all()
     _, state = track(tracking_cases.part(epochs, slice(0, 1000)), line)
     one = tracking_cases.part(epochs, slice(1000, 1001))
-    levels = TrackingLimits(level="on")
     short = tracking_cases.part(epochs, slice(0, 200))
-    _, levelled = track(tracking_cases.part(epochs, slice(900, 1000)), line, limits=levels)
+    _, levelled = track(tracking_cases.part(epochs, slice(900, 1000)), line, levels=True)
     track(one, line, state)
     for label, run, count in (
         ("a chunk", lambda: track(epochs, line), len(epochs)),
         ("epoch by epoch", lambda: [track(one, line, state) for _ in range(100)], 100),
-        ("a chunk with levels", lambda: track(short, line, limits=levels), len(short)),
-        ("epoch by epoch with levels", lambda: [track(one, line, levelled, limits=levels) for _ in range(100)], 100),
+        ("a chunk with levels once a second", lambda: once_a_second(epochs, line), len(epochs)),
+        ("a chunk with levels at each epoch", lambda: track(short, line, levels=True), len(short)),
+        ("epoch by epoch with levels", lambda: [track(one, line, levelled, levels=True) for _ in range(100)], 100),
     ):
-        print(f"{kernels.CHOSEN:6s} {label:32s} {median_us(run, count, rounds):8.1f} us an antenna-epoch", flush=True)
+        print(f"{kernels.CHOSEN:6s} {label:34s} {median_us(run, count, rounds):8.1f} us an antenna-epoch", flush=True)
 
 
 def chain(rounds: int) -> None:

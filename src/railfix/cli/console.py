@@ -142,6 +142,14 @@ def _filtered(tracks: Mapping[str, Filtered]) -> Table:
         sigmas = [found.along_sigma_m for found in tracks.values()]
         cells = ["-" if sigma is None else f"{getattr(sigma, field):.2f} m" for sigma in sigmas]
         table.add_row(f"sigma along the line, {label}", *cells)
+    levels = [found.level for found in tracks.values()]
+    if any(levels):
+        for label, field in (("p50", "p50_m"), ("p95", "p95_m")):
+            values = [None if level is None else getattr(level, field) for level in levels]
+            table.add_row(
+                f"indicative protection level, {label}", *("-" if v is None else f"{v:.2f} m" for v in values)
+            )
+        table.add_row("  with a level", *("-" if level is None else f"{level.finite:,}" for level in levels))
     return table
 
 

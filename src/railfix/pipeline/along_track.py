@@ -24,6 +24,8 @@ from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
+from railfix.tracking.levels import LevelState, with_levels
+from railfix.tracking.result import BOUNDED
 
 #: Reasons that a code is kept by: the filter weighs multipath and faults itself, with more than one epoch to judge by.
 _WEIGHED_BY_FILTER: Final = (
@@ -43,8 +45,6 @@ _END_M: Final = 30.0
 _STRETCH_NS: Final = 5_000_000_000
 #: A direction is given where the speed is beyond this many of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
-#: Statuses whose level bounds the error.
-_BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +102,8 @@ class FilterState:
     slips : SlipState or None
         Of the carrier phases.
     track : TrackState or None
+    level : LevelState
+        Of the filter that gives the levels.
     sensors : SensorState
     fixed, anchor : Fixed or None
         Place of the filter at the last epoch, and at the last one before the present stretch.
@@ -111,6 +113,7 @@ class FilterState:
     line: Line | None = None
     slips: SlipState | None = None
     track: TrackState | None = None
+    level: LevelState = field(default_factory=LevelState)
     sensors: SensorState = field(default_factory=SensorState.empty)
     fixed: Fixed | None = None
     anchor: Fixed | None = None
@@ -194,8 +197,7 @@ def along_track(
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
     status = np.where(beside, np.int8(TrackStatus.MAP_OFFSET), tracked.status)
-    # Beside the map, on one of several branches or on a track in doubt, no sub-filter bounds the error.
-    unbounded = np.isfinite(tracked.level_m) & ~np.isin(status, _BOUNDED)
+    unbounded = np.isfinite(tracked.level_m) & ~np.isin(status, BOUNDED)
     level, amount = (np.where(unbounded, np.inf, values) for values in (tracked.level_m, tracked.amount_m))
     tracked = replace(tracked, status=status, level_m=level, amount_m=amount)
     inside = on_line_m(tracked, trajectory)
@@ -246,7 +248,7 @@ def _tracked(
     motions: list[Codes] = []
     replays: list[Replay] = []
     for first, last in pairwise([0, *edges.tolist(), len(epochs)]):
-        part = epochs if last - first == len(epochs) else epochs.part(first, last)
+        part = epochs if last - first == len(epochs) else epochs.take(slice(first, last))
         if len(part) and state.fixed is not None and _stretch(part.time[0]) != _stretch(state.fixed.time):
             state = _begun_anew(state, state.fixed)
         before = state.sensors
@@ -263,6 +265,9 @@ def _tracked(
         replays.append(Replay(epochs=part, sensors=sensors, before=state.track))
         tracked, after = track(part, line, state.track, limits=config.tracking, sensors=sensors)
         state = replace(state, track=after, sensors=kept, fixed=_fixed(tracked) if len(part) else state.fixed)
+        if config.tracking.level == "on":
+            tracked, level = with_levels(tracked, part, line, state.level, config.tracking, sensors)
+            state = replace(state, level=level)
         parts.append(tracked)
         motions.append(sensed.state)
     return _joined(parts), np.concatenate(motions), tuple(replays), state

@@ -88,7 +88,7 @@ def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[Gn
         return [(replay.epochs, replay.before)] if size else []
     state, pieces = replay.before, []
     for first in range(0, size, _EPOCHS):
-        epochs = replay.epochs.part(first, min(first + _EPOCHS, size))
+        epochs = replay.epochs.take(slice(first, first + _EPOCHS))
         pieces.append((epochs, state))
         _, state = track(epochs, line, state, limits=limits)
     return pieces

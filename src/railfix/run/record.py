@@ -32,11 +32,24 @@ class AlongSigma:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FilterLevel:
+    """Level of the filter of one antenna: median and 95th percentile of the finite ones [m], and how many these are."""
+
+    p50_m: float | None
+    p95_m: float | None
+    finite: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class Filtered:
-    """Positions of the filter along the track of one antenna: epochs by status, and percentiles of sigma [m]."""
+    """Positions of the filter along the track of one antenna: epochs by status, percentiles of sigma and level [m].
+
+    The level: median, 95th percentile and number of the finite ones; None where `tracking.level` is off.
+    """
 
     status: dict[str, int]
     along_sigma_m: AlongSigma | None
+    level: FilterLevel | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,18 +92,28 @@ def along_sigma(folder: OutputFolder) -> dict[str, AlongSigma]:
 
 def filtered(folder: OutputFolder) -> dict[str, Filtered]:
     """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written so far."""
-    sigma, status = pl.col("along_sigma_m"), pl.col("status").cast(pl.String)
+    sigma, status, level = pl.col("along_sigma_m"), pl.col("status").cast(pl.String), pl.col("protection_level_m")
+    finite = level.filter(level.is_finite())
     figures = {
+        "level_p50": finite.quantile(0.5),
+        "level_p95": finite.quantile(0.95),
+        "levels": level.is_not_null().sum(),
+        "finite": finite.len(),
         "p50": sigma.quantile(0.5),
         "p95": sigma.quantile(0.95),
         "max": sigma.max(),
         **{word.text: (status == word.text).sum() for word in TrackStatus},
     }
     found = {}
-    for name, table in folder.by_antenna("train.parquet", ("along_sigma_m", "status")).items():
+    for name, table in folder.by_antenna("train.parquet", ("along_sigma_m", "status", "protection_level_m")).items():
         row = table.select(**figures).row(0, named=True)
         along = AlongSigma(p50_m=row["p50"], p95_m=row["p95"], max_m=row["max"]) if row["max"] is not None else None
-        found[name] = Filtered(status={s.text: row[s.text] for s in TrackStatus}, along_sigma_m=along)
+        bound = FilterLevel(p50_m=row["level_p50"], p95_m=row["level_p95"], finite=row["finite"])
+        found[name] = Filtered(
+            status={s.text: row[s.text] for s in TrackStatus},
+            along_sigma_m=along,
+            level=bound if row["levels"] else None,
+        )
     return found
 
 

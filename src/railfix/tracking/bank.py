@@ -42,6 +42,8 @@ CONSTELLATION_FAULT_S: Final = 3600.0
 #: Sources whose probabilities add up to less than this share of the risk need no sub-filter, if there are so many.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
+#: Risk of the bound on the speed over that of the level.
+SPEED_SHARE: Final = 0.01
 #: A source that is not measured needs no sub-filter once it has left the filter: place and standard deviation differ
 #: by less than this share of the standard deviation.
 JOINED: Final = 0.05
@@ -63,12 +65,17 @@ class Budget:
         Probability that a satellite, a constellation, a sensor is faulty or still remembered; 0 needs no sub-filter.
     k_fault : tuple of float
         Sigmas that noise exceeds on one side with the risk over that probability: what a sub-filter asks for at least.
+    k_speed : float
+    k_speed_fault : tuple of float
+        The same of the bound on the speed, which has `SPEED_SHARE` of the risk on top, in equal parts for all sources.
     """
 
     risk: float
     k: float
     prior: tuple[float, float, float]
     k_fault: tuple[float, float, float]
+    k_speed: float
+    k_speed_fault: tuple[float, float, float]
 
 
 @lru_cache(maxsize=8)
@@ -88,11 +95,19 @@ def budget(limits: TrackingLimits) -> Budget:
     ]
     kept = [prior if MOST_SOURCES * prior > SPARED * risk else 0.0 for prior in exposed]
     risk -= MOST_SOURCES * sum(prior for prior, monitored in zip(exposed, kept, strict=True) if not monitored)
+    of_speed = SPEED_SHARE * risk / (MOST_SOURCES + 1)
+
+    def sigmas(share: float) -> tuple[float, float, float]:
+        found = [float(-ndtri(min(share / prior, 0.5))) if prior else 0.0 for prior in kept]
+        return found[0], found[1], found[2]
+
     return Budget(
         risk=risk,
         k=float(-ndtri(0.5 * risk)),
         prior=(kept[0], kept[1], kept[2]),
-        k_fault=tuple(float(-ndtri(min(risk / prior, 0.5))) if prior else 0.0 for prior in kept),  # type: ignore[arg-type]
+        k_fault=sigmas(risk),
+        k_speed=float(-ndtri(0.5 * of_speed)),
+        k_speed_fault=sigmas(of_speed),
     )
 
 
@@ -281,3 +296,20 @@ def level_m(bank: Bank, place_m: float, sigma_m: float, limits: TrackingLimits) 
             break
     contradicted = (bank.weak_s > limits.level_doubt_s).any()
     return float("inf") if contradicted else level, noise, float(apart.max())
+
+
+def speed_bound_mps(bank: Bank, speed_mps: float, sigma_mps: float, limits: TrackingLimits) -> float:
+    """Bound of the error of the speed [m/s]: what carries the level over the epochs until the next one.
+
+    Parameters
+    ----------
+    bank : Bank
+    speed_mps, sigma_mps : float [m/s]
+        Of the filter.
+    limits : TrackingLimits
+    """
+    given = budget(limits)
+    k = np.array(given.k_speed_fault)[[kind_of(name) for name in bank.without]]
+    apart = np.abs(bank.mean[:, Unknown.SPEED] - speed_mps)
+    sigma = np.sqrt(bank.covariance[:, Unknown.SPEED, Unknown.SPEED])
+    return float(np.max(apart + k * sigma, initial=given.k_speed * sigma_mps))

@@ -52,6 +52,8 @@ class Compiled:
     limits : TrackingLimits
     result : Tracked
         Written to.
+    levels : bool
+        Whether there are sub-filters.
     """
 
     def __init__(
@@ -61,9 +63,12 @@ class Compiled:
         sensors: SensorEpochs,
         limits: TrackingLimits,
         result: Tracked,
+        *,
+        levels: bool,
     ) -> None:
         layout, self.recursion = _kernels()
         self.layout, self.chunk, self.line, self.limits, self.result = layout, chunk, line, limits, result
+        self.levels = levels
         interval, singers = np.unique(chunk.interval_s, return_inverse=True)
         matrices = [singer(float(dt), limits.acceleration_mps2, limits.acceleration_s) for dt in interval]
         ranged, left = sensors.ranges, chunk.apart | chunk.off_map
@@ -97,7 +102,7 @@ class Compiled:
         if (
             not state.hypotheses
             or np.isnat(state.measured)
-            or (state.bank is None and limits.level == "on")
+            or (state.bank is None and self.levels)
             or self.epochs.left[first]
             or (state.weak_motion_s >= hypotheses.BESIDE_AFTER_S and state.hypotheses <= limits.most_hypotheses // 2)
             or state.weak_motion_s >= limits.lost_motion_s
@@ -146,14 +151,15 @@ class Compiled:
     def _subfilters(self, state: TrackState, full: Indices) -> Any:
         """Sub-filters by source, none of them where levels are off."""
         limits, n = self.limits, len(full)
-        names = _sources(state) if limits.level == "on" else []
-        prior, k = np.zeros(len(names)), np.zeros(len(names))
+        names = _sources(state) if self.levels else []
+        prior, k, k_speed = (np.zeros(len(names)) for _ in range(3))
         begun = np.zeros(n + len(_OF_EPOCH))
         running, weak = np.zeros(len(names), dtype=np.bool_), np.zeros(len(names))
         mean, covariance = np.zeros((len(names), n)), np.zeros((len(names), n, n))
         if names:
             given, kinds = bank.budget(limits), [bank.kind_of(name) for name in names]
             prior[:], k[:] = np.array(given.prior)[kinds], np.array(given.k_fault)[kinds]
+            k_speed[:] = np.array(given.k_speed_fault)[kinds]
             start = np.full(1, limits.expired_sigma_m)
             _, fresh = hypotheses.begin(np.zeros(1), start, len(state.satellite), self.line, limits)
             begun[:] = np.diagonal(fresh[0])[np.concatenate([full, _OF_EPOCH])]
@@ -171,6 +177,7 @@ class Compiled:
             weak_s=weak,
             prior=prior,
             k=k,
+            k_speed=k_speed,
             begun=begun,
             clock=np.array(clock, dtype=np.intp),
         )
@@ -223,7 +230,7 @@ class Compiled:
             if unknown not in full:
                 getattr(self.result, name)[placed][known] = idle[unknown]
         state.mean, state.covariance = whole(memory.mean[:count], memory.covariance[:count])
-        if limits.level == "on":
+        if self.levels:
             running = np.flatnonzero(sub.running)
             names = _sources(state)
             means, covariances = whole(sub.mean[running], sub.covariance[running])
@@ -335,6 +342,7 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "most_odds": hypotheses.MOST_ODDS,
         "level_risk": bank.budget(limits).risk,
         "level_k": bank.budget(limits).k,
+        "level_k_speed": bank.budget(limits).k_speed,
         "precision_m": bank.PRECISION_M,
         "rounds": bank.ROUNDS,
         "scale_bound": bank.SCALE_BOUND,

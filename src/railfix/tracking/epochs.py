@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
-from railfix.core.arrays import Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Datetimes, Floats, Indices, Masks, Strings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +49,10 @@ class GnssEpochs:
     def __len__(self) -> int:
         return len(self.time)
 
-    def part(self, first: int, last: int) -> GnssEpochs:
-        """Epochs from one up to another; what belongs to channels stays whole."""
+    def take(self, rows: Indices | slice) -> GnssEpochs:
+        """Return some of the epochs; what belongs to channels stays whole."""
         of_channels = ("satellite", "clock")
-        values = {f.name: getattr(self, f.name)[first:last] for f in fields(self) if f.name not in of_channels}
+        values = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name not in of_channels}
         return replace(self, **values)
 
 
@@ -74,6 +74,11 @@ class RangeEpochs:
     age_s: Floats
     unit_ecef_m: Floats
     lever_m: Floats
+
+    def take(self, rows: Indices) -> RangeEpochs:
+        """Return the ranges of some of the epochs."""
+        names = ("range_m", "sigma_m", "age_s", "unit_ecef_m")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,6 +48,7 @@ def track(
     *,
     limits: TrackingLimits | None = None,
     sensors: SensorEpochs | None = None,
+    levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
     """Places along the trajectory, each from its own and earlier epochs.
@@ -61,6 +62,8 @@ def track(
         Left by the epochs before; None at the start.
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
+    levels : bool
+        Whether a bank of sub-filters gives a level at every epoch (`railfix.tracking.levels`: at a lower rate).
     trace : list of Step, optional
         Gets what the smoother needs of each epoch (`railfix.tracking.smoother`); all epochs are then done by numpy.
 
@@ -78,12 +81,12 @@ def track(
         anew = np.asarray(chunk.fresh.any(axis=1))
         fast = None
         if kernels.CHOSEN == "numba" and trace is None:
-            fast = Compiled(chunk, line, sensors, limits, result)
+            fast = Compiled(chunk, line, sensors, limits, result, levels=levels)
         epoch = 0
         while epoch < len(epochs):
             done = epoch if fast is None else fast.advance(state, epoch)
             if done == epoch:
-                _step(chunk, epoch, line, state, limits, sensors, result, bool(anew[epoch]), trace)
+                _step(chunk, epoch, line, state, limits, sensors, result, bool(anew[epoch]), levels, trace)
                 done += 1
             epoch = done
         leave(chunk, epochs, state, limits)
@@ -100,6 +103,7 @@ def _step(
     sensors: SensorEpochs,
     result: Tracked,
     anew: bool,
+    levels: bool,
     trace: list[Step] | None,
 ) -> None:
     """One epoch: changes the state, writes its row of the result."""
@@ -131,7 +135,7 @@ def _step(
     sensed = sensor_rows(sensors, epoch, line, mean, dt, state.direction)
     rows = rows_of(chunk, epoch, line, mean, mean[:, _PLACES], state.log_scale, sensed)
     if len(rows.variance):
-        _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost, step)
+        _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost, levels, step)
     elif state.bank is not None:
         means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
@@ -161,6 +165,7 @@ def _measure(
     sensors: SensorEpochs,
     result: Tracked,
     lost: bool,
+    levels: bool,
     step: Step,
 ) -> None:
     """Update the state by the rows of an epoch."""
@@ -200,7 +205,7 @@ def _measure(
     state.mean, state.covariance = on_the_line(*after, line, limits), after[1]
     state.measured = chunk.time[epoch]
     best = most_probable(state.log_probability)
-    if limits.level == "on":
+    if levels:
         bank = Bank.empty(mean.shape[1]) if state.bank is None or lost or best else state.bank
         stepped = np.diagonal(covariance[best]) != np.diagonal(predicted_covariance[best])
         named = np.where(rows.column >= 0, chunk.satellite[rows.column], "")

@@ -83,7 +83,11 @@ class TrackingLimits(Settings):
     bend_m : float
         Where motion contradicts the track at an epoch, places so far before and behind (and twice as far) are tried.
     level : {"on", "off"}
-        Whether a bank of sub-filters gives a protection level: some 20 filters instead of one, off for what they cost.
+        Whether a bank of sub-filters gives a protection level; off for what it costs, as many filters as satellites.
+    level_period_s : float
+        Time between the epochs that the bank takes: codes of neighbouring epochs have the same errors.
+    level_acceleration_mps2 : float
+        Largest acceleration between them: emergency braking of trains has up to 3 m/s2 (magnetic track brakes).
     level_risk_per_hour : float
         Probability an hour that the error exceeds the level unnoticed: 1e-7 for the satellite part (P1 2.4).
     level_samples_per_hour : float
@@ -144,6 +148,8 @@ class TrackingLimits(Settings):
     lost_code_s: float = Field(default=12.0, gt=0)
     bend_m: float = Field(default=20.0, gt=0)
     level: Literal["on", "off"] = "off"
+    level_period_s: float = Field(default=1.0, gt=0)
+    level_acceleration_mps2: float = Field(default=3.0, ge=0)
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
     level_samples_per_hour: float = Field(default=60.0, gt=0)
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)

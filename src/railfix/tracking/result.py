@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Integers
-from railfix.tracking.bank import SCALE_BOUND, level_m
+from railfix.tracking.bank import SCALE_BOUND, level_m, speed_bound_mps
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.robust import mean_weight
 from railfix.tracking.rows import Kind, Rows
@@ -46,6 +46,11 @@ class TrackStatus(IntEnum):
         return self.name.lower()
 
 
+#: Statuses whose level bounds the error: beside the map, on one of several branches or on a track in doubt, no
+#: sub-filter does.
+BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tracked:
     """Places of T epochs; NaN where there is none.
@@ -68,6 +73,8 @@ class Tracked:
         Factor on the error of the map's lengths, 1 where codes do not contradict them (`misfit`).
     level_m, level_noise_m, separation_m : ndarray, shape (T,) [m]
         `bank.level_m`; NaN where levels are off.
+    level_speed_mps : ndarray, shape (T,)
+        `bank.speed_bound_mps`.
     amount_m : ndarray, shape (T,) [m]
         Over- and under-reading amount: the level, and never less than the bound of the scale times the way since
         codes were used (SUBSET-026 3.6.8).
@@ -97,6 +104,7 @@ class Tracked:
     map_scale: Floats
     level_m: Floats
     level_noise_m: Floats
+    level_speed_mps: Floats
     separation_m: Floats
     amount_m: Floats
     used: Integers
@@ -114,7 +122,7 @@ class Tracked:
         names = (
             "arc_m", "sigma_m", "speed_mps", "speed_sigma_mps", "acceleration_mps2", "probability", "code_weight",
             "motion_weight", "wheel_scale", "force_offset_mps2", "radar_scale", "map_scale", "level_m", "level_noise_m",
-            "separation_m", "amount_m",
+            "level_speed_mps", "separation_m", "amount_m",
         )  # fmt: skip
         return cls(
             time=time,
@@ -166,6 +174,9 @@ def write_place(
         level = float("inf") if doubtful else level
         result.level_m[epoch], result.level_noise_m[epoch], result.separation_m[epoch] = level, noise, apart
         result.amount_m[epoch] = max(level, SCALE_BOUND * state.unaided_m)
+        result.level_speed_mps[epoch] = speed_bound_mps(
+            state.bank, float(mean[Unknown.SPEED]), float(result.speed_sigma_mps[epoch]), limits
+        )
     if lost:
         status = TrackStatus.LOST
     elif not measured:

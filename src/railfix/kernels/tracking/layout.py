@@ -130,6 +130,7 @@ class Numbers(NamedTuple):
     level_passes: int
     level_risk: float
     level_k: float
+    level_k_speed: float
     precision_m: float
     rounds: int
     scale_bound: float
@@ -170,8 +171,8 @@ class Subfilters(NamedTuple):
     """Sub-filters of the level by their source (`railfix.tracking.bank`): satellites by slot, clocks, sensors.
 
     None of them where levels are off. `running` marks those that there are; `prior` is the probability of a fault of
-    each source, 0 where it needs no sub-filter, `k` the sigmas that follow from it; `begun` has the variances of the
-    compact unknowns and those of an epoch that one begins with; `clock` is that of each satellite.
+    each source, 0 where it needs no sub-filter, `k` and `k_speed` the sigmas that follow from it; `begun` has the
+    variances of the compact unknowns and those of an epoch that one begins with; `clock` is that of each satellite.
     """
 
     running: Masks
@@ -180,6 +181,7 @@ class Subfilters(NamedTuple):
     weak_s: Floats
     prior: Floats
     k: Floats
+    k_speed: Floats
     begun: Floats
     clock: Indices
 
@@ -273,6 +275,7 @@ class Answers(NamedTuple):
     map_scale: Floats
     level_m: Floats
     level_noise_m: Floats
+    level_speed_mps: Floats
     separation_m: Floats
     amount_m: Floats
     used: Integers

@@ -17,6 +17,7 @@ from railfix.kernels.tracking.layout import (
     PHASE_CLOCK,
     PLACE,
     SENSORS,
+    SPEED,
     Active,
     Answers,
     Course,
@@ -212,3 +213,14 @@ def level_of(place: float, sigma: float, bank: Subfilters, numbers: Numbers, ans
         if abs(step) < numbers.precision_m:
             break
     return level
+
+
+@inner
+def speed_bound(speed: float, sigma: float, bank: Subfilters, numbers: Numbers) -> float:
+    """Return the bound of the error of the speed (`railfix.tracking.bank.speed_bound_mps`)."""
+    bound = numbers.level_k_speed * sigma
+    for b in range(len(bank.running)):
+        if bank.running[b]:
+            own = math.sqrt(bank.covariance[b, SPEED, SPEED])
+            bound = max(bound, abs(bank.mean[b, SPEED] - speed) + bank.k_speed[b] * own)
+    return bound

@@ -43,7 +43,7 @@ from railfix.kernels.tracking.layout import (
     Subfilters,
     Work,
 )
-from railfix.kernels.tracking.level import advance_subfilters, level_of
+from railfix.kernels.tracking.level import advance_subfilters, level_of, speed_bound
 from railfix.kernels.tracking.misfit import code_shift, learn_map
 from railfix.kernels.tracking.prediction import add_bend, predict
 from railfix.kernels.tracking.update import apply_update, evidence_of, first_weights, reweight
@@ -389,6 +389,7 @@ def _finish(
             level = math.inf
         answers.level_m[t] = level
         answers.amount_m[t] = max(level, numbers.scale_bound * scalars[UNAIDED])
+        answers.level_speed_mps[t] = speed_bound(memory.mean[0, SPEED], answers.speed_sigma_mps[t], bank, numbers)
     if measured:
         answers.status[t] = numbers.tracking if probability >= numbers.decided else numbers.several
     else:
