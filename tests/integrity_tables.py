@@ -1,7 +1,7 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/bounds.md``: faults, maps, sigmas, starts, priors, sides, late.
+``docs/bounds.md``: faults, maps, sigmas, starts, priors, together, sides, late.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import polars as pl
@@ -27,7 +27,8 @@ from railfix.core.timescale import seconds
 from railfix.evaluate import along_track_error, interpolate_reference
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
-from railfix.integrity.protection import LevelStatus
+from railfix.integrity.protection import LevelStatus, RiskBudget
+from railfix.integrity.protection.risk import set_sums
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
@@ -47,6 +48,8 @@ SETTINGS: Final = parse_config({"elevation": {"mask_deg": 15.0}})
 SIZES_M: Final = (20.0, 50.0, 100.0)
 #: Offsets of the map: right of the line and up [m].
 OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
+#: Priors of local faults that cities ask for (docs/bounds.md).
+LOCAL_PRIORS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4)
 _NORMAL_MEDIAN: Final = 0.6745
 #: Degrees of freedom of Student's t: none, as of late codes for both sides, heavier for late codes, as the filter.
 TAILS: Final = (None, Tails(4.0, 4.0), Tails(4.0, 2.0), Tails(4.0, 1.0), Tails(8.0, 1.0), Tails(1e9, 1.0))
@@ -296,21 +299,46 @@ def _root_mean_square(ranges: Ranges, place: Floats, prior: Floats) -> Floats:
     return np.asarray(np.sqrt(np.maximum(least, 0.0) / np.maximum(ranges.n_used - 2, 1)))
 
 
+def prior_settings() -> dict[str, dict[str, Any]]:
+    """Settings of the risk: priors of local faults, and of a fault of a constellation other than GPS."""
+    settings: dict[str, dict[str, Any]] = {f"local {p:g}": {"local_prior": p} for p in LOCAL_PRIORS}
+    return settings | {
+        f"constellation {p:g}": {"constellation_prior": dict.fromkeys("ECR", p)} for p in (1e-6, 1e-5, 1e-4)
+    }
+
+
 def prior_rows() -> Iterator[str]:
-    """The demonstration's levels by the prior of local faults, and with a prior of a constellation."""
-    yield "demonstration           levels   median [m]   within 20 m [%]"
-    case = cases()["demo"]
-    settings = {f"local_prior {p:g}": {"local_prior": p} for p in (1e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3)}
-    settings |= {f"constellation E {p:g}": {"constellation_prior": {"E": p}} for p in (1e-5, 1e-4)}
-    for name, risk in settings.items():
-        result = case.solved(parse_config({"risk": risk}))
-        level, _ = bounds(result)
-        observed = result.status != Status.NO_OBSERVATION
-        assert result.protection is not None
-        finite = np.isfinite(result.protection.level.level_m)
-        median = float(np.median(result.protection.level.level_m[finite])) if finite.any() else np.nan
-        within = 100.0 * float((level[observed] <= 20.0).mean())
-        yield f"{name:22s} {finite.sum():7d} {median:12.2f} {within:17.1f}"
+    """Levels of every log by the prior of local faults, and by that of a constellation, of epochs with observations."""
+    yield "log    prior                 levels %   median [m]   within 20 m %   40 m %   us an epoch   over"
+    for name, case in cases().items():
+        for prior, risk in prior_settings().items():
+            began = time.process_time()
+            result = case.solved(parse_config({"elevation": {"mask_deg": 15.0}, "risk": risk}))
+            spent = time.process_time() - began
+            assert result.protection is not None
+            of_all = result.protection.level.level_m[result.status != Status.NO_OBSERVATION]
+            finite = of_all[np.isfinite(of_all)]
+            median = float(np.median(finite)) if len(finite) else np.nan
+            within = [100.0 * float((of_all <= limit).mean()) for limit in (20.0, 40.0)]
+            level, calm = bounds(result)
+            over = int((calm & (case.errors(result)[1] > level)).sum())
+            yield (
+                f"{name:6s} {prior:20s} {100.0 * len(finite) / len(of_all):9.1f} {median:12.2f} {within[0]:15.1f}"
+                f" {within[1]:8.1f} {1e6 * spent / len(of_all):13.0f} {over:6d}"
+            )
+
+
+def class_rows() -> Iterator[str]:
+    """Probability of faults together over the risk of a sample, of ten satellites each of G and E, by their priors."""
+    kinds = ("three", "four", "map, two", "side, two", "map, side, one", "const., map", "const., two", "const., side")
+    yield f"{'prior':20s}" + "".join(f"{kind:>15s}" for kind in kinds)
+    for name, settings in prior_settings().items():
+        risk = RiskBudget(**settings)
+        sums = set_sums(risk.prior(["G"] * 10 + ["E"] * 10)[None], 4)[0]
+        one, side, shared = risk.map_prior, 2.0 * risk.side_prior, risk.constellation_prior.get("E", 0.0)
+        of_kinds = (sums[3], sums[4], one * sums[2], side * sums[2], one * side * sums[1])
+        of_kinds += (shared * one, shared * sums[2], shared * side)
+        yield f"{name:20s}" + "".join(f"{value / risk.risk_per_sample:15.2g}" for value in of_kinds)
 
 
 def side_rows() -> Iterator[str]:
@@ -389,6 +417,7 @@ PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "sigmas": sigma_rows,
     "starts": start_rows,
     "priors": prior_rows,
+    "together": class_rows,
     "sides": side_rows,
     "late": late_rows,
 }

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import norm
 
 from railfix.integrity.protection import RiskBudget, along_track_level
-from railfix.integrity.protection.risk import more_than_two
+from railfix.integrity.protection.risk import set_sums
 from railfix.integrity.raim import LinearModel
 
 #: A risk whose parts are all asked for, and leave figures that can be followed.
@@ -73,7 +73,8 @@ def main() -> None:
     print(f"\ndefaults: {usual.risk_per_sample:.2e} a sample, K {usual.sample_k:.2f}")
     for n in (10, 20, 30, 37):
         prior = usual.prior(["G"] * min(n, 10) + ["E"] * max(n - 10, 0))[None]
-        print(f"{n} satellites, ten of them GPS: {more_than_two(prior)[0] / usual.risk_per_sample:.3f} of it unchecked")
+        three = set_sums(prior, 3)[0, 3] / usual.risk_per_sample
+        print(f"{n} satellites, ten of them GPS: {three:.3f} of it unchecked")
 
 
 if __name__ == "__main__":

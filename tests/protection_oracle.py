@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import comb, prod
 
 import numpy as np
 from scipy.optimize import brentq
@@ -33,6 +35,9 @@ class Level:
     worst_one: int
     worst_two: tuple[int, int]
     sigma_m: float
+    unchecked: float
+    k_false_alarm: float
+    orders: dict[tuple[Event, ...], int]
 
 
 class Resolved:
@@ -77,6 +82,62 @@ class Resolved:
         return answer.place_m - self.all.place_m, float(np.sqrt((difference**2).sum()))
 
 
+@dataclass(frozen=True)
+class Event:
+    """A fault that satellites share, or (without any) a wrong map."""
+
+    kind: str  # constellation, side, map
+    prior: float
+    members: tuple[int, ...] = ()
+
+
+def products(priors: Iterable[float], size: int) -> float:
+    """Sum of the products over all sets of a size."""
+    return sum(prod(chosen) for chosen in combinations(priors, size))
+
+
+def sets_of(events: Sequence[Event]) -> list[tuple[Event, ...]]:
+    """Sets of up to three shared faults."""
+    return [some for size in range(4) for some in combinations(events, size)]
+
+
+def kind_of(shared: tuple[Event, ...]) -> int:
+    """Number of faults; sides count as one."""
+    return len(shared) - max(sum(e.kind == "side" for e in shared) - 1, 0)
+
+
+def hypotheses(
+    everyone: Sequence[float], events: Sequence[Event], share: float, typical: float
+) -> tuple[dict[tuple[Event, ...], int], float]:
+    """Satellites left out at most with each set of shared faults (-1: it is no hypothesis), and the probability left.
+
+    The rule in words: a class (shared faults, number of satellites) that is likelier than `share` is a hypothesis, and
+    as long as all others together are, so is the one with the likeliest members.
+    """
+    always = {"constellation": 1, "side": 0, "map": 1}
+    order = {}
+    for shared in sets_of(events):
+        p = prod(e.prior for e in shared)
+        least = 2 if not shared else always[shared[0].kind] if len(shared) == 1 else -1
+        order[shared] = max([least, *(k for k in range(5) if p * products(everyone, k) > share)])
+
+    def rest() -> float:
+        total = products([e.prior for e in events], 4)
+        for shared, k in order.items():
+            within = [s for size in range(len(shared)) for s in combinations(shared, size)]
+            if k >= 0 or all(order[s] >= 0 for s in within):
+                total += prod(e.prior for e in shared) * products(everyone, k + 1)
+        return total
+
+    while rest() > share:
+        further = {s: (prod(e.prior for e in s) * typical ** (k + 1), -k) for s, k in order.items() if k < 4}
+        if not further:
+            break
+        for shared, likely in further.items():
+            order[shared] += likely == max(further.values())
+    return order, rest()
+
+
 def level(
     case: raim_oracle.Problem,
     prior: dict[int, float],
@@ -86,85 +147,84 @@ def level(
     false_alarm: float,
     scale: float = 1.0,
     bias_m: np.ndarray | None = None,
-    constellations: tuple[tuple[tuple[int, ...], float], ...] = (),
-    unchecked_share: float = 0.3,
+    events: Sequence[Event] = (),
+    unmapped: Resolved | None = None,
 ) -> Level:
-    """The level of one epoch; `prior` by channel, `share` of each part, constellations as (channels, prior)."""
+    """The level of one epoch; `prior` by channel, `share` of each part, `unmapped` what takes the place of the map."""
     solved = Resolved(case, scale)
     channels = [int(c) for c in case.channels]
+    everyone, n = [prior[c] for c in channels], len(channels)
     bias = np.zeros(len(solved.noise))
     if bias_m is not None:
-        bias[: len(channels)] = bias_m[channels] / case.sigma_m
-    ones = [((c,), prior[c]) for c in channels] + list(constellations)
-    twos = [((c, d), prior[c] * prior[d]) for c, d in combinations(channels, 2)]
-    threes = [((c, d, e), prior[c] * prior[d] * prior[e]) for c, d, e in combinations(channels, 3)]
-    triples = sum(p for _, p in threes) > unchecked_share * risk_per_sample
-    fours = sum(prior[c] * prior[d] * prior[e] * prior[f] for c, d, e, f in combinations(channels, 4))
-    beyond = fours if triples else sum(p for _, p in threes)
-    with_one = []
-    for members, p in constellations:
-        others = [c for c in channels if c not in members]
-        with_one += [((*members, c), p * prior[c]) for c in others]
-        beyond += p * sum(prior[c] * prior[d] for c, d in combinations(others, 2))
-    beyond += sum(p * q for (_, p), (_, q) in combinations(constellations, 2))
-    part = share * max(risk_per_sample - beyond, 0.0) * (0.75 if triples else 1.0)
-    asked = triples or sum(p for _, p in twos) > part
-    tests = len(ones) + (len(twos) if asked else 0) + (len(threes) if triples else 0)
-    tests += len(channels) * len(constellations)
+        bias[:n] = bias_m[channels] / case.sigma_m
+    typical = float(np.mean(list(prior.values())))
+    order, beyond = hypotheses(everyone, events, 0.3 * risk_per_sample, typical)
+    more = any(k >= 0 and kind_of(shared) + k >= 3 for shared, k in order.items())
+    part = share * max(risk_per_sample - beyond, 0.0) * (0.75 if more else 1.0)
+    asked = order[()] > 2 or products(everyone, 2) > part
+    order[()] = order[()] if asked else 1
+    tests = -1 + sum(comb(n, k) for s, m in order.items() if all(e.kind != "map" for e in s) for k in range(m + 1))
     k_alarm = norm.isf(false_alarm / (2.0 * tests))
 
-    def of(hypotheses: list[tuple[tuple[int, ...], float]]) -> tuple[float, float, tuple[int, ...]]:
-        answers = [(members, p, solved.without(members)) for members, p in hypotheses]
-        left = part - sum(p for _, p, answer in answers if not answer.determined)
-        total = sum(p for _, p, answer in answers if answer.determined)
-        if sum(p for _, p, _ in answers) <= part:
+    kinds: list[list[tuple[float, float, float, tuple[int, ...], float]]] = [[], [], [], []]
+    for shared, most in order.items():
+        out = {c for e in shared for c in e.members}
+        free = any(e.kind == "map" for e in shared)
+        for k in range(most + 1):
+            for further in combinations([c for c in channels if c not in out], k):
+                p = prod(e.prior for e in shared) * prod(prior[c] for c in further) * (1.0 if shared or k else 2.0)
+                members = (*sorted(out), *further)
+                answer = (unmapped if free and unmapped is not None else solved).without(members)
+                if not answer.determined or answer.sigma_m > 1e4:
+                    offset, ratio = np.nan, 0.0
+                elif free:
+                    effect = np.abs(answer.operator) @ (bias / scale)
+                    offset, ratio = abs(answer.place_m - solved.all.place_m) + effect, 0.0
+                else:
+                    distance, sigma = solved.apart(answer)
+                    offset = k_alarm * sigma + np.abs(answer.operator) @ bias
+                    ratio = abs(distance) / (k_alarm * sigma) if sigma > 1e-6 * solved.all.sigma_m else 0.0
+                kinds[min(kind_of(shared) + k, 3)].append((p, float(offset), answer.sigma_m, members, ratio))
+
+    def of(kind: int) -> tuple[float, tuple[int, ...]]:
+        tails = [each for each in kinds[kind] if np.isfinite(each[1])]
+        left = part - sum(each[0] for each in kinds[kind] if not np.isfinite(each[1]))
+        total = sum(each[0] for each in tails)
+        if sum(each[0] for each in kinds[kind]) <= part:
             k = -np.inf
         elif left <= 0:
-            return np.inf, 0.0, ()
+            return np.inf, ()
         else:
             k = norm.isf(left / total) if left < total else -np.inf
-        largest, ratio, worst = 0.0, 0.0, ()
-        for members, _, answer in answers:
-            if answer.determined:
-                distance, sigma = solved.apart(answer)
-                here = k_alarm * sigma + k * answer.sigma_m + np.abs(answer.operator) @ bias
-                if here > largest:
-                    largest, worst = float(here), members
-                if sigma > 1e-6 * solved.all.sigma_m:
-                    ratio = max(ratio, abs(distance) / (k_alarm * sigma))
-        return largest, ratio, worst
+        largest = max(((offset + k * sigma, members) for _, offset, sigma, members, _ in tails), default=(0.0, ()))
+        return (float(largest[0]), largest[1]) if largest[0] > 0.0 else (0.0, ())
 
-    one, ratio_one, worst_one = of(ones)
-    doubles = [*(twos if asked else []), *with_one]
-    two, ratio_two, worst_two = of(doubles) if doubles else (0.0, 0.0, ())
-    three, ratio_three, _ = of(threes) if triples else (0.0, 0.0, ())
-    fault_free = norm.isf(part / 2.0) * solved.all.sigma_m + np.abs(solved.all.operator) @ bias
+    reserved = 0.0 if asked else products(everyone, 2)
+    blind = sum(each[0] for kind in kinds for each in kind if not np.isfinite(each[1]))
+    whole = [each for kind in kinds for each in kind if np.isfinite(each[1])]
+    p_of, offset_of, sigma_of = (np.array([each[k] for each in whole]) for k in range(3))
 
     def spent(level_m: float) -> float:
-        total = 2.0 * norm.sf((level_m - np.abs(solved.all.operator) @ bias) / solved.all.sigma_m)
-        for members, p in [*ones, *doubles, *(threes if triples else [])]:
-            answer = solved.without(members)
-            if answer.determined:
-                offset = k_alarm * solved.apart(answer)[1] + np.abs(answer.operator) @ bias
-                total += p * norm.sf((level_m - offset) / answer.sigma_m)
-            else:
-                total += p
-        return float(total + (0.0 if asked else sum(p for _, p in twos)))
+        return float((p_of * norm.sf((level_m - offset_of) / sigma_of)).sum() + blind + reserved)
 
-    largest = max(float(fault_free), one, two, three)
-    whole = largest
+    (fault_free, _), (one, worst_one), (two, worst_two), (three, _) = (of(kind) for kind in range(4))
+    largest = max(fault_free, one, two, three if more else 0.0)
+    lowest = largest
     if np.isfinite(largest) and largest < 1e4:
-        whole = float(
-            brentq(lambda at: np.log(spent(at)) - np.log((4.0 if triples else 3.0) * part), 0.0, largest, xtol=1e-9)
+        lowest = float(
+            brentq(lambda at: np.log(spent(at)) - np.log((4.0 if more else 3.0) * part), 0.0, largest, xtol=1e-9)
         )
     return Level(
-        level_m=whole,
-        fault_free_m=float(fault_free),
+        level_m=lowest,
+        fault_free_m=fault_free,
         one_fault_m=one,
         two_fault_m=two,
         largest_m=largest,
-        separation=max(ratio_one, ratio_two, ratio_three),
+        separation=max(each[4] for each in whole),
         worst_one=worst_one[0] if len(worst_one) == 1 else -1,
         worst_two=worst_two if len(worst_two) == 2 else (-1, -1),
         sigma_m=solved.all.sigma_m,
+        unchecked=beyond,
+        k_false_alarm=float(k_alarm),
+        orders=order,
     )

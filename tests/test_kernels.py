@@ -112,9 +112,14 @@ def test_a_run_is_the_same_with_compiled_kernels() -> None:
 @with_numba
 @pytest.mark.requirement("A7", "C2")
 @pytest.mark.parametrize("systems", ["GGGGG", "GGGEE", "GGGGGEE", "GGGGEEEECCCR", "GGGGGGGGEEEEEEECCCC"])
-@pytest.mark.parametrize(("by_range", "side_prior"), [(False, 1e-7), (True, 1e-3), (False, 3e-5)])
-def test_levels_of_every_kind_of_hypothesis_are_the_same(systems: str, by_range: bool, side_prior: float) -> None:
-    """Constellations, sides (with one more where likely), a wrong map, triples; overbounds; what nothing checks."""
+@pytest.mark.parametrize(
+    ("by_range", "side_prior", "local_prior"),
+    [(False, 1e-7, 1e-3), (True, 1e-3, 1e-3), (False, 3e-5, 4e-3), (True, 1e-3, 4e-3)],
+)
+def test_levels_of_every_kind_of_hypothesis_are_the_same(
+    systems: str, by_range: bool, side_prior: float, local_prior: float
+) -> None:
+    """Constellations, sides, a wrong map, these together, up to four satellites; overbounds; what nothing checks."""
     arc, n, rng = np.linspace(200.0, 1800.0, 12), len(systems), np.random.default_rng(3)
     ranges = raim_oracle.made(arc, systems, seed=8, faults_m={1: 9.0})
     weight = ranges.weight * (rng.random(ranges.weight.shape) > 0.15)
@@ -122,7 +127,10 @@ def test_levels_of_every_kind_of_hypothesis_are_the_same(systems: str, by_range:
     known = np.tile(np.diag([0.1, 0.01]), (12, 1, 1)) * (rng.random(12) > 0.3)[:, None, None]
     options: dict[str, Any] = {
         "risk": RiskBudget(
-            risk_per_hour=1e-3, local_prior=1e-3, side_prior=side_prior, constellation_prior={"E": 1e-7, "C": 1e-6}
+            risk_per_hour=1e-3,
+            local_prior=local_prior,
+            side_prior=side_prior,
+            constellation_prior={"E": 1e-7, "C": 1e-6},
         ),
         "scale": np.linspace(0.6, 2.0, 12),
         "map_bias_m": rng.normal(size=(12, 2)),

@@ -129,11 +129,11 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
     model, case = constrained_model(ranges, oracle.LINE, ARC), oracle.problem_on_line(ranges, 0, ARC[0])
     budget = HAND.replaced(risk_per_hour=risk, constellation_prior={"E": 1e-5, "C": 1e-4} if shared else {})
     bias = np.random.default_rng(seed).uniform(0.0, 1.0, len(systems)) if biased else None
-    constellations = tuple(
-        (tuple(c for c, s in enumerate(systems) if s == letter), p)
+    events = [
+        protection_oracle.Event("constellation", p, tuple(c for c, s in enumerate(systems) if s == letter))
         for letter, p in budget.constellation_prior.items()
         if letter in systems
-    )
+    ]
     expected = protection_oracle.level(
         case,
         dict(enumerate(budget.prior(list(systems)))),
@@ -142,7 +142,7 @@ def test_level_equals_solving_every_subset_again(seed, system, scale, biased, sh
         false_alarm=0.01,
         scale=scale,
         bias_m=bias,
-        constellations=constellations,
+        events=events,
     )
     if expected.sigma_m > 100.0:
         return  # at the edge of what the ranges determine
@@ -341,8 +341,19 @@ def test_constellation_fault_that_nothing_checks():
     """All satellites of one constellation: without it there is no position."""
     model = constrained_model(oracle.made(ARC, "GGGGGG", seed=5), oracle.LINE, ARC)
     got = along_track_level(model, list("GGGGGG"), risk=RiskBudget(constellation_prior={"G": 1e-4}))
-    assert got.cause[0] == Cause.UNCHECKED
+    assert got.cause[0] == Cause.UNCHECKED_CONSTELLATION
     assert got.worst_constellation[0] == "G"
+    # Without the map six satellites of one constellation are enough, five less one are not: a map and a satellite.
+    known = (np.zeros((1, 2)), np.zeros((1, 2, 2)))
+    few = constrained_model(oracle.made(ARC, "GGGGG", seed=5), oracle.LINE, ARC)
+    free = along_track_level(few, list("GGGGG"), risk=RiskBudget(map_prior=1e-2, local_prior=1e-4), map_seen=known)
+    assert free.cause[0] == Cause.UNCHECKED_MAP
+    wide = constrained_model(oracle.made(ARC, "GGGGGEEEEE", seed=5), oracle.LINE, ARC)
+    priors = RiskBudget(map_prior=1e-2, constellation_prior={"G": 1e-5}, unchecked_share=1e-3)
+    four = oracle.only(oracle.made(ARC, "GGGGGEEEEE", seed=5), [0, 1, 2, 3, 4, 5, 6, 7])
+    both = along_track_level(constrained_model(four, oracle.LINE, ARC), list("GGGGGEEEEE"), risk=priors, map_seen=known)
+    assert both.cause[0] == Cause.UNCHECKED_TOGETHER
+    assert np.isfinite(along_track_level(wide, list("GGGGGEEEEE"), risk=priors, map_seen=known).level_m[0])
     both = constrained_model(oracle.made(ARC, "GGGGGGEEEEE", seed=5), oracle.LINE, ARC)
     ok = along_track_level(both, list("GGGGGGEEEEE"), risk=RiskBudget(constellation_prior={"G": 1e-8}))
     assert np.isfinite(ok.level_m[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import product
 from math import comb, prod
 
 import numpy as np
@@ -11,9 +11,10 @@ import pytest
 from scipy.stats import chi2, norm
 
 import raim_oracle as oracle
+from protection_oracle import Event, hypotheses, kind_of, products
 from railfix.integrity.protection import K_H_NPA, K_H_PA, K_V, MOST_EXCLUDED, RiskBudget, k_factor
 from railfix.integrity.protection.allocation import allocate
-from railfix.integrity.protection.risk import more_than_two, pair_sum
+from railfix.integrity.protection.risk import pair_sum, set_sums
 
 pytestmark = pytest.mark.requirement("C2")
 
@@ -52,9 +53,9 @@ def test_fault_probabilities_bound_what_counting_gives():
         for state in product((0, 1), repeat=n):
             exact[sum(state)] += np.prod(np.where(state, prior, 1.0 - prior))
         assert exact[2:3].sum() <= pair_sum(prior[None])[0] + 1e-15
-        assert exact[3:].sum() <= more_than_two(prior[None])[0] + 1e-15
-        assert more_than_two(prior[None])[0] <= 1.6 * exact[3:].sum() + 1e-15
-    assert more_than_two(np.full((1, 20), 2e-5))[0] == pytest.approx(1140 * 8e-15, rel=1e-9)
+        assert exact[3:].sum() <= set_sums(prior[None], 3)[0, 3] + 1e-15
+        assert set_sums(prior[None], 3)[0, 3] <= 1.6 * exact[3:].sum() + 1e-15
+    assert set_sums(np.full((1, 20), 2e-5), 3)[0, 3] == pytest.approx(1140 * 8e-15, rel=1e-9)
 
 
 def test_every_set_that_could_be_left_together_spends_the_risk():
@@ -72,8 +73,8 @@ def test_priors_and_what_they_leave():
     risk = RiskBudget()
     assert risk.prior(list("GE")) == pytest.approx([2e-5, 4e-5])
     risk.require(["G"] * 10 + ["E"] * 10)
-    with pytest.raises(ValueError, match=r"more than three of 20 satellites are faulty with probability 4\.8e-09"):
-        RiskBudget(satellite_prior={"G": 1e-3}, local_prior=0.0).require(["G"] * 20)
+    with pytest.raises(ValueError, match=r"more than four of 20 satellites are faulty with probability 5\.2e-09"):
+        RiskBudget(satellite_prior={"G": 3.2e-3}, local_prior=0.0).require(["G"] * 20)
     with pytest.raises(ValueError, match="constellation 'X'"):
         risk.prior(["X"])
 
@@ -98,11 +99,6 @@ def test_budgets_that_are_refused(wrong):
         RiskBudget(**wrong)
 
 
-def products(priors: list[float], size: int) -> float:
-    """Sum of the products over all sets of a size."""
-    return sum(prod(chosen) for chosen in combinations(priors, size))
-
-
 def test_measured_priors_are_given():
     """Nothing else takes the word "assumed" from a level; default values do not count as measured."""
     with pytest.raises(ValueError, match="local_prior and side_prior not given"):
@@ -114,11 +110,12 @@ def test_measured_priors_are_given():
 
 
 @pytest.mark.parametrize("of_side", [1e-7, 1e-4, 1e-3])
+@pytest.mark.parametrize("of_constellation", [1e-6, 1e-3])
 @pytest.mark.parametrize("wrong_map", [False, True])
-@pytest.mark.parametrize("excluded", [0, 1, 2])
-@pytest.mark.parametrize("local", [1e-6, 3e-3])
+@pytest.mark.parametrize("excluded", [0, 2])
+@pytest.mark.parametrize("local", [1e-6, 3e-3, 3e-2])
 def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
-    local: float, excluded: int, of_side: float, *, wrong_map: bool
+    local: float, excluded: int, of_constellation: float, of_side: float, *, wrong_map: bool
 ) -> None:
     """Faults that no hypothesis covers are taken off; the rest is shared; false alarms among all separations."""
     systems = "GGGEEECC"
@@ -132,42 +129,72 @@ def test_an_epoch_s_risk_is_divided_as_counting_every_set_says(
         local_prior=local,
         map_prior=1e-5,
         side_prior=of_side,
-        constellation_prior={"E": 1e-6, "C": 3e-6, "R": 1e-5},
+        constellation_prior={"E": of_constellation, "C": 3e-6, "R": 1e-5},
     )
     # Of the second side one satellite is used: no hypothesis.
     sides = np.zeros((1, 3, len(systems)), dtype=bool)
     sides[0, 0, [0, 2, 3]], sides[0, 1, [1, 4]], sides[0, 2, 5:] = True, True, True
     got = allocate(model, list(systems), risk, np.array([excluded]), sides, wrong_map=wrong_map)
-    every = dict(zip(range(len(systems)), risk.prior(list(systems)).tolist(), strict=True))
-    used = {k: p for k, p in every.items() if k != 1}
-    everyone = [*used.values(), *[max(every.values())] * excluded]
-    groups, side, of_map = [1e-6, 3e-6], [of_side, of_side], 1e-5 if wrong_map else 0.0
-    triples = products(everyone, 3) > risk.unchecked_share * 1e-6
-    assert triples == (local == 3e-3)
-    beyond = products(everyone, 4 if triples else 3)
-    beyond += of_map * (sum(groups) + products(everyone, 2))
-    beyond += sum(
-        p * products([q for k, q in used.items() if systems[k] != s], 2) for s, p in zip("EC", groups, strict=True)
-    )
-    with_one = sum(side) * (sum(everyone) + of_map)
-    sided, both = with_one > risk.unchecked_share * 1e-6, of_side == 1e-3
-    assert got.sides_with_one[0].tolist() == [sided, False, sided] + [False] * 3 * both
-    if sided:
-        with_one = sum(side) * (products(everyone, 2) + of_map * sum(everyone))
-    beyond += with_one + sum(side) * sum(groups) + products(groups, 2)
-    beyond += products(side, 2) * (sum(everyone) + of_map + sum(groups) if both else 1.0)
+    every = risk.prior(list(systems)).tolist()
+    everyone = [p for c, p in enumerate(every) if c != 1]
+    used, everyone = everyone, everyone + [max(every)] * excluded
+    events = [Event("constellation", of_constellation, (3, 4, 5)), Event("constellation", 3e-6, (6, 7))]
+    events += [Event("side", of_side, (0, 2, 3)), Event("side", of_side, (5, 6, 7))]
+    events += [Event("map", 1e-5)] if wrong_map else []
+    share = risk.unchecked_share * risk.risk_per_sample
+    order, beyond = hypotheses(everyone, events, share, float(np.mean(every)))
     assert got.beyond[0] == pytest.approx(beyond, rel=1e-9)
-    left = float(risk.sample_risk(7, excluded, beyond)) * (0.75 if triples else 1.0)
+    assert (beyond <= share) == (local < 3e-2)  # five satellites at a time
+
+    left = float(risk.sample_risk(7, excluded, beyond))
+    more = any(k >= 0 and kind_of(shared) + k > 2 for shared, k in order.items())
+    left *= 0.75 if more else 1.0
     assert [got.fault_free[0], got.one[0], got.two[0]] == pytest.approx([left / 3.0] * 3, rel=1e-9)
-    pairs = triples or products(list(used.values()), 2) > left / 3.0
-    assert (got.pairs[0], got.triples[0]) == (pairs, triples)
-    tests = 7 + pairs * comb(7, 2) + triples * comb(7, 3) + len(groups) + 7 * len(groups)
-    tests += len(side) * (8 if sided else 1) + both
+    assert got.more[0] == pytest.approx(left / 3.0 * more, rel=1e-9)
+    pairs = order[()] > 2 or products(used, 2) > left / 3.0
+    assert got.reserved[0] == pytest.approx(0.0 if pairs else products(used, 2), rel=1e-9)
+    place = {0: events[0], 1: events[1], 2: events[2], 4: events[3]}
+    expected = {tuple(map(id, s)): k for s, k in order.items() if s and k >= 0}
+    found = {
+        tuple(id(e) for e in [*map(place.__getitem__, s.events), *events[4 : 4 + s.wrong_map]]): k
+        for s, k in zip(got.shared, got.order[0].tolist(), strict=True)
+        if s.size
+    }
+    assert found == expected
+    assert got.order[0, 0] == (order[()] if pairs else 1)
+    unmapped = [k for s, k in zip(got.shared, got.order[0].tolist(), strict=True) if not s.wrong_map]
+    tests = sum(comb(7, k) for most in unmapped for k in range(most + 1)) - 1
     assert got.k_false_alarm[0] == pytest.approx(norm.isf(risk.false_alarm / (2 * tests)), rel=1e-9)
     assert got.groups == ("E", "C")
-    np.testing.assert_allclose(got.group_prior[0], groups)
-    np.testing.assert_allclose(got.side_prior[0], [of_side, 0.0, of_side] + [0.0, of_side**2, 0.0] * both)
-    np.testing.assert_array_equal(
-        got.sides[0, 3:], [sides[0, a] | sides[0, b] for a, b in [(0, 1), (0, 2), (1, 2)]] if both else sides[0, :0]
-    )
-    assert got.map_prior == of_map
+
+    # All states counted one by one: what no hypothesis covers is not likelier than what was taken off.
+    faults = np.array([1.0])
+    for p in everyone:
+        faults = np.convolve(faults, [1.0 - p, p])
+    open_to_faults = 0.0
+    for state in product((False, True), repeat=len(events)):
+        shared = tuple(event for event, faulty in zip(events, state, strict=True) if faulty)
+        p = prod(e.prior if faulty else 1.0 - e.prior for e, faulty in zip(events, state, strict=True))
+        open_to_faults += p * faults[order.get(shared, -1) + 1 :].sum()
+    assert open_to_faults <= beyond <= 1.7 * open_to_faults
+
+
+def test_more_hypotheses_are_asked_for_only_where_the_rest_is_too_likely() -> None:
+    """The usual priors: satellites, pairs, sides with one, both sides, a wrong map with one or a side, and no more."""
+    systems = "G" * 9 + "E" * 9
+    _, model = oracle.solved(oracle.made(np.array([700.0]), systems, seed=3), np.array([700.0]))
+    sides = np.zeros((1, 2, 18), dtype=bool)
+    sides[0, 0, :5], sides[0, 1, 9:14] = True, True
+
+    def orders(**priors: object) -> dict[tuple[tuple[int, ...], bool], int]:
+        got = allocate(model, list(systems), RiskBudget().replaced(**priors), np.array([0]), sides, wrong_map=True)
+        return {(s.events, s.wrong_map): k for s, k in zip(got.shared, got.order[0].tolist(), strict=True)}
+
+    usual = {((), False): 2, ((0,), False): 1, ((1,), False): 1, ((0, 1), False): 0}
+    usual |= {((), True): 1, ((0,), True): 0, ((1,), True): 0}
+    assert orders() == usual
+    assert orders(local_prior=2e-4) == usual | {((), False): 3, ((), True): 2, ((0,), False): 2, ((1,), False): 2}
+    assert orders(local_prior=5e-4)[(), False] == 4
+    shared = orders(constellation_prior={"E": 1e-5})
+    assert shared[(0,), True] == 0, "a constellation and a wrong map"
+    assert shared[(0, 1), False] == 0, "a constellation and a side"

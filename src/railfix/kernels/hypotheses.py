@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ def _separated(
     apart = noise * square + (1.0 - noise) * (across * across + up * up)
     total = noise * (square + variance) + (1.0 - noise) * (whole_across * whole_across + whole_up * whole_up)
     threshold = common[6] * math.sqrt(max(apart, 0.0) + more[1])
-    bias = abs(whole_across * common[4] + whole_up * common[5]) + more[0]
+    bias = abs(whole_across * common[4] + whole_up * common[5]) + more[0] + common[8] * abs(common[9] - distance)
     ratio = abs(distance) / threshold if threshold > common[7] else 0.0
     return threshold + bias, math.sqrt(max(total, 0.0) + more[2]), ratio
 
@@ -140,62 +141,32 @@ def _with_each_later(
 
 
 @kernel
-def hypotheses(
-    root_weight: Floats,
-    clock: Indices,
-    clock_covariance_m2: Floats,
-    design: Floats,
-    covariance_m2: Floats,
-    map_prior: Floats,
-    misfit: Floats,
-    scale: Floats,
-    least_sigma_m: Floats,
-    bias_m: Floats,
-    map_bias_m: Floats,
-    map_seen_m: Floats,
-    map_information: Floats,
-    sides: Masks,
-    prior: Floats,
-    groups: Masks,
-    group_prior: Floats,
-    side_prior: Floats,
-    sides_with_one: Masks,
-    pairs: Masks,
-    triples: Masks,
-    k_false_alarm: Floats,
-    wrong_map: float,
-) -> tuple[Indices, Floats, Floats, Floats, Indices, Floats]:
-    """Return the used channels, offset, sigma and weight of all hypotheses, their bounds, and the separation."""
+def hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+    """Return the used channels, offset, sigma and weight of all hypotheses, and the separation."""
+    root_weight, clock, clock_covariance_m2 = model.root_weight, model.clock, model.clock_covariance_m2
+    design, map_prior, scale = model.design, model.prior, errors.scale
+    least_sigma_m, bias_m, information = errors.least_sigma_m, errors.bias_m, errors.map_information
     epochs, channels = root_weight.shape
-    n, any_pairs, any_triples = 0, False, False
+    n, some_mapped = 0, np.any(asked.wrong_map)
     for t in range(epochs):
         n = max(n, int(np.count_nonzero(root_weight[t] > 0.0)))
-        any_pairs, any_triples = any_pairs or pairs[t], any_triples or triples[t]
-    clocks, c_groups, c_sides = clock_covariance_m2.shape[1], len(groups), sides.shape[1]
-    by_map = 1 if wrong_map > 0.0 else 0
+    clocks, width = clock_covariance_m2.shape[1], asked.bounds[-1]
     by_range = bias_m.shape[1] > 0 or least_sigma_m.shape[1] > 0
-    sided = np.zeros(c_sides, dtype=np.bool_)
-    for c in range(c_sides):
-        sided[c] = np.any(sides_with_one[:, c])
-    some_sided = int(np.count_nonzero(sided))
-    bounds = np.zeros(5, dtype=np.intp)
-    bounds[1] = 1
-    bounds[2] = bounds[1] + n + c_groups + c_sides + by_map
-    bounds[3] = bounds[2] + (n * (n - 1) // 2 if any_pairs else 0) + (c_groups + by_map) * n
-    bounds[3] += some_sided * (n + by_map)
-    bounds[4] = bounds[3] + (n * (n - 1) * (n - 2) // 6 if any_triples else 0)
-    channel, width = np.empty((epochs, n), dtype=np.intp), bounds[4]
-    offset, sigma, weight = np.empty((epochs, width)), np.empty((epochs, width)), np.empty((epochs, width))
-    separation, ratio = np.zeros(epochs), np.zeros(width)
-    # Projector of the channels, and below it their gains, residuals, responses to the map across and up.
-    rows, work, second = np.empty((n + 4, n)), np.empty((n + 4, n)), np.empty((n + 4, n))
-    member, gone, zero = np.empty(n, dtype=np.bool_), np.empty(4), np.zeros(4)
-    left, own, gain, likely, spread = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty((n, 3))
-    range_bias, beyond, common, free = np.zeros(n), np.zeros(n), np.zeros(8), np.zeros(8)
-    asked, pull, step, shift = np.empty(clocks), np.empty(3), np.empty(3), np.empty(3)
+    channel, separation = np.empty((epochs, n), dtype=np.intp), np.zeros(epochs)
+    offset, sigma, weight = np.empty((epochs, width)), np.empty((epochs, width)), np.zeros((epochs, width))
+    ratio = np.zeros(width)
+    # Projector of the channels, and below it their gains, residuals, responses to the map across and up; the same
+    # without the map; without a shared fault; without one more satellite, without two more.
+    rows, free_rows, work = np.empty((n + 4, n)), np.zeros((n + 4, n)), np.empty((n + 4, n))
+    second, third = np.empty((n + 4, n)), np.empty((n + 4, n))
+    member, single, gone = np.empty(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), np.zeros(4)
+    gone_two, gone_three = np.zeros(4), np.zeros(4)
+    own, likely, others, spread = np.empty(n), np.empty(n), np.empty(n), np.empty((n, 3))
+    range_bias, beyond, common, free = np.zeros(n), np.zeros(n), np.zeros(10), np.zeros(10)
+    requested, pull, step, shift = np.empty(clocks), np.empty(3), np.empty(3), np.empty(3)
     root_across, root_up = math.sqrt(map_prior[1, 1]), math.sqrt(map_prior[2, 2])
     for t in range(epochs):
-        root, y, q, used = root_weight[t], misfit[t], covariance_m2[t], channel[t]
+        root, y, q, used = root_weight[t], model.misfit[t], model.covariance_m2[t], channel[t]
         count = 0
         for m in range(channels):
             if root[m] > 0.0:
@@ -207,11 +178,11 @@ def hypotheses(
                 used[other] = m
                 other += 1
         # Misfits summed by clock, and the place that they ask for.
-        asked[:] = 0.0
+        requested[:] = 0.0
         pull[:] = 0.0
         for i in range(count):
             m = used[i]
-            asked[clock[m]] += root[m] * y[m]
+            requested[clock[m]] += root[m] * y[m]
             for a in range(3):
                 pull[a] += y[m] * design[t, m, a]
         for a in range(3):
@@ -224,7 +195,7 @@ def hypotheses(
                 spread[i, a] = b[0] * q[0, a] + b[1] * q[1, a] + b[2] * q[2, a]
             of_clock = 0.0
             for g in range(clocks):
-                of_clock += clock_covariance_m2[t, clock[m], g] * asked[g]
+                of_clock += clock_covariance_m2[t, clock[m], g] * requested[g]
             rows[n, i] = spread[i, 0]
             rows[n + 1, i] = y[m] - root[m] * of_clock - (b[0] * step[0] + b[1] * step[1] + b[2] * step[2])
             rows[n + 2, i], rows[n + 3, i] = -spread[i, 1] * root_across, -spread[i, 2] * root_up
@@ -238,179 +209,138 @@ def hypotheses(
             rows[i, i] += 1.0
         for i in range(n):
             m = used[i]
-            gain[i], likely[i] = rows[n, i], prior[t, m] if i < count else 0.0
+            likely[i] = asked.prior[t, m] if i < count else 0.0
             if bias_m.shape[1] > 0:
                 range_bias[i] = abs(bias_m[t, m]) * root[m]
             if least_sigma_m.shape[1] > 0:
                 least = (least_sigma_m[t, m] * root[m]) ** 2 if root[m] > 0.0 else 0.0
                 beyond[i] = max(least - scale[t] ** 2, 0.0) if i < count else 0.0
-        limit, k_alarm = _NO_EFFECT * math.sqrt(q[0, 0]), k_false_alarm[t]
+        limit, lost = _NO_EFFECT * math.sqrt(q[0, 0]), 0.0
         common[0], common[1] = scale[t] ** 2, q[0, 0]
         common[2], common[3] = -q[0, 1] * root_across, -q[0, 2] * root_up
-        common[4], common[5] = map_bias_m[t, 0] * root_across, map_bias_m[t, 1] * root_up
-        common[6] = k_alarm
+        common[4], common[5] = errors.map_bias_m[t, 0] * root_across, errors.map_bias_m[t, 1] * root_up
+        common[6] = asked.k_false_alarm[t]
+        more = _of_ranges(rows[n], rows[n], range_bias, beyond)
+        common[7] = common[6] * _SAME * _separated(0.0, 0.0, 0.0, 0.0, more, common)[1]
 
-        # No fault; noise passes on either side.
-        more = _of_ranges(gain, gain, range_bias, beyond)
-        offset[t, 0], sigma[t, 0], ratio[0] = _separated(0.0, 0.0, 0.0, 0.0, more, common)
-        weight[t, 0] = 2.0
-        common[7] = k_alarm * _SAME * sigma[t, 0]
-
-        # One satellite, a constellation, a side.
-        at = 1
-        for i in range(n):
-            checked = rows[i, i] > _LEAST_REDUNDANCY
-            w = gain[i] / rows[i, i] if checked else 0.0
-            if by_range:
-                for m in range(n):
-                    own[m] = gain[m] - w * rows[i, m]
-                more = _of_ranges(own, gain, range_bias, beyond)
-            offset[t, at], sigma[t, at], ratio[at] = _separated(
-                w * gain[i], w * rows[n + 1, i], w * rows[n + 2, i], w * rows[n + 3, i], more, common
-            )
-            if not checked and abs(gain[i]) > limit:
-                offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
-            weight[t, at] = likely[i]
-            at += 1
-        two = bounds[2] + (n * (n - 1) // 2 if any_pairs else 0)
-        for c in range(c_groups + c_sides):
-            whole = c < c_groups
-            with_one = whole or sided[c - c_groups]
-            of_all = group_prior[t, c] if whole else side_prior[t, c - c_groups]
-            for i in range(n):
-                member[i] = i < count and (groups[c, used[i]] if whole else sides[t, c - c_groups, used[i]])
-            blind = _leave_out(rows, member, with_one or by_range, limit, work, gone)
-            more = (0.0, 0.0, 0.0)
-            if by_range:
-                for m in range(n):
-                    left[m] = work[n, m]
-                more = _of_ranges(left, gain, range_bias, beyond)
-            offset[t, at], sigma[t, at], ratio[at] = _separated(gone[0], gone[1], gone[2], gone[3], more, common)
-            if blind:
-                offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
-            weight[t, at] = of_all
-            of_all = of_all if whole or sides_with_one[t, c - c_groups] else 0.0
-            at += 1
-            for i in range(n if with_one else 0):
-                rest = i < count and not member[i]
-                checked = rest and work[i, i] > _LEAST_REDUNDANCY
-                w = work[n, i] / work[i, i] if checked else 0.0
-                if by_range:
-                    for m in range(n):
-                        own[m] = left[m] - w * work[i, m]
-                    more = _of_ranges(own, gain, range_bias, beyond)
-                offset[t, two], sigma[t, two], ratio[two] = _separated(
-                    gone[0] + w * work[n, i], gone[1] + w * work[n + 1, i],
-                    gone[2] + w * work[n + 2, i], gone[3] + w * work[n + 3, i], more, common,
-                )  # fmt: skip
-                if rest and (blind or (not checked and abs(work[n, i]) > limit)):
-                    offset[t, two], sigma[t, two], ratio[two] = 0.0, np.inf, 0.0
-                weight[t, two] = 0.0 if member[i] else of_all * likely[i]
-                two += 1
-
-        # A wrong map, alone, with one satellite, with a side.
-        if by_map:
-            covariance, determined = _without_map(q, map_prior, map_information[t], scale[t])
+        # The place without the map: its distance counts whole, and nothing is tested.
+        determined = False
+        if some_mapped:
+            covariance, determined = _without_map(q, map_prior, information[t], scale[t])
             for a in range(1, 3):
                 for b in range(1, 3):
-                    pull[a] += scale[t] ** 2 * map_information[t, a - 1, b - 1] * map_seen_m[t, b - 1]
+                    pull[a] += scale[t] ** 2 * information[t, a - 1, b - 1] * errors.map_seen_m[t, b - 1]
             for a in range(3):
                 shift[a] = -step[a]
                 for b in range(3):
                     shift[a] += covariance[a, b] * pull[b]
-            free[0], free[1] = common[0], covariance[0, 0]
+            free[0], free[1], free[7], free[8], free[9] = common[0], covariance[0, 0], np.inf, 1.0, shift[0]
             lost = _NO_EFFECT * math.sqrt(covariance[0, 0])
-            for i in range(n):
+            free_rows[:] = 0.0
+            for i in range(count):
                 m = used[i]
                 for a in range(3):
                     spread[i, a] = 0.0
-                    for b in range(3 if i < count else 0):
+                    for b in range(3):
                         spread[i, a] += design[t, m, b] * covariance[b, a]
-                left[i] = spread[i, 0]
-            more = _of_ranges(left, left, range_bias, beyond)
-            _, sigma[t, at], _ = _separated(0.0, 0.0, 0.0, 0.0, more, free)
-            offset[t, at], ratio[at], weight[t, at] = abs(shift[0]) + more[0], 0.0, wrong_map
-            if not determined:
-                offset[t, at], sigma[t, at] = 0.0, np.inf
-            for i in range(n):
-                m = used[i]
-                share, residual = 0.0, 0.0
-                if i < count:
-                    share = 1.0 - root[m] ** 2 * clock_covariance_m2[t, clock[m], clock[m]]
-                    residual = rows[n + 1, i]
-                    for a in range(3):
-                        share -= spread[i, a] * design[t, m, a]
-                        residual -= design[t, m, a] * shift[a]
-                checked = share > _LEAST_REDUNDANCY
-                w = left[i] / share if checked else 0.0
-                second[n, i], second[n + 1, i], second[n + 2 :, i] = left[i], residual, 0.0
-                for j in range(n if by_range or some_sided > 0 else 0):
+                free_rows[n, i], free_rows[n + 1, i] = spread[i, 0], rows[n + 1, i]
+                for a in range(3):
+                    free_rows[n + 1, i] -= design[t, m, a] * shift[a]
+                for j in range(i + 1):
                     k = used[j]
-                    value = 1.0 if i == j and i < count else 0.0
-                    if i < count and j < count:
-                        value -= root[m] * root[k] * clock_covariance_m2[t, clock[m], clock[k]]
-                        for a in range(3):
-                            value -= spread[i, a] * design[t, k, a]
-                    second[i, j] = value
-                if by_range:
-                    for j in range(n):
-                        own[j] = left[j] - w * second[i, j]
-                    more = _of_ranges(own, left, range_bias, beyond)
-                _, sigma[t, two], _ = _separated(w * left[i], 0.0, 0.0, 0.0, more, free)
-                offset[t, two], ratio[two], weight[t, two] = (
-                    abs(shift[0] - w * residual) + more[0],
-                    0.0,
-                    wrong_map * likely[i],
-                )
-                if not determined or (not checked and abs(left[i]) > lost):
-                    offset[t, two], sigma[t, two] = 0.0, np.inf
-                two += 1
-            for c in range(c_sides):
-                if not sided[c]:
-                    continue
-                for i in range(n):
-                    member[i] = i < count and sides[t, c, used[i]]
-                blind = _leave_out(second, member, by_range, lost, work, gone)
-                if by_range:
-                    more = _of_ranges(work[n], left, range_bias, beyond)
-                _, sigma[t, two], _ = _separated(gone[0], 0.0, 0.0, 0.0, more, free)
-                offset[t, two], ratio[two] = abs(shift[0] - gone[1]) + more[0], 0.0
-                weight[t, two] = wrong_map * side_prior[t, c] if sides_with_one[t, c] else 0.0
-                if blind or not determined:
-                    offset[t, two], sigma[t, two] = 0.0, np.inf
-                two += 1
+                    value = -root[m] * root[k] * clock_covariance_m2[t, clock[m], clock[k]]
+                    for a in range(3):
+                        value -= spread[i, a] * design[t, k, a]
+                    free_rows[i, j], free_rows[j, i] = value, value
+                free_rows[i, i] += 1.0
 
-        # Two and three satellites.
-        at = bounds[2]
-        for i in range(n if any_pairs else 0):
-            end = at + n - 1 - i
-            _with_each_later(
-                rows, i, zero, False, limit, common, by_range, gain, gain, own, range_bias, beyond,
-                offset[t, at:end], sigma[t, at:end], ratio[at:end],
-            )  # fmt: skip
-            for j in range(i + 1, n):
-                weight[t, at] = likely[i] * likely[j] if pairs[t] else 0.0
-                at += 1
-        at = bounds[3]
-        for i in range(n if any_triples else 0):
-            member[:] = False
-            member[i] = True
-            blind = _leave_out(rows, member, True, limit, second, gone)
-            for m in range(n):
-                left[m] = second[n, m]
-            for j in range(i + 1, n):
-                end = at + n - 1 - j
-                _with_each_later(
-                    second, j, gone, blind, limit, common, by_range, gain, left, own, range_bias, beyond,
-                    offset[t, at:end], sigma[t, at:end], ratio[at:end],
+        for base in range(len(asked.first)):
+            order, first = asked.order[t, base], asked.first[base]
+            if order < 0:
+                continue
+            mapped, of_base = asked.wrong_map[base], asked.shared_prior[t, base]
+            system, known, nil = (free_rows, free, lost) if mapped else (rows, common, limit)
+            gain, some = system[n], False
+            for i in range(n):
+                member[i] = i < count and asked.members[t, base, used[i]]
+                others[i] = 0.0 if member[i] else likely[i]
+                some |= member[i]
+            blind = mapped and not determined
+            gone[:] = 0.0
+            if some:
+                blind |= _leave_out(system, member, by_range or order > 0, nil, work, gone)
+                system = work
+            left = system[n]
+            more = _of_ranges(left, gain, range_bias, beyond) if by_range else (0.0, 0.0, 0.0)
+            at = first[0]
+            offset[t, at], sigma[t, at], ratio[at] = _separated(gone[0], gone[1], gone[2], gone[3], more, known)
+            if blind:
+                offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
+            # Noise passes on either side.
+            weight[t, at] = of_base * (2.0 if at == 0 else 1.0)
+            at = first[1]
+            for i in range(n if order > 0 else 0):
+                checked = system[i, i] > _LEAST_REDUNDANCY
+                w = system[n, i] / system[i, i] if checked else 0.0
+                if by_range:
+                    for m in range(n):
+                        own[m] = left[m] - w * system[i, m]
+                    more = _of_ranges(own, gain, range_bias, beyond)
+                offset[t, at], sigma[t, at], ratio[at] = _separated(
+                    gone[0] + w * system[n, i], gone[1] + w * system[n + 1, i],
+                    gone[2] + w * system[n + 2, i], gone[3] + w * system[n + 3, i], more, known,
                 )  # fmt: skip
-                for k in range(j + 1, n):
-                    weight[t, at] = likely[i] * likely[j] * likely[k] if triples[t] else 0.0
-                    at += 1
+                if blind or (not checked and abs(system[n, i]) > nil):
+                    offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
+                weight[t, at] = of_base * others[i]
+                at += 1
+            two, three, four = first[2], first[3], first[4]
+            for i in range(n if order > 1 else 0):
+                end = two + n - 1 - i
+                _with_each_later(
+                    system, i, gone, blind, nil, known, by_range, gain, left, own, range_bias, beyond,
+                    offset[t, two:end], sigma[t, two:end], ratio[two:end],
+                )  # fmt: skip
+                for j in range(i + 1, n):
+                    weight[t, two] = of_base * others[i] * others[j]
+                    two += 1
+                if order < 3:
+                    continue
+                single[i] = True
+                blind_two = _leave_out(system, single, True, nil, second, gone_two) or blind
+                single[i] = False
+                gone_two += gone
+                for j in range(i + 1, n):
+                    end = three + n - 1 - j
+                    _with_each_later(
+                        second, j, gone_two, blind_two, nil, known, by_range, gain, second[n], own, range_bias, beyond,
+                        offset[t, three:end], sigma[t, three:end], ratio[three:end],
+                    )  # fmt: skip
+                    of_two = of_base * others[i] * others[j]
+                    for k in range(j + 1, n):
+                        weight[t, three] = of_two * others[k]
+                        three += 1
+                    if order < 4:
+                        continue
+                    single[j] = True
+                    blind_three = _leave_out(second, single, True, nil, third, gone_three) or blind_two
+                    single[j] = False
+                    gone_three += gone_two
+                    for k in range(j + 1, n):
+                        end = four + n - 1 - k
+                        _with_each_later(
+                            third, k, gone_three, blind_three, nil, known, by_range, gain, third[n], own, range_bias,
+                            beyond, offset[t, four:end], sigma[t, four:end], ratio[four:end],
+                        )  # fmt: skip
+                        for m in range(k + 1, n):
+                            weight[t, four] = of_two * others[k] * others[m]
+                            four += 1
         for m in range(width):
-            if weight[t, m] > 0.0 and ratio[m] > separation[t]:
+            if not weight[t, m] > 0.0:
+                offset[t, m], sigma[t, m] = 0.0, 1.0
+            elif ratio[m] > separation[t]:
                 separation[t] = ratio[m]
-    return channel, offset, sigma, weight, bounds, separation
+    return channel, offset, sigma, weight, separation
 
 
 @inner

@@ -80,13 +80,15 @@ POSITION_COLUMNS: Final[dict[str, str]] = {
     "protection_k_fault_free": "K of the first part",
     "protection_k_one_fault": "K of the second part, beside its threshold",
     "protection_k_two_faults": "K of the third part, beside its threshold",
-    "protection_separation": "largest distance of the position without one or two satellites, over its threshold",
+    "protection_separation": "largest distance of the position without the satellites of a hypothesis, over its "
+    "threshold",
     "protection_kind": "basis: `sbas`, its integrity and hypotheses of local faults; or `separation`, "
     "hypotheses of satellites' own faults as well",
     "protection_basis": "`measured`: the priors of faults were measured on the line; `indicative`: they are assumed, "
     "the one of a side of the track without support by data, and the level carries no risk an hour",
-    "protection_cause": "what sets the level: "
-    "`fault_free`, `one_fault`, `two_faults`, `unchecked`, `budget`, `no_position`, `three_faults`",
+    "protection_cause": "what sets the level: `fault_free`, `one_fault`, `two_faults`, `three_faults` or more; or why "
+    "there is none: `unchecked`, `unchecked_constellation`, `unchecked_side`, `unchecked_map`, `unchecked_together` "
+    "(faults that nothing checks, by what they share), `budget`, `unbounded`, `no_position`",
     "protection_status": "`available` within the alarm limit; `unavailable`, also where the status has a doubt about "
     "the place; `alarm`: the ranges contradict the level, or a check has failed",
     **_screen_columns("positions"),

@@ -21,7 +21,7 @@ WORST: Final = 20
 NO_LEVELS: Final = "The run has no protection levels (protection is off)."
 _KINDS: Final = {
     "sbas": "satellite faults are covered by SBAS; hypotheses of local faults (multipath)",
-    "separation": "solution separation without one or two satellites; hypotheses of satellite and local faults",
+    "separation": "solution separation; hypotheses of satellite and local faults",
 }
 _EXPLAINED: Final = (
     "Usable levels: status ok and no alarm; every other position counts as having an infinite level. All: every "

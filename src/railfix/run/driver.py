@@ -413,8 +413,8 @@ def _notes_of_levels(config: Config, tally: Tally, levels: Mapping[str, Levels])
     for name, of_antenna in levels.items():
         if of_antenna.without_budget:
             yield (
-                f"{name}: {of_antenna.without_budget} epochs without a protection level, where more than three faults "
-                "at a time, or more satellites excluded, are likelier than the risk allows (settings risk)"
+                f"{name}: {of_antenna.without_budget} epochs without a protection level, where more faults at a time "
+                "than can be left out, or more satellites excluded, are likelier than the risk allows (settings risk)"
             )
     risk = risk_of(config)
     yield (

@@ -56,7 +56,7 @@ class Filtered:
 class Levels:
     """Protection levels of an antenna: median and 95th percentile of the finite ones [m], and epochs by status.
 
-    `without_budget`: epochs without a level because more faults are likelier than the risk allows.
+    `without_budget`: epochs without a level because more faults than can be left out are likelier than the risk allows.
     """
 
     p50_m: float | None

@@ -1,4 +1,4 @@
-"""Protection level along the track with fault hypotheses: solution separation over one and two satellites.
+"""Protection level along the track with fault hypotheses: solution separation over sets of faults.
 
 While ``|x_J - x| <= T_J`` the position x is that far at most from x_J, in which a fault of the subset J has no
 part, and whose own error has the Gaussian tail of ``sigma_J``. The level L is where the tails of all
@@ -10,42 +10,36 @@ Thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false alarms evenly. The lev
 of three parts, each of which has its share of the risk,
 
 - no fault: ``K_ff sigma_0 + b_0``;
-- one fault, two faults: the largest ``T_J + K sigma_J + b_J``, the share divided in proportion to the priors, so
-  that all hypotheses of a part have one K.
+- one fault, two faults (and more, where these are hypotheses): the largest ``T_J + K sigma_J + b_J``, the share divided
+  in proportion to the priors, so that all hypotheses of a part have one K.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 from itertools import combinations
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import comb
 
 from railfix.core.arrays import Codes, Floats, Indices, Masks, Strings
 from railfix.integrity.protection.allocation import Allocation, allocate
-from railfix.integrity.protection.groups import without_group, without_group_and_one
-from railfix.integrity.protection.risk import RiskBudget, pair_sum
-from railfix.integrity.protection.separation import (
-    Separations,
-    all_in_view,
-    without_map,
-    without_none,
-    without_one,
-    without_three,
-    without_two,
-)
+from railfix.integrity.protection.risk import MOST_TOGETHER, RiskBudget
+from railfix.integrity.protection.separation import all_in_view, without_group, without_map
 from railfix.integrity.protection.tails import lowered
 from railfix.integrity.raim import LinearModel
 from railfix.kernels import compiled_by
 
 #: Numbers of a pair array that a block of epochs holds.
 _BLOCK_SIZE: Final = 80_000
-#: Number of the tails of three faults among those of all kinds.
-_OF_TRIPLES: Final = 3
+#: Number of the tails of three faults and more among those of all kinds.
+_OF_MORE: Final = 3
 #: Separation, over the sigma of the position, below which the two positions are the same.
 _SAME: Final = 1e-9
 
@@ -55,20 +49,28 @@ class Cause(IntEnum):
 
     #: The noise of the position without a fault.
     FAULT_FREE = 0
-    #: A fault of one satellite, of a constellation, of a side of the track, or of the map.
+    #: A fault of one satellite, of a constellation, of a side of the track (or of both), or of the map.
     ONE_FAULT = 1
-    #: Faults of two satellites, or of one satellite and what else `ONE_FAULT` names, or of a side and the map.
+    #: Two of these at a time.
     TWO_FAULTS = 2
-    #: Infinite: a fault that nothing checks is likelier than its share of the risk.
+    #: Infinite: faults of satellites that nothing checks are likelier than their share of the risk.
     UNCHECKED = 3
-    #: Infinite: more faults than are checked are likelier than the risk allows, or too many satellites excluded.
+    #: Infinite: more faults than can be hypotheses are likelier than the risk allows, or too many satellites excluded.
     BUDGET = 4
     #: No position.
     NO_POSITION = 5
-    #: Faults of three satellites.
+    #: Three of these at a time, or more.
     THREE_FAULTS = 6
     #: Infinite: local faults cannot be bounded at this place of the line.
     UNBOUNDED = 7
+    #: As `UNCHECKED`, most of it faults of a constellation, alone or with satellites.
+    UNCHECKED_CONSTELLATION = 8
+    #: As `UNCHECKED`, of a side of the track or of both.
+    UNCHECKED_SIDE = 9
+    #: As `UNCHECKED`, of the map.
+    UNCHECKED_MAP = 10
+    #: As `UNCHECKED`, of several of these three together.
+    UNCHECKED_TOGETHER = 11
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +101,7 @@ class ProtectionLevel:
     worst_constellation : ndarray of str, shape (T,)
         Letter of the constellation that sets `one_fault_m`; empty where none does.
     unchecked_risk : ndarray, shape (T,)
-        Probability of more faults than are checked, taken off the risk.
+        Probability of the faults that are no hypotheses, taken off the risk.
     cause : ndarray of int8, shape (T,)
         `Cause`.
     """
@@ -135,7 +137,7 @@ def along_track_level(
     sides: Masks | None = None,
     n_excluded: ArrayLike = 0,
 ) -> ProtectionLevel:
-    """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension, up to two satellites).
+    """Protection level along the track (P1 2.4; WG-C ARAIM in one dimension).
 
     Parameters
     ----------
@@ -154,7 +156,7 @@ def along_track_level(
         Offset of the map across and up that is not within its sigma; none: 0.
     map_seen : tuple of ndarray, shapes (T, 2) [m] and (T, 2, 2) [1/m^2], optional
         Place of the antenna across and above the line without the map, and its inverse covariance (0: unknown). With it
-        a wrong map, alone and with each faulty satellite, is a hypothesis of prior `RiskBudget.map_prior`.
+        a wrong map is a hypothesis of prior `RiskBudget.map_prior`.
     sides : ndarray of bool, shape (T, S, M), optional
         Sets of satellites that one reflection can make faulty together, each a hypothesis of `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or ()
@@ -182,19 +184,18 @@ def along_track_level(
     out = np.broadcast_to(np.asarray(n_excluded, dtype=np.int64), (epochs,))
     groups = np.zeros((epochs, 0, channels), dtype=bool) if sides is None else sides
     plan = allocate(model, systems, risk, out, groups, wrong_map=map_seen is not None)
-    given = (
+    given = Errors(
         scale,
         _by_epoch(least_sigma_m, epochs, channels),
         _by_epoch(bias_m, epochs, channels),
         _by_epoch(0.0 if map_bias_m is None else map_bias_m, epochs, 2),
         np.zeros((epochs, 2)) if map_seen is None else map_seen[0],
         np.zeros((epochs, 2, 2)) if map_seen is None else map_seen[1],
-        plan.sides,
     )
     located = np.isfinite(model.covariance_m2).all(axis=(1, 2)) & np.isfinite(scale)
     result = _empty(epochs, plan)
-    for block in _blocks(model, np.flatnonzero(located)):
-        _level_of_block(result, block, model.take(block), plan, *(each[block] for each in given))
+    for block in _blocks(model, plan, np.flatnonzero(located)):
+        _level_of_block(result, block, model.take(block), plan, given)
     return result
 
 
@@ -231,33 +232,67 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
     )
 
 
-def _blocks(model: LinearModel, rows: Indices) -> Iterator[Indices]:
-    """Epochs of like numbers of satellites together: no block is wider than it must be."""
+def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
+    """Epochs of like numbers of hypotheses together: no block is wider than it must be."""
+    if len(rows) < 2:
+        return iter([rows] * len(rows))
     used = np.count_nonzero(model.used[rows], axis=1)
-    rows = rows[np.argsort(used, kind="stable")]
-    widest = int(used.max(initial=1))
-    size = max(1, _BLOCK_SIZE // (widest * widest))
+    sizes = np.cumsum(comb(used[:, None], np.arange(MOST_TOGETHER + 1)), axis=1)
+    sizes = np.concatenate([sizes, np.zeros((len(rows), 1))], axis=1)
+    count = np.take_along_axis(sizes, plan.order[rows], axis=1).sum(axis=1)
+    order = np.lexsort((used, count))
+    rows, widest = rows[order], max(int(count.max(initial=1)), int(used.max(initial=1)) ** 2)
+    size = max(1, _BLOCK_SIZE // widest)
     return (rows[first : first + size] for first in range(0, len(rows), size))
 
 
+class Positions(NamedTuple):
+    """Fields of `LinearModel` that hypotheses ask for, T epochs by M channels, in C order."""
+
+    root_weight: Floats
+    clock: Indices
+    clock_covariance_m2: Floats
+    design: Floats
+    covariance_m2: Floats
+    prior: Floats
+    misfit: Floats
+
+
+class Errors(NamedTuple):
+    """Parameters of `along_track_level` of the same names; of shape (T, 0) for none."""
+
+    scale: Floats
+    least_sigma_m: Floats
+    bias_m: Floats
+    map_bias_m: Floats
+    map_seen_m: Floats
+    map_information: Floats
+
+
+class Asked(NamedTuple):
+    """Hypotheses of a block of epochs: fields of `Allocation`, and where they stand in the arrays of all."""
+
+    prior: Floats  # (T, M)
+    members: Masks  # (T, B, M) satellites of each set of shared faults
+    wrong_map: Masks  # (B,)
+    shared_prior: Floats  # (T, B)
+    order: Indices  # (T, B)
+    k_false_alarm: Floats  # (T,)
+    first: Indices  # (B, MOST_TOGETHER + 1) place of the first hypothesis with so many satellites; -1: none
+    bounds: Indices  # (5,) first place of no fault, one fault, two, more; their number
+
+
 def _level_of_block(
-    result: ProtectionLevel, rows: Indices, model: LinearModel, plan: Allocation, *given: Floats | Masks
+    result: ProtectionLevel, rows: Indices, model: LinearModel, plan: Allocation, given: Errors
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
-    arrays: Iterable[Any] = (
-        *(model.root_weight, model.clock, model.clock_covariance_m2, model.design, model.covariance_m2, model.prior),
-        *(model.misfit, *given),
-        *(plan.prior[rows], plan.members, plan.group_prior[rows], plan.side_prior[rows]),
-        *(plan.sides_with_one[rows], plan.pairs[rows], plan.triples[rows], plan.k_false_alarm[rows]),
-    )
-    arrays = (*map(np.ascontiguousarray, arrays), plan.map_prior)
-    channel, offset, sigma, weight, bounds, separation = hypotheses(*arrays)
-    share = np.stack([plan.fault_free[rows], plan.one[rows], plan.two[rows]], axis=1)
-    share = np.concatenate([share, np.where(plan.triples[rows], share.sum(axis=1) / 3.0, 0.0)[:, None]], axis=1)
-    reserved = np.where(plan.pairs[rows], 0.0, pair_sum(plan.prior[rows]))
-    level, spender, part, k, worst = lowered(offset, sigma, weight, bounds, share, reserved)
+    positions = Positions(*(np.ascontiguousarray(getattr(model, name)) for name in Positions._fields))
+    of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
+    n = int(np.count_nonzero(model.used, axis=1).max())
+    channel, offset, sigma, weight, separation = hypotheses(positions, of_block, asked := _asked(plan, rows, n))
+    share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
+    level, spender, part, k, worst = lowered(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
 
-    n = channel.shape[1]
     result.level_m[rows], result.sigma_m[rows], result.k_false_alarm[rows] = (
         level,
         sigma[:, 0],
@@ -269,14 +304,63 @@ def _level_of_block(
     one, two = worst[:, 1], worst[:, 2]
     result.worst_one[rows] = _channels(channel, np.where(one < n, one, -1)[:, None])[:, 0]
     # After the channels: constellations, then the sides, a wrong map, and none.
-    letters = np.array([*plan.groups, *[""] * (plan.side_prior.shape[1] + 2)])
+    letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
     result.worst_constellation[rows] = letters[np.where(one >= n, one - n, -1)]
-    pairs = np.stack(np.triu_indices(n if plan.pairs[rows].any() else 0, 1), axis=1)
+    pairs = np.stack(np.triu_indices(n if asked.first[0, 2] >= 0 else 0, 1), axis=1)
     pairs = np.concatenate([pairs, [[-1, -1]]])
     result.worst_two[rows] = _channels(channel, pairs[np.where(two < len(pairs), two, -1)])
-    infinite = np.where(plan.fault_free[rows] > 0, Cause.UNCHECKED, Cause.BUDGET)
-    spent_on = np.where(spender == _OF_TRIPLES, Cause.THREE_FAULTS, spender)
+    infinite = np.full(len(rows), Cause.BUDGET)
+    if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():
+        infinite[unchecked] = _unchecked(plan, asked, np.where(np.isinf(sigma), weight, 0.0), n)[unchecked]
+    spent_on = np.where(spender == _OF_MORE, Cause.THREE_FAULTS, spender)
     result.cause[rows] = np.where(np.isinf(level), infinite, spent_on)
+
+
+def _unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:
+    """Return the cause (T,): the shared faults that have most of the probability (T, K) that nothing checks."""
+    spent, causes = [], []
+    for shared, first in zip(plan.shared, asked.first.tolist(), strict=True):
+        classes = [open_to_faults[:, at : at + math.comb(n, k)].sum(axis=1) for k, at in enumerate(first) if at >= 0]
+        spent.append(sum(classes, np.zeros(len(open_to_faults))))
+        kinds = {event < len(plan.groups) for event in shared.events}
+        if len(kinds) + shared.wrong_map > 1 or shared.kind > 1:
+            causes.append(Cause.UNCHECKED_TOGETHER)
+        elif shared.events:
+            causes.append(Cause.UNCHECKED_CONSTELLATION if kinds == {True} else Cause.UNCHECKED_SIDE)
+        else:
+            causes.append(Cause.UNCHECKED_MAP if shared.wrong_map else Cause.UNCHECKED)
+    return np.asarray(np.array(causes, dtype=np.int8)[np.argmax(spent, axis=0)])
+
+
+@lru_cache(maxsize=256)
+def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indices, Indices]:
+    """Return `Asked.first` and `Asked.bounds` of sets of shared faults with so many of n satellites at most."""
+    bounds, place = [], 0
+    first = np.full((len(kinds), MOST_TOGETHER + 1), -1, dtype=np.intp)
+    for kind in range(_OF_MORE + 1):
+        bounds.append(place)
+        for b, own in enumerate(kinds):
+            for k in range(most[b] + 1):
+                if min(own + k, _OF_MORE) == kind:
+                    first[b, k], place = place, place + math.comb(n, k)
+    return first, np.array([*bounds, place])
+
+
+def _asked(plan: Allocation, rows: Indices, n: int) -> Asked:
+    """Return the hypotheses of some epochs, of n channels in use at most: none, then one fault, two, more."""
+    order = plan.order[rows]
+    kinds = tuple(shared.kind for shared in plan.shared)
+    first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
+    return Asked(
+        prior=plan.prior[rows],
+        members=plan.members[rows],
+        wrong_map=np.array([shared.wrong_map for shared in plan.shared]),
+        shared_prior=plan.shared_prior[rows],
+        order=order,
+        k_false_alarm=plan.k_false_alarm[rows],
+        first=first,
+        bounds=bounds,
+    )
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
@@ -284,36 +368,15 @@ def _channels(channel: Indices, place: Indices) -> Indices:
     return np.where(place >= 0, np.take_along_axis(channel, np.maximum(place, 0), axis=1), -1)
 
 
-@compiled_by("hypotheses")
-def hypotheses(
-    root_weight: Floats,
-    clock: Indices,
-    clock_covariance_m2: Floats,
-    design: Floats,
-    covariance_m2: Floats,
-    map_prior: Floats,
-    misfit: Floats,
-    scale: Floats,
-    least_sigma_m: Floats,
-    bias_m: Floats,
-    map_bias_m: Floats,
-    map_seen_m: Floats,
-    map_information: Floats,
-    sides: Masks,
-    prior: Floats,
-    groups: Masks,
-    group_prior: Floats,
-    side_prior: Floats,
-    sides_with_one: Masks,
-    pairs: Masks,
-    triples: Masks,
-    k_false_alarm: Floats,
-    wrong_map: float,
-) -> tuple[Indices, Floats, Floats, Floats, Indices, Floats]:
-    """Return the tails of all hypotheses of a block of epochs: no fault, one, two and three.
+@lru_cache(maxsize=64)
+def _sets(n: int, size: int) -> Indices:
+    """Return all sets of places, shape (size, K)."""
+    return np.array(list(combinations(range(n), size)), dtype=np.intp).reshape(math.comb(n, size), size).T
 
-    Parameters are fields of `LinearModel` and of `Allocation`, and parameters of `along_track_level`, of these epochs
-    and in C order; `least_sigma_m` and `bias_m` of shape (T, 0) for none, `wrong_map` 0 for no such hypothesis.
+
+@compiled_by("hypotheses")
+def hypotheses(model: Positions, errors: Errors, asked: Asked) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+    """Return the tails of all hypotheses of a block of epochs.
 
     Returns
     -------
@@ -321,58 +384,38 @@ def hypotheses(
         Channels in use, side by side.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
         As `tails.lowered` takes them: threshold and bias, sigma (infinite where nothing bounds a fault), probability.
-    bounds : ndarray of int, shape (5,)
     separation : ndarray, shape (T,)
         `ProtectionLevel.separation`.
     """
-    model = LinearModel(
-        root_weight=root_weight,
-        clock=clock,
-        clock_covariance_m2=clock_covariance_m2,
-        design=design,
-        covariance_m2=covariance_m2,
-        prior=map_prior,
-        misfit=misfit,
-        freedom=np.zeros(len(scale), dtype=np.int64),
-        interest=1,
-    )
-    full = all_in_view(model, scale, least_sigma_m, bias_m, map_bias_m)
-    n, zero = full.channel.shape[1], np.zeros((len(scale), 1))
-    likely = np.take_along_axis(prior, full.channel, axis=1) * full.used
-    ones, twos, threes = [(without_one(full), likely)], [], []
-    if pairs.any():
-        i, j = np.triu_indices(n, 1)
-        twos.append((without_two(full, i, j), likely[:, i] * likely[:, j] * pairs[:, None]))
-    for c, members in enumerate(groups):
-        of_group, of_all = members[full.channel] & full.used, group_prior[:, c, None]
-        ones.append((without_group(full, of_group), of_all))
-        twos.append((without_group_and_one(full, of_group), of_all * likely * ~of_group))
-    sided = np.any(sides_with_one, axis=0).tolist()
-    side = [np.take_along_axis(sides[:, c], full.channel, axis=1) & full.used for c in range(sides.shape[1])]
-    for c, of_side in enumerate(side):
-        ones.append((without_group(full, of_side), side_prior[:, c, None]))
-        if sided[c]:
-            of_one = (side_prior[:, c] * sides_with_one[:, c])[:, None] * likely * ~of_side
-            twos.append((without_group_and_one(full, of_side), of_one))
-    if wrong_map > 0.0:
-        free = without_map(full, model, map_seen_m, map_information, groups=any(sided))
-        ones.append((free.apart(without_none(free.of_ranges)), zero + wrong_map))
-        twos.append((free.apart(without_one(free.of_ranges)), wrong_map * likely))
-        for c in (number for number, asked in enumerate(sided) if asked):
-            of_both = wrong_map * (side_prior[:, c] * sides_with_one[:, c])[:, None]
-            twos.append((free.apart(without_group(free.of_ranges, side[c])), of_both))
-    if triples.any():
-        i, j, k = np.array(list(combinations(range(n), 3)), dtype=np.intp).reshape(-1, 3).T
-        of_three = likely[:, i] * likely[:, j] * likely[:, k] * triples[:, None]
-        threes.append((without_three(full, i, j, k), of_three))
-    kinds = [[(without_none(full), zero + 2.0)], ones, twos, threes]  # noise passes on either side
-    apart = [part for kind in kinds for part, _ in kind]
-    weight = np.concatenate([each for kind in kinds for _, each in kind], axis=1)
-    sigma, between, moved, bias = (
-        np.concatenate([getattr(part, item.name) for part in apart], axis=1) for item in fields(Separations)
-    )
-    threshold = k_false_alarm[:, None] * between
-    moving = (weight > 0.0) & (between > _SAME * sigma[:, :1])
-    separation = np.max(np.abs(moved) / np.where(moving, threshold, np.inf), axis=1)
-    bounds = np.cumsum([0, *(sum(each.shape[1] for _, each in kind) for kind in kinds)])
-    return full.channel, threshold + bias, sigma, weight, bounds, separation
+    epochs = len(errors.scale)
+    whole = LinearModel(**model._asdict(), freedom=np.zeros(epochs, dtype=np.int64), interest=1)
+    full = all_in_view(whole, errors.scale, errors.least_sigma_m, errors.bias_m, errors.map_bias_m)
+    n = full.channel.shape[1]
+    prior = np.take_along_axis(asked.prior, full.channel, axis=1) * full.used
+    offset, sigma, weight = (np.zeros((epochs, int(asked.bounds[-1]))) for _ in range(3))
+    separation = np.zeros(epochs)
+    free = without_map(full, whole, errors.map_seen_m, errors.map_information) if asked.wrong_map.any() else None
+    for b, first in enumerate(asked.first.tolist()):
+        if first[0] < 0:
+            continue
+        members = np.take_along_axis(asked.members[:, b], full.channel, axis=1) & full.used
+        apart = free if free is not None and asked.wrong_map[b] else None
+        rest = without_group(full if apart is None else apart.of_ranges, members if members.any() else None)
+        others = prior * ~members
+        for k, start in enumerate(first):
+            if start < 0:
+                continue
+            sets = _sets(n, k)
+            got = rest.without(sets) if apart is None else apart.apart(rest.without(sets))
+            here = slice(start, start + sets.shape[1])
+            # Noise passes on either side.
+            of_group = asked.shared_prior[:, b] * (asked.order[:, b] >= k) * (2.0 if start == 0 else 1.0)
+            weight[:, here] = of_group[:, None] * others[:, sets].prod(axis=1)
+            threshold = asked.k_false_alarm[:, None] * got.separation_sigma_m
+            likely = weight[:, here] > 0.0
+            offset[:, here] = np.where(likely, threshold + got.bias_m, 0.0)
+            sigma[:, here] = np.where(likely, got.sigma_m, 1.0)
+            moving = likely & (got.separation_sigma_m > _SAME * sigma[:, :1])
+            ratio = np.abs(got.moved_m) / np.where(moving, threshold, np.inf)
+            separation = np.maximum(separation, ratio.max(axis=1, initial=0.0))
+    return full.channel, offset, sigma, weight, separation

@@ -2,7 +2,7 @@
 
 Integrity is specified per hour, a level is computed per epoch: the risk of the hour is divided
 by the number of independent samples in it. The risk of an epoch is divided among the hypotheses:
-no fault, one, two; more than two are not checked, their whole probability is taken off beforehand.
+no fault, one, two, and more where these are likely; the whole probability of the rest is taken off beforehand.
 P1 2.4 sets out from 1e-7 an hour (RTCA DO-229D).
 """
 
@@ -38,6 +38,8 @@ SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5
 #: Exclusions after which a level is still given (P1 2.3(4) excludes up to two satellites).
 MOST_EXCLUDED: Final = 2
+#: Faulty satellites at a time that can be hypotheses of a level.
+MOST_TOGETHER: Final = 4
 
 
 def k_factor(risk: float) -> float:
@@ -82,8 +84,8 @@ class RiskBudget(Settings):
         level is lowered until all tails together use their sum; a share twice as large lowers a K of 6 by 0.1, one
         of 3 by 0.2: thirds.
     unchecked_share : float
-        Of the risk, that faults which are not hypotheses may have together: where three at a time are likelier than
-        this, they become hypotheses too, and four at a time are what is left unchecked.
+        Of the risk, that faults which are not hypotheses may have together: where they are likelier, further ones
+        become hypotheses, up to four satellites at a time and three shared faults (constellation, side, map).
     exclusion_share : float
         Of the risk, kept for epochs with one and (as much again) with two satellites excluded.
     false_alarm : float
@@ -99,8 +101,7 @@ class RiskBudget(Settings):
     side_prior : float
         Probability that one reflection makes the low satellites of one side of the track faulty together:
         `SUPPORTED_SIDE_PRIOR`. No data supports a smaller one, and every output of the levels then says so; 0: no such
-        hypothesis. Where a side together with a satellite or a wrong map is likelier than `unchecked_share` of the
-        risk, these are hypotheses too, and so are both sides at a time.
+        hypothesis.
     side_elevation_deg : float
         Elevation up to which satellites count as low: of a wall as high as it is away.
     priors : {"assumed", "measured"}
@@ -196,17 +197,17 @@ class RiskBudget(Settings):
         return np.asarray(left * np.select([out == e for e in range(len(each))], each, 0.0))
 
     def require(self, systems: Sequence[str]) -> None:
-        """Raise where more than three faults among these satellites already exceed the risk.
+        """Raise where more than four faults among these satellites already exceed the risk.
 
         Raises
         ------
         ValueError
             Says what is over what.
         """
-        spent = float(more_than_three(self.prior(systems)[None])[0])
+        spent = float(set_sums(self.prior(systems)[None], MOST_TOGETHER + 1)[0, -1])
         if spent >= self.risk_per_sample:
             raise ValueError(
-                f"more than three of {len(systems)} satellites are faulty with probability {spent:.2g} a sample, "
+                f"more than four of {len(systems)} satellites are faulty with probability {spent:.2g} a sample, "
                 f"all that the risk allows is {self.risk_per_sample:.2g}: lower samples_per_hour or the priors, "
                 "or allow more risk"
             )
@@ -214,27 +215,20 @@ class RiskBudget(Settings):
 
 def pair_sum(prior: Floats) -> Floats:
     """Sum over pairs of the product of their priors, shape (T, M) to (T,)."""
-    one, two = _power_sums(prior, 2)
-    return np.asarray((one * one - two) / 2.0)
+    return set_sums(prior, 2)[:, 2]
 
 
-def _power_sums(prior: Floats, most: int) -> list[Floats]:
-    """Sums of the powers up to `most`, each of shape (T,)."""
-    power, sums = prior, [prior.sum(axis=1)]
-    for _ in range(most - 1):
+def set_sums(prior: Floats, most: int) -> Floats:
+    """Sums over sets of 0, 1, ..., `most` faults of the product of their priors, shape (T, M) to (T, most + 1).
+
+    Bounds of the probability of as many faults or more (Newton's identities).
+    """
+    power, powers = prior, []
+    for _ in range(most):
+        powers.append(power.sum(axis=1))
         power = power * prior
-        sums.append(power.sum(axis=1))
-    return sums
-
-
-def more_than_three(prior: Floats) -> Floats:
-    """Bound of the probability of four faults or more: the sum over sets of four, shape (T, M) to (T,)."""
-    one, two, three, four = _power_sums(prior, 4)
-    total = one**4 - 6.0 * one**2 * two + 3.0 * two**2 + 8.0 * one * three - 6.0 * four
-    return np.asarray(np.maximum(total / 24.0, 0.0))
-
-
-def more_than_two(prior: Floats) -> Floats:
-    """Bound of the probability of three faults or more: the sum over triples of their product, shape (T, M) to (T,)."""
-    one, two, three = _power_sums(prior, 3)
-    return np.asarray(np.maximum((one**3 - 3.0 * one * two + 2.0 * three) / 6.0, 0.0))
+    sums = [np.ones(len(prior))]
+    for size in range(1, most + 1):
+        total = sum((-1.0) ** j * sums[size - 1 - j] * powers[j] for j in range(size))
+        sums.append(np.maximum(total / size, 0.0))
+    return np.stack(sums, axis=1)

@@ -1,4 +1,4 @@
-"""How far, and how surely, the position moves without one satellite, a pair, or a constellation.
+"""How far, and how surely, the position moves without some satellites, those of a shared fault, or the map.
 
 With the whitened model of `raim` (residuals ``nu``, their projector S, gains g of the along-track
 position x) leaving out the channels J moves the position by ``x_J - x = -g_J^T S_JJ^-1 nu_J``, with
@@ -13,7 +13,6 @@ with a the response of the position to one sigma across and up, is therefore tak
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -33,7 +32,6 @@ class AllInView:
     channel: Indices  # (T, n) channel of the model
     used: Masks  # (T, n)
     projector: Floats  # (T, n, n)
-    share: Floats  # (T, n) its diagonal
     residual: Floats  # (T, n)
     gain_m: Floats  # (T, n)
     map_gain_m: Floats  # (T, n, 2) what each channel has of the response to the map error
@@ -109,7 +107,6 @@ def all_in_view(
         channel=parts.channel,
         used=parts.used,
         projector=parts.projector,
-        share=np.einsum("tii->ti", parts.projector),
         residual=parts.residual,
         gain_m=parts.gain_m[..., 0],
         map_gain_m=-gain[..., 1:] * root,
@@ -145,69 +142,93 @@ class WithoutMap:
         )
 
 
-def without_none(full: AllInView) -> Separations:
-    """No channel left out, K = 1."""
-    zero = np.zeros((len(full.scale), 1))
-    return Separations(
-        sigma_m=full.sigma_m[:, None], separation_sigma_m=zero, moved_m=zero, bias_m=full.bias_m[:, None]
-    )
+@dataclass(frozen=True)
+class Remaining:
+    """Channels of T epochs without those of a shared fault, and what these take with them.
 
-
-def without_one(full: AllInView) -> Separations:
-    """Each channel left out, K = n."""
-    return _in_order(full, (np.arange(full.channel.shape[1]),))
-
-
-def without_two(full: AllInView, first: Indices, second: Indices) -> Separations:
-    """Pairs of places (K,) in the compact arrays left out."""
-    return _in_order(full, (first, second))
-
-
-def without_three(full: AllInView, first: Indices, second: Indices, third: Indices) -> Separations:
-    """Triples of places (K,) in the compact arrays left out."""
-    return _in_order(full, (first, second, third))
-
-
-def _in_order(full: AllInView, members: tuple[Indices, ...]) -> Separations:
-    """Leave out K sets of channels, one member after the other.
-
-    Without a channel i the others have the projector ``S - S_.i S_i. / S_ii``, and residuals, gains and responses to
-    the map alike. A member that nothing checks by then, ``S_ii = 0`` (a satellite, or the last of several, of a clock
-    of its own), must not move the position; where it does, nothing bounds it.
+    Columns are those of the projector, then gain, residual and response to the map error across and up.
     """
-    limit = NO_EFFECT * np.sqrt(full.variance_m2)[:, None]
-    columns = np.stack([full.gain_m, full.residual, *np.moveaxis(full.map_gain_m, 2, 0)], axis=1)
-    own = [columns[..., m] for m in members]
-    shares = {(q, q): full.share[:, m] for q, m in enumerate(members)}
-    for q, r in combinations(range(len(members)), 2):
-        shares[q, r] = full.projector[:, members[q], members[r]]
-    rows = [full.projector[:, m] for m in members] if full.by_range else []
-    left = full.gain_m[:, None] if full.by_range else None
-    gone, blind = np.zeros(own[0].shape), np.zeros(shares[0, 0].shape, dtype=bool)
-    for q in range(len(members)):
-        share = shares[q, q]
-        unchecked = share <= LEAST_REDUNDANCY
-        if unchecked.any():
-            share = np.where(unchecked, np.inf, share)
-            blind |= unchecked & (np.abs(own[q][:, 0]) > limit)
-        inverse = 1.0 / share
-        weight = inverse * own[q][:, 0]
-        gone += weight[:, None] * own[q]
-        if left is not None:
-            left = left - weight[..., None] * rows[q]
-        for r in range(q + 1, len(members)):
-            ratio = inverse * shares[q, r]
-            own[r] -= ratio[:, None] * own[q]
-            for k in range(r, len(members)):
-                shares[r, k] = shares[r, k] - ratio * shares[q, k]
+
+    of: AllInView
+    columns: Floats  # (T, n, n + 4)
+    gone: Floats  # (T, 4) variance of the distance, -distance, its response to the map error across and up
+    blind: Masks  # (T,) nothing bounds a fault
+
+    def without(self, members: Indices) -> Separations:
+        """Leave out K sets of k channels, one member after the other.
+
+        Without a channel i the others have the projector ``S - S_.i S_i. / S_ii``, and residuals, gains and responses
+        to the map alike. A member that nothing checks by then, ``S_ii = 0`` (a satellite, or the last of several, of a
+        clock of its own), must not move the position; where it does, nothing bounds it.
+
+        Parameters
+        ----------
+        members : ndarray of int, shape (k, K)
+            Places in the compact arrays.
+        """
+        full, epochs, (size, count) = self.of, len(self.gone), members.shape
+        n = full.channel.shape[1]
+        limit = NO_EFFECT * np.sqrt(full.variance_m2)[:, None]
+        gone = np.repeat(self.gone[..., None], count, axis=2)
+        blind = np.repeat(self.blind[:, None], count, axis=1)
+        by_channel = np.moveaxis(self.columns[..., n:], 2, 1)
+        own = [by_channel[..., m] for m in members]
+        shares = {(q, r): self.columns[:, members[q], members[r]] for q in range(size) for r in range(q, size)}
+        rows = [self.columns[:, m, :n] for m in members] if full.by_range else []
+        left = np.broadcast_to(by_channel[:, :1], (epochs, count, n)) if full.by_range else None
+        for q in range(size):
+            share = shares[q, q]
+            unchecked = share <= LEAST_REDUNDANCY
+            if unchecked.any():
+                share = np.where(unchecked, np.inf, share)
+                blind |= unchecked & (np.abs(own[q][:, 0]) > limit)
+            inverse = 1.0 / share
+            weight = inverse * own[q][:, 0]
+            gone += weight[:, None] * own[q]
             if left is not None:
-                rows[r] = rows[r] - ratio[..., None] * rows[q]
-    return separations(full, gone, left, blind)
+                left = left - weight[..., None] * rows[q]
+            for r in range(q + 1, size):
+                ratio = inverse * shares[q, r]
+                own[r] = own[r] - ratio[:, None] * own[q]
+                for k in range(r, size):
+                    shares[r, k] = shares[r, k] - ratio * shares[q, k]
+                if left is not None:
+                    rows[r] = rows[r] - ratio[..., None] * rows[q]
+        return _separations(full, gone, left, blind)
 
 
-def without_map(
-    full: AllInView, model: LinearModel, seen_m: Floats, information: Floats, *, groups: bool = False
-) -> WithoutMap:
+def without_group(full: AllInView, members: Masks | None) -> Remaining:
+    """Leave out a group of channels, one after the other.
+
+    Parameters
+    ----------
+    full : AllInView
+    members : ndarray of bool, shape (T, n), or None
+        Places of the group in the compact arrays; some epochs may have none.
+    """
+    epochs, n = full.channel.shape
+    columns = np.concatenate(
+        [full.projector, full.gain_m[..., None], full.residual[..., None], full.map_gain_m], axis=2
+    )
+    gone, blind = np.zeros((epochs, 4)), np.zeros(epochs, dtype=bool)
+    if members is None:
+        return Remaining(full, columns, gone, blind)
+    limit, at = NO_EFFECT * np.sqrt(full.variance_m2), np.arange(epochs)
+    place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
+    rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
+    scaled = np.empty_like(rows)
+    for k in range(place.shape[1]):
+        row, later = rows[:, k], rows[:, k + 1 :]
+        share = row[at, place[:, k]]
+        checked = share > LEAST_REDUNDANCY
+        blind |= ~checked & (np.abs(row[:, n]) > limit)
+        scaled[:, k] = row / np.where(checked, share, np.inf)[:, None]
+        later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
+    gone = np.einsum("tm,tmc->tc", rows[..., n], scaled[..., n:])
+    return Remaining(full, columns - rows[..., :n].swapaxes(1, 2) @ scaled, gone, blind)
+
+
+def without_map(full: AllInView, model: LinearModel, seen_m: Floats, information: Floats) -> WithoutMap:
     """The map left out.
 
     What takes the place of the map is its offset as the positions in space of the last minutes show it. Without one
@@ -221,8 +242,6 @@ def without_map(
         Place of the antenna across and above the line over minutes; any finite value where nothing is known.
     information : ndarray, shape (T, 2, 2) [1/m^2]
         Inverse covariance of that; 0 where nothing is known.
-    groups : bool
-        Whether groups of channels are left out of the result, for which it needs the projector.
     """
     of_map = np.zeros((len(model), 3, 3))
     of_map[:, 1:, 1:] = full.scale[:, None, None] ** 2 * information
@@ -238,8 +257,7 @@ def without_map(
     nothing = np.zeros((len(model), 2))
     without = replace(
         full,
-        projector=compact(free).projector if full.by_range or groups else full.projector[:, :0, :0],
-        share=np.take_along_axis(free.redundancy, full.channel, axis=1),
+        projector=compact(free).projector,
         residual=full.residual - np.einsum("tni,ti->tn", own, shift),
         gain_m=np.einsum("tni,ti->tn", own, covariance[:, :, 0]),
         map_gain_m=np.zeros(full.map_gain_m.shape),
@@ -250,7 +268,7 @@ def without_map(
     return WithoutMap(without, shift[:, 0], blind)
 
 
-def separations(full: AllInView, gone: Floats, left: Floats | None, blind: Masks) -> Separations:
+def _separations(full: AllInView, gone: Floats, left: Floats | None, blind: Masks) -> Separations:
     """Noise and biases of what K sets of channels take with them.
 
     Parameters
