@@ -28,6 +28,8 @@ from railfix.ranges.sbas import SbasMessages
 
 #: Epochs of one antenna that may wait; more than that means the other antenna's clock is elsewhere.
 _LONGEST_QUEUE = 100
+#: Way after which the order of the antennas is looked at again [m].
+_ORDER_STEP_M = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +127,7 @@ class LiveEngine:
         self.settings = settings
         self.counts: Counter[str] = Counter()
         self.told: deque[str] = deque(maxlen=100)
+        self._order, self._ordered_at_m = processor.antenna_order(), float("-inf")
         self._antennas = tuple(processor.trajectories)
         self._waiting: dict[str, deque[_Waiting]] = {name: deque() for name in self._antennas}
         self._last_tag: dict[str, int] = {}
@@ -365,4 +368,21 @@ class LiveEngine:
             epochs, self._state, navigation=news.navigation, messages=news.messages
         )
         self._done_ns = max(head.tag_ns for head in heads.values())
+        self._check_order(result)
         return LiveOutput(message=message_of(result, self.settings, sequence=0, sent_ns=0), result=result)
+
+    def _check_order(self, result: Result) -> None:
+        """Tell once where the positions have the antennas in the wrong order."""
+        if self._order is None or len(result.antennas) < 2:
+            return
+        front, rear = (result.antennas[name] for name in ("front", "rear"))
+        place = float(front.chainage_m[-1])
+        if not abs(place - self._ordered_at_m) >= _ORDER_STEP_M:
+            return
+        self._ordered_at_m = place
+        new = self._order.add(
+            (front.time, front.chainage_m, front.along_sigma_m), (rear.time, rear.chainage_m, rear.along_sigma_m)
+        )
+        if new and (note := self._order.note) is not None:
+            self.told.append(note)
+            self._order = None

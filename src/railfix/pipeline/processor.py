@@ -18,6 +18,7 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
 from railfix.pipeline.along_track import AlongTrack, FilterState, SingleEpochs, along_track
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
@@ -138,6 +139,13 @@ class EpochProcessor:
         if self.config.protection == "on" and self.config.carrier == "float":
             notes.append("protection level: asked for, but there is none for positions from code and phase together")
         return tuple(notes)
+
+    def antenna_order(self) -> AntennaOrder | None:
+        """Return a test, without positions as yet, of the order of two antennas; None without two of one vehicle."""
+        if len(self.trajectories) < 2 or not self._setup.spacing_known:
+            return None
+        tolerance = self.config.antenna_pair.tag_tolerance_s
+        return AntennaOrder(self.trajectories["front"], self.trajectories["rear"], tolerance_s=tolerance)
 
     def process(
         self,

@@ -313,7 +313,8 @@ def _position(
 
     The rows of a chunk are written by `beside` while the next one is positioned.
     """
-    tally, after = Tally(min_satellites=processor.config.min_satellites), np.datetime64("NaT", "ns")
+    tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
+    after = np.datetime64("NaT", "ns")
     written: Future[None] | None = None
     for cut in cuts({name: run.more for name, run in runs.items()}):
         began = clock.perf_counter()
@@ -325,6 +326,7 @@ def _position(
         processor.compare(chunks)
         rows = {name: run.finished() for name, run in chunks.items()}
         tally.took(cut.values(), clock.perf_counter() - began)
+        tally.compare({name: of_antenna.positions for name, of_antenna in rows.items()})
         for name, of_antenna in rows.items():
             tally.antennas[name] = of_antenna.tally
             tally.notes.update(dict.fromkeys(of_antenna.notes))
@@ -354,7 +356,7 @@ def notes_of(
     note_statistic : float
         Statistic of the test of the map from which on there is a note (`MapOffsetLimits.note_threshold`).
     """
-    notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.notes]
+    notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.all_notes]
     for name, antenna in tally.antennas.items():
         notes += [
             f"{name}: screen {screen.name} has judged nothing; it needs {screen.needs}"

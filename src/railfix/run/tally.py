@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
+from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.processor import AntennaResult, Result
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
@@ -240,18 +242,37 @@ class Tally:
         As keys, in the order in which they came.
     chunks : list of (datetime64[ns], int, float)
         First epoch of each chunk, its epochs of all antennas, and the time that positioning it took [s].
+    order : AntennaOrder, optional
+        Test of the order of two antennas.
     """
 
     min_satellites: int = 3
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     notes: dict[str, None] = field(default_factory=dict)
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
+    order: AntennaOrder | None = None
 
     def add(self, result: Result) -> None:
         """Count one more chunk."""
         for name, antenna in result.antennas.items():
             self.antennas.setdefault(name, AntennaTally(min_satellites=self.min_satellites)).add(antenna)
         self.notes.update(dict.fromkeys(result.notes))
+
+    def compare(self, positions: Mapping[str, pl.DataFrame]) -> None:
+        """Compare the positions of one more chunk of two antennas (`tables.positions_table`)."""
+        if self.order is not None and len(positions) > 1:
+            self.order.add(
+                *(
+                    (rows["time_gpst"].to_numpy(), rows["chainage_m"].to_numpy(), rows["along_sigma_m"].to_numpy())
+                    for rows in (positions["front"], positions["rear"])
+                )
+            )
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """Notes of the chunks, and of their comparison."""
+        order = None if self.order is None else self.order.note
+        return tuple(self.notes) if order is None else (*self.notes, order)
 
     def took(self, times: Iterable[Datetimes], spent_s: float) -> None:
         """Note how long the positions of one more chunk took: its time tags by antenna, and the time [s]."""
