@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import document_commands
 from conftest import ROOT
 from readme_example import real, shown, without_duration
 from reference_document import DOCUMENT, document
@@ -50,6 +51,31 @@ def test_links_between_documents_lead_somewhere(path: Path) -> None:
     assert [target for target, _ in links if not (path.parent / target).exists()] == []
     places = [(path.parent / target if target else path, place) for target, place in links if place]
     assert [(str(target), place) for target, place in places if place not in anchors(target)] == []
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_command_lines_and_options_exist(path: Path) -> None:
+    wrong = [text for line in document_commands.shown(path) if (text := document_commands.wrong_with(line))]
+    assert [*wrong, *document_commands.wrong_options(path), *document_commands.wrong_scripts(path)] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "whole", "said"),
+    [
+        ("runs --front a", True, "no command runs"),
+        ("map chek a", False, "no command chek"),
+        ("run ... --fron a", False, "unknown --fron"),
+        ("run ... --set elevation.mask=15", False, "elevation.mask"),
+        ("run ... --without dopler", False, "dopler"),
+        ("run --front a --track b --out c --workers x", True, "integer"),
+        ("run --front a --nav b --out c", True, "--track"),
+        ("run --front a --nav b --track c --out d --workers 2", True, None),
+    ],
+)
+def test_what_is_wrong_with_a_command_line_is_found(words: str, whole: bool, said: str | None) -> None:
+    found = document_commands.wrong_with(document_commands.Shown("here", tuple(words.split()), whole))
+    assert (said is None) == (found is None)
+    assert said is None or said in str(found)
 
 
 def anchors(path: Path) -> set[str]:

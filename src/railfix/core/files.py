@@ -393,7 +393,8 @@ def _decode_hatanaka(path: FilePath, source: IO[bytes], held: ExitStack) -> Byte
             shutil.copyfileobj(unpacked, spool, _COPY_BYTES)
         spool.flush()
         source = spool
-    source.seek(0)
+    # the decoder inherits the descriptor, whose place `seek` need not move within what is buffered
+    os.lseek(source.fileno(), 0, os.SEEK_SET)
     log = _temporary(held)
     name = "crx2rnx.exe" if sys.platform == "win32" else "crx2rnx"
     program = held.enter_context(importlib.resources.as_file(importlib.resources.files("hatanaka.bin") / name))
