@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
-from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
-from railfix.io.position_log import read_positions, write_positions_csv
+from railfix.io.position_log import read_positions
 
 Truth = tuple[Datetimes, Floats]
 
@@ -88,5 +88,12 @@ TRUTHS: Final = {
 
 def write_truth_csv(truth: Truth, path: Path) -> Path:
     """The reference as CSV that ``railfix map from-positions`` reads."""
-    write_positions_csv(path, *truth)
+    time, ecef_m = truth
+    latitude, longitude, height = geodetic_from_ecef(ecef_m)
+    rows = zip(np.datetime_as_string(time, unit="ns"), latitude, longitude, height, strict=True)
+    lines = [
+        "time_gpst,latitude_deg,longitude_deg,height_m",
+        *(f"{t},{a:.10f},{b:.10f},{h:.4f}" for t, a, b, h in rows),
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path

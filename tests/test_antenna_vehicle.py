@@ -20,7 +20,15 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Provenance, Track
 from railfix.track.from_positions import ANTENNA_PATH
 from railfix.track.trajectory import Trajectory
-from railfix.track.vehicle import PATH_TOLERANCE_M, AntennaOffset, Vehicle, antenna_trajectory, body_pose, read_vehicle
+from railfix.track.vehicle import (
+    PATH_TOLERANCE_M,
+    AntennaOffset,
+    Vehicle,
+    _Line,
+    _pose,
+    antenna_trajectory,
+    read_vehicle,
+)
 
 ORIGIN = (34.7, 135.5, 80.0)
 OFFSET = AntennaOffset(along_m=9.1, across_m=0.35, up_m=4.1)
@@ -205,7 +213,8 @@ def test_chords_of_the_path_stay_near_the_antenna(ramp: float) -> None:
 
 def _dense(track: Track) -> Floats:
     """The antenna every half metre, without the path's points."""
-    pose = body_pose(track, vehicle(), np.arange(10.0, track.chainage_m[-1] - 10.0, 0.5))
+    car, middle = vehicle(), np.arange(10.0, track.chainage_m[-1] - 10.0, 0.5)
+    pose = _pose(_Line(track, car.contact_spacing_m), track, car, middle)
     return pose.origin + OFFSET.along_m * pose.forward + OFFSET.across_m * pose.right + OFFSET.up_m * pose.up
 
 

@@ -91,7 +91,9 @@ def test_gps_lnav(seed: int) -> None:
     rtk.decode_frame(octets(rtk, np.packbits(bits)), rtk.SYS_GPS, ephemeris, almanac, ion, utc)
     values: dict[str, np.ndarray] = {}
     for k in (1, 2, 3):
-        values |= nav_messages.lnav_fields(bits[240 * (k - 1) : 240 * k][None], k)
+        values |= nav_messages.fields(
+            bits[240 * (k - 1) : 240 * k][None], {**nav_messages.LNAV_HEAD, **nav_messages.LNAV[k]}
+        )
     compare(values, ephemeris)
     assert values["sqrt_a"][0] ** 2 == pytest.approx(ephemeris.A, rel=1e-14)
     assert (values["iodc"][0], values["iode"][0]) == (ephemeris.iodc, ephemeris.iode)

@@ -117,12 +117,6 @@ def test_versions_and_unknown_keys() -> None:
         decode(b"\0" * (LONGEST + 1))
 
 
-def test_rear_end() -> None:
-    assert PLACED.rear_cm == 1_234_567 - 4_000
-    assert PLACED.replaced(facing=-1).rear_cm == 1_234_567 + 4_000
-    assert PLACED.replaced(facing=0).rear_cm is None
-
-
 def test_position_report_by_hand() -> None:
     """12345.67 m, reference at 12000 m: 346 m ahead (345.67), doubts 8.12 and 6.55 m with 0.33 m of rounding."""
     report = etcs_report(PLACED, reference_cm=1_200_000, reference=77)

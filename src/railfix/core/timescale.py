@@ -18,8 +18,6 @@ from railfix.core.constants import BDT_MINUS_GPST_S
 GPS_EPOCH: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 #: Origin of BeiDou time, written in BDT (BDS-SIS-ICD-B1I 3.0, 3.3).
 BDT_EPOCH: Final = np.datetime64("2006-01-01T00:00:00", "ns")
-#: Origin of Galileo system time, written in GST = GPST (Galileo OS SIS ICD 5.1.2).
-GST_EPOCH: Final = np.datetime64("1999-08-22T00:00:00", "ns")
 
 SECONDS_PER_WEEK: Final = 604_800
 SECONDS_PER_DAY: Final = 86_400

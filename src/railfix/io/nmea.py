@@ -24,7 +24,7 @@ from railfix.io.receiver.positions import read_receiver_positions
 from railfix.io.receiver.recognise import head_of, is_receiver_log
 from railfix.io.text_positions import read_gpx_positions, read_novatel_positions
 
-#: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.QUALITY_NAMES`); others are 0, no position.
+#: GGA's quality (NMEA 0183 4.10, field 6) as RTKLIB's (`position_log.PositionLog`); others are 0, no position.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 _DAY_S: Final = 86_400.0
 _NS: Final = 1e9

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -14,13 +13,11 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import ending, read_text
-from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
+from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.spelling import misspelt
 from railfix.core.timescale import from_week, timedelta, utc_to_gpst
 from railfix.io.named_columns import NamedColumns, read_named_columns
 
-#: RTKLIB's solution quality (RTKLIB manual 2.4.2, B.1).
-QUALITY_NAMES: Final = {1: "fix", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 #: Columns of a CSV log; coordinates are geodetic or ECEF.
 CSV_COLUMNS: Final = ("time_gpst", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m", "z_m", "quality", "ratio")
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
@@ -39,7 +36,8 @@ class PositionLog:
     ecef_m : ndarray, shape (n, 3) [m]
         NaN where a row has no position.
     quality : ndarray of int, shape (n,)
-        Q of RTKLIB (see `QUALITY_NAMES`), or the number in the log; -1 where it has none.
+        Q of RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; or the number in the log; -1
+        where it has none.
     sigma_m : ndarray, shape (n, 3) [m]
         Standard deviations north, east, up; NaN where the log has none.
     line : ndarray of int, shape (n,)
@@ -323,14 +321,3 @@ def _rtklib_ratio(rest: Floats, names: list[str]) -> Floats | None:
     """Return the column ``ratio``; None where the file has none."""
     after = [name.split("(")[0] for name in names[3:]]
     return rest[:, after.index("ratio")] if "ratio" in after[: rest.shape[1]] else None
-
-
-def write_positions_csv(path: str | PathLike[str], time: Datetimes, ecef_m: Floats) -> None:
-    """Write positions as CSV with the columns that `read_positions` reads."""
-    latitude, longitude, height = geodetic_from_ecef(ecef_m)
-    rows = zip(np.datetime_as_string(time, unit="ns"), latitude, longitude, height, strict=True)
-    lines = [
-        "time_gpst,latitude_deg,longitude_deg,height_m",
-        *(f"{t},{a:.10f},{b:.10f},{h:.4f}" for t, a, b, h in rows),
-    ]
-    Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -129,13 +129,6 @@ class TrainMessage(Settings):
             raise ValueError("over_cm and under_cm stand beside chainage_cm")
         return self
 
-    @property
-    def rear_cm(self) -> int | None:
-        """Chainage of the train's rear end [cm], its length behind the front; None without facing or position."""
-        if self.chainage_cm is None or self.facing == 0:
-            return None
-        return self.chainage_cm - self.facing * self.length_cm
-
 
 #: Integer key of each field; keys are never used again for another meaning.
 KEYS: Final[dict[str, int]] = {name: k for k, name in enumerate(TrainMessage.model_fields, start=1)}

@@ -216,22 +216,6 @@ def _bogies(line: _Line, middle: Floats, distance_m: float, track: Track) -> tup
     )
 
 
-def body_pose(track: Track, vehicle: Vehicle, middle_m: Floats) -> Body:
-    """Compute position and attitude of the body with its bogies symmetric about given chainages.
-
-    Parameters
-    ----------
-    track : Track
-    vehicle : Vehicle
-    middle_m : ndarray, shape (n,) [m]
-
-    Returns
-    -------
-    Body
-    """
-    return _pose(_Line(track, vehicle.contact_spacing_m), track, vehicle, np.asarray(middle_m, dtype=np.float64))
-
-
 def _pose(line: _Line, track: Track, vehicle: Vehicle, middle: Floats) -> Body:
     lower, upper = _bogies(line, middle, vehicle.bogie_distance_m, track)
     first, second = line.at(lower), line.at(upper)

@@ -22,7 +22,6 @@ from railfix.core.arrays import Bytes, Indices, Integers, Masks, Strings
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _CRC24_POLYNOMIAL: Final = 0x1864CFB
-PROTOCOLS: Final = ("ubx", "rtcm3", "sbf", "nmea")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +33,7 @@ class Frames:
     data : ndarray of uint8
         The buffer.
     protocol : ndarray of str, shape (N,)
-        One of `PROTOCOLS`.
+        "ubx", "rtcm3", "sbf" or "nmea".
     kind : ndarray of int, shape (N,)
         UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0.
     start, end : ndarray of int, shape (N,)

@@ -239,11 +239,6 @@ GLONASS: Final[dict[int, dict[str, Field]]] = {
 URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192])
 
 
-def lnav_fields(bits: Bytes, subframe: int) -> dict[str, Floats]:
-    """Fields of LNAV subframes of one number, bits shape (N, 240)."""
-    return fields(bits, {**LNAV_HEAD, **LNAV[subframe]})
-
-
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
     """Words of Galileo I/NAV page pairs, and which have a valid CRC.
 

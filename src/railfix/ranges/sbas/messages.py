@@ -15,9 +15,8 @@ from railfix.ranges.sbas.standard import DECODED, system_name, type_name
 
 #: First eight bits of three successive messages (DO-229D, A.4.3.1).
 PREAMBLES: Final = (0x53, 0x9A, 0xC6)
-#: Preamble, type and data; parity; bytes a message takes in `SbasMessages.bits`.
+#: Preamble, type and data; bytes a message takes in `SbasMessages.bits`.
 DATA_BITS: Final = 226
-PARITY_BITS: Final = 24
 ROW_BYTES: Final = 32
 #: The same message twice within this time was passed on by two receivers.
 _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
