@@ -63,6 +63,15 @@ def state() -> Interlocking:
     return Interlocking(trains=trains, points={name: PointState() for name in LAYOUT.points()})
 
 
+@pytest.mark.requirement("F4")
+@pytest.mark.parametrize("bound", ["over_cm", "under_cm"])
+def test_a_report_without_a_bound_moves_nothing(state: Interlocking, bound: str) -> None:
+    whole = message(1, 1, 340.0)
+    assert report_received(state, whole, LAYOUT) != state
+    assert report_received(state, whole.model_copy(update={bound: 0}), LAYOUT) != state
+    assert report_received(state, whole.model_copy(update={bound: None}), LAYOUT) == state
+
+
 def test_pieces_of_an_interval() -> None:
     assert LAYOUT.pieces(300.0, 2100.0, {0: 2, 1: 1}) == [(2, 300.0, 350.0), (0, 350.0, 2050.0), (3, 2050.0, 2100.0)]
     assert LAYOUT.pieces(2100.0, 300.0, {0: 2}) == LAYOUT.pieces(300.0, 2100.0, {0: 2})

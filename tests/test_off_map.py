@@ -24,14 +24,14 @@ from tracking_cases import part, ride
 START = np.datetime64("2026-03-01T10:00:00", "ns")
 
 
-def judged(said: str, cuts: tuple[int, ...] = (), longest_s: float = 3.0) -> str:
+def judged(said: str, cuts: tuple[int, ...] = (), least_s: float = 3.0) -> str:
     """Verdicts of epochs a second apart: positions on the map (+), off it (-), none (.)."""
     time = START + timedelta(np.arange(float(len(said))))
     on, off = np.array([c == "+" for c in said]), np.array([c == "-" for c in said])
     state, parts = OffMapState(), []
     for first, last in zip((0, *cuts), (*cuts, len(said)), strict=True):
         here = slice(first, last)
-        found, state = off_map_epochs(time[here], on[here], off[here], state, longest_s=longest_s)
+        found, state = off_map_epochs(time[here], on[here], off[here], state, least_s=least_s)
         parts.append(found)
     return "".join("x" if away else "o" for away in np.concatenate(parts))
 
@@ -57,7 +57,7 @@ def test_departure_and_return_take_their_time(said: str, expected: str) -> None:
 def test_any_cutting_gives_the_same_verdicts() -> None:
     said = "".join(np.random.default_rng(3).choice(list("+-."), size=400, p=[0.4, 0.4, 0.2]).tolist())
     said = said.replace("+-+", "+++").replace("-+-", "---")
-    whole = judged(said, longest_s=2.0)
+    whole = judged(said, least_s=2.0)
     assert set(whole) == {"o", "x"}
     assert judged(said, tuple(range(1, 400)), 2.0) == whole
     assert judged(said, (7, 8, 150), 2.0) == whole

@@ -22,7 +22,7 @@ from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.positioning.normal_equations import Ranges
 from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
-from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
+from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel, FaultRate
 from railfix.ranges.sbas import (
     IonosphereDelays,
     IonosphereState,
@@ -292,6 +292,22 @@ def test_a_corrected_code_is_without_clock_ionosphere_and_troposphere() -> None:
     assert (delays.troposphere_m[used] > 2.0).all()
     assert (delays.ionosphere_m[used] > 1.0).all()
     np.testing.assert_allclose(result.corrected_code_m[:, columns][used], expected[used], atol=0.02)
+
+
+def test_a_model_of_an_earlier_version_is_noted() -> None:
+    """Files of an earlier version have no rate of satellites of one side that are faulty together."""
+    measured = {"beyond_sigma": 5.0, "ranges": 10, "faulty": 0, "blocks": 10, "faulty_blocks": 0, "prior": 0.0}
+    notes = {}
+    for name, more in (("old", {}), ("new", {"side_upper": 1.0})):
+        faults = FaultRate.model_validate({**measured, "upper": 0.3, "together": 0.0, **more})
+        model = replace(uniform_model(3.0, 0.0), faults=faults)
+        config = parse_config({"error_model": "line.toml", "screens": []})
+        notes[name] = EpochProcessor(config, cases.clean_trajectories(), error_model=model).notes
+    assert [note for note in notes["old"] if note not in notes["new"]] == [
+        "error model: it does not state how often low satellites of one side are faulty together (faults.side_upper), "
+        "as one of an earlier version; railfix error-model measures it"
+    ]
+    assert set(notes["new"]) < set(notes["old"])
 
 
 def test_a_bias_of_the_error_model_widens_the_protection_level() -> None:

@@ -138,13 +138,16 @@ def report_received(
     """
     known = state.trains.get(message.train)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING) and message.facing != 0
-    if known is None or not placed or message.chainage_cm is None:
+    if known is None or not placed:
+        return state
+    chainage_cm, over_cm, under_cm = message.chainage_cm, message.over_cm, message.under_cm
+    if chainage_cm is None or over_cm is None or under_cm is None:  # a bound that is absent is unknown, not 0
         return state
     if Rule.SEQUENCE in rules and message.sequence <= known.sequence:
         return state
-    front, facing = message.chainage_cm / 100.0, message.facing
-    behind = ((message.over_cm or 0) + message.length_cm) / 100.0 if Rule.SAFE_REAR in rules else 0.0
-    rear, ahead = front - facing * behind, front + facing * (message.under_cm or 0) / 100.0
+    front, facing = chainage_cm / 100.0, message.facing
+    behind = (over_cm + message.length_cm) / 100.0 if Rule.SAFE_REAR in rules else 0.0
+    rear, ahead = front - facing * behind, front + facing * under_cm / 100.0
     if facing == known.direction:
         if Rule.SEQUENCE in rules:  # a wider bound moves no rear end back either
             rear = facing * max(facing * rear, facing * known.rear_m)

@@ -33,11 +33,11 @@ class OffMapState:
 
 
 def off_map_epochs(
-    time: Datetimes, on_map: Masks, off_map: Masks, state: OffMapState, *, longest_s: float
+    time: Datetimes, on_map: Masks, off_map: Masks, state: OffMapState, *, least_s: float
 ) -> tuple[Masks, OffMapState]:
     """Return the epochs at which the train is off the map, shape (T,), and the state to pass on.
 
-    It leaves the map once all positions of the last `longest_s` are off it, and returns once all of that time are on
+    It leaves the map once all positions of the last `least_s` are off it, and returns once all of that time are on
     it: a single position can be off the map by reflected signals, or on it by chance. The first position of a log
     decides alone.
 
@@ -47,7 +47,7 @@ def off_map_epochs(
     on_map, off_map : ndarray of bool, shape (T,)
         Single-epoch positions that the ranges fit, and those that they contradict; both False without a position.
     state : OffMapState
-    longest_s : float [s]
+    least_s : float [s]
         How long positions contradict the state before it changes.
     """
     off, known, since = state.off, state.known, state.since
@@ -60,7 +60,7 @@ def off_map_epochs(
             since = _NEVER
             continue
         since = time[run[0]] if np.isnat(since) else since
-        enough = run[seconds(time[run] - since) >= longest_s] if known else run
+        enough = run[seconds(time[run] - since) >= least_s] if known else run
         if len(enough):
             result[enough[0] :] = says
             off, known, since = says, True, _NEVER

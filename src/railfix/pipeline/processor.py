@@ -136,6 +136,12 @@ class EpochProcessor:
         conditions = None if self._error_model is None else self._error_model.conditions
         if conditions and (differences := condition_differences(conditions, conditions_of(self.config))):
             notes.append(f"error model: made under other conditions than this run's: {'; '.join(differences)}")
+        faults = None if self._error_model is None else self._error_model.faults
+        if faults is not None and "side_upper" not in faults.model_fields_set:
+            notes.append(
+                "error model: it does not state how often low satellites of one side are faulty together "
+                "(faults.side_upper), as one of an earlier version; railfix error-model measures it"
+            )
         if self.config.protection == "on" and self.config.carrier == "float":
             notes.append("protection level: asked for, but there is none for positions from code and phase together")
         return tuple(notes)

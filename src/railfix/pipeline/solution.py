@@ -122,7 +122,7 @@ def solve(
     )
     scale = np.maximum(scale, _least_scale(config))
     away, off_map_state = off_map_epochs(
-        time, np.isfinite(constrained.arc_m) & ~off_map, off_map, state.off_map, longest_s=config.off_map_s
+        time, np.isfinite(constrained.arc_m) & ~off_map, off_map, state.off_map, least_s=config.off_map_s
     )
     offset, map_state = map_offset(
         time, agreeing, free, corrected.nominal_m, np.maximum(scale, 1.0) ** 2, trajectory,
