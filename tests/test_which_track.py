@@ -20,6 +20,7 @@ from railfix.positioning.which_track import StandstillErrors, StandstillFix, Tra
 from railfix.run.standstill import BaseStation, StandstillCodes, standstill_codes
 from railfix.run.track_prior import prior_of_interlocking, prior_of_last_place, write_last_place
 from railfix.run.which_track import decide_track
+from railfix.simulate.demo_data import demo_files
 from yard_made import RISKS, SPACING_M, decided, made_tracks, to_geojson
 
 pytestmark = pytest.mark.requirement("E6")
@@ -266,6 +267,13 @@ def test_a_moving_train_is_an_error(recordings: Path) -> None:
     folder = recordings / "kinematic" / "japan_mosaic_2021265_with_GEONET3034"
     with pytest.raises(MismatchError, match="standstill"):
         standstill_codes(read_observations(folder / "SEPT265G.21O"), read_navigation(folder / "SEPT2650.21P"), Config())
+
+
+def test_a_train_that_comes_back_is_a_moving_one() -> None:
+    files = demo_files()
+    log = read_observations(files["front"])[::10]
+    with pytest.raises(MismatchError, match="standstill"):
+        standstill_codes(log, read_navigation(files["nav"]), Config())
 
 
 # --- what is known beforehand ------------------------------------------------

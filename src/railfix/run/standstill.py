@@ -25,7 +25,7 @@ from railfix.positioning.which_track import StandstillErrors, StandstillFix, sta
 _SHARE: Final = 0.9
 #: Residual standard deviation of satellite and atmosphere errors beside a base station [m]; it is at most 10 km away.
 _BESIDE_BASE_M: Final = 0.05
-#: Largest difference of mean places of the first and the last third of the log [m].
+#: Largest difference of the median places of the thirds of the log [m].
 _AT_REST_M: Final = 8.0
 #: Change of a double difference from epoch to epoch that is a slip [wavelengths].
 _SLIP: Final = 0.25
@@ -108,10 +108,11 @@ def standstill_codes(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
         raise MismatchError("the log has no positions; are the navigation files of its day?")
-    third = max(1, len(places) // 3)
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(places[0]))
-    change = np.median(places[-third:], axis=0) - np.median(places[:third], axis=0)
-    moved = float(np.hypot(*(enu_axes(latitude, longitude)[:2] @ change)))
+    # thirds of the log, as a train that comes back is at its first place in the end
+    thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
+    level = (thirds - thirds[0]) @ enu_axes(latitude, longitude)[:2].T
+    moved = float(np.linalg.norm(level, axis=1).max())
     if moved > _AT_REST_M:
         raise MismatchError(f"the antenna moves by {moved:.0f} m in the log; give --start and --end of a standstill")
     origin = np.median(places, axis=0) if origin_ecef_m is None else origin_ecef_m
@@ -133,7 +134,8 @@ def standstill_codes(
     residual = residual[:, kept]
     for letter in np.unique(system):
         rows = system == letter
-        residual[:, rows] -= np.nanmean(residual[:, rows], axis=1, keepdims=True)
+        received = np.isfinite(residual[:, rows]).sum(axis=1, keepdims=True)  # 0 in a tunnel
+        residual[:, rows] -= np.nansum(residual[:, rows], axis=1, keepdims=True) / np.maximum(received, 1)
     elevation, azimuth = seen.elevation_deg[:, columns[kept]], seen.azimuth_deg[:, columns[kept]]
     turn = np.radians(azimuth)
     return StandstillCodes(
