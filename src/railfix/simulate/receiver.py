@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.gnss.navigation import KeplerRecords
+from railfix.gnss.observations import ObservationHeader
+from railfix.simulate.errors.common import CommonErrors
 from railfix.simulate.errors.processes import satellite_key
 from railfix.simulate.errors.settings import InterSystemSettings
 from railfix.simulate.noise import CarriedNoise, CodeSmoothing, Tracking
 from railfix.simulate.satellites import newest_record
-
-if TYPE_CHECKING:
-    from railfix.simulate.signals import Simulation
-
+from railfix.simulate.scenario import Scenario
 
 #: Signals of each constellation, the first one first.
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
@@ -25,21 +25,40 @@ _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
 class Receiver:
-    """One receiver's channels, and its state that is carried between chunks."""
+    """One receiver's channels, and its state that is carried between chunks.
 
-    def __init__(self, simulation: Simulation, antenna: str) -> None:
-        scenario, errors, channels = simulation.scenario, simulation.scenario.errors, simulation.channels
-        number = scenario.receivers.index(antenna)
-        self.antenna = antenna
-        self.header = simulation.header(antenna)
+    Parameters
+    ----------
+    scenario : Scenario
+    antenna : {"front", "rear"}
+    header : ObservationHeader
+    channels : sequence of (str, str)
+        Satellite and signal of each.
+    satellites : sequence of str
+        Columns of the sky, in alphabetical order.
+    common_errors : CommonErrors
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        antenna: str,
+        header: ObservationHeader,
+        *,
+        channels: Sequence[tuple[str, str]],
+        satellites: Sequence[str],
+        common_errors: CommonErrors,
+    ) -> None:
+        errors, number = scenario.errors, scenario.receivers.index(antenna)
+        self.antenna, self.header = antenna, header
         self.names, self.signals = (np.array(part) for part in zip(*channels, strict=True))
-        self.column = np.searchsorted(simulation.satellites, self.names)
+        self.column = np.searchsorted(satellites, self.names)
         frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in channels])
         self.wavelength_m = SPEED_OF_LIGHT / frequency
         #: Ionospheric delay relative to that on L1.
         self.scale = (FREQUENCY_L1 / frequency) ** 2
         self.second = np.array([g != SIGNALS[n[0]][0] for n, g in channels])
-        self.group_delay_error_m = simulation.common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
+        self.group_delay_error_m = common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
         offsets = [errors.intersystem.get(name[0], InterSystemSettings()) for name, _ in channels]
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if antenna == "rear" else 0.0) for o in offsets])
         self.offset_drift_mps = np.array([o.drift_mps for o in offsets])

@@ -214,7 +214,14 @@ class Simulation:
         antenna : {"front", "rear"}
         chunk_epochs : int
         """
-        receiver = Receiver(self, antenna)
+        receiver = Receiver(
+            self.scenario,
+            antenna,
+            self.header(antenna),
+            channels=self.channels,
+            satellites=self.satellites,
+            common_errors=self.common_errors,
+        )
         for first in range(0, self.scenario.epochs, chunk_epochs):
             yield _piece(self, receiver, self.time(first, min(first + chunk_epochs, self.scenario.epochs)))
 
