@@ -121,8 +121,6 @@ class Reflections:
         Mirror image of the antenna, from the antenna.
     back_x, back_y : ndarray
         Horizontal direction of arrival.
-    far_m : ndarray [m]
-        From the antenna to the point of reflection.
     cosine : ndarray
         Of the angle of incidence from the wall's normal.
     """
@@ -134,7 +132,6 @@ class Reflections:
     y_m: Floats
     back_x: Floats
     back_y: Floats
-    far_m: Floats
     cosine: Floats
 
 
@@ -168,7 +165,6 @@ def reflections(row: Strips, rays: Rays) -> Reflections:
         y_m=sign * 2.0 * distance * cosine,
         back_x=back_x,
         back_y=sign * back,
-        far_m=far,
         cosine=np.maximum(facing, 0.0),
     )
 
