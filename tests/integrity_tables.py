@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -21,7 +21,7 @@ import recordings_truth
 from conftest import ROOT
 from integrity_recordings import ranges_of
 from railfix.core.arrays import Floats, Masks
-from railfix.core.geodesy import range_with_rotation
+from railfix.core.geodesy import elevation_azimuth, range_with_rotation
 from railfix.core.reasons import Status
 from railfix.core.timescale import seconds
 from railfix.evaluate import along_track_error, interpolate_reference
@@ -51,8 +51,29 @@ OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 
 #: Priors of local faults that cities ask for (docs/bounds.md).
 LOCAL_PRIORS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4)
 _NORMAL_MEDIAN: Final = 0.6745
-#: Degrees of freedom of Student's t: none, as of late codes for both sides, heavier for late codes, as the filter.
-TAILS: Final = (None, Tails(4.0, 4.0), Tails(4.0, 2.0), Tails(4.0, 1.0), Tails(8.0, 1.0), Tails(1e9, 1.0))
+
+
+class Reweighting(NamedTuple):
+    """Student's t in single epochs: degrees of freedom; least redundancy; of satellites up to an elevation."""
+
+    tails: Tails
+    redundancy: int = 1
+    elevation_deg: float = 90.0
+
+    @property
+    def text(self) -> str:
+        return f"{self.tails.usual:g}, {self.tails.late:g} {self.redundancy:11d} {self.elevation_deg:10.0f}"
+
+
+#: As of late codes for both sides; heavier for late codes, 4 and 1 as in the filter; with redundancy that tells late
+#: codes from early ones; of satellites up to 45 deg, which walls as high as they are away reflect; both.
+REWEIGHTINGS: Final = (
+    None,
+    *(Reweighting(Tails(4.0, late)) for late in (4.0, 3.0, 2.0, 1.0)),
+    *(Reweighting(Tails(4.0, 1.0), redundancy) for redundancy in (5, 8)),
+    Reweighting(Tails(4.0, 1.0), 1, 45.0),
+    Reweighting(Tails(4.0, 1.0), 5, 45.0),
+)
 
 
 @dataclass(frozen=True)
@@ -362,53 +383,53 @@ def side_rows() -> Iterator[str]:
             )
 
 
-def reweighted(ranges: Ranges, line: Trajectory, arc: Floats, section: Floats, scale: Floats, tails: Tails) -> Floats:
+def reweighted(
+    ranges: Ranges, line: Trajectory, arc: Floats, section: Floats, scale: Floats, how: Reweighting
+) -> Floats:
     """Movement along the line by Student's t weights of the residuals, in sigmas of the level, shape (T,) [m]."""
     section = np.maximum(section, 0)
     residual = np.nan_to_num(
         constrained_model(ranges, line, arc, section=section).residual / np.maximum(scale, 1.0)[:, None]
     )
-    weight = ranges.weight * tails.weight(residual, residual**2, residual.shape[1])
+    elevation, _ = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(np.nan_to_num(arc)))
+    weighed = (elevation <= how.elevation_deg) & (ranges.n_used - ranges.n_clocks - 1 >= how.redundancy)[:, None]
+    factor = np.where(weighed, how.tails.weight(residual, residual**2, residual.shape[1]), 1.0)
+    weight = ranges.weight * factor
     return np.nan_to_num(constrained_model(replace(ranges, weight=weight), line, arc, section=section).step_m[:, 0])
 
 
 def late_rows() -> Iterator[str]:
     """Single epochs reweighted once with heavier tails for late codes; levels take the movement whole."""
-    yield "            degrees of    straight distance [m]     error over sigma  level  over"
-    yield "log      freedom, late     p50     p95    max            68 %   95 %  median"
+    yield "            degrees of   redundancy  elevation   straight distance [m]     error over sigma  level  over"
+    yield "log      freedom, late     at least    up to      p50     p95    max            68 %   95 %  median"
     for name, case in cases().items():
         result = case.solved()
         assert result.protection is not None
-        for tails in TAILS:
+        for how in REWEIGHTINGS:
             fixed, movement = result.constrained, np.zeros(len(result))
-            if tails is not None:
+            if how is not None:
                 arc = np.where(np.isfinite(result.arc_m), fixed.arc_m, np.nan)
-                movement = reweighted(ranges_of(result), case.trajectory, arc, fixed.section, result.noise_scale, tails)
+                movement = reweighted(ranges_of(result), case.trajectory, arc, fixed.section, result.noise_scale, how)
             moved = replace(result, arc_m=np.clip(result.arc_m + movement, 0.0, case.trajectory.arc_m[-1]))
             straight, along = case.errors(moved)
             level = np.where(result.protection.level.consistent, result.protection.level.level_m, np.inf)
             level, known = level + np.abs(movement), np.isfinite(along) & np.isfinite(level)
             ratio = along / result.along_sigma_m
+            sizes = np.percentile(straight[np.isfinite(straight)], (50.0, 95.0, 100.0))
             yield (
-                _late_row(name, tails, straight)
+                _late_row(name, how, sizes)
                 + f" {np.percentile(ratio[np.isfinite(ratio)], 68.0):15.2f}"
                 + f" {np.percentile(ratio[np.isfinite(ratio)], 95.0):6.2f} {np.median(level[known]):7.1f}"
                 + f" {int((along[known] > level[known]).sum()):5d}"
             )
-    for tails in TAILS:
-        found = smartloc(DATA.parent, SETTINGS, None if tails is None else partial(reweighted, tails=tails))
+    for how in REWEIGHTINGS:
+        found = smartloc(DATA.parent, SETTINGS, None if how is None else partial(reweighted, how=how))
         assert found.straight is not None
-        sizes = np.array([found.straight.p50_m, found.straight.p95_m, found.straight.max_m])
-        yield f"{'smartLoc':9s}{_named(tails):>13s} {sizes[0]:7.3f} {sizes[1]:7.3f} {sizes[2]:6.1f}"
+        yield _late_row("smartLoc", how, np.array([found.straight.p50_m, found.straight.p95_m, found.straight.max_m]))
 
 
-def _late_row(name: str, tails: Tails | None, straight: Floats) -> str:
-    sizes = np.percentile(straight[np.isfinite(straight)], (50.0, 95.0, 100.0))
-    return f"{name:9s}{_named(tails):>13s} {sizes[0]:7.3f} {sizes[1]:7.3f} {sizes[2]:6.1f}"
-
-
-def _named(tails: Tails | None) -> str:
-    return "-" if tails is None else f"{tails.usual:g}, {tails.late:g}"
+def _late_row(name: str, how: Reweighting | None, sizes: Floats) -> str:
+    return f"{name:9s}{'-' if how is None else how.text:>36s} {sizes[0]:7.3f} {sizes[1]:7.3f} {sizes[2]:6.1f}"
 
 
 PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
