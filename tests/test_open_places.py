@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ from scipy.stats import norm
 
 import integrity_tables
 from integrity_recordings import ranges_of
-from railfix.core.geodesy import range_with_rotation
+from railfix import kernels
+from railfix.core.geodesy import elevation_azimuth, range_with_rotation
 from railfix.core.reasons import Status
 from railfix.integrity.protection import SATELLITE_PRIOR, RiskBudget
 from railfix.integrity.raim import constrained_model
@@ -50,13 +53,21 @@ def test_no_ok_position_is_over_its_level_with_a_large_fault(pixel: integrity_ta
     assert judged > 200
 
 
-def risk_beyond(y: np.ndarray, beyond: np.ndarray, noise: np.ndarray, prior: np.ndarray) -> float:
+def risk_beyond(
+    y: np.ndarray,
+    beyond: np.ndarray,
+    noise: np.ndarray,
+    prior: np.ndarray,
+    sides: list[tuple[int, ...]],
+    of_side: float,
+) -> float:
     """Sum over the hypotheses by generalised least squares at every point: one clock, map error in the noise.
 
     y: misfit (points, n); beyond: points that count; noise: covariance (n, n).
     """
     total, n = 0.0, y.shape[1]
-    for out in [(), *combinations(range(n), 1), *combinations(range(n), 2)]:
+    sets = [((), 2.0), *((out, float(np.prod(prior[list(out)]))) for k in (1, 2) for out in combinations(range(n), k))]
+    for out, p in [*sets, *((side, of_side) for side in sides if len(side) > 1)]:
         left = np.setdiff1d(np.arange(n), out)
         inverse = np.linalg.inv(noise[np.ix_(left, left)])
         ones = np.ones(len(left))
@@ -64,23 +75,27 @@ def risk_beyond(y: np.ndarray, beyond: np.ndarray, noise: np.ndarray, prior: np.
         q = np.einsum("pi,ij,pj->p", y[:, left], inverse, y[:, left])
         excess = q[beyond].min() - q.min()
         tail = norm.sf(np.sqrt(excess)) if excess > 0 else 1.0
-        total += tail * (2.0 if not out else float(np.prod(prior[list(out)])))
+        total += p * tail
     return total
 
 
 @pytest.mark.requirement("C2")
-@pytest.mark.parametrize("local_prior", [0.0, 1e-5, 2e-4], ids=["noise", "one fault", "two faults"])
+@pytest.mark.parametrize(
+    ("local_prior", "side_prior"),
+    [(0.0, 0.0), (1e-5, 0.0), (2e-4, 0.0), (0.0, 1.3e-5)],
+    ids=["noise", "one fault", "two faults", "a side"],
+)
 def test_open_places_are_those_that_solving_every_subset_leaves_open(
-    pixel: integrity_tables.Case, local_prior: float
+    pixel: integrity_tables.Case, local_prior: float, side_prior: float
 ) -> None:
-    """No satellite, each one and each pair left out, at points of the whole course half a metre from each other.
+    """None, each satellite, each pair and each side left out, at points of the whole course half a metre apart.
 
     Without priors noise alone leaves places open beyond too small a level; with large ones mostly two faults do.
     """
     settings = integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-8)})  # smaller levels
     result, line = pixel.solved(settings), pixel.trajectory
     own = SATELLITE_PRIOR if local_prior else dict.fromkeys(SATELLITE_PRIOR, 0.0)
-    risk = RiskBudget(local_prior=local_prior, satellite_prior=dict(own))
+    risk = RiskBudget(local_prior=local_prior, satellite_prior=dict(own), side_prior=side_prior)
     assert result.protection is not None
     level = result.protection.level.level_m * (1.0 if local_prior else 0.3)
     ranges = ranges_of(result)
@@ -91,7 +106,10 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
     model = constrained_model(ranges, line, arc, section=section)
     scale = np.maximum(result.noise_scale[rows], 1.0)
     index, every = SearchIndex(line), np.arange(len(rows))
-    found = places_beyond_the_level(index, arc, model, level, scale, systems, risk, every)
+    elevation, azimuth = elevation_azimuth(ranges.sat_ecef_m, line.at_arc(arc))
+    right = np.sin(np.radians(azimuth - line.heading_deg[section][:, None])) > 0
+    sides = np.stack([(elevation < 45.0) & ~right, (elevation < 45.0) & right], axis=1)
+    found = places_beyond_the_level(index, arc, model, level, scale, systems, risk, sides, every)
     points = line.at_arc(np.arange(0.0, line.arc_m[-1], 0.5))
     open_ones = 0
     for t in range(len(rows)):
@@ -105,7 +123,9 @@ def test_open_places_are_those_that_solving_every_subset_leaves_open(
         away = points - place
         off = np.abs(away @ line.tangent[section[t]]) < 0.9945 * np.linalg.norm(away, axis=1)
         beyond = off & (np.linalg.norm(away, axis=1) > level[t])
-        expected = risk_beyond(ranges.code_m[t, use] - distance, beyond, noise, risk.prior(systems)[use])
+        of_sides = [tuple(np.flatnonzero(side[use]).tolist()) for side in sides[t]]
+        y = ranges.code_m[t, use] - distance
+        expected = risk_beyond(y, beyond, noise, risk.prior(systems)[use], of_sides, side_prior)
         open_ones += expected > 1.1 * risk.risk_per_sample
         if not 0.9 < expected / risk.risk_per_sample < 1.1:
             assert found[t] == (expected > risk.risk_per_sample), (rows[t], expected)
@@ -126,6 +146,12 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
     model = constrained_model(ranges_of(result), path, arc, section=np.maximum(result.constrained.section, 0))
     systems = [name[0] for name in result.satellite[result.columns].tolist()]
     scale, rows = np.maximum(result.noise_scale, 1.0), np.flatnonzero(np.isfinite(level))
+    columns = result.columns
+    right = (
+        np.sin(np.radians(result.azimuth_deg[:, columns] - path.heading_deg[result.constrained.section][:, None])) > 0
+    )
+    low = result.elevation_deg[:, columns] < 45.0
+    sides = np.stack([low & ~right, low & right], axis=1)
     looked_at: list[int] = []
     exact = open_places._risk_of_block
 
@@ -134,9 +160,35 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
         return exact(index, arc_m, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(open_places, "_risk_of_block", counted)
-    bounded = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), rows)
+    bounded = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), sides, rows)
     assert 0 < sum(looked_at) < 0.3 * len(rows)
     monkeypatch.setattr(open_places, "risk_off_tangent", lambda *arrays: np.full(len(arrays[0]), 1.0))
-    every = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), rows)
+    every = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), sides, rows)
     np.testing.assert_array_equal(bounded, every)
     assert every.any() == (share < 1.0)
+
+
+@pytest.mark.requirement("C2")
+@pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (railfix[fast])")
+@pytest.mark.parametrize("enough", [0.0, 1.0], ids=["each hypothesis", "loose bound"])
+def test_bounds_are_the_same_compiled(
+    pixel: integrity_tables.Case, monkeypatch: pytest.MonkeyPatch, enough: float
+) -> None:
+    """Probabilities are far below the metres that kernels are compared to: to a millionth of themselves."""
+    calls: list[tuple[Any, ...]] = []
+
+    def recorded(*arrays: Any) -> np.ndarray:
+        calls.append(arrays)
+        return np.zeros(len(arrays[0]))
+
+    monkeypatch.setattr(open_places, "risk_off_tangent", recorded)
+    pixel.solved(integrity_tables.SETTINGS.model_copy(update={"risk": RiskBudget(side_prior=1e-2)}))
+    assert calls
+    for *arrays, clear_m, plan, height, _ in calls:
+        clear_m = np.linspace(20.0, 200.0, len(clear_m))
+        one, other = (
+            function(*arrays, clear_m, plan, height, enough)
+            for function in (kernels.REGISTERED["risk_off_tangent"][0], kernels.compiled("risk_off_tangent"))
+        )
+        assert 0.1 * len(one) < np.count_nonzero((one > 1e-12) & (one < 1e-2))
+        np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-15)

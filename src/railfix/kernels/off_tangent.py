@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 
 #: `railfix.integrity.raim.exclusion.LEAST_REDUNDANCY`.
@@ -71,6 +71,75 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
     return 0.5 * math.erfc(math.sqrt(0.5 * excess)) if excess > 0.0 else 1.0
 
 
+@inner
+def _tail_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, slope: Floats, clear_m: float) -> float:
+    """Return the tail of a form by its own matrix and slope."""
+    sx, sy, sz = slope[0], slope[1], slope[2]
+    c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
+    c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
+    det = xx * c_xx + xy * c_xy + xz * c_xz
+    mean = (xx + yy + zz) / 3.0
+    if not det > 1e-12 * mean * mean * mean:
+        return 1.0
+    inverse = 1.0 / det
+    x = (c_xx * sx + c_xy * sy + c_xz * sz) * inverse
+    y = (c_xy * sx + c_yy * sy + c_yz * sz) * inverse
+    z = (c_xz * sx + c_yz * sy + c_zz * sz) * inverse
+    gap = max(clear_m - math.sqrt(x * x + y * y), 0.0)
+    excess = gap * gap / ((c_xx + c_yy) * inverse) - max(x * sx + y * sy + z * sz, 0.0)
+    if excess > 1400.0:
+        return 0.0
+    return 0.5 * math.erfc(math.sqrt(0.5 * excess)) if excess > 0.0 else 1.0
+
+
+@inner
+def _of_sides(
+    used: Indices,
+    n: int,
+    sides: Masks,
+    side_prior: float,
+    projector: Floats,
+    residual: Floats,
+    rows: Floats,
+    slope: Floats,
+    matrix: Floats,
+    clear_m: float,
+) -> float:
+    """Return the sum of the tails with the channels of each side left out, one after the other."""
+    total = 0.0
+    member = np.empty(n, dtype=np.intp)
+    for c in range(len(sides)):
+        count = 0
+        for i in range(n):
+            if sides[c, used[i]]:
+                member[count] = i
+                count += 1
+        if count < 2 or side_prior == 0.0:
+            continue
+        work, left, s, m = np.empty((count, count + 4)), np.empty(3), slope.copy(), matrix.copy()
+        for a in range(count):
+            for b in range(count):
+                work[a, b] = projector[max(member[a], member[b]), min(member[a], member[b])]
+            work[a, count] = residual[member[a]]
+            for b in range(3):
+                work[a, count + 1 + b] = rows[member[a], b]
+        for a in range(count):
+            if not work[a, a] > _LEAST_REDUNDANCY:
+                continue
+            for b in range(3):
+                left[b] = work[a, count + 1 + b] / work[a, a]
+            for b in range(3):
+                s[b] -= work[a, count] * left[b]
+                for d in range(3):
+                    m[b, d] -= work[a, count + 1 + b] * left[d]
+            for later in range(a + 1, count):
+                ratio = work[later, a] / work[a, a]
+                for column in range(a, count + 4):
+                    work[later, column] -= ratio * work[a, column]
+        total += side_prior * _tail_of(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2], s, clear_m)
+    return total
+
+
 @kernel
 def risk_off_tangent(
     root_weight: Floats,
@@ -82,6 +151,8 @@ def risk_off_tangent(
     misfit: Floats,
     scale: Floats,
     likely: Floats,
+    sides: Masks,
+    side_prior: float,
     clear_m: Floats,
     sigma_plan_m: float,
     sigma_height_m: float,
@@ -93,7 +164,7 @@ def risk_off_tangent(
     used, prior, leverage = np.empty(channels, dtype=np.intp), np.empty(channels), np.empty(channels)
     projector, effect, residual = np.empty((channels, channels)), np.empty((channels, channels)), np.empty(channels)
     rows, spread_of, asked = np.empty((channels, 3)), np.empty((channels, 3)), np.empty(clocks)
-    pull, step, slope, of_map = np.empty(3), np.empty(3), np.empty(3), np.zeros(3)
+    pull, step, slope, of_map, form = np.empty(3), np.empty(3), np.empty(3), np.zeros(3), np.empty(3)
     for t in range(epochs):
         n, noise = 0, scale[t]
         for m in range(channels):
@@ -175,7 +246,8 @@ def risk_off_tangent(
                 regular = det > _LEAST_REDUNDANCY * a * c and min(a, c) > _LEAST_REDUNDANCY
                 two = max(two, tau if regular else 0.0)
         root = math.sqrt(max(constant, 0.0))
-        total[t] = 2.0 * _tail(clear_m[t], spread, start, root, 0.0)
+        of_sides = _of_sides(used, n, sides[t], side_prior, projector, residual, rows, slope, matrix, clear_m[t])
+        total[t] = of_sides + 2.0 * _tail(clear_m[t], spread, start, root, 0.0)
         total[t] += singles * _tail(clear_m[t], spread, start, root, one)
         total[t] += 0.5 * (singles * singles - squares) * _tail(clear_m[t], spread, start, root, two)
         if total[t] <= enough:
@@ -183,7 +255,7 @@ def risk_off_tangent(
         s, r, u = slope[0], slope[1], slope[2]
         m_xx, m_xy, m_xz = matrix[0, 0], matrix[0, 1], matrix[0, 2]
         m_yy, m_yz, m_zz = matrix[1, 1], matrix[1, 2], matrix[2, 2]
-        spent = 0.0
+        spent = of_sides
         # One hypothesis after the other: none, each channel (j = -1), each pair.
         for i in range(-1, n):
             for j in range(-1, i if i >= 0 else 0):
@@ -232,22 +304,7 @@ def risk_off_tangent(
                             yy -= iy * fy + jy * gy
                             yz -= iy * fz + jy * gz
                             zz -= iz * fz + jz * gz
-                c_xx, c_yy, c_zz = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
-                c_xy, c_xz, c_yz = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
-                det = xx * c_xx + xy * c_xy + xz * c_xz
-                mean = (xx + yy + zz) / 3.0
-                tail = 1.0
-                if det > 1e-12 * mean * mean * mean:
-                    inverse = 1.0 / det
-                    x = (c_xx * sx + c_xy * sy + c_xz * sz) * inverse
-                    y = (c_xy * sx + c_yy * sy + c_yz * sz) * inverse
-                    z = (c_xz * sx + c_yz * sy + c_zz * sz) * inverse
-                    gap = max(clear_m[t] - math.sqrt(x * x + y * y), 0.0)
-                    excess = gap * gap / ((c_xx + c_yy) * inverse) - max(x * sx + y * sy + z * sz, 0.0)
-                    if excess > 1400.0:
-                        tail = 0.0
-                    elif excess > 0.0:
-                        tail = 0.5 * math.erfc(math.sqrt(0.5 * excess))
-                spent += p * tail
+                form[0], form[1], form[2] = sx, sy, sz
+                spent += p * _tail_of(xx, xy, xz, yy, yz, zz, form, clear_m[t])
         total[t] = spent
     return total

@@ -115,7 +115,7 @@ def protection_levels(
     offset: MapOffset,
     raim: RaimResult,
     scale: Floats,
-    heading_deg: Floats,
+    sides: Masks,
     config: Config,
 ) -> ProtectionResult:
     """Return the protection levels of the positions of a chunk.
@@ -132,8 +132,8 @@ def protection_levels(
     scale : ndarray, shape (T,)
         The receiver's noise scale. Quiet residuals shrink no level: it is taken as 1 at least, and with an error model
         the sigma of no range falls below the model's.
-    heading_deg : ndarray, shape (T,)
-        Azimuth of the track.
+    sides : ndarray of bool, shape (T, 2, K)
+        `low_sides`.
     config : Config
 
     Returns
@@ -150,15 +150,15 @@ def protection_levels(
         bias_m=None if config.error_model is None else corrected.bias_m,
         map_bias_m=np.stack(offset.beyond_m, axis=1),
         map_seen=offset.seen,
-        sides=_sides(corrected, heading_deg, config.risk.side_elevation_deg),
+        sides=sides,
         n_excluded=raim.excluded.sum(axis=1),
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
 
 
-def _sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float) -> Masks:
-    """Return the low satellites left and right of the track, shape (T, 2, K)."""
+def low_sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float) -> Masks:
+    """Return the low satellites left and right of the track, shape (T, 2, K); `heading_deg` is its azimuth (T,)."""
     right = np.sin(np.radians(corrected.azimuth_deg - heading_deg[:, None])) > 0
     low = corrected.elevation_deg < elevation_deg
     return np.stack([low & ~right, low & right], axis=1)

@@ -1,20 +1,21 @@
 """Bound of the probability that the true place lies off the tangent at the position.
 
-Under each hypothesis of the level (no fault, one faulty satellite, two) the weighted sum of squared residuals is a
-quadratic form in the place.
+Under each hypothesis of the level (no fault, one faulty satellite, two, those of a side) the weighted sum of squared
+residuals is a quadratic form in the place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
 from scipy.special import ndtr
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.protection.risk import one_sided_k, pair_sum
+from railfix.integrity.protection.separation import one_after_the_other
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact, compact
@@ -42,6 +43,11 @@ class Forms:
     def take(self, epochs: Indices) -> Forms:
         """Return the forms of some epochs, by index."""
         return Forms(self.prior[epochs], self.constant[epochs], self.slope[epochs], self.matrix[epochs])
+
+    def beside(self, *others: Forms) -> Forms:
+        """Return these and other hypotheses of the same epochs together."""
+        every = (self, *others)
+        return Forms(*(np.concatenate([getattr(f, item.name) for f in every], axis=1) for item in fields(Forms)))
 
     def coefficients(self) -> Floats:
         """Return the coefficients of `open_places._Sections.monomials`, shape (T, 10, K)."""
@@ -118,6 +124,8 @@ def risk_off_tangent(
     misfit: Floats,
     scale: Floats,
     likely: Floats,
+    sides: Masks,
+    side_prior: float,
     clear_m: Floats,
     sigma_plan_m: float,
     sigma_height_m: float,
@@ -138,6 +146,10 @@ def risk_off_tangent(
     scale : ndarray, shape (T,)
     likely : ndarray, shape (M,)
         Probability of a fault of each channel.
+    sides : ndarray of bool, shape (T, S, M)
+        Channels that are faulty together.
+    side_prior : float
+        Probability of that.
     clear_m : ndarray, shape (T,) [m]
         Distance within which no place is off the tangent.
     sigma_plan_m, sigma_height_m : float [m]
@@ -147,7 +159,7 @@ def risk_off_tangent(
     Returns
     -------
     ndarray, shape (T,)
-        Summed over no fault, one faulty satellite and two.
+        Summed over no fault, one faulty satellite, two and those of a side.
     """
     model = LinearModel(
         root_weight=root_weight,
@@ -162,11 +174,46 @@ def risk_off_tangent(
     )
     parts, rows, none = whitened(model, sigma_plan_m, sigma_height_m, scale)
     prior = np.where(parts.used, likely[parts.channel], 0.0)
-    bound = _loose(parts.projector, rows, prior, none, clear_m)
+    side = without_sides(parts, rows, none, sides, side_prior)
+    of_sides = _bounded(
+        side.prior,
+        [side.slope[..., a] for a in range(3)],
+        {(a, b): side.matrix[..., a, b] for a in range(3) for b in range(a, 3)},
+        clear_m,
+    )
+    bound = of_sides + _loose(parts.projector, rows, prior, none, clear_m)
     near = np.flatnonzero(~(bound <= enough))
     if len(near):
-        bound[near] = _tight(parts.take(near), rows[near], prior[near], none.take(near), clear_m[near])
+        bound[near] = of_sides[near] + _tight(parts.take(near), rows[near], prior[near], none.take(near), clear_m[near])
     return bound
+
+
+def without_sides(parts: Compact, design: Floats, none: Forms, sides: Masks, prior: float) -> Forms:
+    """Return the forms with the channels of each side left out, K = S; prior 0 where fewer than two are in use.
+
+    Parameters
+    ----------
+    parts, design, none
+        As `whitened` returns them.
+    sides : ndarray of bool, shape (T, S, M)
+    prior : float
+    """
+    n, forms = parts.channel.shape[1], []
+    columns = np.concatenate([parts.projector, parts.residual[..., None], design], axis=2)
+    for c in range(sides.shape[1]):
+        members = np.take_along_axis(sides[:, c], parts.channel, axis=1) & parts.used
+        rows, scaled, _ = one_after_the_other(columns, members)
+        residual, own = rows[..., n], rows[..., n + 1 :]
+        forms.append(
+            Forms(
+                prior=np.where(np.count_nonzero(members, axis=1) > 1, prior, 0.0)[:, None],
+                constant=none.constant - np.einsum("tm,tm->t", residual, scaled[..., n])[:, None],
+                slope=none.slope - np.einsum("tm,tmi->ti", residual, scaled[..., n + 1 :])[:, None],
+                matrix=none.matrix - np.einsum("tmi,tmj->tij", own, scaled[..., n + 1 :])[:, None],
+            )
+        )
+    empty = Forms(none.prior[:, :0], none.constant[:, :0], none.slope[:, :0], none.matrix[:, :0])
+    return empty.beside(*forms)
 
 
 def _loose(projector: Floats, design: Floats, prior: Floats, none: Forms, clear_m: Floats) -> Floats:

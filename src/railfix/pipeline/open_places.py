@@ -2,8 +2,8 @@
 
 A level is linear: it bounds the error along the tangent at the position. Where the line turns away, passes itself or
 branches, a satellite left out can move the position to a place that no tangent leads to. Under each hypothesis
-of the level (no fault, one faulty satellite, two) the sum of squared residuals (`off_tangent.Forms`) is evaluated along
-the line around the position, where a bound does not rule such places out.
+of the level (no fault, one faulty satellite, two, those of a side) the sum of squared residuals (`off_tangent.Forms`)
+is evaluated along the line around the position, where a bound does not rule such places out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact
 from railfix.kernels import compiled_by
-from railfix.pipeline.off_tangent import Forms, risk_off_tangent, whitened
+from railfix.pipeline.off_tangent import Forms, risk_off_tangent, whitened, without_sides
 from railfix.positioning.section_search import SearchIndex
 
 #: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
@@ -71,6 +71,7 @@ def places_beyond_the_level(
     scale: Floats,
     systems: Sequence[str],
     risk: RiskBudget,
+    sides: Masks,
     rows: Indices,
 ) -> Masks:
     """Return the epochs with places of the line that are open beyond the level, shape (T,).
@@ -94,6 +95,8 @@ def places_beyond_the_level(
     systems : sequence of str
         Constellation letter of each channel.
     risk : RiskBudget
+    sides : ndarray of bool, shape (T, S, M)
+        Low satellites of each side of the track.
     rows : ndarray of int
         Epochs to look at; those without a finite level are left out.
     """
@@ -109,15 +112,23 @@ def places_beyond_the_level(
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
         arrays: Iterable[Any] = (
             *(part.root_weight, part.clock, part.clock_covariance_m2, part.design, part.covariance_m2, part.prior),
-            *(part.misfit, noise, likely, _off_tangent_m(index, arc_m[block])),
+            *(part.misfit, noise, likely, sides[block]),
         )
-        arrays = (*map(np.ascontiguousarray, arrays), line.sigma_plan_m, line.sigma_height_m, risk.risk_per_sample)
+        arrays = (
+            *map(np.ascontiguousarray, arrays),
+            risk.side_prior,
+            _off_tangent_m(index, arc_m[block]),
+            line.sigma_plan_m,
+            line.sigma_height_m,
+            risk.risk_per_sample,
+        )
         near = np.flatnonzero(risk_off_tangent(*arrays) > risk.risk_per_sample)
         for some in np.array_split(near, 1 + 9 * len(near) // size) if len(near) else ():
             rest = block[some]
             parts, design, none = whitened(part.take(some), line.sigma_plan_m, line.sigma_height_m, noise[some])
             prior = np.where(parts.used, likely[parts.channel], 0.0)
-            spent = _risk_of_block(index, arc_m[rest], level_m[rest], parts, design, none, prior, risk)
+            of_sides = without_sides(parts, design, none, sides[rest], risk.side_prior)
+            spent = _risk_of_block(index, arc_m[rest], level_m[rest], parts, design, none, prior, of_sides, risk)
             result[rest] = spent > risk.risk_per_sample
     return result
 
@@ -188,26 +199,18 @@ def _risk_of_block(
     design: Floats,
     none: Forms,
     prior: Floats,
+    of_sides: Forms,
     risk: RiskBudget,
 ) -> Floats:
     """Return the probability that the true place lies beyond the level off the tangent, shape (T,)."""
     allowed = risk.risk_per_sample
-    forms = _beside(none, _without_one(parts, design, none, prior))
+    forms = none.beside(_without_one(parts, design, none, prior), of_sides)
     spent = _risk_beyond(forms, _around(index, arc_m, level_m, forms.radius_m(allowed)))
     left = np.flatnonzero(spent <= allowed)
     if len(left) and parts.channel.shape[1] > 1:
         pairs = _without_two(parts.take(left), design[left], none.take(left), prior[left])
         spent[left] += _risk_beyond(pairs, _around(index, arc_m[left], level_m[left], pairs.radius_m(allowed)))
     return spent
-
-
-def _beside(first: Forms, second: Forms) -> Forms:
-    return Forms(
-        *(
-            np.concatenate([getattr(first, name), getattr(second, name)], axis=1)
-            for name in ("prior", "constant", "slope", "matrix")
-        )
-    )
 
 
 def _without_one(parts: Compact, design: Floats, none: Forms, prior: Floats) -> Forms:

@@ -16,7 +16,7 @@ from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
-from railfix.pipeline.level_stage import protection_levels, risk_of
+from railfix.pipeline.level_stage import low_sides, protection_levels, risk_of
 from railfix.pipeline.off_map import off_map_epochs
 from railfix.pipeline.open_places import places_beyond_the_level
 from railfix.pipeline.reason_table import alone_on_their_clocks
@@ -135,7 +135,8 @@ def solve(
     level, open_elsewhere = None, np.zeros(len(ranges), dtype=bool)
     if config.protection == "on" and config.carrier != "float":
         heading = trajectory.heading_deg[np.maximum(constrained.section, 0)]
-        level = protection_levels(corrected, model, offset, raim, scale, heading, config)
+        sides = low_sides(corrected, heading, config.risk.side_elevation_deg)
+        level = protection_levels(corrected, model, offset, raim, scale, sides, config)
         systems = [name[0] for name in corrected.satellite.tolist()]
         bounding, bounding_scale = model, scale
         if config.error_model is not None:
@@ -152,6 +153,7 @@ def solve(
             bounding_scale,
             systems,
             risk_of(config),
+            sides,
             np.flatnonzero(place.section.excess > config.section.threshold),
         )
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)

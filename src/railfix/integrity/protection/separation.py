@@ -210,22 +210,42 @@ def without_group(full: AllInView, members: Masks | None) -> Remaining:
     columns = np.concatenate(
         [full.projector, full.gain_m[..., None], full.residual[..., None], full.map_gain_m], axis=2
     )
-    gone, blind = np.zeros((epochs, 4)), np.zeros(epochs, dtype=bool)
     if members is None:
-        return Remaining(full, columns, gone, blind)
-    limit, at = NO_EFFECT * np.sqrt(full.variance_m2), np.arange(epochs)
+        return Remaining(full, columns, np.zeros((epochs, 4)), np.zeros(epochs, dtype=bool))
+    rows, scaled, checked = one_after_the_other(columns, members)
+    limit = NO_EFFECT * np.sqrt(full.variance_m2)[:, None]
+    blind: Masks = np.any(~checked & (np.abs(rows[..., n]) > limit), axis=1)
+    gone = np.einsum("tm,tmc->tc", rows[..., n], scaled[..., n:])
+    return Remaining(full, columns - rows[..., :n].swapaxes(1, 2) @ scaled, gone, blind)
+
+
+def one_after_the_other(columns: Floats, members: Masks) -> tuple[Floats, Floats, Masks]:
+    """Leave out a group of channels, each from what those before it leave.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (T, n, n + c)
+        Projector of the residuals, and beside it what changes alike.
+    members : ndarray of bool, shape (T, n)
+
+    Returns
+    -------
+    rows, scaled : ndarray, shape (T, m, n + c)
+        Row of each member, and that over its part of the projector; 0 where nothing checks it. Without the group the
+        columns are less by ``rows[..., :n]^T scaled``.
+    checked : ndarray of bool, shape (T, m)
+    """
+    at = np.arange(len(columns))
     place = np.argsort(~members, axis=1, kind="stable")[:, : int(np.count_nonzero(members, axis=1).max(initial=0))]
     rows = columns[at[:, None], place] * members[at[:, None], place][..., None]
-    scaled = np.empty_like(rows)
+    scaled, checked = np.empty_like(rows), np.empty(place.shape, dtype=bool)
     for k in range(place.shape[1]):
         row, later = rows[:, k], rows[:, k + 1 :]
         share = row[at, place[:, k]]
-        checked = share > LEAST_REDUNDANCY
-        blind |= ~checked & (np.abs(row[:, n]) > limit)
-        scaled[:, k] = row / np.where(checked, share, np.inf)[:, None]
+        checked[:, k] = share > LEAST_REDUNDANCY
+        scaled[:, k] = row / np.where(checked[:, k], share, np.inf)[:, None]
         later -= np.take_along_axis(later, place[:, None, k, None], axis=2) * scaled[:, k, None]
-    gone = np.einsum("tm,tmc->tc", rows[..., n], scaled[..., n:])
-    return Remaining(full, columns - rows[..., :n].swapaxes(1, 2) @ scaled, gone, blind)
+    return rows, scaled, checked
 
 
 def without_map(full: AllInView, model: LinearModel, seen_m: Floats, information: Floats) -> WithoutMap:
