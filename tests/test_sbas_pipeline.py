@@ -24,7 +24,7 @@ from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import Config, parse_config
 from railfix.pipeline.fault_exclusion import fault_free
-from railfix.pipeline.level_stage import level_facts, protection_levels, standing
+from railfix.pipeline.level_stage import level_facts, low_sides, protection_levels, standing
 from railfix.pipeline.processor import AntennaResult
 from railfix.pipeline.results import AntennaState, State
 from railfix.pipeline.solve import place_on_line
@@ -175,8 +175,10 @@ def test_the_level_of_an_sbas_rests_on_its_sigmas_and_never_shrinks_them(
     nothing = (np.zeros(len(ranges)), np.zeros(len(ranges)))
     offset = cast("MapOffset", SimpleNamespace(beyond_m=nothing, seen=None))
 
+    sides = low_sides(one, np.zeros(len(scale)), config.risk.side_elevation_deg)
+
     def levels(scale: np.ndarray, settings: Config) -> np.ndarray:
-        return protection_levels(one, model_on_line, offset, raim, scale, np.zeros(len(scale)), settings).level.level_m
+        return protection_levels(one, model_on_line, offset, raim, scale, sides, settings).level.level_m
 
     has = np.isfinite(levels(scale, config))
     assert has.any()
