@@ -40,7 +40,7 @@ from railfix.simulate.demo_data import demo_files
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
-from railfix.tracking.tails import Tails
+from railfix.tracking.student_t import Tails
 from recordings_score import smartloc, trajectory_of
 
 DATA: Final = ROOT.parent / "shared" / "data" / "kinematic"

@@ -13,7 +13,7 @@ from railfix.tracking.predict import singer_step
 from railfix.tracking.robust import applied, log_evidence, prior_of, robust_update
 from railfix.tracking.rows import Rows
 from railfix.tracking.state import TrackState
-from railfix.tracking.tails import Tails
+from railfix.tracking.student_t import Tails
 from tracking_cases import Ride, bent_line, part, ride, wheel, without_epochs
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from importlib import import_module
 from importlib.util import find_spec
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,3 +123,21 @@ def test_a_wheel_wrong_in_the_kernel_would_be_seen() -> None:
     given, _ = _with("numba", epochs, line, sensors=replace(sensors, wheel_m=sensors.wheel_m * 1.0001))
     with pytest.raises(AssertionError):
         _assert_equal(given, expected, 1e-6)
+
+
+@pytest.mark.requirement("E5")
+@pytest.mark.parametrize("size", range(1, 12))
+def test_factors_and_products_by_four_rows_at_a_time_are_those_of_numpy(size: int) -> None:
+    algebra: Any = import_module("railfix.kernels.tracking.algebra")
+    random = np.random.default_rng(size)
+    root, right = random.normal(size=(size, size)), random.normal(size=(size, 5))
+    matrix = np.stack([np.full((size, size), np.nan), root @ root.T + np.eye(size)])
+    factor, lower, inverse, product = (np.full((12, 12), np.nan) for _ in range(4))
+    lower[:] = 0.0
+    log_determinant = algebra.factorise.py_func(matrix, 1, size, factor)
+    algebra.invert_factor.py_func(factor, size, lower)
+    algebra.square.py_func(lower, size, inverse[None], 0)
+    algebra.multiply.py_func(matrix, 1, right, size, 4, product)
+    np.testing.assert_allclose(log_determinant, np.linalg.slogdet(matrix[1])[1], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(inverse[:size, :size], np.linalg.inv(matrix[1]), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(product[:size, :4], matrix[1] @ right[:, :4], rtol=1e-12, atol=1e-12)

@@ -10,7 +10,7 @@ from railfix.core.geodesy import ecef_from_geodetic, enu_axes
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackingLimits, TrackState, track
-from railfix.tracking.hypotheses import judged
+from railfix.tracking.branches import judged
 from tracking_cases import LATITUDE, LONGITUDE, part, ride
 
 LAP_M = 800.0

@@ -1,10 +1,10 @@
-"""Where the time of `railfix run --filter off` goes, stage by stage, in one process.
+"""Where the time of `railfix run` goes, stage by stage, in one process.
 
 The two logs of an hour at 10 Hz of `bench_run.py` are simulated first, or taken from ``--run``. Each stage's own time
 without the stages inside it, the least of the rounds; threads that polars starts count as everything else.
 ``RAILFIX_KERNELS`` chooses the kernels::
 
-    python tests/benchmarks/bench_stages.py [--run FOLDER] [--rounds 3]
+    python tests/benchmarks/bench_stages.py [--run FOLDER] [--rounds 3] [--filter off|track]
 """
 
 from __future__ import annotations
@@ -53,6 +53,13 @@ STAGES: Final = (
     ("open places", "railfix.pipeline.solution", "places_beyond_the_level"),
     ("results", "railfix.pipeline.processor", "antenna_result"),
     ("results", "railfix.run.tally", "AntennaTally.add"),
+    ("filter: measurements", "railfix.pipeline.along_track", "gnss_epochs"),
+    ("filter: preparation", "railfix.tracking.filter", "prepared"),
+    ("filter: preparation", "railfix.tracking.filter", "Compiled.__init__"),
+    ("filter: recursion", "railfix.tracking.filter", "Compiled.advance"),
+    ("filter: starts and searches", "railfix.pipeline.along_track", "track"),
+    ("filter: positions", "railfix.pipeline.processor", "along_track"),
+    ("filter: rows of train.csv", "railfix.run.antennas", "train_table"),
     ("tables", "railfix.run.antennas", "positions_table"),
     ("tables", "railfix.run.output", "OutputFolder.append_csv"),
     ("tables", "railfix.run.output", "OutputFolder.append_parquet"),
@@ -117,6 +124,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, help="folder of a simulated run, made with --plain")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--filter", choices=("off", "track"), default="off")
     options = parser.parse_args()
     if "PYTHONDONTWRITEBYTECODE" in os.environ:  # an installed package has its compiled modules
         compileall.compile_dir(Path(railfix.__file__).parent, quiet=1)
@@ -142,7 +150,7 @@ def main() -> None:
             stages.spent.clear()
             begin = time.process_time()
             summary = run_files(
-                inputs, Config(filter="off"), out=Path(scratch) / f"out{number}", options=RunOptions(workers=1)
+                inputs, Config(filter=options.filter), out=Path(scratch) / f"out{number}", options=RunOptions(workers=1)
             )
             whole = time.process_time() - begin
             epochs = summary.tally.epochs

@@ -16,6 +16,7 @@ modes without a fault.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import lru_cache
 from typing import Final
 
@@ -23,8 +24,8 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from railfix.core.arrays import Floats, Masks, Strings
+from railfix.tracking.branches import begin, on_the_line
 from railfix.tracking.chunk import FORGOTTEN, Chunk
-from railfix.tracking.hypotheses import begin, on_the_line
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
@@ -50,6 +51,14 @@ JOINED: Final = 0.05
 #: Newton's steps for the level end when one is smaller than this [m].
 PRECISION_M: Final = 1e-7
 ROUNDS: Final = 20
+
+
+class SourceKind(IntEnum):
+    """Kind of a source of measurements that has a sub-filter, in the order of `Budget.prior`."""
+
+    SATELLITE = 0
+    CONSTELLATION = 1
+    SENSOR = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +179,8 @@ def levelled(
     kept = [
         k
         for k, name in enumerate(bank.without)
-        if not weak[k] and (kind_of(name) or (name in remembered and (name in names or not near[k])))
+        if not weak[k]
+        and (kind_of(name) is not SourceKind.SATELLITE or (name in remembered and (name in names or not near[k])))
     ]
     added = [name for name in names if name not in {bank.without[k] for k in kept}]
     # The filter itself is one without a source that it has not met.
@@ -240,9 +250,11 @@ def _sources(rows: Rows, satellite: Strings, limits: TrackingLimits) -> list[str
     ]
 
 
-def kind_of(name: str) -> int:
-    """Kind of a source, as `Budget` orders them: satellite, constellation, sensor."""
-    return 1 if name in CLOCKS else 2 if name in SENSORS.values() else 0
+def kind_of(name: str) -> SourceKind:
+    """Kind of a source: `G12` is a satellite, `G` a constellation, `wheel` a sensor."""
+    if name in CLOCKS:
+        return SourceKind.CONSTELLATION
+    return SourceKind.SENSOR if name in SENSORS.values() else SourceKind.SATELLITE
 
 
 def clock_of(satellite: str) -> str:
@@ -252,9 +264,9 @@ def clock_of(satellite: str) -> str:
 
 def _of(name: str, rows: Rows, satellite: Strings) -> Masks:
     """Rows of a source."""
-    if kind_of(name) == 2:
+    if kind_of(name) is SourceKind.SENSOR:
         return np.asarray(rows.kind == next(kind for kind, text in SENSORS.items() if text == name))
-    if kind_of(name) == 1:
+    if kind_of(name) is SourceKind.CONSTELLATION:
         return np.array([clock_of(str(other)) == name for other in satellite], dtype=np.bool_)
     return np.asarray(satellite == name)
 

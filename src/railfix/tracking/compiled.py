@@ -15,7 +15,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.timescale import seconds, timedelta
-from railfix.tracking import bank, clocks, hypotheses, misfit, predict, rows
+from railfix.tracking import bank, branches, clocks, misfit, predict, rows
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
@@ -104,7 +104,7 @@ class Compiled:
             or np.isnat(state.measured)
             or (state.bank is None and self.levels)
             or self.epochs.left[first]
-            or (state.weak_motion_s >= hypotheses.BESIDE_AFTER_S and state.hypotheses <= limits.most_hypotheses // 2)
+            or (state.weak_motion_s >= branches.BESIDE_AFTER_S and state.hypotheses <= limits.most_hypotheses // 2)
             or state.weak_motion_s >= limits.lost_motion_s
             or state.weak_code_s >= limits.lost_code_s
         ):
@@ -161,7 +161,7 @@ class Compiled:
             prior[:], k[:] = np.array(given.prior)[kinds], np.array(given.k_fault)[kinds]
             k_speed[:] = np.array(given.k_speed_fault)[kinds]
             start = np.full(1, limits.expired_sigma_m)
-            _, fresh = hypotheses.begin(np.zeros(1), start, len(state.satellite), self.line, limits)
+            _, fresh = branches.begin(np.zeros(1), start, len(state.satellite), self.line, limits)
             begun[:] = np.diagonal(fresh[0])[np.concatenate([full, _OF_EPOCH])]
         if names and state.bank is not None:
             at = [names.index(name) for name in state.bank.without if name in names]
@@ -267,12 +267,13 @@ def _work_space(layout: ModuleType, channels: int, unknowns: int, hypotheses: in
         "new_covariance": (room, unknowns, unknowns), "log_before": (room,), "log_after": (room,),
         "evidence": (room,), "joined": (2, room), "variance": (most,), "masked": (most,),
         "system": (room, size, size), "factor": (size, size), "lower": (size, size), "right": (max(size, room),),
+        "diagonal": (size,), "with_clock": (size,),
         "ordered": (most,), "part": (4,), "gain": (size, unknowns + 1), "less": (size, unknowns),
         "stepped": (width, unknowns), "faded": (unknowns,), "share": (size, 6), "sight": (channels, 7), "bend": (2,),
         "point": (2, 3), "axes": (2, 3, 3), "places": (room, 3), "place_axes": (room, 3, 3),
     }  # fmt: skip
     work = layout.Work(
-        **{name: np.empty(shape) for name, shape in shapes.items()},
+        **{name: np.zeros(shape) for name, shape in shapes.items()},
         anew=np.zeros((room, 2), dtype=np.bool_),
         source=np.zeros(sources, dtype=np.bool_),
         met=np.zeros(sources, dtype=np.bool_),
@@ -337,9 +338,9 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "direction_mps": rows.DIRECTION_MPS,
         "chord_m": rows.CHORD_M,
         "gravity_mps2": rows.GRAVITY_MPS2,
-        "beside_after_s": hypotheses.BESIDE_AFTER_S,
-        "switch": hypotheses.SWITCH,
-        "most_odds": hypotheses.MOST_ODDS,
+        "beside_after_s": branches.BESIDE_AFTER_S,
+        "switch": branches.SWITCH,
+        "most_odds": branches.MOST_ODDS,
         "level_risk": bank.budget(limits).risk,
         "level_k": bank.budget(limits).k,
         "level_k_speed": bank.budget(limits).k_speed,

@@ -11,11 +11,11 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Floats
 from railfix.tracking.bank import levelled
+from railfix.tracking.branches import judged, most_probable, on_the_line, surviving
 from railfix.tracking.chunk import Chunk, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
-from railfix.tracking.hypotheses import judged, most_probable, on_the_line, surviving
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from railfix.core.settings import Settings
-from railfix.tracking.tails import Tails
+from railfix.tracking.student_t import Tails
 
 
 class TrackingLimits(Settings):

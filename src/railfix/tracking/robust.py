@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Masks
 from railfix.tracking.rows import MOTION, Rows
 from railfix.tracking.state import Unknown
-from railfix.tracking.tails import Tails
+from railfix.tracking.student_t import Tails
 
 #: Share of a sensor's variance that no weight takes away: two sensors of the same combination keep it regular.
 SENSOR_FLOOR: Final = 1e-6

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.timescale import seconds
+from railfix.tracking.branches import BESIDE_AFTER_S, begin, beside, places, split
 from railfix.tracking.chunk import Chunk
-from railfix.tracking.hypotheses import BESIDE_AFTER_S, begin, beside, places, split
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted

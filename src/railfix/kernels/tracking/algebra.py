@@ -5,54 +5,105 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.layout import Work
+from railfix.kernels.compiling import borrowing
 
 
-@inner
-def invert(matrix: Floats, m: int, size: int, work: Work, result: Floats, to: int) -> float:
-    """Write the inverse of a symmetric matrix into `result[to]` by Cholesky; return log det of the matrix.
+@borrowing
+def factorise(matrix: Floats, m: int, size: int, factor: Floats) -> float:
+    """Write the upper Cholesky factor U of a symmetric matrix, U' U = `matrix[m]`; return log det of the matrix.
 
-    Of `matrix[m]` the upper half is read.
+    Of `matrix[m]` the upper half is read. Four rows at a time are taken off: half the time of one by one.
     """
-    factor, lower = work.factor, work.lower
-    log_determinant = 0.0
+    log_determinant, pivots = 0.0, 1.0
     for i in range(size):
         for j in range(i, size):
             factor[i, j] = matrix[m, i, j]
-    for k in range(size):
-        pivot = math.sqrt(max(factor[k, k], 1e-300))
-        log_determinant += math.log(pivot)
-        for j in range(k, size):
-            factor[k, j] /= pivot
-        for i in range(k + 1, size):
-            share = factor[k, i]
+        for k in range(0, i - 3, 4):
+            a, b, c, d = factor[k, i], factor[k + 1, i], factor[k + 2, i], factor[k + 3, i]
             for j in range(i, size):
-                factor[i, j] -= share * factor[k, j]
-    for k in range(size):
-        pivot = 1.0 / factor[k, k]
-        for i in range(k):
-            lower[k, i] = 0.0
-        for j in range(k):
-            share = factor[j, k] * pivot
-            for i in range(j + 1):
-                lower[k, i] -= share * lower[j, i]
-        lower[k, k] = pivot
-        for i in range(k + 1):
-            result[to, k, i] = 0.0
-    # result = lower' lower, its lower half first
-    for k in range(size):
-        for i in range(k + 1):
-            share = lower[k, i]
-            for j in range(i + 1):
-                result[to, i, j] += share * lower[k, j]
-    for i in range(size):
-        for j in range(i):
-            result[to, j, i] = result[to, i, j]
+                factor[i, j] -= a * factor[k, j] + b * factor[k + 1, j] + c * factor[k + 2, j] + d * factor[k + 3, j]
+        for k in range(i // 4 * 4, i):
+            a = factor[k, i]
+            for j in range(i, size):
+                factor[i, j] -= a * factor[k, j]
+        pivot = math.sqrt(max(factor[i, i], 1e-300))
+        pivots *= pivot
+        if i % 2 or i == size - 1:
+            log_determinant += math.log(pivots)
+            pivots = 1.0
+        scale = 1.0 / pivot
+        for j in range(i, size):
+            factor[i, j] *= scale
     return 2.0 * log_determinant
 
 
-@inner
+@borrowing
+def invert_factor(factor: Floats, size: int, lower: Floats) -> None:
+    """Write L, the inverse of U', into `lower`, whose upper half is 0: the inverse of U' U is L' L."""
+    for k in range(size):
+        for i in range(k):
+            lower[k, i] = 0.0
+        for j in range(0, k - 3, 4):
+            a, b, c, d = factor[j, k], factor[j + 1, k], factor[j + 2, k], factor[j + 3, k]
+            for i in range(j + 4):
+                lower[k, i] += a * lower[j, i] + b * lower[j + 1, i] + c * lower[j + 2, i] + d * lower[j + 3, i]
+        for j in range(k // 4 * 4, k):
+            a = factor[j, k]
+            for i in range(j + 1):
+                lower[k, i] += a * lower[j, i]
+        scale = 1.0 / factor[k, k]
+        for i in range(k):
+            lower[k, i] *= -scale
+        lower[k, k] = scale
+
+
+@borrowing
+def square(lower: Floats, size: int, result: Floats, to: int) -> None:
+    """Write L' L into `result[to]`."""
+    for i in range(size):
+        for j in range(i + 1):
+            result[to, i, j] = 0.0
+        for k in range(i, size - 3, 4):
+            a, b, c, d = lower[k, i], lower[k + 1, i], lower[k + 2, i], lower[k + 3, i]
+            for j in range(i + 1):
+                result[to, i, j] += a * lower[k, j] + b * lower[k + 1, j] + c * lower[k + 2, j] + d * lower[k + 3, j]
+        for k in range(i + (size - i) // 4 * 4, size):
+            a = lower[k, i]
+            for j in range(i + 1):
+                result[to, i, j] += a * lower[k, j]
+        for j in range(i):
+            result[to, j, i] = result[to, i, j]
+
+
+@borrowing
+def multiply(left: Floats, l: int, right: Floats, size: int, width: int, result: Floats) -> None:  # noqa: E741
+    """Write the product of `left[l]`, `size` squared, and the first `width` columns of `right` into `result`."""
+    for i in range(size):
+        for c in range(width):
+            result[i, c] = 0.0
+        for j in range(0, size - 3, 4):
+            a, b, d, e = left[l, i, j], left[l, i, j + 1], left[l, i, j + 2], left[l, i, j + 3]
+            for c in range(width):
+                result[i, c] += a * right[j, c] + b * right[j + 1, c] + d * right[j + 2, c] + e * right[j + 3, c]
+        for j in range(size // 4 * 4, size):
+            a = left[l, i, j]
+            for c in range(width):
+                result[i, c] += a * right[j, c]
+
+
+@borrowing
+def invert(matrix: Floats, m: int, size: int, factor: Floats, lower: Floats, result: Floats, to: int) -> float:
+    """Write the inverse of a symmetric matrix into `result[to]`; return log det of the matrix.
+
+    Of `matrix[m]` the upper half is read; `factor` and `lower` are work space, the upper half of `lower` is 0.
+    """
+    log_determinant = factorise(matrix, m, size, factor)
+    invert_factor(factor, size, lower)
+    square(lower, size, result, to)
+    return log_determinant
+
+
+@borrowing
 def median(values: Floats, h: int, first: int, size: int, ordered: Floats) -> float:
     """Median of a part of a row; `ordered` is work space."""
     for i in range(size):
@@ -67,7 +118,7 @@ def median(values: Floats, h: int, first: int, size: int, ordered: Floats) -> fl
     return float(0.5 * (ordered[size // 2 - 1] + ordered[size // 2]))
 
 
-@inner
+@borrowing
 def restart(spread: Floats, unknown: int, variance: float, h: int) -> None:
     """Make an unknown independent of all else."""
     for c in range(spread.shape[1]):
@@ -76,7 +127,7 @@ def restart(spread: Floats, unknown: int, variance: float, h: int) -> None:
     spread[h, unknown, unknown] = variance
 
 
-@inner
+@borrowing
 def log_sum(values: Floats, size: int) -> float:
     """Logarithm of the sum of exponentials."""
     largest = values[0]
@@ -88,7 +139,7 @@ def log_sum(values: Floats, size: int) -> float:
     return float(largest + math.log(total))
 
 
-@inner
+@borrowing
 def most_probable(values: Floats, size: int, switch: float) -> int:
     """Return the most probable hypothesis; the first unless another is `switch` times as probable."""
     best = 0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import inner
+from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.layout import PLACE, Course, Work
 
 
-@inner
+@borrowing
 def _on_course(course: Course, arc: float) -> float:
     """Arc length on the line of a place beyond an end of a closed one (`railfix.tracking.line.Line.round_m`)."""
     first, last = course.arc_m[0], course.arc_m[-1]
@@ -20,7 +20,7 @@ def _on_course(course: Course, arc: float) -> float:
     return arc
 
 
-@inner
+@borrowing
 def point_at(course: Course, arc: float, point: Floats, axes: Floats, p: int) -> None:
     """Write point and axes of the line at an arc length into row `p`."""
     arc = _on_course(course, arc)
@@ -45,7 +45,7 @@ def point_at(course: Course, arc: float, point: Floats, axes: Floats, p: int) ->
             axes[p, k, c] /= square
 
 
-@inner
+@borrowing
 def find_ends(course: Course, now: float, before: float, work: Work) -> None:
     """Write points and axes now and at the epoch before, and the change of the tangent between to the right and up."""
     point_at(course, now, work.point, work.axes, 0)
@@ -57,7 +57,7 @@ def find_ends(course: Course, now: float, before: float, work: Work) -> None:
             bend[k] += (axes[0, 0, c] - axes[1, 0, c]) * axes[0, k + 1, c]
 
 
-@inner
+@borrowing
 def gradient_at(course: Course, arc: float) -> float:
     """Gradient of the line, linear between the middles of segments."""
     middle_m, gradient = course.middle_m, course.gradient
@@ -77,9 +77,9 @@ def gradient_at(course: Course, arc: float) -> float:
     return float((1.0 - share) * gradient[low - 1] + share * gradient[low])
 
 
-@inner
+@borrowing
 def onto_line(course: Course, reach_m: float, work: Work, h: int) -> None:
-    """Put a place a little beyond an end of the line on it (`railfix.tracking.hypotheses.on_the_line`)."""
+    """Put a place a little beyond an end of the line on it (`railfix.tracking.branches.on_the_line`)."""
     mean, covariance = work.new_mean, work.new_covariance
     excess = min(max(mean[h, PLACE], course.start_m), course.end_m) - mean[h, PLACE]
     variance = covariance[h, PLACE, PLACE]

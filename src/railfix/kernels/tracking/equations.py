@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.kernels.compiling import inner
+from railfix.kernels.compiling import borrowing
 from railfix.kernels.sight import TURN, sight
 from railfix.kernels.tracking.course import find_ends, gradient_at
 from railfix.kernels.tracking.layout import (
@@ -43,7 +43,7 @@ from railfix.kernels.tracking.layout import (
 )
 
 
-@inner
+@borrowing
 def write_equations(
     epochs: Epochs,
     t: int,
@@ -158,7 +158,7 @@ def write_equations(
             value[h, i] = measured - mean[h, PLACE]
 
 
-@inner
+@borrowing
 def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: int) -> None:
     """Take over the equations of the sensors in row `best`, about another mean, `work.mean[h]`."""
     mean, sensed, sensors = work.mean, work.sensed, rows.sensors
@@ -188,7 +188,7 @@ def move_sensor_equations(active: Active, rows: Rows, best: int, work: Work, h: 
         )
 
 
-@inner
+@borrowing
 def combine(epochs: Epochs, t: int, active: Active, floor: float, rows: Rows, work: Work, h: int) -> None:
     """Write the covariance of the combinations with the unknowns and with each other, in their standard deviations.
 

@@ -234,6 +234,8 @@ class Work(NamedTuple):
     factor: Floats
     lower: Floats
     right: Floats
+    diagonal: Floats
+    with_clock: Floats
     ordered: Floats
     part: Floats
     source: Masks

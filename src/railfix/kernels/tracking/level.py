@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from railfix.kernels.compiling import inner
+from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import invert, restart
 from railfix.kernels.tracking.course import find_ends, onto_line
 from railfix.kernels.tracking.equations import combine, move_sensor_equations, write_equations
@@ -31,7 +31,7 @@ from railfix.kernels.tracking.prediction import add_bend, predict
 from railfix.kernels.tracking.update import apply_update, first_weights, reweight
 
 
-@inner
+@borrowing
 def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, best: int, work: Work) -> None:
     """Mark the sources that an epoch needs a sub-filter for, and as `met` the clocks of all satellites in view."""
     clocks = len(bank.running) - SENSORS - slots
@@ -56,7 +56,7 @@ def _sources(epochs: Epochs, t: int, rows: Rows, bank: Subfilters, slots: int, b
             source[k] = source[k] or best > 0
 
 
-@inner
+@borrowing
 def _begin(bank: Subfilters, b: int, copied: bool, best: int, work: Work, h: int) -> None:
     """Begin a sub-filter with the state of the filter, or with what is known of nothing but the place."""
     mean, spread = work.mean, work.spread
@@ -72,7 +72,7 @@ def _begin(bank: Subfilters, b: int, copied: bool, best: int, work: Work, h: int
         mean[h, PLACE] = mean[h, width - OF_EPOCH + OLD_PLACE] = mean[best, PLACE]
 
 
-@inner
+@borrowing
 def _update(
     epochs: Epochs,
     t: int,
@@ -96,14 +96,15 @@ def _update(
     write_equations(epochs, t, course, active, numbers, rows, 1.0, work, h)
     move_sensor_equations(active, rows, best, work, h)
     combine(epochs, t, active, numbers.sensor_floor, rows, work, h)
-    invert(work.own, h, rows.counts[0] + COMBINED + rows.counts[3], work, work.information, h)
+    size = rows.counts[0] + COMBINED + rows.counts[3]
+    invert(work.own, h, size, work.factor, work.lower, work.information, h)
     first_weights(rows, work.masked, numbers.degrees, 0.0, 0.0, work, h, h)
     reweight(rows, work.masked, numbers.degrees, numbers.level_passes, work, h, h, h)
     apply_update(rows, work, h)
     onto_line(course, numbers.start_sigma_m, work, h)
 
 
-@inner
+@borrowing
 def _contradicted(rows: Rows, numbers: Numbers, work: Work, h: int) -> bool:
     """Return whether the measurements that a sub-filter uses, codes or phases and Dopplers, have lost their weight."""
     nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
@@ -120,7 +121,7 @@ def _contradicted(rows: Rows, numbers: Numbers, work: Work, h: int) -> bool:
     return weak
 
 
-@inner
+@borrowing
 def advance_subfilters(
     epochs: Epochs,
     t: int,
@@ -182,7 +183,7 @@ def advance_subfilters(
                 bank.covariance[b, c, e] = work.new_covariance[h, c, e]
 
 
-@inner
+@borrowing
 def level_of(place: float, sigma: float, bank: Subfilters, numbers: Numbers, answers: Answers, t: int) -> float:
     """Return the level of a place, write its parts (`railfix.tracking.bank.level_m`)."""
     noise, apart = numbers.level_k * sigma, math.nan
@@ -215,7 +216,7 @@ def level_of(place: float, sigma: float, bank: Subfilters, numbers: Numbers, ans
     return level
 
 
-@inner
+@borrowing
 def speed_bound(speed: float, sigma: float, bank: Subfilters, numbers: Numbers) -> float:
     """Return the bound of the error of the speed (`railfix.tracking.bank.speed_bound_mps`)."""
     bound = numbers.level_k_speed * sigma

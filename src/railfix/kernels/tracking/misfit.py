@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.algebra import invert
+from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.algebra import factorise
 from railfix.kernels.tracking.layout import MAP_SCALE, SHIFT, SHIFT_VARIANCE, Numbers, Rows, Work
 
 
-@inner
+@borrowing
 def code_shift(rows: Rows, clipped: float, work: Work, h: int) -> float:
     """Shift of the place that the codes ask for over its standard deviation (`railfix.tracking.misfit`)."""
     nc, root, own, design, value = rows.counts[0], work.root, work.own, work.design, work.value
-    system, inverse = work.system, work.after
+    system, factor, right = work.system, work.factor, work.right
     clock = root[h, nc]
     for i in range(nc):
         for j in range(i, nc):
@@ -24,19 +24,25 @@ def code_shift(rows: Rows, clipped: float, work: Work, h: int) -> float:
                 + clock * clock
             )
         system[h, i, i] += work.variance[i] / min(work.weight[h, i], 1.0)
-    invert(system, h, nc, work, inverse, h)
+    factorise(system, h, nc, factor)
+    # both solved forward: the products of U'^-1 by the design with itself and with the values are what is wanted
     score, information = 0.0, 0.0
     for i in range(nc):
-        for j in range(nc):
-            part = design[h, i, 0] * inverse[h, i, j]
-            score += part * value[h, j]
-            information += part * design[h, j, 0]
+        right[i] = design[h, i, 0]
+        work.ordered[i] = value[h, i]
+    for i in range(nc):
+        solved, other = right[i] / factor[i, i], work.ordered[i] / factor[i, i]
+        score += solved * other
+        information += solved * solved
+        for j in range(i + 1, nc):
+            right[j] -= factor[i, j] * solved
+            work.ordered[j] -= factor[i, j] * other
     if not information > 0.0:
         return 0.0
     return float(min(max(score / math.sqrt(information), -clipped), clipped))
 
 
-@inner
+@borrowing
 def learn_map(scalars: Floats, shift: float, dt: float, numbers: Numbers) -> None:
     """Take an epoch's shift into the running mean, and raise or lower the error of the map's lengths."""
     dt = min(dt, 1.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import inner
+from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.layout import (
     CODE_CLOCK,
     CODE_PLACE,
@@ -30,7 +30,7 @@ from railfix.kernels.tracking.layout import (
 )
 
 
-@inner
+@borrowing
 def predict(
     epochs: Epochs,
     t: int,
@@ -136,7 +136,7 @@ def predict(
     spread[to, n + CODE_CLOCK, n + CODE_CLOCK] = numbers.code_clock_sigma_m**2
 
 
-@inner
+@borrowing
 def add_bend(numbers: Numbers, work: Work, h: int) -> None:
     """Add what the line bends by where the place is uncertain to the displacements across."""
     spread, bend, n = work.spread, work.bend, work.mean.shape[1] - OF_EPOCH

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import inner, kernel
+from railfix.kernels.compiling import borrowing, kernel
 from railfix.kernels.tracking.algebra import invert, median, most_probable, restart
+from railfix.kernels.tracking.branches import keep_hypotheses, reweigh
 from railfix.kernels.tracking.course import onto_line
 from railfix.kernels.tracking.equations import combine, write_equations
-from railfix.kernels.tracking.hypotheses import keep_hypotheses, reweigh
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
     C_SPEED,
@@ -49,7 +49,7 @@ from railfix.kernels.tracking.prediction import add_bend, predict
 from railfix.kernels.tracking.update import apply_update, evidence_of, first_weights, reweight
 
 
-@inner
+@borrowing
 def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, memory: Memory) -> bool:
     """Return whether numpy has to do an epoch: a restart, a search, or places that go round a closed line."""
     scalars, count = memory.scalars, int(memory.scalars[HYPOTHESES])
@@ -63,7 +63,7 @@ def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, mem
     return left
 
 
-@inner
+@borrowing
 def _choose_rows(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows: Rows) -> bool:
     """List the channels of each kind of measurement; return False where numpy has to seek places first."""
     counts = rows.counts
@@ -84,7 +84,7 @@ def _choose_rows(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows:
     return known and not (counts[0] > 0 and epochs.time_s[t] - memory.scalars[MEASURED] > numbers.gap_s)
 
 
-@inner
+@borrowing
 def _choose_sensors(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, rows: Rows, work: Work) -> None:
     """List the sensors that have measured; a wheel without a sign needs a direction."""
     count = int(memory.scalars[HYPOTHESES])
@@ -98,7 +98,7 @@ def _choose_sensors(epochs: Epochs, t: int, numbers: Numbers, memory: Memory, ro
             rows.counts[3] += 1
 
 
-@inner
+@borrowing
 def _forget(epochs: Epochs, t: int, active: Active, memory: Memory, bank: Subfilters) -> None:
     """Make the code errors of satellites that come into view independent of all else."""
     for i in range(epochs.fresh.shape[1]):
@@ -113,7 +113,7 @@ def _forget(epochs: Epochs, t: int, active: Active, memory: Memory, bank: Subfil
                     restart(bank.covariance, k, 1.0, b)
 
 
-@inner
+@borrowing
 def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covariance: Floats, h: int) -> None:
     """Copy a row of the compact unknowns."""
     for c in range(mean.shape[1]):
@@ -122,7 +122,7 @@ def _take(mean: Floats, covariance: Floats, to: int, new_mean: Floats, new_covar
             covariance[to, c, e] = new_covariance[h, c, e]
 
 
-@inner
+@borrowing
 def _coast(
     epochs: Epochs,
     t: int,
@@ -144,7 +144,7 @@ def _coast(
             _take(bank.mean, bank.covariance, b, work.mean, work.spread, h)
 
 
-@inner
+@borrowing
 def _write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, variance: Floats) -> None:
     """Write the variances of the measurements, with what has been learnt of phases and Dopplers."""
     nc, nph, nd = rows.counts[0], rows.counts[1], rows.counts[2]
@@ -158,7 +158,7 @@ def _write_variances(epochs: Epochs, t: int, memory: Memory, rows: Rows, varianc
         variance[nc + nph + nd + j] = epochs.sensor_sigma[t, rows.sensors[j]] ** 2
 
 
-@inner
+@borrowing
 def _start_clocks(numbers: Numbers, rows: Rows, work: Work, h: int) -> None:
     """Take the median of each kind of innovation into its clock; clocks that have stepped begin anew."""
     mean, spread, value = work.mean, work.spread, work.value
@@ -183,7 +183,7 @@ def _start_clocks(numbers: Numbers, rows: Rows, work: Work, h: int) -> None:
         begin = end
 
 
-@inner
+@borrowing
 def _doubtful(numbers: Numbers, rows: Rows, work: Work, h: int) -> bool:
     """Return whether codes, or phases and Dopplers, have lost so much weight that a second start is worth trying."""
     nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
@@ -197,7 +197,7 @@ def _doubtful(numbers: Numbers, rows: Rows, work: Work, h: int) -> bool:
     return doubtful
 
 
-@inner
+@borrowing
 def _second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -> None:
     """Fit again with weights from innovations with place and speed set free, in row `other`; keep the better fit."""
     own, root, sensed, share = work.own, work.root, work.sensed, work.right
@@ -220,7 +220,7 @@ def _second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) 
         for i in range(size):
             for j in range(i, size):
                 own[other, i, j] += freedom * share[i] * share[j]
-    invert(own, other, size, work, work.information, other)
+    invert(own, other, size, work.factor, work.lower, work.information, other)
     first_weights(rows, work.variance, numbers.degrees, numbers.freedom_place, numbers.freedom_speed, work, h, other)
     log_after = 0.0
     for by in (other, h):
@@ -237,7 +237,7 @@ def _second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) 
             work.fitted[h, i] = work.fitted[other, i]
 
 
-@inner
+@borrowing
 def _update(
     epochs: Epochs,
     t: int,
@@ -268,7 +268,7 @@ def _update(
                 for i in range(gnss + rows.counts[3]):
                     work.innovation[h, i] = work.value[h, i]
             combine(epochs, t, active, numbers.sensor_floor, rows, work, h)
-            work.log_before[h] = invert(work.own, h, size, work, work.information, h)
+            work.log_before[h] = invert(work.own, h, size, work.factor, work.lower, work.information, h)
             if turn == 0:
                 first_weights(rows, work.variance, numbers.degrees, 0.0, 0.0, work, h, h)
                 if h == going and nc >= numbers.misfit_codes:
@@ -290,7 +290,7 @@ def _update(
     return shift
 
 
-@inner
+@borrowing
 def _learn(
     numbers: Numbers,
     memory: Memory,
@@ -341,7 +341,7 @@ def _learn(
         answers.sensed[t, rows.sensors[j]] = innovation[best, gnss + j]
 
 
-@inner
+@borrowing
 def _finish(
     t: int,
     best: int,

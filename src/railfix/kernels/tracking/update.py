@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 
 from railfix.core.arrays import Floats
-from railfix.kernels.compiling import inner
-from railfix.kernels.tracking.algebra import invert, median
+from railfix.kernels.compiling import borrowing
+from railfix.kernels.tracking.algebra import factorise, invert_factor, median, multiply, square
 from railfix.kernels.tracking.layout import C_RIGHT, C_WAY, COMBINED, Rows, Work
 
 
-@inner
+@borrowing
 def weight_of(square: float, late: bool, degrees: tuple[float, float]) -> float:
     """Weight of a measurement by its square over its variance: `railfix.tracking.robust.Tails`."""
     own = degrees[1] if late else degrees[0]
     return (degrees[0] + 1.0) / degrees[0] * own / (own + square)
 
 
-@inner
+@borrowing
 def first_weights(
     rows: Rows,
     variance: Floats,
@@ -64,14 +64,14 @@ def first_weights(
         weight[to, i] = weight_of(value[h, i] * value[h, i] / (spread + variance[i]), False, degrees)
 
 
-@inner
+@borrowing
 def reweight(
     rows: Rows, variance: Floats, degrees: tuple[float, float], passes: int, work: Work, h: int, by: int, to: int
 ) -> float:
     """Rounds of reweighting; return log det of the covariance of the combinations after the epoch."""
     design, value, root, information, system = work.design, work.value, work.root, work.information, work.system
-    change, after, weight, right = work.change, work.after, work.weight, work.right
-    residual, spread = work.residual, work.fitted
+    change, weight, right, diagonal, with_clock = work.change, work.weight, work.right, work.diagonal, work.with_clock
+    residual, spread, factor, lower = work.residual, work.fitted, work.factor, work.lower
     nc, nph, ns = rows.counts[0], rows.counts[1], rows.counts[3]
     gnss, size = nc + nph + rows.counts[2], nc + COMBINED + ns
     log_determinant = 0.0
@@ -105,42 +105,54 @@ def reweight(
             a = root[h, k] * weight[to, i] / variance[i]
             system[to, k, k] += a * root[h, k]
             right[k] += a * value[h, i]
-        log_determinant = -invert(system, to, size, work, after, to)
+        log_determinant = -factorise(system, to, size, factor)
+        invert_factor(factor, size, lower)
         for i in range(size):
-            total = 0.0
-            for j in range(size):
-                total += after[to, i, j] * right[j]
-            change[to, i] = total
+            change[to, i] = 0.0
+            diagonal[i] = with_clock[i] = 0.0
+        for k in range(size):
+            solved = right[k] / factor[k, k]
+            for i in range(k + 1, size):
+                right[i] -= factor[k, i] * solved
+            for i in range(k + 1):
+                change[to, i] += solved * lower[k, i]
+                diagonal[i] += lower[k, i] * lower[k, i]
+        for k in range(nc, size):
+            for i in range(nc + 1):
+                with_clock[i] += lower[k, nc] * lower[k, i]
         for i in range(nc):
             residual[to, i] = value[h, i] - root[h, i] * change[to, i] - clock * change[to, nc]
             spread[to, i] = (
-                root[h, i] * root[h, i] * after[to, i, i]
-                + 2.0 * root[h, i] * clock * after[to, i, nc]
-                + clock * clock * after[to, nc, nc]
+                root[h, i] * root[h, i] * diagonal[i]
+                + 2.0 * root[h, i] * clock * with_clock[i]
+                + clock * clock * with_clock[nc]
             )
         for i in range(nc, gnss):
             base = nc + C_WAY if i < nc + nph else nc + C_RIGHT
-            fitted, square = 0.0, 0.0
+            fitted, variance_of_fit = 0.0, 0.0
             for c in range(4):
                 part[c] = design[h, i, c] * root[h, base + c]
                 fitted += part[c] * change[to, base + c]
-            for c in range(4):
-                for e in range(4):
-                    square += part[c] * part[e] * after[to, base + c, base + e]
+            for k in range(base, size):
+                along = 0.0
+                for c in range(4):
+                    along += lower[k, base + c] * part[c]
+                variance_of_fit += along * along
             residual[to, i] = value[h, i] - fitted
-            spread[to, i] = square
+            spread[to, i] = variance_of_fit
         for j in range(ns):
             i, k = gnss + j, nc + COMBINED + j
             residual[to, i] = value[h, i] - root[h, k] * change[to, k]
-            spread[to, i] = root[h, k] * root[h, k] * after[to, k, k]
+            spread[to, i] = root[h, k] * root[h, k] * diagonal[k]
         if turn < passes - 1:
             for i in range(gnss + ns):
-                square = (residual[to, i] ** 2 + spread[to, i]) / variance[i]
-                weight[to, i] = weight_of(square, residual[to, i] > 0.0 and i < nc, degrees)
+                relative = (residual[to, i] ** 2 + spread[to, i]) / variance[i]
+                weight[to, i] = weight_of(relative, residual[to, i] > 0.0 and i < nc, degrees)
+    square(lower, size, work.after, to)
     return log_determinant
 
 
-@inner
+@borrowing
 def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work: Work, h: int, to: int) -> float:
     """Logarithm of the evidence of the measurements, for the fit in row `to`."""
     residual, variance, change, information = work.residual, work.variance, work.change, work.information
@@ -160,27 +172,18 @@ def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work
     return float(-0.5 * (usual + 1.0) / usual * fit - 0.5 * away + 0.5 * (log_after - work.log_before[h]))
 
 
-@inner
+@borrowing
 def apply_update(rows: Rows, work: Work, h: int) -> None:
     """Write mean and covariance of the compact unknowns after the epoch, and behind them the mean of the old place."""
-    mean, spread, cross, own, information = work.mean, work.spread, work.cross, work.own, work.information
-    after, change, gain, less = work.after, work.change, work.gain, work.less
+    mean, spread, cross, system = work.mean, work.spread, work.cross, work.system
+    own, after, change, gain, less = work.own, work.after, work.change, work.gain, work.less
     new_mean, new_covariance = work.new_mean, work.new_covariance
     size, n = rows.counts[0] + COMBINED + rows.counts[3], new_covariance.shape[1]
+    multiply(work.information, h, cross[h], size, n + 1, gain)
     for i in range(size):
-        for c in range(n + 1):
-            gain[i, c] = 0.0
         for j in range(size):
-            share = information[h, i, j]
-            for c in range(n + 1):
-                gain[i, c] += share * cross[h, j, c]
-    for i in range(size):
-        for c in range(n):
-            less[i, c] = 0.0
-        for j in range(size):
-            share = own[h, i, j] - after[h, i, j]
-            for c in range(n):
-                less[i, c] += share * gain[j, c]
+            system[h, i, j] = own[h, i, j] - after[h, i, j]
+    multiply(system, h, gain, size, n, less)
     for c in range(n + 1):
         new_mean[h, c] = mean[h, c]
     for i in range(size):
@@ -189,11 +192,13 @@ def apply_update(rows: Rows, work: Work, h: int) -> None:
     for c in range(n):
         for e in range(c + 1):
             new_covariance[h, c, e] = spread[h, c, e]
-    for i in range(size):
-        for c in range(n):
-            share = gain[i, c]
+        for i in range(0, size - 3, 4):
+            p, q, r, s = gain[i, c], gain[i + 1, c], gain[i + 2, c], gain[i + 3, c]
             for e in range(c + 1):
-                new_covariance[h, c, e] -= share * less[i, e]
-    for c in range(n):
+                new_covariance[h, c, e] -= p * less[i, e] + q * less[i + 1, e] + r * less[i + 2, e] + s * less[i + 3, e]
+        for i in range(size // 4 * 4, size):
+            p = gain[i, c]
+            for e in range(c + 1):
+                new_covariance[h, c, e] -= p * less[i, e]
         for e in range(c):
             new_covariance[h, e, c] = new_covariance[h, c, e]

@@ -1,19 +1,19 @@
-"""Probabilities of hypotheses, and which of them go on (`railfix.tracking.hypotheses`)."""
+"""Probabilities of hypotheses, and which of them go on (`railfix.tracking.branches`)."""
 
 from __future__ import annotations
 
 import math
 
-from railfix.kernels.compiling import inner
+from railfix.kernels.compiling import borrowing
 from railfix.kernels.tracking.algebra import log_sum, most_probable
 from railfix.kernels.tracking.course import point_at
 from railfix.kernels.tracking.layout import PLACE, Course, Memory, Numbers, Rows, Work
 from railfix.kernels.tracking.update import evidence_of
 
 
-@inner
+@borrowing
 def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: Work, count: int) -> None:
-    """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.hypotheses`)."""
+    """Update the probabilities of hypotheses by the evidence of an epoch (`railfix.tracking.branches`)."""
     log_probability, places, after = memory.log_probability, work.places, work.right
     best = 0
     for h in range(count):
@@ -34,7 +34,7 @@ def reweigh(course: Course, numbers: Numbers, rows: Rows, memory: Memory, work: 
         log_probability[h] = after[h] - total
 
 
-@inner
+@borrowing
 def keep_hypotheses(memory: Memory, numbers: Numbers, work: Work, count: int) -> int:
     """Order the hypotheses, join twins, drop the improbable; return how many are left."""
     mean, covariance, log_probability = memory.mean, memory.covariance, memory.log_probability
