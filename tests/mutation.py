@@ -40,7 +40,7 @@ TESTS: Final = {
     "pipeline/received": "received",
     "pipeline/along_track": "train_output tracking",
     "pipeline/train_table": "train_output",
-    "pipeline/open_places": "open_places",
+    "integrity/protection/open_places": "open_places",
     "pipeline/locate": "locate",
     "pipeline": "pipeline_reasons settings range_corrections sbas_pipeline carrier_stage screen_columns "
     "pipeline_couplings pipeline",

@@ -16,12 +16,11 @@ from integrity_recordings import ranges_of
 from railfix import kernels
 from railfix.core.geodesy import elevation_azimuth, range_with_rotation
 from railfix.core.reasons import Status
-from railfix.integrity.protection import SATELLITE_PRIOR, RiskBudget
+from railfix.integrity.protection import SATELLITE_PRIOR, RiskBudget, open_places
+from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.raim import constrained_model
 from railfix.io.rinex import read_navigation, read_observations
-from railfix.pipeline import open_places
 from railfix.pipeline.config import Config
-from railfix.pipeline.open_places import places_beyond_the_level
 from railfix.positioning.section_search import SearchIndex
 from railfix.run.processor import processor_of
 from railfix.simulate.demonstration import demo_inputs

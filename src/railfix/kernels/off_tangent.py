@@ -1,4 +1,4 @@
-"""Compiled functions of `railfix.pipeline`: distance to parts of a line off a tangent, bound of the risk there."""
+"""Compiled functions of `railfix.integrity.protection`: distance to parts of a line off a tangent, risk there."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.kernels.compiling import inner, kernel
 
 #: `railfix.integrity.raim.exclusion.LEAST_REDUNDANCY`.
 _LEAST_REDUNDANCY = 1e-9
-#: Of `railfix.pipeline.open_places`.
+#: Of `railfix.integrity.protection.open_places`.
 _ALONG, _CLEAR_M, _ON_TANGENT_M = 0.9945, 200.0, 1e-3
 
 

@@ -11,6 +11,7 @@ from scipy.special import chdtri, expit
 from railfix.core.arrays import Codes, Floats, Masks
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
+from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
@@ -18,7 +19,6 @@ from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
 from railfix.pipeline.level_stage import low_sides, protection_levels, risk_of
 from railfix.pipeline.off_map import off_map_epochs
-from railfix.pipeline.open_places import places_beyond_the_level
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
 from railfix.pipeline.solve import Place, place_on_line, redundancy_of

@@ -113,7 +113,7 @@ class SearchIndex:
         Of its points.
     off_tangent_m : ndarray, shape (V - 1,) [m]
         Distance of each section from the parts of the line off its tangent, filled in where a train comes along
-        (`pipeline.open_places`); NaN elsewhere.
+        (`integrity.protection.open_places`); NaN elsewhere.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:

@@ -17,12 +17,12 @@ import numpy as np
 from scipy.special import ndtr
 
 from railfix.core.arrays import Floats, Indices, Masks
-from railfix.integrity.protection import RiskBudget
+from railfix.integrity.protection.off_tangent import Forms, risk_off_tangent, whitened, without_sides
+from railfix.integrity.protection.risk import RiskBudget
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
 from railfix.integrity.raim.model import Compact
 from railfix.kernels import compiled_by
-from railfix.pipeline.off_tangent import Forms, risk_off_tangent, whitened, without_sides
 from railfix.positioning.section_search import SearchIndex
 
 #: Cosine of the angle off the tangent (6 deg) within which the linear model of the level holds.
