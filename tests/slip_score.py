@@ -48,6 +48,8 @@ class Score:
     flagged: list[float] = field(default_factory=list)
     way_m: list[float] = field(default_factory=list)
     alarms: int = 0
+    #: Of these, carries that the end of a slip has not released within 5 s.
+    held: int = 0
     hours: float = 0.0
 
 
@@ -142,7 +144,9 @@ def count(score: Score, t: np.ndarray, state: np.ndarray, way: np.ndarray, simul
         k, m = np.searchsorted(t, [slip.start_s - 1.0, slip.end_s + 3.0])
         chainage = simulation.motion.at(t[[k, m]])[0]
         score.way_m.append(float(abs(way[m] - way[k]) - rolling * abs(chainage[1] - chainage[0])))
-    score.alarms += int(np.count_nonzero(np.diff((flagged & ~covered).astype(int)) == 1))
+    raised = np.flatnonzero(np.diff((flagged & ~covered).astype(int)) == 1)
+    score.alarms += len(raised)
+    score.held += int(np.count_nonzero(flagged[raised]))
     score.hours += (t[-1] - t[0]) / 3600.0
 
 
@@ -166,8 +170,8 @@ def table(scores: dict[str, Score], file: TextIO) -> None:
         print(
             f"{name:13s} {score.slips} slips in {score.hours:.1f} h: missed {len(score.missed)}, found after {late} s, "
             f"instants flagged {100 * np.mean(score.flagged):3.0f} %, false alarms {score.alarms} "
-            f"({score.alarms / score.hours:.2f} an hour), way p50 {np.median(way):.2f} "
-            f"p95 {np.percentile(way, 95):.2f} largest {way.max():.2f} m, "
+            f"({score.alarms / score.hours:.2f} an hour; {score.held} are carries not released), "
+            f"way p50 {np.median(way):.2f} p95 {np.percentile(way, 95):.2f} largest {way.max():.2f} m, "
             f"within 0.15 m {100 * np.mean(way <= 0.15):.0f} %",
             file=file,
             flush=True,
