@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -77,6 +77,17 @@ def test_the_papers_rule_misses_slow_slips_that_the_map_shows() -> None:
     case = motion(100.0, weak)
     assert not np.isin(case.run(rule="p2").state, SLIPPING).any()
     assert np.isin(case.run().state, SLIPPING).any()
+
+
+@pytest.mark.requirement("E1")
+def test_a_long_slip_is_released_though_the_carried_speed_has_drifted() -> None:
+    """8 s of a 5 % slip, in which the accelerometer is off by 0.02 m/s2: 0.16 m/s and more at its end."""
+    case = motion(110.0, [(75.0, 8.0, 0.3)])
+    slip = (case.time_s > 75.0) & (case.time_s < 83.0)
+    case = replace(case, force=case.force + 0.024 * slip)
+    slipping = [np.isin(case.run(carry_drift_mps2=drift).state[case.time_s > 85.0], SLIPPING) for drift in (0.01, 0.0)]
+    assert not slipping[0].any()
+    assert slipping[1].any()
 
 
 @pytest.mark.requirement("E1")

@@ -75,10 +75,13 @@ class SlipLimits(Settings):
         Time over the limit after which a slip is one.
     latch_mps, latch_share, latch_s : float
         A slip ends when wheel and inertia agree within the larger of a speed and a share of it for so long.
+    carry_drift_mps2 : float
+        The two may differ by so much more a second of the carry: 1e-3 of gravity, the offset of the accelerometer and
+        the error of the pitch together.
     look_back_s : float
         How long before the detection the carry begins.
     longest_carry_s : float
-        After this the carried speed has expired: an offset of 1e-3 of gravity has become 0.3 m/s.
+        After this the carried speed has expired: `carry_drift_mps2` has become 0.3 m/s.
     smoothing_s : float
         Time constant of the mean of the pitch: of the body's pitching at about 1 Hz and of vibration.
     offset_s : float
@@ -101,6 +104,7 @@ class SlipLimits(Settings):
     latch_mps: float = Field(default=0.15, gt=0)
     latch_share: float = Field(default=0.01, ge=0)
     latch_s: float = Field(default=0.5, ge=0)
+    carry_drift_mps2: float = Field(default=0.01, ge=0)
     look_back_s: float = Field(default=0.3, ge=0)
     longest_carry_s: float = Field(default=30.0, gt=0)
     smoothing_s: float = Field(default=0.2, gt=0)
@@ -361,7 +365,7 @@ class _Automaton:
             if back:
                 self.state, self.speed = MotionState.NORMAL, wheel
             return
-        near = max(limits.latch_mps, limits.latch_share * abs(self.speed))
+        near = max(limits.latch_mps, limits.latch_share * abs(self.speed)) + limits.carry_drift_mps2 * self._carried
         fits = heard and abs(wheel - self.speed) < near and abs(self._smooth) < self._limit
         self._gap = self._gap + (wheel - self.speed) * dt if fits else 0.0
         self._fits = self._fits + dt if fits else 0.0
