@@ -58,17 +58,21 @@ def make_staging(folder: Path) -> Staging:
     """
     while True:
         name = folder / f"{_PREFIX}{secrets.token_hex(4)}"
-        lock = name.with_name(name.name + _LOCK).open("x", encoding="ascii")
-        staging = Staging(path=name, lock=lock)
+        path, staging = name.with_name(name.name + _LOCK), None
         try:
+            lock = path.open("x", encoding="ascii")
+            staging = Staging(path=name, lock=lock)
             lock.write(f"{os.getpid()}\n")
             lock.flush()
             # Another process may have taken the new file for a leftover before it was locked.
             if _try_lock(lock) and Path(lock.name).exists():
                 name.mkdir()
                 return staging
-        except BaseException:  # a signal that ends the program among them
-            staging.remove()
+        except BaseException as error:  # a signal that ends the program among them, also while the file is opened
+            if staging is not None:
+                staging.remove()
+            elif not isinstance(error, FileExistsError):
+                path.unlink(missing_ok=True)
             raise
         lock.close()
 
