@@ -1,13 +1,13 @@
 """Compiled alternatives to the hottest functions of arrays, with numba (``pip install railfix[fast]``).
 
 A function of arrays that is worth compiling stands in numpy where it belongs and is decorated with `compiled_by`, which
-names a module of this room that has a function of the same name, arguments and results. The numpy function is the
-reference: it is what runs without numba, and tests hold both equal. Which of the two run is chosen once, when this room
-is imported: the compiled ones where numba is installed, unless the environment variable ``RAILFIX_KERNELS`` says
+names a module of this package that has a function of the same name, arguments and results. The numpy function is the
+reference: it is what runs without numba, and tests hold both equal. Which of the two run is chosen once, when this
+package is imported: the compiled ones where numba is installed, unless the environment variable ``RAILFIX_KERNELS`` says
 ``numpy``; ``numba`` asks for them and fails where they cannot run. ``run.json`` names the choice ("kernels").
 
-Modules of this room are imported at the first call of one of their functions, so that numba costs nothing where it is
-not used. They see arrays and numbers alone, and import nothing of railfix but this room and `railfix.core`.
+Modules of this package are imported at the first call of one of their functions, so that numba costs nothing where it
+is not used. They see arrays and numbers alone, and import nothing of railfix but this package and `railfix.core`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def choose(asked: str, *, installed: bool) -> Literal["numpy", "numba"]:
 
 #: Kernels of this process.
 CHOSEN: Final = choose(os.environ.get(VARIABLE, ""), installed=find_spec("numba") is not None)
-#: Compiled functions by the name of their reference, as (reference, module of this room).
+#: Compiled functions by the name of their reference, as (reference, module of this package).
 REGISTERED: Final[dict[str, tuple[Callable[..., Any], str]]] = {}
 
 
@@ -64,7 +64,7 @@ def kernels_in_use() -> str:
 
 @cache
 def compiled(name: str) -> Callable[..., Any]:
-    """Return the compiled function of a registered name; imports numba and its module of this room."""
+    """Return the compiled function of a registered name; imports numba and its module of this package."""
     function: Callable[..., Any] = getattr(import_module(f"railfix.kernels.{REGISTERED[name][1]}"), name)
     return function
 
@@ -83,7 +83,7 @@ def load() -> int:
 
 
 def compiled_by(module: str) -> Callable[[Callable[Arguments, Returned]], Callable[Arguments, Returned]]:
-    """Return a decorator that runs the function of the same name in a module of this room, where numba is chosen.
+    """Return a decorator that runs the function of the same name in a module of this package, where numba is chosen.
 
     The decorated function takes arrays and numbers by position and returns arrays, as the compiled one does.
     ``__wrapped__`` of the result is the reference.
@@ -91,7 +91,7 @@ def compiled_by(module: str) -> Callable[[Callable[Arguments, Returned]], Callab
     Parameters
     ----------
     module : str
-        Name within this room.
+        Name within this package.
     """
 
     def decorate(reference: Callable[Arguments, Returned]) -> Callable[Arguments, Returned]:

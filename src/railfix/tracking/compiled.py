@@ -249,8 +249,8 @@ class Compiled:
 
 def _kernels() -> tuple[ModuleType, ModuleType]:
     """Layout and recursion; imported only where numba is used."""
-    room = "railfix.kernels.tracking"
-    return import_module(f"{room}.layout"), import_module(f"{room}.recursion")
+    package = "railfix.kernels.tracking"
+    return import_module(f"{package}.layout"), import_module(f"{package}.recursion")
 
 
 def _work_space(layout: ModuleType, channels: int, unknowns: int, hypotheses: int, sources: int) -> tuple[Any, Any]:
