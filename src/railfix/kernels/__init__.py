@@ -3,8 +3,8 @@
 A function of arrays that is worth compiling stands in numpy where it belongs and is decorated with `compiled_by`, which
 names a module of this package that has a function of the same name, arguments and results. The numpy function is the
 reference: it is what runs without numba, and tests hold both equal. Which of the two run is chosen once, when this
-package is imported: the compiled ones where numba is installed, unless the environment variable ``RAILFIX_KERNELS`` says
-``numpy``; ``numba`` asks for them and fails where they cannot run. ``run.json`` names the choice ("kernels").
+package is imported: the compiled ones where numba is installed, unless the environment variable ``RAILFIX_KERNELS``
+says ``numpy``; ``numba`` asks for them and fails where they cannot run. ``run.json`` names the choice ("kernels").
 
 Modules of this package are imported at the first call of one of their functions, so that numba costs nothing where it
 is not used. They see arrays and numbers alone, and import nothing of railfix but this package and `railfix.core`.
