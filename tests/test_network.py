@@ -243,7 +243,7 @@ def test_page_has_the_network_its_faults_and_the_run(tmp_path: Path) -> None:
 def test_plan_of_a_large_network_is_thinned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     net = made_network(100.0)
     write_network_page(net, check_network(net), tmp_path / "whole.html")
-    monkeypatch.setattr("railfix.report.network_page._DRAWN", 500)
+    monkeypatch.setattr("railfix.report.plots.network._DRAWN", 500)
     write_network_page(net, check_network(net), tmp_path / "thin.html")
     sizes = [(tmp_path / name).stat().st_size for name in ("whole.html", "thin.html")]
     assert sizes[1] < sizes[0] - 20_000

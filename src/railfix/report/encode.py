@@ -15,21 +15,13 @@ from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Ma
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
 #: Unknown value of an unsigned 16-bit number.
 _UNKNOWN: Final = 65535
+_OF_CHART: Final = (
+    "title", "x_label", "y_label", "x_scale", "y_scale", "y_linear", "x_range", "y_range", "equal",
+)  # fmt: skip
 
 
 def script_json(value: Any) -> str:
-    """JSON text that is safe inside a script element.
-
-    Parameters
-    ----------
-    value : object
-        Plain values.
-
-    Raises
-    ------
-    ValueError
-        A NaN or an infinity stands outside an array.
-    """
+    """JSON text of plain values that is safe inside a script element; ValueError for NaN outside an array."""
     text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for mark, code in (("<", "\\u003c"), (">", "\\u003e"), ("\u2028", "\\u2028"), ("\u2029", "\\u2029")):
         text = text.replace(mark, code)
@@ -37,44 +29,17 @@ def script_json(value: Any) -> str:
 
 
 def packed(values: NDArray[Any], kind: str = "f") -> str:
-    """An array as base 64, little endian, after the letter of its kind.
-
-    Parameters
-    ----------
-    values : ndarray
-    kind : {"f", "h", "i"}
-        32-bit floats, unsigned 16-bit, unsigned 32-bit.
+    """An array as base 64, little endian, after the letter of its kind: 32-bit float, unsigned 16-bit, unsigned
+    32-bit.
     """
     dtype = {"f": "<f4", "h": "<u2", "i": "<u4"}[kind]
     return kind + base64.b64encode(np.ascontiguousarray(values, dtype=dtype).tobytes()).decode("ascii")
 
 
 def chart_values(chart: Chart, epochs_from: np.datetime64 | None = None) -> dict[str, Any]:
-    """A chart as plain values.
-
-    Parameters
-    ----------
-    chart : Chart
-    epochs_from : datetime64[ns], optional
-        Origin of ``epoch_s`` of its points, if not `Chart.start`.
-
-    Returns
-    -------
-    dict
-    """
-    values: dict[str, Any] = {
-        "title": chart.title,
-        "x_label": chart.x_label,
-        "y_label": chart.y_label,
-        "x_scale": chart.x_scale,
-        "y_scale": chart.y_scale,
-        "y_linear": chart.y_linear,
-        "x_range": chart.x_range,
-        "y_range": chart.y_range,
-        "equal": chart.equal,
-        "axis": chart.shared_axis,
-        "layers": [_layer(layer) for layer in chart.layers],
-    }
+    """A chart as plain values; `epochs_from`: origin of ``epoch_s`` of its points, if not `Chart.start`."""
+    values: dict[str, Any] = {name: getattr(chart, name) for name in _OF_CHART}
+    values |= {"axis": chart.shared_axis, "layers": [_layer(layer) for layer in chart.layers]}
     if chart.start is not None:
         values["start"] = since_1970(chart.start)
     if epochs_from is not None:

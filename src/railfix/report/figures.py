@@ -40,17 +40,7 @@ NO_TIMES: Final = "run.json has no processing times, so there is no chart of the
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Charts under one heading.
-
-    Attributes
-    ----------
-    title : str
-    charts : tuple of Chart or SkyEpochs
-    start : datetime64[ns]
-        Origin of `Points.epoch_s` of the charts.
-    absent : tuple of str
-        Reasons for missing charts.
-    """
+    """Charts under one heading, and reasons for missing ones; `start` is the origin of `Points.epoch_s`."""
 
     title: str
     charts: tuple[Chart | SkyEpochs, ...]
@@ -94,18 +84,8 @@ def antenna_groups(
 ) -> Iterator[Group]:
     """Charts of one antenna of a run.
 
-    Parameters
-    ----------
-    run : ReportedRun
-    antenna : str
-    sky : int
-        Largest number of epochs of the sky plot.
-    background : sequence of ndarray, shape (P, 2) [deg]
-        Longitude and latitude of lines to draw below the plan.
-
-    Yields
-    ------
-    Group
+    `sky` is the largest number of epochs of the sky plot; `background` has longitude and latitude of lines to draw
+    below the plan, each of shape (P, 2) [deg].
     """
     positions, errors = run.positions_of(antenna), run.errors_of(antenna)
     start = start_of(positions)

@@ -144,73 +144,45 @@ def report_page(
     background: Sequence[Floats] = (),
     title: str = "",
 ) -> str:
-    """HTML of the report.
-
-    Parameters
-    ----------
-    runs : sequence of ReportedRun
-    evaluation : Evaluation or None
-    background : sequence of ndarray, shape (P, 2) [deg]
-        Longitude and latitude of lines to draw below the plan.
-    title : str
-    """
+    """HTML of the report; `background`: longitude and latitude of lines below the plan, each of shape (P, 2) [deg]."""
     numbers = count()
     antennas = max(sum(len(run.folder.antennas) for run in runs), 1)
     # many antennas share the size that two have
     epochs = max(_LEAST_SKY, min(SKY_EPOCHS, 2 * SKY_EPOCHS // antennas))
-    return (
-        _environment()
-        .get_template("page.html.j2")
-        .render(
-            title=title or f"railfix report: {', '.join(run.name for run in runs)}",
-            created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            version=__version__,
-            policy=_POLICY,
-            style=_resource("page.css"),
-            scripts=(_resource("errors.js"), _resource("page.js")),
-            runs=[
-                _run(run, evaluation, number, numbers, sky=epochs, background=background)
-                for number, run in enumerate(runs)
-            ],
-            summary=_summary(runs, evaluation),
-            ranges=_ranges(runs, evaluation, numbers),
-        )
+    return _rendered(
+        "page.html.j2",
+        title or f"railfix report: {', '.join(run.name for run in runs)}",
+        runs=[
+            _run(run, evaluation, number, numbers, sky=epochs, background=background) for number, run in enumerate(runs)
+        ],
+        summary=_summary(runs, evaluation),
+        ranges=_ranges(runs, evaluation, numbers),
     )
 
 
 def charts_page(title: str, charts: Sequence[Chart], tables: Sequence[Block]) -> str:
-    """HTML of a page of charts and tables under them.
-
-    Parameters
-    ----------
-    title : str
-    charts : sequence of Chart
-    tables : sequence of Block
-    """
+    """HTML of a page of charts and tables under them."""
     numbers = count()
-    return (
-        _environment()
-        .get_template("charts.html.j2")
-        .render(
-            title=title,
-            created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
-            version=__version__,
-            policy=_POLICY,
-            style=_resource("page.css"),
-            scripts=(_resource("errors.js"), _resource("page.js")),
-            charts=_Part(title="", figures=[_figure(chart, numbers) for chart in charts]),
-            tables=tables,
-        )
-    )
+    figures = _Part(title="", figures=[_figure(chart, numbers) for chart in charts])
+    return _rendered("charts.html.j2", title, charts=figures, tables=tables)
 
 
-def _environment() -> Environment:
-    return Environment(
+def _rendered(template: str, title: str, **content: Any) -> str:
+    environment = Environment(
         loader=PackageLoader("railfix.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(
+        title=title,
+        created=datetime.now(tz=UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        version=__version__,
+        policy=_POLICY,
+        style=_resource("page.css"),
+        scripts=(_resource("errors.js"), _resource("page.js")),
+        **content,
     )
 
 

@@ -5,16 +5,31 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 import polars as pl
 
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import flattened
-from railfix.report.content import Absent, Block, Command, Folded, Notes, Sentence, Table, number, share
+from railfix.report.content import (
+    Absent,
+    Block,
+    Column,
+    Command,
+    Folded,
+    Notes,
+    Sentence,
+    Table,
+    count,
+    listing,
+    number,
+    share,
+)
 from railfix.report.runs import ReportedRun
 
 _POSITION_NAMES = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
+_NAMED = pl.col("position").replace(_POSITION_NAMES)
 
 
 def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table:
@@ -31,7 +46,7 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                 run.name,
                 antenna,
                 "; ".join(chosen),
-                number(facts.get("epochs"), 0),
+                count(facts.get("epochs")),
                 share(facts.get("positioning_rate")),
                 share(facts.get("ok_rate")),
                 number(_plain(sigma.get("p95_m"))),
@@ -89,7 +104,7 @@ def provenance(run: ReportedRun) -> list[Block]:
         ("wall time", f"{record.get('wall_s', '?')} s"),
     ]
     inputs = [
-        [str(f["input"]), str(f["path"]), number(f.get("bytes"), 0), str(f.get("sha256", ""))]
+        [str(f["input"]), str(f["path"]), count(f.get("bytes")), str(f.get("sha256", ""))]
         for f in record.get("inputs") or []
     ]
     notes = [*(str(note) for note in record.get("notes") or []), *run.notes]
@@ -108,10 +123,9 @@ def settings(run: ReportedRun) -> list[Block]:
     names = [*(name for name in used if name in asked), *(name for name in asked if name not in used)]
     names += [name for name in used if name not in asked]
     rows = [[name, _word(asked.get(name, "")), _word(used.get(name, ""))] for name in names]
-    count = len(asked)
     return [
-        Sentence(f"{count} of {len(used)} settings were asked for; the others are defaults."),
-        Table(name="settings", head=["setting", "asked", "used"], rows=rows, marked=range(count)),
+        Sentence(f"{len(asked)} of {len(used)} settings were asked for; the others are defaults."),
+        Table(name="settings", head=["setting", "asked", "used"], rows=rows, marked=range(len(asked))),
     ]
 
 
@@ -121,10 +135,10 @@ def budget(run: ReportedRun) -> list[Block]:
     names = list(antennas)
     statuses = dict.fromkeys(s for facts in antennas.values() for s, n in (facts.get("status") or {}).items() if n)
     rows = [
-        ["epochs", *(number(antennas[n].get("epochs"), 0) for n in names)],
-        ["with observations", *(number(antennas[n].get("epochs_with_observations"), 0) for n in names)],
-        ["with position", *(number(antennas[n].get("epochs_with_position"), 0) for n in names)],
-        *([f"  {s}", *(number((antennas[n].get("status") or {}).get(s, 0), 0) for n in names)] for s in statuses),
+        ["epochs", *(count(antennas[n].get("epochs")) for n in names)],
+        ["with observations", *(count(antennas[n].get("epochs_with_observations")) for n in names)],
+        ["with position", *(count(antennas[n].get("epochs_with_position")) for n in names)],
+        *([f"  {s}", *(count((antennas[n].get("status") or {}).get(s, 0)) for n in names)] for s in statuses),
         ["positioning rate", *(share(antennas[n].get("positioning_rate")) for n in names)],
         ["rate of ok", *(share(antennas[n].get("ok_rate")) for n in names)],
     ]
@@ -132,7 +146,7 @@ def budget(run: ReportedRun) -> list[Block]:
     rows += [
         [
             f"too few satellites, by {r}",
-            *(number((antennas[n].get("too_few_satellites_by_first_reason") or {}).get(r, 0), 0) for n in names),
+            *(count((antennas[n].get("too_few_satellites_by_first_reason") or {}).get(r, 0)) for n in names),
         ]
         for r in few
     ]
@@ -141,14 +155,14 @@ def budget(run: ReportedRun) -> list[Block]:
     head = ["", *(word for n in names for word in (n, "share", "only reason"))]
     observed = {n: antennas[n].get("observations") or 0 for n in names}
 
-    def cells(count: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
+    def cells(ranges: Mapping[str, float], alone: Mapping[str, float] | None) -> list[str]:
         return [
             word
             for n in names
             for word in (
-                number(count[n], 0),
-                share(count[n] / observed[n] if observed[n] else None),
-                "" if alone is None else number(alone[n], 0),
+                count(ranges[n]),
+                share(ranges[n] / observed[n] if observed[n] else None),
+                "" if alone is None else count(alone[n]),
             )
         ]
 
@@ -202,67 +216,47 @@ def filter_tables(run: ReportedRun, evaluation: Evaluation) -> list[Block]:
         return [Absent("The run has no filter along the track (railfix run --filter off).")]
     figures = evaluation.figures.filter(pl.col("grouping").is_in(["all", "signals"]), run=name, epochs_of="own")
     rows = figures.filter(pl.col("position") == "constrained").sort("antenna", "grouping", maintain_order=True)
-    blocks: list[Block] = [
-        Table(
-            name="filter",
-            head=["antenna", "epochs", "epochs", "rate", "mean", "std", "p50", "p95", "p99", "largest", "p95 / sigma"],
-            rows=[
-                [
-                    str(row["antenna"]),
-                    str(row["group"]),
-                    number(row["epochs"], 0),
-                    share(row["rate_of_run"]),
-                    *(number(row[key]) for key in ("mean_m", "std_m", "p50_m", "p95_m", "p99_m", "max_m")),
-                    number(row["normalised_p95"]),
-                ]
-                for row in rows.iter_rows(named=True)
-            ],
-            caption="Errors along the line of the filter along the track, in metres; rate: share of all epochs",
-            numeric=range(2, 11),
-        )
+    filtered: list[Column] = [
+        ("antenna", "antenna", str),
+        ("epochs", "group", str),
+        ("epochs", "epochs", count),
+        ("rate", "rate_of_run", share),
+        *((head, f"{head}_m", number) for head in ("mean", "std", "p50", "p95", "p99")),
+        ("largest", "max_m", number),
+        ("p95 / sigma", "normalised_p95", number),
     ]
+    caption = "Errors along the line of the filter along the track, in metres; rate: share of all epochs"
+    blocks: list[Block] = [listing("filter", rows, filtered, caption)]
     if evaluation.outages is not None and len(outages := evaluation.outages.filter(run=name)):
-        blocks.append(
-            Table(
-                name="outages",
-                head=["antenna", "begin", "environment", "carried by", "lasting, s", "way", "p95", "largest",
-                      "at its end", "sigma there"],
-                rows=[
-                    [
-                        str(row["antenna"]),
-                        f"{row['begin_gpst']:%H:%M:%S}",
-                        str(row["environment"]),
-                        row["carried_by"] or "prediction",
-                        number(row["duration_s"], 1),
-                        number(row["travelled_m"], 0),
-                        *(number(row[key]) for key in ("outage_p95_m", "outage_max_m", "end_error_m", "end_sigma_m")),
-                    ]
-                    for row in outages.iter_rows(named=True)
-                ],
-                caption="Stretches without satellites, in metres",
-                numeric=range(4, 10),
-            )
-        )  # fmt: skip
+        outages = outages.with_columns(
+            pl.col("begin_gpst").dt.strftime("%H:%M:%S"), pl.col("carried_by").fill_null("").replace("", "prediction")
+        )
+        passed = (
+            ("antenna", "antenna", str),
+            ("begin", "begin_gpst", str),
+            ("environment", "environment", str),
+            ("carried by", "carried_by", str),
+            ("lasting, s", "duration_s", partial(number, digits=1)),
+            ("way", "travelled_m", count),
+            ("p95", "outage_p95_m", number),
+            ("largest", "outage_max_m", number),
+            ("at its end", "end_error_m", number),
+            ("sigma there", "end_sigma_m", number),
+        )
+        blocks.append(listing("outages", outages, passed, "Stretches without satellites, in metres"))
     if evaluation.branches is not None and len(branches := evaluation.branches.filter(run=name)):
-        blocks.append(
-            Table(
-                name="branches",
-                head=["antenna", "stated probability", "positions", "mean of it", "right", "wrong", "blocks",
-                      "with a wrong one"],
-                rows=[
-                    [
-                        str(row["antenna"]),
-                        str(row["probability"]),
-                        number(row["judged"], 0),
-                        *(share(row[key]) for key in ("probability_mean", "right_share")),
-                        *(number(row[key], 0) for key in ("wrong_places", "blocks", "wrong_blocks")),
-                    ]
-                    for row in branches.iter_rows(named=True)
-                ],
-                caption="Stated probability of the place against the share of places within 50 m of the reference",
-                numeric=range(2, 8),
-            )
-        )  # fmt: skip
+        stated = (
+            ("antenna", "antenna", str),
+            ("stated probability", "probability", str),
+            ("positions", "judged", count),
+            ("mean of it", "probability_mean", share),
+            ("right", "right_share", share),
+            ("wrong", "wrong_places", count),
+            ("blocks", "blocks", count),
+            ("with a wrong one", "wrong_blocks", count),
+        )
+        caption = "Stated probability of the place against the share of places within 50 m of the reference"
+        blocks.append(listing("branches", branches, stated, caption))
     return blocks
 
 
@@ -271,7 +265,7 @@ def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
     return [
         str(row[first]),
         where,
-        number(row["errors"], 0),
+        count(row["errors"]),
         share(row["rate"]) + _limits(row["rate_low"], row["rate_high"], per_cent=True),
         number(row["mean_m"]) + _limits(row["mean_low_m"], row["mean_high_m"]),
         number(row["std_m"]),
@@ -279,7 +273,7 @@ def _merit(row: Mapping[str, Any], first: str, antenna: str = "") -> list[str]:
         number(row["p95_m"]) + _limits(row["p95_low_m"], row["p95_high_m"]),
         number(row["p99_m"]),
         number(row["max_m"]),
-        number(row["wrong_places"], 0),
+        count(row["wrong_places"]),
         number(row["normalised_rms"]),
         number(row["normalised_p95"]),
     ]
@@ -296,22 +290,17 @@ def _intervals(evaluation: Evaluation, name: str) -> Block:
     rows = evaluation.intervals.filter(pl.col("run") == name) if "run" in evaluation.intervals.columns else None
     if rows is None or not len(rows):
         return Absent("There are no two consecutive positions, so there are no intervals.")
-    columns = [f"interval_{name}_m" for name in ("mean", "p50", "p95", "p99", "max")] + ["gap_p95_s", "gap_max_s"]
-    return Table(
-        name="intervals",
-        head=["antenna", "position", "intervals", "mean", "p50", "p95", "p99", "largest", "gap p95, s", "largest, s"],
-        rows=[
-            [
-                str(r["antenna"]),
-                _POSITION_NAMES[r["position"]],
-                number(r["intervals"], 0),
-                *(number(r[c]) for c in columns),
-            ]
-            for r in rows.iter_rows(named=True)
-        ],
-        caption="Positioning interval: distance travelled between consecutive positions, in metres",
-        numeric=range(2, 10),
-    )
+    columns: list[Column] = [
+        ("antenna", "antenna", str),
+        ("position", "position", str),
+        ("intervals", "intervals", count),
+        *((head, f"interval_{head}_m", number) for head in ("mean", "p50", "p95", "p99")),
+        ("largest", "interval_max_m", number),
+        ("gap p95, s", "gap_p95_s", number),
+        ("largest, s", "gap_max_s", number),
+    ]
+    caption = "Positioning interval: distance travelled between consecutive positions, in metres"
+    return listing("intervals", rows.with_columns(_NAMED), columns, caption)
 
 
 def level_sizes(evaluation: Evaluation, name: str) -> list[Block]:
@@ -319,28 +308,20 @@ def level_sizes(evaluation: Evaluation, name: str) -> list[Block]:
     if evaluation.levels is None:
         return []
     rows = evaluation.levels.filter(pl.col("run") == name) if "run" in evaluation.levels.columns else evaluation.levels
-    table = Table(
-        name="levels",
-        head=["level", "antenna", "position", "positions", "finite", "p50", "p95", "errors", "over the level", "share"],
-        rows=[
-            [
-                str(r["level"]),
-                str(r["antenna"]),
-                _POSITION_NAMES[r["position"]],
-                number(r["positions"], 0),
-                number(r["with_level"], 0),
-                number(r["level_p50_m"]),
-                number(r["level_p95_m"]),
-                number(r["errors"], 0),
-                number(r["over_level"], 0),
-                share(r["over_level_share"], 3),
-            ]
-            for r in rows.iter_rows(named=True)
-        ],
-        caption="Protection levels in metres, and errors above them",
-        numeric=range(3, 10),
+    columns = (
+        ("level", "level", str),
+        ("antenna", "antenna", str),
+        ("position", "position", str),
+        ("positions", "positions", count),
+        ("finite", "with_level", count),
+        ("p50", "level_p50_m", number),
+        ("p95", "level_p95_m", number),
+        ("errors", "errors", count),
+        ("over the level", "over_level", count),
+        ("share", "over_level_share", partial(share, digits=3)),
     )
-    return [table]
+    caption = "Protection levels in metres, and errors above them"
+    return [listing("levels", rows.with_columns(_NAMED), columns, caption)]
 
 
 def _plain(value: Any) -> float | None:

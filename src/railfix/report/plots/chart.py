@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from railfix.core.arrays import Floats, Integers, Strings
 
@@ -33,13 +32,25 @@ Scale = Literal["linear", "symlog", "log"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Points:
+class _Layer:
+    """Values drawn in one colour under one name of the legend; a blank one is not in the legend."""
+
+    label: str
+    colour: str
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where the arrays differ in length."""
+        lengths = [len(value) for value in vars(self).values() if isinstance(value, np.ndarray | tuple)]
+        if len(set(lengths)) > 1:
+            raise ValueError(f"{self.label}: arrays of lengths {lengths}, expected equal ones")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Points(_Layer):
     """Points, P of them.
 
     Attributes
     ----------
-    label : str
-    colour : str
     x, y : ndarray, shape (P,)
         NaN is not drawn.
     shape : {"dot", "square", "cross", "ring"}
@@ -49,63 +60,43 @@ class Points:
         Time since the start of the run; a click on a point shows the sky at that time.
     """
 
-    label: str
-    colour: str
     x: Floats
     y: Floats
     shape: Shape = "dot"
     size: float = 3.0
     epoch_s: Floats | None = None
 
-    def __post_init__(self) -> None:
-        _same_length(self.label, self.x, self.y)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Line:
+class Line(_Layer):
     """A line through P points, broken where one is NaN."""
 
-    label: str
-    colour: str
     x: Floats
     y: Floats
     width: float = 1.5
     dash: Literal["solid", "dashed", "dotted"] = "solid"
 
-    def __post_init__(self) -> None:
-        _same_length(self.label, self.x, self.y)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Band:
+class Band(_Layer):
     """The area between two lines of P points, broken where one is NaN."""
 
-    label: str
-    colour: str
     x: Floats
     low: Floats
     high: Floats
 
-    def __post_init__(self) -> None:
-        _same_length(self.label, self.x, self.low, self.high)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Bars:
+class Bars(_Layer):
     """Upright bars from `left` to `right`, each B long."""
 
-    label: str
-    colour: str
     left: Floats
     right: Floats
     height: Floats
 
-    def __post_init__(self) -> None:
-        _same_length(self.label, self.left, self.right, self.height)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Cells:
+class Cells(_Layer):
     """Numbers of points in the cells of a grid; darker cells have more.
 
     Attributes
@@ -114,8 +105,6 @@ class Cells:
     counts : ndarray of int, shape (A, B)
     """
 
-    label: str
-    colour: str
     x_edges: Floats
     y_edges: Floats
     counts: Integers
@@ -126,7 +115,7 @@ class Cells:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ranges:
+class Ranges(_Layer):
     """A bar from minimum to maximum with a mark at the mean for each name, from the top down.
 
     Attributes
@@ -136,26 +125,18 @@ class Ranges:
         NaN is not drawn.
     """
 
-    label: str
-    colour: str
     names: tuple[str, ...]
     low: Floats
     mid: Floats
     high: Floats
 
-    def __post_init__(self) -> None:
-        _same_length(self.label, np.array(self.names), self.low, self.mid, self.high)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Marks:
+class Marks(_Layer):
     """Text at points.
 
     Attributes
     ----------
-    label : str
-        Blank: not in the legend.
-    colour : str
     x, y : ndarray, shape (P,)
     words : tuple of str
         Lines separated by line feeds.
@@ -163,15 +144,10 @@ class Marks:
         Beside a cross at the point, or centred on it without a cross.
     """
 
-    label: str
-    colour: str
     x: Floats
     y: Floats
     words: tuple[str, ...]
     place: Literal["beside", "on"] = "beside"
-
-    def __post_init__(self) -> None:
-        _same_length(self.label, self.x, self.y, np.array(self.words))
 
 
 Layer = Points | Line | Band | Bars | Cells | Ranges | Marks
@@ -279,8 +255,3 @@ def _drawn(layer: Layer) -> bool:
     if isinstance(layer, Ranges):
         return bool(np.isfinite(layer.mid).any())
     return bool((np.isfinite(layer.x) & np.isfinite(layer.y)).any())
-
-
-def _same_length(label: str, *arrays: NDArray[np.generic]) -> None:
-    if len({len(array) for array in arrays}) > 1:
-        raise ValueError(f"{label}: arrays of lengths {[len(array) for array in arrays]}, expected equal ones")

@@ -23,13 +23,7 @@ def words(table: pl.DataFrame, name: str) -> Strings:
 
 
 def start_of(table: pl.DataFrame) -> np.datetime64:
-    """Earliest time of a table.
-
-    Raises
-    ------
-    ValueError
-        The table is empty.
-    """
+    """Earliest time of a table; ValueError where it is empty."""
     if not len(table):
         raise ValueError("the table has no rows")
     return np.datetime64(table["time_gpst"].to_numpy().min(), "ns")

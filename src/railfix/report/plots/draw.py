@@ -4,13 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from inspect import cleandoc, signature
+from inspect import signature
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, ParamSpec
 
 import numpy as np
 
+from railfix.core.files import staged_file
 from railfix.core.timescale import timedelta
-from railfix.report.plots.chart import Band, Bars, Cells, Chart, Layer, Line, Marks, Points, Ranges, SkyEpochs
+from railfix.report.plots.chart import (
+    BLUE,
+    RED,
+    Band,
+    Bars,
+    Cells,
+    Chart,
+    Layer,
+    Line,
+    Marks,
+    Points,
+    Ranges,
+    SkyEpochs,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,8 +36,6 @@ P = ParamSpec("P")
 
 _MARKERS: Final = {"dot": "o", "square": "s", "cross": "x", "ring": "o"}
 _DASHES: Final = {"solid": "-", "dashed": "--", "dotted": ":"}
-#: Colours of a sky plot: used, rejected.
-_USED, _REJECTED = "#0072b2", "#d55e00"
 
 
 def drawn(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
@@ -33,31 +47,13 @@ def drawn(chart_of: Callable[P, Chart]) -> Callable[P, Figure]:
 
     draw.__name__ = draw.__qualname__ = f"plot_{chart_of.__name__}"
     draw.__annotations__ = {**chart_of.__annotations__, "return": "Figure"}
-    draw.__doc__ = _returning_figure(chart_of.__doc__ or "")
     del draw.__wrapped__
     draw.__signature__ = signature(chart_of).replace(return_annotation="Figure")  # type: ignore[attr-defined]
     return draw
 
 
-def _returning_figure(text: str) -> str:
-    """Documentation of a function that returns a chart, for one that returns a figure of it."""
-    # without indentation, as Python keeps the documentation itself from 3.13 on
-    head, heading, _ = cleandoc(text).partition("Returns\n-------\n")
-    return f"{head}{heading}matplotlib.figure.Figure\n" if heading else text
-
-
 def draw_figure(chart: Chart) -> Figure:
-    """Draw a chart as a matplotlib figure.
-
-    Parameters
-    ----------
-    chart : Chart
-
-    Returns
-    -------
-    Figure
-        ``figure.savefig("error.png")`` writes it; a notebook shows it after ``%matplotlib inline``.
-    """
+    """A chart as a matplotlib figure: ``figure.savefig("error.png")`` writes it, a notebook shows it."""
     from matplotlib.figure import Figure
 
     size = (10.0, 7.0) if chart.equal else (10.0 if chart.width == "wide" else 6.0, 4.2)
@@ -66,19 +62,15 @@ def draw_figure(chart: Chart) -> Figure:
     return figure
 
 
+def save_figure(figure: Figure, path: str | PathLike[str]) -> Path:
+    """Write a figure as PNG, or SVG where the name says so; OutputError where it cannot be written."""
+    with staged_file(path, what="picture") as staged:
+        figure.savefig(staged, format="svg" if str(path).endswith(".svg") else "png", dpi=110)
+    return Path(path)
+
+
 def draw_chart(chart: Chart, axes: Axes) -> Axes:
-    """Draw a chart into matplotlib axes.
-
-    Parameters
-    ----------
-    chart : Chart
-    axes : Axes
-
-    Returns
-    -------
-    Axes
-        `axes`.
-    """
+    """Draw a chart into matplotlib axes, which are returned."""
     for layer in chart.layers:
         _draw(layer, axes, chart)
     axes.set_title(chart.title, fontsize="medium")
@@ -93,19 +85,7 @@ def draw_chart(chart: Chart, axes: Axes) -> Axes:
 
 
 def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> Axes:
-    """Draw the satellites over an antenna at the epoch nearest to a time.
-
-    Parameters
-    ----------
-    sky : SkyEpochs
-    time : datetime64
-        GPS time.
-    axes : Axes, optional
-        Polar axes; created if not given.
-
-    Returns
-    -------
-    Axes
+    """Draw the satellites over an antenna at the epoch nearest to a GPS time, into polar axes.
 
     Raises
     ------
@@ -128,7 +108,7 @@ def draw_sky(sky: SkyEpochs, time: np.datetime64, axes: Axes | None = None) -> A
     polar.set_rlim(90.0, 0.0)
     bearing, elevation = np.radians(sky.azimuth_deg[rows]), sky.elevation_deg[rows]
     used = sky.reason[rows] == "used"
-    for mask, colour, marker, label in ((used, _USED, "o", "used"), (~used, _REJECTED, "x", "rejected")):
+    for mask, colour, marker, label in ((used, BLUE, "o", "used"), (~used, RED, "x", "rejected")):
         polar.plot(bearing[mask], elevation[mask], marker, color=colour, label=label)
     for where, high, name, cn0 in zip(bearing, elevation, sky.satellite[rows], sky.cn0_dbhz[rows], strict=True):
         text = f"{name}\n{cn0:.0f}" if np.isfinite(cn0) else str(name)

@@ -50,15 +50,8 @@ def error_over_time(
 
     Parameters
     ----------
-    errors : polars.DataFrame
-        Of one antenna, in order of time.
-    filtered : polars.DataFrame, optional
-        Errors of the filter along the track.
-    title : str
-
-    Returns
-    -------
-    Chart
+    errors, filtered : polars.DataFrame
+        Of one antenna, in order of time; `filtered` of the filter along the track.
     """
     start = start_of(errors)
     return _errors(errors, filtered, name="error-time", title=title, x_label="GPS time", start=start)
@@ -67,20 +60,7 @@ def error_over_time(
 def error_over_chainage(
     errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None, title: str = "Error along the line over chainage"
 ) -> Chart:
-    """Errors over the chainage of the reference (P1 figure 8).
-
-    Parameters
-    ----------
-    errors : polars.DataFrame
-        Of one antenna.
-    filtered : polars.DataFrame, optional
-        Errors of the filter along the track.
-    title : str
-
-    Returns
-    -------
-    Chart
-    """
+    """Errors over the chainage of the reference (P1 figure 8), of the tables of `error_over_time`."""
     label = "chainage of the reference [m]"
     return _errors(errors, filtered, name="error-chainage", title=title, x_label=label, start=None)
 
@@ -195,18 +175,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def error_ranges(runs: Mapping[str, pl.DataFrame], *, title: str = "Range of the errors") -> Chart:
-    """Minimum, mean and maximum error of each run, on the map and conventional (P1 figure 11).
-
-    Parameters
-    ----------
-    runs : mapping of str to polars.DataFrame
-        Errors by the name of the run.
-    title : str
-
-    Returns
-    -------
-    Chart
-    """
+    """Minimum, mean and maximum error of each run by its name, on the map and conventional (P1 figure 11)."""
     names: list[str] = []
     values: list[Floats] = []
     for run, errors in runs.items():

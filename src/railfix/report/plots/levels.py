@@ -37,17 +37,7 @@ _REGIONS: Final = (
 def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
     """Protection level over the size of the error, counted in cells, with the epochs of each region written into it.
 
-    Parameters
-    ----------
-    diagram : Stanford
-        Of `railfix.integrity.stanford.stanford`.
-    title : str
-
-    Returns
-    -------
-    Chart
-        Values beyond the axes stand in their last cells. The darkness of a cell grows with the logarithm of its
-        epochs.
+    Values beyond the axes stand in their last cells. The darkness of a cell grows with the logarithm of its epochs.
     """
     width = diagram.edges_m[1] - diagram.edges_m[0]
     edges = np.append(diagram.edges_m[:-1], diagram.edges_m[-2] + width)
@@ -103,7 +93,7 @@ def _regions(diagram: Stanford, top_m: float) -> Marks:
 
 
 def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: str = "Protection level") -> Chart:
-    """Protection level and its parts over time, against the alarm limit.
+    """Protection level and its parts over time, against the alarm limit; empty where the run has no levels.
 
     Parameters
     ----------
@@ -111,11 +101,6 @@ def levels_over_time(positions: pl.DataFrame, alarm_limit_m: float, *, title: st
         Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`.
     alarm_limit_m : float [m]
     title : str
-
-    Returns
-    -------
-    Chart
-        Empty where the run has no levels.
     """
     start = start_of(positions)
     x = since(positions, start)

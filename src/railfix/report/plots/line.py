@@ -52,7 +52,7 @@ def plan(
     background: Sequence[Floats] = (),
     title: str = "Plan of the line",
 ) -> Chart:
-    """Positions and line in local metres, with marks of the kilometrage (P1 figure 6).
+    """Positions and line in local metres, with marks of the kilometrage (P1 figure 6); no layers without a position.
 
     Parameters
     ----------
@@ -70,11 +70,6 @@ def plan(
     background : sequence of ndarray, shape (P, 2) [deg]
         Longitude and latitude of lines to draw below, see `railfix.report.background`.
     title : str
-
-    Returns
-    -------
-    Chart
-        Without layers where there is no position.
     """
     ecef, conventional = points(positions, *_ECEF), points(positions, *(f"conventional_{name}" for name in _ECEF))
     has = np.isfinite(ecef[:, 0])
@@ -278,18 +273,7 @@ _FIXES: Final = (
 
 
 def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning interval") -> Chart:
-    """Distance from each position to the previous one, over chainage (P1 figure 12).
-
-    Parameters
-    ----------
-    table : polars.DataFrame
-        See `interval`.
-    title : str
-
-    Returns
-    -------
-    Chart
-    """
+    """Distance from each position to the previous one, over chainage (P1 figure 12), of the table of `interval`."""
     layers: list[Layer] = []
     shown = total = 0
     longest = []
@@ -313,18 +297,7 @@ def interval_over_chainage(table: pl.DataFrame, *, title: str = "Positioning int
 
 
 def interval_distribution(table: pl.DataFrame, *, title: str = "Positioning interval, distribution") -> Chart:
-    """Distribution of the distances from the previous position (P1 figure 12).
-
-    Parameters
-    ----------
-    table : polars.DataFrame
-        See `interval`.
-    title : str
-
-    Returns
-    -------
-    Chart
-    """
+    """Distribution of the distances from the previous position (P1 figure 12), of the table of `interval`."""
     distances = {label: interval(table, prefix)[1] for label, prefix, _, _ in _FIXES}
     largest = max((float(y.max()) for y in distances.values() if len(y)), default=1.0)
     step = nice_step(max(largest, 1e-3) / 40.0)
@@ -355,18 +328,7 @@ def _by(table: pl.DataFrame) -> str:
 
 
 def satellites_over_time(positions: pl.DataFrame, *, title: str = "Satellites") -> Chart:
-    """Satellites used and rejected at each epoch.
-
-    Parameters
-    ----------
-    positions : polars.DataFrame
-        Of one antenna.
-    title : str
-
-    Returns
-    -------
-    Chart
-    """
+    """Satellites used and rejected at each epoch of one antenna."""
     start = start_of(positions)
     x = since(positions, start)
     layers: list[Layer] = []

@@ -1,28 +1,27 @@
-"""The picture of a network of tracks."""
+"""The plan of a network of tracks: as a chart of its page, and as a picture."""
 
 from __future__ import annotations
 
 from os import PathLike
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from railfix.core.files import staged_file
+from railfix.core.arrays import Floats, Indices
+from railfix.core.geodesy import ecef_from_geodetic, enu_axes
+from railfix.report.plots.chart import BLACK, BLUE, GREEN, GREY, ORDERED, RED, Chart, Layer, Line, Marks, Points
+from railfix.report.plots.draw import draw_figure, save_figure
+from railfix.track.network import Network, end_points
+from railfix.track.network_check import NetworkQuality
+from railfix.track.network_match import Matched, PlanLog
 
-if TYPE_CHECKING:
-    from railfix.track.network import Network
-    from railfix.track.network_check import NetworkQuality
-    from railfix.track.network_match import Matched, PlanLog
-
-_COLOURS: Final = {
-    "gap": "#c1272d",
-    "kink": "#e08e0b",
-    "joint": "#c1272d",
-    "too near": "#7b3294",
-    "dead end": "#888888",
-}
-#: Tracks that are named in the picture at most.
-_NAMED: Final = 60
+#: Points of tracks that are drawn at most; of larger networks every n-th one and the ends.
+_DRAWN: Final = 200_000
+#: Tracks that are named in the plan at most.
+_NAMED: Final = 400
+_KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
+#: Positions by the probability of their track: at least this, and the colour.
+_CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
 
 
 def plot_network(
@@ -32,54 +31,91 @@ def plot_network(
     quality: NetworkQuality | None = None,
     run: tuple[PlanLog, Matched] | None = None,
 ) -> None:
-    """Draw the tracks with their names, findings of the check, and the positions of a run.
+    """Write `network_plan` as a PNG or SVG file; OutputError where it cannot be written."""
+    save_figure(draw_figure(network_plan(network, quality, run)), path)
 
-    Parameters
-    ----------
-    network : Network
-    path : path
-        PNG or SVG file; it appears whole or not at all.
-    quality : NetworkQuality, optional
-    run : (PlanLog, Matched), optional
-        Positions, coloured by the probability of their track.
 
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 9), dpi=120)
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    for track, name in zip(network.tracks, network.names, strict=True):
-        axes.plot(track.longitude_deg, track.latitude_deg, color="#1f4e79", linewidth=0.8)
-        if len(network.tracks) <= _NAMED:
-            middle = len(track.latitude_deg) // 2
-            axes.annotate(name, (track.longitude_deg[middle], track.latitude_deg[middle]), fontsize=5)
-    for kind, colour in _COLOURS.items():
+def network_plan(network: Network, quality: NetworkQuality | None, run: tuple[PlanLog, Matched] | None) -> Chart:
+    """Tracks with their switches and names, findings of the check, and the positions of a run."""
+    latitude, longitude = (
+        np.concatenate([getattr(t, name) for t in network.tracks]) for name in ("latitude_deg", "longitude_deg")
+    )
+    at = (float(np.median(latitude)), float(np.median(longitude)))
+    nth = max(1, len(latitude) // _DRAWN)
+    rows, breaks = _thinned(network, nth)
+    layers: list[Layer] = [_line("tracks", BLUE, _local(at, latitude[rows], longitude[rows]), breaks)]
+    ends, _ = end_points(network)
+    axes = enu_axes(*at)[:2]
+    stems = _switches(network)
+    if len(stems):
+        east, north = ((ends[stems[:, 0], stems[:, 1]] - ecef_from_geodetic(*at, 0.0)) @ axes.T).T
+        layers.append(Points(label="switches", colour=GREEN, x=east, y=north, shape="square", size=4.0))
+    for kind, colour in _KINDS.items():
         found = [f for f in quality.findings if f.kind == kind] if quality is not None else []
         if found:
-            axes.plot(
-                [f.longitude_deg for f in found],
-                [f.latitude_deg for f in found],
-                "o",
-                color=colour,
-                fillstyle="none",
-                label=f"{kind} ({len(found)})",
-            )
+            place = _local(at, np.array([f.latitude_deg for f in found]), np.array([f.longitude_deg for f in found]))
+            layers.append(Points(label=kind, colour=colour, x=place[0], y=place[1], shape="cross", size=7.0))
     if run is not None:
-        log, matched = run
-        shown = axes.scatter(
-            log.longitude_deg, log.latitude_deg, c=matched.probability, s=4, cmap="RdYlGn", vmin=0.0, vmax=1.0, zorder=3
+        layers += _positions(at, *run)
+    if len(network.tracks) <= _NAMED:
+        middle = (network.first_point[:-1] + network.first_point[1:]) // 2
+        east, north = _local(at, latitude[middle], longitude[middle])
+        layers.append(Marks(label="names", colour=BLACK, x=east, y=north, words=network.names, place="on"))
+    caption = f"Plan about {at[0]:.5f}, {at[1]:.5f}."
+    if nth > 1:
+        caption += f" Every {nth}th point of a track and its ends are drawn."
+    return Chart(
+        name="network", title="Tracks", caption=caption, x_label="east [m]", y_label="north [m]", layers=tuple(layers),
+        equal=True,
+    )  # fmt: skip
+
+
+def _local(at: tuple[float, float], latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
+    """East and north of a place on the ellipsoid [m]."""
+    plan = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg))) - ecef_from_geodetic(*at, 0.0)
+    east, north = (plan @ enu_axes(*at)[:2].T).T
+    return east, north
+
+
+def _thinned(network: Network, nth: int) -> tuple[Indices, Indices]:
+    """Every n-th point of each track and its last one, and where in them a new track begins."""
+    first, last = network.first_point[:-1], network.first_point[1:] - 1
+    track = np.repeat(np.arange(len(first)), last - first + 1)
+    place = np.arange(len(track)) - first[track]
+    kept = np.flatnonzero((place % nth == 0) | (np.arange(len(track)) == last[track]))
+    return kept, np.flatnonzero(np.diff(track[kept])) + 1
+
+
+def _line(label: str, colour: str, place: tuple[Floats, Floats], breaks: Indices) -> Line:
+    east, north = (np.insert(values, breaks, np.nan) for values in place)
+    return Line(label=label, colour=colour, x=east, y=north, width=1.2)
+
+
+def _switches(network: Network) -> Indices:
+    """Track and end of each stem of a switch, shape (n, 2)."""
+    ends = np.array(
+        [
+            pair
+            for link in network.links
+            if link.navigable
+            for pair in ((link.first, link.first_end), (link.second, link.second_end))
+        ],
+        dtype=np.intp,
+    ).reshape(-1, 2)
+    stems, count = np.unique(ends, axis=0, return_counts=True)
+    return np.asarray(stems[count > 1], dtype=np.intp)
+
+
+def _positions(at: tuple[float, float], log: PlanLog, matched: Matched) -> list[Layer]:
+    """Positions in classes of the probability of their track, and those on none."""
+    east, north = _local(at, log.latitude_deg, log.longitude_deg)
+    on, layers, above = matched.track >= 0, [], np.inf
+    for low, colour in _CLASSES:
+        rows = on & (matched.probability >= low) & (matched.probability < above)
+        layers.append(
+            Points(label=f"position, probability of its track from {low:g}", colour=colour, x=east[rows], y=north[rows])
         )
-        figure.colorbar(shown, label="probability of the track", shrink=0.6)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="best")
-    axes.set_aspect(1.0 / np.cos(np.radians(float(np.mean(axes.get_ylim())))))
-    axes.set_xlabel("longitude [deg]")
-    axes.set_ylabel("latitude [deg]")
-    with staged_file(path) as staged:
-        figure.savefig(staged, format="svg" if str(path).endswith(".svg") else "png")
+        above = low
+    off = ~on & np.isfinite(log.latitude_deg)
+    layers.append(Points(label="position on no track", colour=BLACK, x=east[off], y=north[off], shape="ring"))
+    return [layer for layer in layers if len(layer.x)]

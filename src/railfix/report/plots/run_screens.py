@@ -44,24 +44,12 @@ class _Rows:
 
 
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
-    """Draw every screen of a run that tested anything, one picture per antenna.
-
-    Parameters
-    ----------
-    run : Path
-        Folder that ``railfix run --observations`` wrote.
-    out : Path
-        Folder for the pictures; it is created.
-
-    Returns
-    -------
-    list of Path
-        ``front_doppler.png`` and the like.
+    """Draw every screen of a run that tested anything, one picture per antenna: ``front_doppler.png`` and the like.
 
     Raises
     ------
     InputFileError
-        The folder is not that of a run, or the run wrote no observations.
+        The folder is not that of a run, or the run wrote no observations (``railfix run --observations``).
     OutputError
         A picture cannot be written.
     """
@@ -128,20 +116,7 @@ class RunScreen:
 
 
 def screens_of(config: Config, positions: pl.DataFrame, observations: pl.LazyFrame) -> Iterator[RunScreen]:
-    """Every screen of a run that tested anything, antenna by antenna.
-
-    Parameters
-    ----------
-    config : Config
-        Settings that were used.
-    positions : polars.DataFrame
-    observations : polars.LazyFrame
-        Tables of the run, columns of `railfix.pipeline.tables`.
-
-    Yields
-    ------
-    RunScreen
-    """
+    """Every screen of a run that tested anything, antenna by antenna, with the settings that were used."""
     antennas = positions["antenna"].unique(maintain_order=True).to_list()
     for antenna in antennas:
         mine = positions.filter(pl.col("antenna") == antenna) if len(antennas) > 1 else positions

@@ -5,28 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks
-from railfix.core.files import staged_file
 from railfix.core.timescale import seconds
-from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean, Cn0Samples
-from railfix.report.plots.chart import Chart, Layer, Line, Points
+from railfix.ranges.cn0_curve import Cn0Curve, Cn0Samples
+from railfix.report.plots.chart import BLACK, RED, Chart, Layer, Line, Points
 from railfix.report.plots.columns import nice_step
-from railfix.report.plots.draw import draw_chart
+from railfix.report.plots.draw import draw_chart, save_figure
+from railfix.report.plots.signals import open_sky_chart
 from railfix.report.plots.thinning import counts_sentence, extremes, spread
 from railfix.screens import Cn0Limits, ScreenPicture
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-#: Colours distinguishable with colour blindness (Okabe and Ito).
-_MEAN, _LIMIT, _FLOOR, _REJECTED, _KEPT = "#0072b2", "#d55e00", "#000000", "#d55e00", "#2f86b8"
+_KEPT: Final = "#2f86b8"
 _COLUMNS: Final = 4
 #: Rows of a picture that are looked at together.
 _BLOCK: Final = 100_000
@@ -37,15 +31,7 @@ _LINE_POINTS: Final = 1500
 def draw_screen(
     path: str | PathLike[str], picture: ScreenPicture, time: Datetimes, chainage_m: Floats | None = None
 ) -> Path:
-    """Draw a metric against its limit over time, and over chainage where it is known.
-
-    Parameters
-    ----------
-    path : path
-        PNG file; it appears whole or not at all.
-    picture : ScreenPicture
-    time : ndarray of datetime64[ns], shape (T,)
-    chainage_m : ndarray, shape (T,) [m], optional
+    """Draw a metric against its limit over T times, and over chainage [m] where it is known, as a PNG file.
 
     Raises
     ------
@@ -60,7 +46,7 @@ def draw_screen(
     figure = Figure(figsize=(12, 4.2 * len(charts)), layout="constrained")
     for axes, chart in zip(np.ravel(figure.subplots(len(charts), 1)), charts, strict=True):
         draw_chart(chart, axes)
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[np.integer] | None = None) -> Chart:
@@ -72,10 +58,6 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
     time : ndarray of datetime64[ns], shape (T,), or (E,) with `epoch`
     epoch : ndarray of int, shape (T,), optional
         Epoch of each row of the picture, where `time` is that of E epochs.
-
-    Returns
-    -------
-    Chart
     """
     start = time.min() if len(time) else np.datetime64(0, "ns")
     return _screen(picture, seconds(time - start), epoch, name="time", x_label="GPS time", start=start)
@@ -84,19 +66,7 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
 def screen_over_chainage(
     picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
 ) -> Chart:
-    """Chart of a metric against its limit over the place.
-
-    Parameters
-    ----------
-    picture : ScreenPicture
-    chainage_m : ndarray, shape (T,), or (E,) with `epoch` [m]
-    epoch : ndarray of int, shape (T,), optional
-        See `screen_over_time`.
-
-    Returns
-    -------
-    Chart
-    """
+    """The same over the chainage, shape (T,), or (E,) with `epoch` [m]; see `screen_over_time`."""
     return _screen(picture, chainage_m, epoch, name="chainage", x_label="chainage [m]", start=None)
 
 
@@ -114,7 +84,7 @@ def _screen(
     share = f"{100 * rejected / judged:.2f} %" if judged else "none"
     layers: list[Layer] = []
     shown = total = 0
-    for reject, colour, label in ((False, _KEPT, "passed"), (True, _REJECTED, "rejected")):
+    for reject, colour, label in ((False, _KEPT, "passed"), (True, RED, "rejected")):
         parts = []
         for along, metric, rejects, _ in _blocks(picture, x, epoch):
             mask = rejects == reject
@@ -136,7 +106,7 @@ def _screen(
     rows = extremes(at, least, points=_LINE_POINTS)
     for sign in {"both": (1.0, -1.0), "above": (1.0,), "below": (1.0,)}[picture.sides]:
         label = "limit" if sign > 0 else ""
-        layers.append(Line(label=label, colour=_FLOOR, x=at[rows], y=sign * least[rows], width=1.0))
+        layers.append(Line(label=label, colour=BLACK, x=at[rows], y=sign * least[rows], width=1.0))
     scale: dict[str, Any] = {}
     if finite and picture.sides != "below" and judged:
         top = 6.0 * float(np.median(least)) if len(least) else 0.0
@@ -188,16 +158,7 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
 def draw_cn0_curve(
     path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples, *, limits: Cn0Limits | None = None
 ) -> Path:
-    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3).
-
-    Parameters
-    ----------
-    path : path
-        PNG file; it appears whole or not at all.
-    curve : Cn0Curve
-    samples : Cn0Samples
-        What the curve was fitted on.
-    limits : Cn0Limits, optional
+    """Draw C/N0 over elevation with mean and threshold, a panel a constellation and signal (P1 figure 3), as PNG.
 
     Raises
     ------
@@ -206,43 +167,15 @@ def draw_cn0_curve(
     """
     from matplotlib.figure import Figure
 
-    limits = limits or Cn0Limits()
-    rows = -(-len(curve.means) // _COLUMNS)
-    figure = Figure(figsize=(4.0 * min(_COLUMNS, len(curve.means)), 3.0 * rows), layout="constrained")
+    charts = [open_sky_chart(mean, *samples.of(mean.kind, mean.signal), limits or Cn0Limits()) for mean in curve.means]
+    columns = min(_COLUMNS, len(charts))
+    rows = -(-len(charts) // columns)
+    figure = Figure(figsize=(4.5 * columns, 3.5 * rows), layout="constrained")
     source = curve.source
     figure.suptitle(f"{source.antenna or 'antenna not named'}, {source.receiver or 'receiver not named'}")
-    panels = np.ravel(figure.subplots(rows, min(_COLUMNS, len(curve.means)), sharex=True, sharey=True))
-    for axes, mean in zip(panels, curve.means, strict=False):
-        _draw_mean(axes, mean, samples, limits)
-    for axes in panels[len(curve.means) :]:
+    panels = np.ravel(figure.subplots(rows, columns, sharex=True, sharey=True))
+    for axes, chart in zip(panels, charts, strict=False):
+        draw_chart(chart, axes)
+    for axes in panels[len(charts) :]:
         axes.set_visible(False)
-    panels[0].legend(fontsize="x-small", loc="lower right")
-    return _save(figure, path)
-
-
-def _draw_mean(axes: Axes, mean: Cn0Mean, samples: Cn0Samples, limits: Cn0Limits) -> None:
-    from matplotlib.colors import LogNorm
-
-    elevation, cn0 = samples.of(mean.kind, mean.signal)
-    axes.hist2d(elevation, cn0, bins=[np.arange(0, 91, 1.0), np.arange(10, 61, 0.5)], cmap="Greys", norm=LogNorm())
-    at = np.linspace(0.0, 90.0, 361)
-    level = mean.at(at)
-    axes.plot(at, level, "-", color=_MEAN, label="mean")
-    axes.plot(mean.elevation_deg, mean.mean_dbhz, ".", color=_MEAN, ms=4)
-    if limits.deficit_dbhz is not None:
-        axes.plot(at, level - limits.deficit_dbhz, "--", color=_LIMIT, label=f"mean - {limits.deficit_dbhz:g} dB-Hz")
-    if limits.floor_dbhz is not None:
-        axes.axhline(limits.floor_dbhz, color=_FLOOR, lw=0.8, ls=":", label=f"floor {limits.floor_dbhz:g} dB-Hz")
-    axes.set_title(f"{KINDS.get(mean.kind, mean.kind)}, {mean.signal}", fontsize="small")
-    axes.set_xlim(0, 90)
-    axes.set_ylim(10, 60)
-    axes.set_xlabel("elevation [deg]", fontsize="small")
-    axes.set_ylabel("C/N0 [dB-Hz]", fontsize="small")
-    axes.label_outer()
-    axes.grid(alpha=0.3)
-
-
-def _save(figure: Figure, path: str | PathLike[str]) -> Path:
-    with staged_file(path, what="picture") as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
-    return Path(path)
+    return save_figure(figure, path)

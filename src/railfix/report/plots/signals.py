@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
 import polars as pl
 
-from railfix.core.arrays import Datetimes, Floats
+from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.reasons import Reason, first_reason, reason_names
-from railfix.ranges.cn0_curve import KINDS, Cn0Curve
+from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0Mean
 from railfix.ranges.cn0_curve.curve import satellite_kind
 from railfix.report.plots.chart import BLACK, BLUE, GREY, PURPLE, RED, Cells, Chart, Layer, Line, Points, SkyEpochs
 from railfix.report.plots.columns import floats, since, start_of, words
@@ -77,21 +77,32 @@ def cn0_over_elevation(
         counts = np.zeros((len(_ELEVATION_EDGES) - 1, len(_CN0_EDGES) - 1), dtype=np.int64)
         drawn = mine.filter(pl.col("up").is_between(0, counts.shape[1] - 1), pl.col("across") < len(counts))
         np.add.at(counts, (drawn["across"].to_numpy(), drawn["up"].to_numpy()), drawn["count"].to_numpy())
-        cells = Cells(label="observations", colour=BLACK, x_edges=_ELEVATION_EDGES, y_edges=_CN0_EDGES, counts=counts)
-        charts.append(
-            Chart(
-                name=f"cn0-{kind}-{signal}".lower(),
-                title=f"{title}: {KINDS.get(kind, kind)}, {signal}",
-                caption=f"{size:,} observations, the more the darker.",
-                x_label="elevation [deg]",
-                y_label="C/N0 [dB-Hz]",
-                layers=(cells, *lines),
-                x_range=(0.0, 90.0),
-                y_range=(10.0, 60.0),
-                width="half",
-            )
-        )
+        caption = f"{size:,} observations, the more the darker."
+        charts.append(_cn0_chart(kind, signal, counts, lines, title=f"{title}: ", caption=caption))
     return charts
+
+
+def open_sky_chart(mean: Cn0Mean, elevation_deg: Floats, cn0_dbhz: Floats, limits: Cn0Limits) -> Chart:
+    """Samples of one constellation and signal under open sky, with their mean and the thresholds."""
+    counts = np.histogram2d(elevation_deg, cn0_dbhz, bins=[_ELEVATION_EDGES, _CN0_EDGES])[0].astype(np.int64)
+    return _cn0_chart(mean.kind, mean.signal, counts, (*_open_sky(mean, limits), *_floor(limits)))
+
+
+def _cn0_chart(
+    kind: str, signal: str, counts: Integers, lines: Sequence[Layer], *, title: str = "", caption: str = ""
+) -> Chart:
+    cells = Cells(label="observations", colour=BLACK, x_edges=_ELEVATION_EDGES, y_edges=_CN0_EDGES, counts=counts)
+    return Chart(
+        name=f"cn0-{kind}-{signal}".lower(),
+        title=f"{title}{KINDS.get(kind, kind)}, {signal}",
+        caption=caption,
+        x_label="elevation [deg]",
+        y_label="C/N0 [dB-Hz]",
+        layers=(cells, *lines),
+        x_range=(0.0, 90.0),
+        y_range=(10.0, 60.0),
+        width="half",
+    )
 
 
 def _cell(column: str, edges: Floats) -> pl.Expr:
@@ -109,23 +120,28 @@ def _lines(
     curve: Cn0Curve | None,
     mask_deg: float | None,
 ) -> Iterator[Layer]:
-    whole = np.array([0.0, 90.0])
     mean = next((m for m in curve.means if (m.kind, m.signal) == (kind, signal)), None) if curve else None
-    if mean is not None:
-        at = np.linspace(0.0, 90.0, 181)
-        level = mean.at(at)
-        yield Line(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
-        if limits is not None and limits.deficit_dbhz is not None:
-            label = f"{limits.deficit_dbhz:g} dB below"
-            yield Line(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
-    else:
-        yield from _mean_of(cells)
-    if limits is not None and limits.floor_dbhz is not None:
-        floor = np.full(2, limits.floor_dbhz)
-        yield Line(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
+    yield from _mean_of(cells) if mean is None else _open_sky(mean, limits)
+    yield from _floor(limits)
     if mask_deg is not None:
         edge = np.full(2, mask_deg)
         yield Line(label=f"mask {mask_deg:g} deg", colour=GREY, x=edge, y=np.array([10.0, 60.0]), dash="dotted")
+
+
+def _open_sky(mean: Cn0Mean, limits: Cn0Limits | None) -> Iterator[Layer]:
+    """Mean of the open sky, and the threshold below it."""
+    at = np.linspace(0.0, 90.0, 181)
+    level = mean.at(at)
+    yield Line(label="mean of the open sky", colour=BLUE, x=at, y=level, width=2.0)
+    if limits is not None and limits.deficit_dbhz is not None:
+        label = f"{limits.deficit_dbhz:g} dB below"
+        yield Line(label=label, colour=RED, x=at, y=level - limits.deficit_dbhz, width=2.0, dash="dashed")
+
+
+def _floor(limits: Cn0Limits | None) -> Iterator[Layer]:
+    if limits is not None and limits.floor_dbhz is not None:
+        floor, whole = np.full(2, limits.floor_dbhz), np.array([0.0, 90.0])
+        yield Line(label=f"floor {limits.floor_dbhz:g} dB-Hz", colour=PURPLE, x=whole, y=floor, dash="dotted")
 
 
 def _mean_of(cells: pl.DataFrame) -> Iterator[Layer]:

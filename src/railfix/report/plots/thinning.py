@@ -14,19 +14,9 @@ _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
 
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Rows of the smallest and the largest `y` in each piece of `x`.
+    """Rows of the smallest and the largest `y` in each piece of `x`, in rising order; rows with NaN are left out.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (P,)
-        Rows with NaN are left out.
-    points : int
-        About how many rows are left; all, if there are no more.
-
-    Returns
-    -------
-    ndarray of int
-        Rows in rising order: of each of `points` / 2 equal pieces of `x` two at most.
+    All rows where there are at most `points`, else two of each of `points` / 2 equal pieces of `x` at most.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
@@ -46,20 +36,9 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
-    """Rows of which no two lie in one square cell; the cells grow until at most `points` rows are left.
+    """Rows in rising order of which no two lie in one square cell; rows with NaN are left out.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (P,)
-        Rows with NaN are left out.
-    cell : float
-        Initial width of a cell.
-    points : int
-
-    Returns
-    -------
-    ndarray of int
-        Rows in rising order.
+    The cells, at first of width `cell`, grow until at most `points` rows are left.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
@@ -73,22 +52,10 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 
 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Rows with the same density as all rows, and the extremes of each piece of `x`.
+    """At most `points` rows with the same density as all rows, and the extremes of each piece of `x`, in rising order.
 
-    Rows are sampled uniformly by the golden-ratio sequence, which has no period in common with satellites or epochs;
-    a fifth of the points are extremes, so that the outline and single outliers stay.
-
-    Parameters
-    ----------
-    x, y : ndarray, shape (P,)
-        Rows with NaN are left out.
-    points : int
-        Largest number of rows.
-
-    Returns
-    -------
-    ndarray of int
-        Rows in rising order.
+    Rows with NaN are left out, the others are sampled uniformly by the golden-ratio sequence, which has no period in
+    common with satellites or epochs; a fifth of the points are extremes, so that the outline and single outliers stay.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:

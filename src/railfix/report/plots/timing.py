@@ -12,18 +12,7 @@ from railfix.report.plots.chart import BLUE, GREY, Chart, Line, Points
 
 
 def processing_time(chunks: Mapping[str, Sequence[Any]], *, title: str = "Time an epoch") -> Chart:
-    """Time an epoch over the run, the mean of each chunk.
-
-    Parameters
-    ----------
-    chunks : mapping
-        ``chunks`` of ``run.json``: ``first_epoch_gpst``, ``epochs``, ``positioning_s``.
-    title : str
-
-    Returns
-    -------
-    Chart
-    """
+    """Time an epoch over the run, the mean of each chunk; of ``chunks`` of ``run.json``."""
     time = np.array([str(t) for t in chunks["first_epoch_gpst"]], dtype="datetime64[ns]")
     epochs = np.array(chunks["epochs"], dtype=np.float64)
     spent = np.array(chunks["positioning_s"], dtype=np.float64)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.core.files import staged_file
 from railfix.core.geodesy import enu_axes
+from railfix.report.plots.draw import save_figure
 from railfix.track import Track, TrackQuality
 
 if TYPE_CHECKING:
@@ -42,31 +42,22 @@ def _plan(track: Track) -> tuple[Floats, Floats]:
 
 
 def plot_track_quality(quality: TrackQuality, path: str | PathLike[str]) -> None:
-    """Draw plan, mid-chord deviation, spacing, turns, gradient and cant, with the findings marked.
-
-    Parameters
-    ----------
-    quality : TrackQuality
-    path : path
-        PNG file; it appears whole or not at all.
+    """Draw plan, mid-chord deviation, spacing, turns, gradient and cant, with the findings marked, as a PNG file.
 
     Raises
     ------
     OutputError
         The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 14), layout="constrained")
-    FigureCanvasAgg(figure)
     names = ("mid-chord", "spacing", "turn", "gradient", "cant")
     grid = figure.add_gridspec(1 + len(names), 1, height_ratios=[2.6] + [1.0] * len(names))
     _draw_plan(figure.add_subplot(grid[0]), quality)
     panels = {name: figure.add_subplot(grid[i + 1]) for i, name in enumerate(names)}
     _draw_panels(panels, quality)
-    with staged_file(path, what="picture") as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+    save_figure(figure, path)
 
 
 def _draw_plan(axes: Axes, quality: TrackQuality) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from railfix.core.files import staged_file
+from railfix.report.plots.draw import save_figure
 
 if TYPE_CHECKING:
     from railfix.run.which_track import TrackDecision
@@ -21,11 +21,9 @@ def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, r
     OutputError
         The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)
-    FigureCanvasAgg(figure)
     above, below = figure.subplots(2, 1, sharex=True)
     shares = np.array([p.probability for p in decision.posteriors])
     for k, name in enumerate(decision.posteriors[-1].names):
@@ -38,5 +36,4 @@ def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, r
     below.set_xlabel("time at rest [s]")
     above.set_title(f"track: {decision.track}")
     below.legend(loc="best", fontsize=7)
-    with staged_file(path) as staged:
-        figure.savefig(staged, format="svg" if str(path).endswith(".svg") else "png")
+    save_figure(figure, path)
