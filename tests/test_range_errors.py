@@ -75,7 +75,7 @@ def test_a_station_speaks_between_its_epochs_and_of_its_satellites() -> None:
     )
     at = EPOCH + np.array([-1, 0, 15, 30, 60, 91]) * np.timedelta64(1, "s")
     found = station.at(at, np.array(["E01", "R01"]), largest_gap_s=35.0)
-    np.testing.assert_allclose(found[:, 0], [np.nan, 1.0, 2.0, np.nan, np.nan, np.nan])
+    np.testing.assert_allclose(found[:, 0], [np.nan, 1.0, 2.0, 3.0, np.nan, np.nan])
     assert np.isnan(found[:, 1]).all()
     assert np.isnan(station.at(at, np.array(["G01"]), largest_gap_s=100.0)[2, 0])
 

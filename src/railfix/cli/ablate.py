@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.table import Table
 
-from railfix.cli.console import console_of_tables, progress_bar, show_files, show_notes
+from railfix.cli.console import console_of_tables, plain_table, progress_bar, show_files, show_notes
 from railfix.cli.options import OutOption, Without, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.evaluate import Score
@@ -69,16 +67,13 @@ def show_ablation(ablation: Ablation) -> None:
 
 def _show(console: Console, effects: list[Effect]) -> None:
     scored = effects[0].coordinates is not None
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("screens", no_wrap=True)
     heads = ["rate\n%", "ok\n%", "sats\nused", "sigma\np50 m"]
     if scored:
         heads += [f"{head}\n{of}" for of in ("all", "ok") for head in ("p50", "p95", "max", "wrong")]
     filtered = any(effect.sources for effect in effects)
     if scored and filtered:
         heads += [f"{head}\nno sats" for head in ("p50", "p95", "max")] + ["p95\n/sigma"]
-    for head in heads:
-        table.add_column(head, justify="right", no_wrap=True)
+    table = plain_table("screens", *heads, text=1)
     for effect in effects:
         cells = [f"{100 * effect.rate:.2f}", f"{100 * effect.ok_rate:.2f}", f"{effect.n_used:.2f}"]
         cells.append(f"{effect.sigma_p50_m:.2f}")

@@ -83,10 +83,7 @@ def campaign(
 def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, tuple[type[Exception], ...]]]:
     """Give the executor, and the errors by which it reports that a worker process is gone.
 
-    Raises
-    ------
-    SettingsError
-        There is no such scheduler, or `distributed` is not installed.
+    SettingsError: there is no such scheduler, or `distributed` is not installed.
     """
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:

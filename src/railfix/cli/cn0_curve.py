@@ -9,13 +9,12 @@ import typer
 from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_files, show_notes
-from railfix.cli.options import LenientOption, OverwriteOption
+from railfix.cli.options import LenientOption, OverwriteOption, check_outputs
 from railfix.core.arrays import Floats
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.settings import validated
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, CurveFit, cn0_curve_from_log, write_cn0_curve
-from railfix.run.output import check_output_file
 
 
 def cn0_curve(
@@ -55,15 +54,7 @@ def cn0_curve(
     """
     fit = validated(CurveFit, {"bin_deg": bin_deg}, source="--bin")
     place = None if position is None else place_of(position, "--position")
-    outputs = [path for path in (out, plot) if path is not None]
-    for path in outputs:
-        others = [other for other in outputs if other is not path]
-        check_output_file(
-            path,
-            overwrite="replace" if overwrite else "refuse",
-            inputs=[*observations, *nav, *others],
-            kind="png" if path is plot else "any",
-        )
+    outputs = check_outputs((out, "any"), (plot, "png"), overwrite=overwrite, inputs=[*observations, *nav])
     fitted = cn0_curve_from_log(
         observations, nav, position_ecef_m=place, fit=fit, broken_lines="count" if lenient else "stop"
     )

@@ -98,13 +98,7 @@ class Commands(TyperGroup):
 
 
 class LazyCommands(Commands):
-    """The commands of the program, each imported from its module when it is called.
-
-    Attributes
-    ----------
-    summaries : mapping of str to str
-        What each command does, by its name, for the list of commands.
-    """
+    """The commands of the program, each imported from its module when it is called; `summaries` are for their list."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -31,6 +32,41 @@ def console_of_tables() -> Console:
     if not console.is_terminal:
         console.width = max(console.width, _FILE_WIDTH)
     return console
+
+
+#: Head, column and format of a column of a table.
+Column = tuple[str, str, Callable[[Any], str]]
+
+
+def plain_table(*heads: str, text: int) -> Table:
+    """A table without a frame whose first columns are text and the others numbers."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for number, head in enumerate(heads):
+        table.add_column(head, justify="left" if number < text else "right", no_wrap=True, overflow="fold")
+    return table
+
+
+def listed(rows: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> Table:
+    """A plain table of rows; the first columns, of format `str`, are text."""
+    table = plain_table(*(head for head, _, _ in columns), text=sum(form is str for _, _, form in columns))
+    for row in rows:
+        table.add_row(*(form(row[column]) for _, column, form in columns))
+    return table
+
+
+def count(value: int) -> str:
+    """A whole number with thousands separators."""
+    return f"{value:,}"
+
+
+def percent(share: float | None) -> str:
+    """A share in per cent, without the sign of it."""
+    return "-" if share is None else f"{100 * share:.2f}"
+
+
+def metres(value: float | None, *, sign: str = "") -> str:
+    """A length to the centimetre; "-" where there is none."""
+    return "-" if value is None else f"{value:{sign}.2f}"
 
 
 def show_notes(console: Console, notes: Iterable[str]) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from railfix.cli.options import OverwriteOption, from_models
+from railfix.cli.options import OverwriteOption, from_models, overwriting
 from railfix.core.errors import SettingsError
 from railfix.run.options import LogReading
 
@@ -45,11 +45,10 @@ def convert(
     """
     if out is None and nav_out is None:
         raise SettingsError("nothing to write: give --out for observations, --nav-out for ephemerides, or both")
-    from railfix.run.convert import Conversion, convert_logs
+    from railfix.run.convert import convert_logs
 
-    result = convert_logs(
-        Conversion(logs=tuple(logs), out=out, nav_out=nav_out, rinex=rinex, reading=reading),
-        overwrite="replace" if overwrite else "refuse",
+    lines = convert_logs(
+        tuple(logs), out=out, nav_out=nav_out, rinex=rinex, reading=reading, overwrite=overwriting(overwrite)
     )
-    for line in result:
+    for line in lines:
         typer.echo(line)

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from railfix.cli.console import console_of_tables, progress_bar, show_summary
 from railfix.cli.evaluate_tables import outages
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, overwriting
 from railfix.evaluate import Evaluation
 from railfix.evaluate.run_folder import POSITIONS_TABLE
 from railfix.pipeline.config import Config
@@ -48,7 +48,7 @@ def demo(
     """
     inputs = demo_inputs()
     with progress_bar() as progress:
-        options = RunOptions(observations="write", overwrite="replace" if overwrite else "refuse", chunk_epochs=200)
+        options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
         summary = run_files(inputs, Config(filter="track"), out=out, options=options, progress=progress)
     show_summary(summary)
     # the conventional positions of P1 use ranges that are not screened

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from railfix.cli.cn0_curve import place_of
 from railfix.cli.console import console_of_tables
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, check_outputs
 from railfix.core.errors import SettingsError
 from railfix.core.settings import validated
 from railfix.evaluate.range_errors import ModelInputs, error_model_from_runs
@@ -25,7 +25,6 @@ from railfix.ranges.error_model import (
     summary,
     write_error_model,
 )
-from railfix.run.output import check_output_file
 
 
 def error_model(
@@ -83,7 +82,7 @@ def error_model(
     if len(reference) != len(runs):
         raise SettingsError(f"{len(runs)} runs and {len(reference)} references: give --reference once for each run")
     in_runs = [path for run in runs if run.is_dir() for path in run.iterdir()]
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[*reference, *(base or ()), *in_runs])
+    check_outputs((out, "any"), overwrite=overwrite, inputs=[*reference, *(base or ()), *in_runs])
     edges = {"elevation_deg": _edges("--elevations", elevations), "cn0_dbhz": _edges("--cn0", cn0)}
     bins = validated(ErrorBins, {**edges, "sectors": sectors}, source="bins of the model")
     fit = validated(ErrorModelFit, {"bins": bins, "least_blocks": least_blocks}, source="--least-blocks")

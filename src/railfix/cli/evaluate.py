@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from railfix.cli.evaluate_tables import show_evaluation
-from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.cli.options import OverwriteOption, Without, from_models, overwriting
 from railfix.core.errors import SettingsError
 from railfix.evaluate import EvaluationOptions, RunAndReference, TrackFiles, evaluate_runs, write_evaluation
 from railfix.evaluate.run_folder import POSITIONS_TABLE, TABLES, tables_of
@@ -116,7 +116,7 @@ def evaluate(
     else:
         given = [pair.reference for pair in pairs if isinstance(pair.reference, Path)]
         inputs = [*given, *files.track, *(path for path in (sections, files.vehicle) if path is not None)]
-        with OutputFolder(out, overwrite="replace" if overwrite else "refuse", inputs=inputs) as folder:
+        with OutputFolder(out, overwrite=overwriting(overwrite), inputs=inputs) as folder:
             evaluation = evaluate_runs(pairs, sections=sections, files=files, options=options)
             written = write_evaluation(evaluation, folder)
     show_evaluation(evaluation, written, beside="p1" if beside_p1 else "nothing")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
 
 import polars as pl
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from railfix.cli.console import Column, count, listed, percent
 from railfix.pipeline.level_stage import standing
 
 if TYPE_CHECKING:
@@ -16,15 +17,19 @@ if TYPE_CHECKING:
 
 #: Epochs beyond that are shown; the files have all.
 _MOST_BEYOND: Final = 5
+#: The run, or the configuration whose runs are together.
+RUN_OR_CONFIGURATION: Final = pl.when(pl.col("run") != "all").then("run").otherwise("configuration").alias("of")
 _LEVELS_OF: Final = {"usable": "usable", "all": "levels alone"}
-_COUNTS: Final = (
-    "epochs", "nominal", "misleading", "hazardously_misleading", "unavailable", "unavailable_misleading", "unjudged",
-    "no_position",
-)  # fmt: skip
-_HEADS: Final = (
-    "epochs", "nominal", "misl.", "hazard.\nmisl.", "unavail.", "unavail.\nmisl.", "un-\njudged", "no\npos.",
-    "avail. %", "of ob-\nserved %", "blocks\nbeyond", "15 s %", "60 s %",
-)  # fmt: skip
+_COUNTS: Final = {
+    "epochs": "epochs",
+    "nominal": "nominal",
+    "misl.": "misleading",
+    "hazard.\nmisl.": "hazardously_misleading",
+    "unavail.": "unavailable",
+    "unavail.\nmisl.": "unavailable_misleading",
+    "un-\njudged": "unjudged",
+    "no\npos.": "no_position",
+}
 
 
 def show_integrity(evaluation: Evaluation, console: Console) -> None:
@@ -54,30 +59,29 @@ def _show_environments(rows: pl.DataFrame, console: Console) -> None:
             rows = rows.filter(pl.col(column) == "all")
     if rows["group"].n_unique() > 1:
         console.print("The same by environment, usable, at the alarm limit of the run")
-        console.print(_counts(rows, first=("group",)))
+        console.print(_counts(rows, first=(("environment", "group", str),)))
 
 
-def _counts(rows: pl.DataFrame, *, first: tuple[str, ...]) -> Table:
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for head in ("of", "antenna", *first, "levels", "limit m"):
-        table.add_column("environment" if head == "group" else head, no_wrap=True)
-    for head in _HEADS:
-        table.add_column(head, justify="right", no_wrap=True)
-    for row in rows.iter_rows(named=True):
-        shares = [row["availability"], row["availability_of_observed"]]
-        table.add_row(
-            str(row["run"] if row["run"] != "all" else row["configuration"]),
-            row["antenna"],
-            *(row[name] for name in first),
-            _LEVELS_OF[row["levels_of"]],
-            f"{row['alarm_limit_m']:g}{' (own)' if row['own_limit'] else ''}",
-            *(f"{row[name]:,}" for name in _COUNTS),
-            *map(_percent, shares),
-            f"{row['beyond_blocks']:,}",
-            _percent(row["continuity_15_s"]),
-            _percent(row["continuity_60_s"]),
-        )
-    return table
+def _counts(rows: pl.DataFrame, *, first: tuple[Column, ...]) -> Table:
+    columns: Sequence[Column] = (
+        ("of", "of", str),
+        ("antenna", "antenna", str),
+        *first,
+        ("levels", "levels_of", str),
+        ("limit m", "limit", str),
+        *((head, column, count) for head, column in _COUNTS.items()),
+        ("avail. %", "availability", percent),
+        ("of ob-\nserved %", "availability_of_observed", percent),
+        ("blocks\nbeyond", "beyond_blocks", count),
+        ("15 s %", "continuity_15_s", percent),
+        ("60 s %", "continuity_60_s", percent),
+    )
+    own = zip(rows["alarm_limit_m"], rows["own_limit"], strict=True)
+    limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in own]
+    shown = rows.with_columns(
+        RUN_OR_CONFIGURATION, pl.col("levels_of").replace(_LEVELS_OF), pl.Series("limit", limits, dtype=pl.String)
+    )
+    return listed(shown.iter_rows(named=True), columns)
 
 
 def _show_beyond(found: Integrity, kind: str, console: Console) -> None:
@@ -99,7 +103,3 @@ def _show_beyond(found: Integrity, kind: str, console: Console) -> None:
             markup=False,
             soft_wrap=True,
         )
-
-
-def _percent(value: Any) -> str:
-    return "-" if value is None else f"{100 * value:.2f}"

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import polars as pl
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from railfix.cli.console import console_of_tables, show_files, show_notes
-from railfix.cli.evaluate_levels import show_integrity
+from railfix.cli.console import (
+    Column,
+    console_of_tables,
+    count,
+    listed,
+    metres,
+    percent,
+    plain_table,
+    show_files,
+    show_notes,
+)
+from railfix.cli.evaluate_levels import RUN_OR_CONFIGURATION, show_integrity
 from railfix.evaluate.figures import WITH_SATELLITES
 from railfix.evaluate.output import P1_COMMERCIAL, P1_TABLE_4
 from railfix.evaluate.scores import WRONG_PLACE_M
@@ -94,32 +104,40 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, beside: L
     show_files(console, files.values())
 
 
-def _table(*heads: str, text: int) -> Table:
-    """A table whose first columns are text and the others numbers."""
-    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for number, head in enumerate(heads):
-        table.add_column(head, justify="left" if number < text else "right", no_wrap=True, overflow="fold")
-    return table
+_WHERE: Final[tuple[Column, ...]] = (("run", "run", str), ("antenna", "antenna", str))
+_OF: Final[tuple[Column, ...]] = (("of", "of", str), ("antenna", "antenna", str))
+_signed: Final = partial(metres, sign="+")
+
+
+def _named(rows: pl.DataFrame) -> pl.DataFrame:
+    """Rows with the words for their kind of position."""
+    return rows.with_columns(pl.col("position").replace({name: text.strip() for name, text in _NAMES.items()}))
+
+
+def _place(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f} m"
 
 
 def _overall(rows: pl.DataFrame) -> Table:
-    heads = ("epochs", "rate %", "of run %", "mean", "std", "rms", "p50", "p95", "p99", "max", "at", "wrong", "/sigma")
-    table = _table("run", "antenna", "position", *heads, text=3)
-    for row in _in_order(rows):
-        table.add_row(
-            row["run"],
-            row["antenna"],
-            _NAMES[row["position"]] + (", epochs of both" if row["epochs_of"] == "common" else ""),
-            f"{row['observed'] if row['epochs_of'] == 'own' else row['positions']:,}",
-            _percent(row["rate"]),
-            _percent(row["rate_of_run"]),
-            _metres(row["mean_m"], sign="+"),
-            *(_metres(row[name]) for name in ("std_m", "rms_m", "p50_m", "p95_m", "p99_m", "max_m")),
-            _place(row["max_at_chainage_m"]),
-            f"{row['wrong_places']:,}",
-            _metres(row["normalised_rms"]),
-        )
-    return table
+    columns: Sequence[Column] = (
+        *_WHERE,
+        ("position", "name", str),
+        ("epochs", "counted", count),
+        ("rate %", "rate", percent),
+        ("of run %", "rate_of_run", percent),
+        ("mean", "mean_m", _signed),
+        *((name, f"{name}_m", metres) for name in ("std", "rms", "p50", "p95", "p99", "max")),
+        ("at", "max_at_chainage_m", _place),
+        ("wrong", "wrong_places", count),
+        ("/sigma", "normalised_rms", metres),
+    )
+    named = [
+        row
+        | {"name": _NAMES[row["position"]] + (", epochs of both" if row["epochs_of"] == "common" else "")}
+        | {"counted": row["observed" if row["epochs_of"] == "own" else "positions"]}
+        for row in _in_order(rows)
+    ]
+    return listed(named, columns)
 
 
 def _in_order(rows: pl.DataFrame) -> Iterator[dict[str, Any]]:
@@ -134,24 +152,22 @@ def _in_order(rows: pl.DataFrame) -> Iterator[dict[str, Any]]:
 
 
 def _limits(rows: pl.DataFrame) -> Table:
-    table = _table("run", "antenna", "position", "blocks", "rate %", "mean", "p95", text=3)
+    table = plain_table("run", "antenna", "position", "blocks", "rate %", "mean", "p95", text=3)
     for row in _in_order(rows.filter(pl.col("mean_low_m").is_not_null())):
         table.add_row(
             row["run"],
             row["antenna"],
             _NAMES[row["position"]],
-            f"{row['blocks']:,}",
-            f"{_percent(row['rate_low'])} to {_percent(row['rate_high'])}",
-            f"{_metres(row['mean_low_m'], sign='+')} to {_metres(row['mean_high_m'], sign='+')}",
-            f"{_metres(row['p95_low_m'])} to {_metres(row['p95_high_m'])}",
+            count(row["blocks"]),
+            f"{percent(row['rate_low'])} to {percent(row['rate_high'])}",
+            f"{_signed(row['mean_low_m'])} to {_signed(row['mean_high_m'])}",
+            f"{metres(row['p95_low_m'])} to {metres(row['p95_high_m'])}",
         )
     return table
 
 
 def _grouped(rows: pl.DataFrame) -> Table:
     """Constrained and conventional of each group in one row."""
-    heads = ("epochs", "rate %", "mean", "std", "p50", "p95", "max")
-    table = _table("of", "group", "antenna", *heads, *(f"conv.\n{head}" for head in heads[1:]), text=3)
     keys = ["run", "configuration", "line", "antenna", "group"]
     left = rows.filter(pl.col("position") == "constrained")
     right = rows.filter(pl.col("position") == "conventional")
@@ -161,117 +177,91 @@ def _grouped(rows: pl.DataFrame) -> Table:
         both = both.filter(pl.col("antenna") == "all")
     if rows["grouping"][0] == "section":
         both = both.head(_MOST_SECTIONS)
-    for row in both.iter_rows(named=True):
-        # without satellites nothing is observed: every epoch counts
-        counted, rate = ("epochs", "rate_of_run") if row["grouping"] == "signals" else ("observed", "rate")
-        cells = [f"{row[counted]:,}"]
-        for suffix in ("", "_conventional"):
-            cells.append(_percent(row[f"{rate}{suffix}"]))
-            cells.append(_metres(row[f"mean_m{suffix}"], sign="+"))
-            cells += [_metres(row[f"{name}{suffix}"]) for name in ("std_m", "p50_m", "p95_m", "max_m")]
-        table.add_row(_of(row), row["group"], row["antenna"], *cells)
-    return table
+    # without satellites nothing is observed: every epoch counts
+    counted, rate = ("epochs", "rate_of_run") if rows["grouping"][0] == "signals" else ("observed", "rate")
+    columns: list[Column] = [_OF[0], ("group", "group", str), _OF[1], ("epochs", counted, count)]
+    for conv, suffix in (("", ""), ("conv.\n", "_conventional")):
+        columns += [(f"{conv}rate %", f"{rate}{suffix}", percent), (f"{conv}mean", f"mean_m{suffix}", _signed)]
+        columns += [(f"{conv}{name}", f"{name}_m{suffix}", metres) for name in ("std", "p50", "p95", "max")]
+    return listed(both.with_columns(RUN_OR_CONFIGURATION).iter_rows(named=True), columns)
 
 
 def _intervals(rows: pl.DataFrame) -> Table:
-    heads = ("intervals", "standing", "p50 m", "p95 m", "largest m", "at", "p95 s", "longest s")
-    table = _table("of", "antenna", "position", *heads, text=3)
-    for row in rows.iter_rows(named=True):
-        table.add_row(
-            _of(row),
-            row["antenna"],
-            _NAMES[row["position"]].strip(),
-            f"{row['intervals']:,}",
-            f"{row['standing']:,}",
-            *(_metres(row[name]) for name in ("interval_p50_m", "interval_p95_m", "interval_max_m")),
-            _place(row["interval_max_chainage_m"]),
-            *(_metres(row[name]) for name in ("gap_p95_s", "gap_max_s")),
-        )
-    return table
+    columns: Sequence[Column] = (
+        *_OF,
+        ("position", "position", str),
+        ("intervals", "intervals", count),
+        ("standing", "standing", count),
+        ("p50 m", "interval_p50_m", metres),
+        ("p95 m", "interval_p95_m", metres),
+        ("largest m", "interval_max_m", metres),
+        ("at", "interval_max_chainage_m", _place),
+        ("p95 s", "gap_p95_s", metres),
+        ("longest s", "gap_max_s", metres),
+    )
+    return listed(_named(rows).with_columns(RUN_OR_CONFIGURATION).iter_rows(named=True), columns)
 
 
 def _levels(rows: pl.DataFrame) -> Table:
-    heads = ("positions", "finite %", "p50 m", "p95 m", "errors", "over level")
-    table = _table("run", "antenna", "position", "level", *heads, text=4)
-    for row in rows.iter_rows(named=True):
-        table.add_row(
-            row["run"],
-            row["antenna"],
-            _NAMES[row["position"]].strip(),
-            row["level"],
-            f"{row['positions']:,}",
-            _percent(row["level_share"]),
-            _metres(row["level_p50_m"]),
-            _metres(row["level_p95_m"]),
-            f"{row['errors']:,}",
-            f"{row['over_level']:,}",
-        )
-    return table
+    columns: Sequence[Column] = (
+        *_WHERE,
+        ("position", "position", str),
+        ("level", "level", str),
+        ("positions", "positions", count),
+        ("finite %", "level_share", percent),
+        ("p50 m", "level_p50_m", metres),
+        ("p95 m", "level_p95_m", metres),
+        ("errors", "errors", count),
+        ("over level", "over_level", count),
+    )
+    return listed(_named(rows).iter_rows(named=True), columns)
 
 
 def outages(rows: pl.DataFrame) -> Table:
     """Table of stretches without satellites."""
-    heads = ("lasting s", "way m", "rate %", "p50", "p95", "max", "at its end", "sigma there", "max /sigma")
-    table = _table("run", "antenna", "begin", "environment", "carried by", *heads, text=5)
-    for row in rows.iter_rows(named=True):
-        table.add_row(
-            row["run"],
-            row["antenna"],
-            f"{row['begin_gpst']:%H:%M:%S}",
-            row["environment"],
-            row["carried_by"] or "prediction",
-            f"{row['duration_s']:.1f}",
-            "-" if row["travelled_m"] is None else f"{row['travelled_m']:.0f}",
-            _percent(row["positions"] / row["epochs"]),
-            *(_metres(row[f"outage_{name}_m"]) for name in ("p50", "p95", "max")),
-            _metres(row["end_error_m"], sign="+"),
-            _metres(row["end_sigma_m"]),
-            _metres(row["largest_normalised"]),
-        )
-    return table
+    columns: Sequence[Column] = (
+        *_WHERE,
+        ("begin", "begin_gpst", str),
+        ("environment", "environment", str),
+        ("carried by", "carried_by", str),
+        ("lasting s", "duration_s", "{:.1f}".format),
+        ("way m", "travelled_m", lambda value: "-" if value is None else f"{value:.0f}"),
+        ("rate %", "rate", percent),
+        *((name, f"outage_{name}_m", metres) for name in ("p50", "p95", "max")),
+        ("at its end", "end_error_m", _signed),
+        ("sigma there", "end_sigma_m", metres),
+        ("max /sigma", "largest_normalised", metres),
+    )
+    shown = rows.with_columns(
+        pl.col("begin_gpst").dt.strftime("%H:%M:%S"),
+        pl.col("carried_by").fill_null("").replace("", "prediction"),
+        rate=pl.col("positions") / pl.col("epochs"),
+    )
+    return listed(shown.iter_rows(named=True), columns)
 
 
 def _branches(rows: pl.DataFrame) -> Table:
-    heads = ("positions", "stated %", "right %", "wrong", "blocks", "with a wrong one")
-    table = _table("run", "antenna", "probability", *heads, text=3)
-    for row in rows.iter_rows(named=True):
-        shares = (_percent(row[name]) for name in ("probability_mean", "right_share"))
-        counts = (f"{row[name]:,}" for name in ("wrong_places", "blocks", "wrong_blocks"))
-        table.add_row(row["run"], row["antenna"], row["probability"], f"{row['judged']:,}", *shares, *counts)
-    return table
+    columns: Sequence[Column] = (
+        *_WHERE,
+        ("probability", "probability", str),
+        ("positions", "judged", count),
+        ("stated %", "probability_mean", percent),
+        ("right %", "right_share", percent),
+        ("wrong", "wrong_places", count),
+        ("blocks", "blocks", count),
+        ("with a wrong one", "wrong_blocks", count),
+    )
+    return listed(rows.iter_rows(named=True), columns)
 
 
 def _show_p1(console: Console) -> None:
     """The figures of the source paper."""
+    rate: Column = ("rate %", "rate", percent)
     console.print("The source paper, test line (table 4)")
-    table = _table("configuration", "rate %", "mean", "std", text=1)
-    for row in P1_TABLE_4:
-        table.add_row(
-            str(row["configuration"]), _percent(row["rate"]), _metres(row["mean_m"], sign="+"), _metres(row["std_m"])
-        )
-    console.print(table)
+    test_line = (("configuration", "configuration", str), rate, ("mean", "mean_m", _signed), ("std", "std_m", metres))
+    console.print(listed(P1_TABLE_4, test_line))
     console.print(
         "The source paper, commercial lines with MSAS (5): rate of the section without tunnels (figure 10), "
         "largest error of all (figure 11)"
     )
-    table = _table("position", "rate %", "max", text=1)
-    for row in P1_COMMERCIAL:
-        table.add_row(str(row["position"]), _percent(row["rate"]), _metres(row["max_m"]))
-    console.print(table)
-
-
-def _of(row: dict[str, Any]) -> str:
-    """The run, or the configuration whose runs are together."""
-    return str(row["run"] if row["run"] != "all" else row["configuration"])
-
-
-def _percent(value: Any) -> str:
-    return "-" if value is None else f"{100 * value:.2f}"
-
-
-def _metres(value: Any, *, sign: str = "") -> str:
-    return "-" if value is None else f"{value:{sign}.2f}"
-
-
-def _place(value: Any) -> str:
-    return "-" if value is None else f"{value:.0f} m"
+    console.print(listed(P1_COMMERCIAL, (("position", "position", str), rate, ("max", "max_m", metres))))

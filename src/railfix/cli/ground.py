@@ -14,9 +14,8 @@ from rich.table import Table
 
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_files
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, check_outputs
 from railfix.core.errors import MismatchError, OutputError, SettingsError
-from railfix.run.output import check_output_file
 
 if TYPE_CHECKING:
     from railfix.ground.monitor import MonitorLimits, Order
@@ -100,10 +99,9 @@ def monitor(
     except ValueError as error:
         raise SettingsError(f"--radius, --side, --late: {str(error).splitlines()[-2].strip()}") from None
     files = [out / "monitor.csv", out / "triangle.png"]
-    for path in files:
-        if path.parent.exists():
-            inputs = [*(Path(log) for log in logs), *(nav or [])]
-            check_output_file(path, overwrite="replace" if overwrite else "refuse", inputs=inputs)
+    if out.exists():
+        inputs = [*(Path(log) for log in logs), *(nav or [])]
+        check_outputs((files[0], "any"), (files[1], "any"), overwrite=overwrite, inputs=inputs)
     if point is not None and len(point) != 3:
         raise SettingsError(f"--point was given {len(point)} times; give it once for each receiver")
     if live:
@@ -271,8 +269,7 @@ def demo(
 
     from railfix.ground.demo import run_demo
 
-    if coverage is not None:
-        check_output_file(coverage, overwrite="replace" if overwrite else "refuse", inputs=[], kind="picture")
+    check_outputs((coverage, "picture"), overwrite=overwrite, inputs=[])
     console, password = console_of_tables(), secrets.token_urlsafe(12)
 
     def announce(url: str) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from railfix.cli.options import OverwriteOption, from_models
+from railfix.cli.options import OverwriteOption, from_models, overwriting
 from railfix.cli.settings import Choices, set_value, settings_of
 from railfix.run.options import LogReading, TrackReading
 
@@ -124,7 +124,7 @@ def live(
         state=state,
         log=log,
         out=out,
-        overwrite="replace" if overwrite else "refuse",
+        overwrite=overwriting(overwrite),
     )
     for line in asyncio.run(run_live(inputs)):
         typer.echo(line, err=True)

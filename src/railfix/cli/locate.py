@@ -8,11 +8,10 @@ from typing import Annotated
 import typer
 
 from railfix.cli.console import console_of_tables, show_notes
-from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.cli.settings import Choices, settings_of
 from railfix.run.locate import LocateInputs, locate_files
 from railfix.run.options import LogReading
-from railfix.run.output import check_output_file
 
 
 @from_models
@@ -33,7 +32,7 @@ def locate(
 
     Exit codes as `railfix --help` says; 7 where no epoch has a position.
     """
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths), kind="pos")
+    check_outputs((out, "pos"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = settings_of(choices)
     summary = locate_files(inputs, settings, out=out, reading=reading)
     console = console_of_tables()

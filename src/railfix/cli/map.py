@@ -12,12 +12,11 @@ from rich.table import Table
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
 from railfix.cli.map_network import columns_of, match_command, network, route
-from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import read_positions
 from railfix.run.options import TrackReading
-from railfix.run.output import check_output_file
 from railfix.track import (
     MapLimits,
     Thinned,
@@ -83,7 +82,7 @@ def check(
         raise SettingsError("--mid-chord and --max-gap must be positive")
     picture = None if out is None else out / "map_check.png"
     if picture is not None and picture.parent.exists():
-        check_output_file(picture, overwrite="replace" if overwrite else "refuse", inputs=tracks)
+        check_outputs((picture, "any"), overwrite=overwrite, inputs=tracks)
     track = read_track(
         list(tracks),
         crs=reading.crs,
@@ -138,8 +137,7 @@ def features(
     from railfix.motion.features import line_series, map_features
     from railfix.track.trajectory import Trajectory
 
-    if out is not None:
-        check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=tracks, kind="csv")
+    check_outputs((out, "csv"), overwrite=overwrite, inputs=tracks)
     track = read_track(list(tracks), crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
     trajectory = Trajectory.from_track(track)
     found = map_features(line_series(trajectory))
@@ -209,7 +207,7 @@ def from_positions_command(
     """
     if not spacing > 0.0 or (max_sigma is not None and not max_sigma > 0.0):
         raise SettingsError("--spacing and --max-sigma must be positive")
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=[positions], kind="csv")
+    check_outputs((out, "csv"), overwrite=overwrite, inputs=[positions])
     log = read_positions(positions, columns=columns_of(column)) if column else read_any_positions(positions)
     track, thinned = from_position_log(
         log,

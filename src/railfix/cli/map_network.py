@@ -10,11 +10,10 @@ import typer
 from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_notes
-from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.core.errors import MapQualityError, MismatchError, SettingsError
 from railfix.core.files import write_whole
 from railfix.run.options import TrackReading
-from railfix.run.output import FileKind, check_output_file
 from railfix.track import write_track_csv
 from railfix.track.network import Network
 from railfix.track.network_check import check_network
@@ -85,10 +84,7 @@ def network(
 
     Exit codes as `railfix --help` says; 6 where the network has gaps, kinks, or connections that do not meet.
     """
-    outputs: tuple[tuple[Path | None, FileKind], ...] = ((out, "picture"), (page, "page"))
-    for target, kind in outputs:
-        if target is not None:
-            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=maps, kind=kind)
+    check_outputs((out, "picture"), (page, "page"), overwrite=overwrite, inputs=maps)
     tracks = _network(maps, reading, tolerance)
     quality = check_network(tracks)
     console = console_of_tables()
@@ -156,8 +152,7 @@ def route(
     ways = [w for w in (tracks, via, positions) if w]
     if len(ways) > 1:
         raise SettingsError("give one of --tracks, --via and --positions")
-    read = [path for path in (*maps, positions, heights, reading.jgd_parameters) if path is not None]
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=read, kind="csv")
+    check_outputs((out, "csv"), overwrite=overwrite, inputs=[*maps, positions, heights, reading.jgd_parameters])
     net = _network(maps, reading, tolerance)
     notes: list[str] = []
     if tracks:
@@ -246,10 +241,7 @@ def match_command(
     """
     if sigma is not None and not sigma > 0.0:
         raise SettingsError("--sigma must be positive")
-    outputs: tuple[tuple[Path | None, FileKind], ...] = ((out, "csv"), (picture, "picture"), (page, "page"))
-    for target, kind in outputs:
-        if target is not None:
-            check_output_file(target, overwrite="replace" if overwrite else "refuse", inputs=[*maps, log], kind=kind)
+    check_outputs((out, "csv"), (picture, "picture"), (page, "page"), overwrite=overwrite, inputs=[*maps, log])
     net = _network(maps, reading, tolerance)
     positions, notes = _positions(log, net, column, reading, same_frame=same_frame)
     matched = match(net, positions, sigma_m=sigma)

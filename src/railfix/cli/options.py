@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import wraps
@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from railfix.core.errors import SettingsError
 from railfix.core.settings import Settings
+from railfix.run.output import FileKind, Overwrite, check_output_file
 
 _DAY: Final = "%Y-%m-%d"
 _TIMES: Final = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", _DAY]
@@ -34,6 +35,21 @@ LenientOption = Annotated[
         help="Count broken lines of the input files and continue, instead of stopping.",
     ),
 ]
+
+
+def overwriting(asked: bool) -> Overwrite:
+    """What `OverwriteOption` asks for."""
+    return "replace" if asked else "refuse"
+
+
+def check_outputs(*outputs: tuple[Path | None, FileKind], overwrite: bool, inputs: Iterable[Path | None]) -> list[Path]:
+    """Raise where a file cannot or must not be written (`check_output_file`); return those that are asked for."""
+    asked = [(path, kind) for path, kind in outputs if path is not None]
+    read = [path for path in inputs if path is not None]
+    for path, kind in asked:
+        others = [other for other, _ in asked if other is not path]
+        check_output_file(path, overwrite=overwriting(overwrite), inputs=[*read, *others], kind=kind)
+    return [path for path, _ in asked]
 
 
 @dataclass(frozen=True)
@@ -148,13 +164,7 @@ def _plain_type(annotation: Any) -> tuple[Any, bool]:
 
 
 def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any]) -> Model:
-    """Return the model with the values of the command line.
-
-    Raises
-    ------
-    SettingsError
-        A value is out of range; names the option.
-    """
+    """Return the model with the values of the command line; SettingsError names the option that is out of range."""
     values: dict[str, Any] = {}
     for option in options:
         value = given[option.parameter.name]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, overwriting
 from railfix.report.plots.run_screens import draw_run_screens
 from railfix.run.folder import reading_table
 from railfix.run.output import OutputFolder
@@ -32,7 +32,7 @@ def plot_screens(
     Exit codes: 0 done; 2 the command line was misused; 3 DIR is not the folder of a run with observations;
     8 the pictures cannot be written; 1 a defect of railfix.
     """
-    with OutputFolder(out, overwrite="replace" if overwrite else "refuse") as folder:
+    with OutputFolder(out, overwrite=overwriting(overwrite)) as folder:
         with reading_table(run / "observations.parquet"):
             pictures = draw_run_screens(run, folder.staging)
         for picture in pictures:

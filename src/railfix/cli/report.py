@@ -9,10 +9,9 @@ from typing import Annotated, Final
 
 import typer
 
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, check_outputs
 from railfix.report import write_report
 from railfix.run.folder import reading_table
-from railfix.run.output import check_output_file
 
 #: ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the size from which on an array has pages of its own [bytes].
 _THRESHOLD: Final = (-3, 1 << 17)
@@ -70,9 +69,8 @@ def report(
         for path in run.iterdir()
         if path.suffix != ".html"
     ]
-    inputs = [*(reference or ()), *in_runs, *([] if background is None else [background])]
     _free_arrays_at_once()
-    check_output_file(out, overwrite="replace" if overwrite else "refuse", inputs=inputs, kind="page")
+    check_outputs((out, "page"), overwrite=overwrite, inputs=[*(reference or ()), *in_runs, background])
     # the observations are read piece by piece while the page is drawn
     with reading_table(runs[0] / "observations.parquet" if len(runs) == 1 else Path("observations.parquet of a RUN")):
         page = write_report(

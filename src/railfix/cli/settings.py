@@ -13,23 +13,7 @@ from railfix.run.inputs import INPUTS
 
 
 class Choices(Settings):
-    """Settings of a run as the command line gives them; later fields override earlier ones.
-
-    Attributes
-    ----------
-    config : Path or None
-    preset : str or None
-        Overrides the preset of the file.
-    setting : tuple of str
-        KEY=VALUE.
-    screens : str or None
-        Names with commas, or "none".
-    without : tuple of str
-        Screens to switch off.
-    filter : {"track", "off"} or None
-    cn0_curve, error_model : Path or None
-    sbas : tuple of Path
-    """
+    """Settings of a run as the command line gives them; later fields override earlier ones."""
 
     preset: str | None = option(
         "Base preset; other settings override it: default; strict, fewer positions of higher integrity; p1, the "
@@ -73,13 +57,7 @@ class Choices(Settings):
 
 
 def settings_of(choices: Choices) -> tuple[Config, dict[str, Any]]:
-    """Return the settings of the file, overridden by those of the command line.
-
-    Returns
-    -------
-    Config
-    dict
-        The settings that were given, as opposed to defaults.
+    """Return the settings of the file, overridden by those of the command line; and those that were given.
 
     Raises
     ------
@@ -136,12 +114,7 @@ def _screens(option: str, text: str) -> list[str]:
 
 
 def check_set_once(settings: tuple[str, ...]) -> None:
-    """Raise where one setting is given twice.
-
-    Raises
-    ------
-    SettingsError
-    """
+    """Raise SettingsError where one setting is given twice."""
     keys = [text.partition("=")[0].strip() for text in settings]
     if repeated := [key for key in keys if keys.count(key) > 1]:
         raise SettingsError(f"--set {repeated[0]} is given {keys.count(repeated[0])} times; give it once")

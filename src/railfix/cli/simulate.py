@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from railfix.cli.console import progress_bar
-from railfix.cli.options import OverwriteOption
+from railfix.cli.options import OverwriteOption, overwriting
 from railfix.cli.settings import check_set_once, set_value
 from railfix.core.errors import SettingsError
 from railfix.run.output import Overwrite, check_folder
@@ -87,7 +87,7 @@ def simulate(
         raise typer.BadParameter("give a SCENARIO and --out DIR, or --list")
     recipe = load_recipe(scenario)
     numbers = _chosen(recipe, only or [])
-    replacing: Overwrite = "replace" if overwrite else "refuse"
+    replacing = overwriting(overwrite)
     folders = {number: out / recipe.names[number] for number in numbers}
     for folder in folders.values():
         check_folder(folder, overwrite=replacing)

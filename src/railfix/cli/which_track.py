@@ -10,9 +10,8 @@ import typer
 from rich.table import Table
 
 from railfix.cli.console import console_of_tables, show_notes
-from railfix.cli.options import OverwriteOption, Without, from_models
+from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
 from railfix.cli.settings import Choices, settings_of
-from railfix.run.output import FileKind, check_output_file
 from railfix.run.track_prior import write_last_place
 from railfix.run.which_track import WhichTrackInputs, WhichTrackOptions, which_track_files
 
@@ -43,12 +42,7 @@ def which_track(
 
     Exit codes as `railfix --help` says; 5 where the train moves or no track is near.
     """
-    outputs: tuple[tuple[Path | None, FileKind], ...] = ((out, "picture"), (save_last, "any"))
-    for target, kind in outputs:
-        if target is not None:
-            check_output_file(
-                target, overwrite="replace" if overwrite else "refuse", inputs=list(inputs.paths), kind=kind
-            )
+    check_outputs((out, "picture"), (save_last, "any"), overwrite=overwrite, inputs=inputs.paths)
     settings, _ = settings_of(choices)
     decision = which_track_files(inputs, options, settings)
     console = console_of_tables()

@@ -23,7 +23,7 @@ from railfix.pipeline.along_track import AlongTrack
 from railfix.pipeline.config import Config, FilterSource
 from railfix.pipeline.processor import AntennaResult, State
 from railfix.ranges.cn0_curve import read_cn0_curve
-from railfix.run.checks import RECORD_REACH, check_positions, check_same_day, check_same_place, check_same_time
+from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.chunks import aligned
 from railfix.run.driver import Progress, notes_of, open_inputs, sensors_of
 from railfix.run.inputs import RunInputs
@@ -57,10 +57,8 @@ class Effect:
     ----------
     choice : str
         "all", "none", "only raim", "without raim"; "filter", "filter without phase".
-    screens : tuple of str
-    sources : tuple of str
-        Of the filter along the track; empty for single epochs.
-    antenna : str
+    screens, sources : tuple of str
+        Active screens; sources of the filter along the track, empty for single epochs.
     epochs : int
         Epochs with observations, and with a reference where one is given.
     rate, ok_rate : float
@@ -112,16 +110,7 @@ _OF_SCORE: Final = ("positions", "mean_m", "std_m", "p50_m", "p95_m", "max_m", "
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """Effects of all choices.
-
-    Attributes
-    ----------
-    effects : tuple of Effect
-        By antenna, then by choice.
-    notes : tuple of str
-    files : mapping of str to Path
-    wall_s : float
-    """
+    """Effects of all choices, by antenna, then by choice."""
 
     effects: tuple[Effect, ...]
     notes: tuple[str, ...]
@@ -173,18 +162,7 @@ def ablate_files(
 
     With ``config.filter = "track"`` the filter along the track has rows too: with everything that is there, and
     without each of its sources, all screens on. The logs are read once. ``ablation.csv`` has a row per choice and
-    antenna, ``ablation.json`` also the content of ``run.json``.
-
-    Parameters
-    ----------
-    inputs : RunInputs
-        With a `truth`, errors along the line are added.
-    config : Config, optional
-        Its screens are switched.
-    out : Path
-    options : RunOptions, optional
-    asked : mapping, optional
-    progress : Progress, optional
+    antenna, ``ablation.json`` also the content of ``run.json``. With a `truth`, errors along the line are added.
 
     Raises
     ------
@@ -237,10 +215,7 @@ def ablate_files(
             check_same_place(tallies[NONE], antennas="all")
             if progress is not None:
                 progress(epochs=tallies[NONE].epochs, fraction=min(log.share for log in logs.values()))
-        check_same_time(tallies[NONE])
-        check_same_day(navigation, tallies[NONE], reach=RECORD_REACH)
-        check_same_place(tallies[NONE])
-        check_positions(tallies[NONE])
+        check_whole_run(navigation, tallies[NONE])
         effects = tuple(
             _effect(name, processor.config, antenna, parts[name, antenna])
             for antenna in inputs.logs
@@ -259,10 +234,6 @@ def ablate_files(
             line=line.facts,
             navigation=navigation,
             tally=tallies[ALL],
-            sigma={},
-            protection={},
-            found_levels={},
-            found_tracks={},
             notes=notes,
             wall_s=wall,
         )

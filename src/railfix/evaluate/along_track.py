@@ -23,7 +23,7 @@ def interpolate_reference(
     *,
     largest_gap_s: float = LARGEST_GAP_S,
 ) -> Floats:
-    """Reference positions at other times, linearly; NaN outside and in gaps.
+    """Reference positions at other times, linearly, shape (T, 3) [m]; NaN outside and in gaps.
 
     Parameters
     ----------
@@ -33,10 +33,6 @@ def interpolate_reference(
     reference_ecef_m : ndarray, shape (R, 3) [m]
     largest_gap_s : float
         Longest step of the reference that is bridged.
-
-    Returns
-    -------
-    ndarray, shape (T, 3) [m]
     """
     return bracket(time, reference_time, largest_gap_s=largest_gap_s).of(reference_ecef_m)
 
@@ -44,7 +40,7 @@ def interpolate_reference(
 def along_track_error(
     arc_m: Floats, reference_ecef_m: Floats, trajectory: Trajectory, *, same_place_m: float = 30.0
 ) -> Floats:
-    """Signed distance on the map from the reference's point to the answer, shape (T,) [m].
+    """Signed distance on the map from the reference's point to the answer, + toward the end of the line (P1 3.3).
 
     The distance along the line. Where the map passes the reference's place more than once (laps, a
     road's two carriageways) the pass nearest to the answer counts: which of them it was, one epoch
@@ -64,7 +60,7 @@ def along_track_error(
     Returns
     -------
     ndarray, shape (T,) [m]
-        + toward the end of the line (P1 3.3); NaN where either is missing.
+        NaN where either is missing.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -101,18 +97,7 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     """Straight distance between positions on the map and the reference's nearest point on the map, shape (T,) [m].
 
     It needs no choice between several passes of the line at one place, and never exceeds the distance along the line.
-
-    Parameters
-    ----------
-    arc_m : ndarray, shape (T,) [m]
-        Positions along the trajectory; NaN where there is none.
-    reference_ecef_m : ndarray, shape (T, 3) [m]
-    trajectory : Trajectory
-
-    Returns
-    -------
-    ndarray, shape (T,) [m]
-        NaN where either is missing.
+    NaN where the position or the reference, shape (T, 3), is missing.
     """
     distance = np.full(len(arc_m), np.nan)
     rows = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))

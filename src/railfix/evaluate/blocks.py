@@ -6,7 +6,6 @@ of a minute nearly are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import nan
 from typing import Final
 
@@ -20,23 +19,9 @@ FEWEST_BLOCKS: Final = 5
 _NODES: Final = 400
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Confidence limits, NaN with fewer than `FEWEST_BLOCKS` blocks.
-
-    Attributes
-    ----------
-    blocks : int
-    mean_m, rate, p95_m, normalised_p68, normalised_p95 : tuple of float
-        Lower and upper limit; the last two are of the error size over its standard deviation.
-    """
-
-    blocks: int
-    mean_m: tuple[float, float] = (nan, nan)
-    rate: tuple[float, float] = (nan, nan)
-    p95_m: tuple[float, float] = (nan, nan)
-    normalised_p68: tuple[float, float] = (nan, nan)
-    normalised_p95: tuple[float, float] = (nan, nan)
+#: Figures with limits, as columns: lower and upper limit; the last two are of the error size over its sigma.
+LIMITS: Final = ("mean{}_m", "rate{}", "p95{}_m", "normalised_p68{}", "normalised_p95{}")
+LIMIT_COLUMNS: Final = tuple(name.format(end) for name in LIMITS for end in ("_low", "_high"))
 
 
 def block_limits(
@@ -49,18 +34,16 @@ def block_limits(
     replicates: int,
     seed: int,
     confidence: float,
-) -> Limits:
-    """Percentile limits of mean, rate and percentiles, by resampling blocks with replacement.
+) -> dict[str, float]:
+    """Percentile limits of mean, rate and percentiles (`LIMIT_COLUMNS`) and number of blocks, by resampling blocks.
 
-    Each resample has as many blocks as the data. A percentile of a resample is the smallest value that the given
-    share of its values do not exceed.
+    Blocks are drawn with replacement, as many as the data has. A percentile of a resample is the smallest value that
+    the given share of its values do not exceed. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks.
 
     Parameters
     ----------
-    error_m : ndarray, shape (T,) [m]
-        NaN where there is no error.
-    sigma_m : ndarray, shape (T,) [m]
-        Standard deviation of the position; NaN where it is not known.
+    error_m, sigma_m : ndarray, shape (T,) [m]
+        NaN where there is no error, where the standard deviation of the position is not known.
     observed, positioned : ndarray of bool, shape (T,)
     block : ndarray of int, shape (T,)
     replicates, seed : int
@@ -69,7 +52,7 @@ def block_limits(
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)
     if blocks < FEWEST_BLOCKS:
-        return Limits(blocks=blocks)
+        return {"blocks": blocks, **dict.fromkeys(LIMIT_COLUMNS, nan)}
     drawn = np.random.default_rng(seed).integers(0, blocks, (replicates, blocks))
     times = np.zeros((replicates, blocks))
     np.add.at(times, (np.arange(replicates)[:, None], drawn), 1.0)
@@ -96,14 +79,15 @@ def block_limits(
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = sums(np.where(has, error_m, 0.0)) / errors
         rate = sums((positioned & observed).astype(np.float64)) / sums(observed.astype(np.float64))
-    return Limits(
-        blocks=blocks,
-        mean_m=limits(mean),
-        rate=limits(rate),
-        p95_m=of_percentile(np.abs(error_m), 0.95),
-        normalised_p68=of_percentile(np.abs(error_m) / sigma_m, 0.68),
-        normalised_p95=of_percentile(np.abs(error_m) / sigma_m, 0.95),
+    size = np.abs(error_m)
+    ends = (
+        *limits(mean),
+        *limits(rate),
+        *of_percentile(size, 0.95),
+        *of_percentile(size / sigma_m, 0.68),
+        *of_percentile(size / sigma_m, 0.95),
     )
+    return {"blocks": blocks, **dict(zip(LIMIT_COLUMNS, ends, strict=True))}
 
 
 def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, *, share: float) -> Floats:

@@ -45,15 +45,7 @@ class Bracket:
 
 
 def bracket(time: Datetimes, reference_time: Datetimes, *, largest_gap_s: float = LARGEST_GAP_S) -> Bracket:
-    """Neighbouring instants of a reference for each time.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    reference_time : ndarray of datetime64[ns], shape (R,)
-        Rising, at least two.
-    largest_gap_s : float [s]
-        Longest gap that is interpolated over.
+    """Neighbouring instants of a reference, rising and at least two, for each time.
 
     Raises
     ------

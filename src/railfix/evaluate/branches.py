@@ -31,12 +31,8 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     """Stated probability against the share of right places, by class; None without a table of the filter.
 
-    Calibrated probabilities have a `right_share` of at least `probability_mean`: a hypothesis rejected can be near.
-
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs.
+    Of `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs. Calibrated probabilities have a `right_share` of at least
+    `probability_mean`: a hypothesis rejected can be near.
     """
     filtered = epochs.select(*KEYS, *_USED).filter(OF_FILTER)
     if not len(filtered):

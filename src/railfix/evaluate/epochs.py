@@ -72,12 +72,10 @@ class AntennaEpochs:
         `EPOCH_COLUMNS` without run, configuration and line; the run's protection levels with their parts.
     errors : Errors
     speed_from : {"reference", "places"}
-    outside : int
-        Epochs of the log outside the reference.
+    outside, from_sections : int
+        Epochs of the log outside the reference; epochs with a reference whose environment is that of the sections.
     step_s : float [s]
         Step of the log.
-    from_sections : int
-        Epochs with a reference whose environment is that of the sections.
     """
 
     table: pl.DataFrame
@@ -120,19 +118,13 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Epochs of a log and those missing in its gaps.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-        Rising.
+    """Epochs of a log, rising, and those missing in its gaps: times, which of them are of the log, and its step.
 
     Returns
     -------
     time : ndarray of datetime64[ns], shape (N,)
         With instants at the step of the log (its median step) in every gap of more than 1.5 steps.
     logged : ndarray of bool, shape (N,)
-        Those of the log.
     step_s : float [s]
         NaN with fewer than two epochs.
     """
@@ -154,10 +146,11 @@ def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
 def travelled(
     time: Datetimes, step_m: Floats, known: Masks, speed_mps: Floats, *, options: EvaluationOptions
 ) -> Floats:
-    """Distance travelled since the first epoch with a known reference position.
+    """Distance travelled since the first epoch with a known reference position, shape (T,) [m].
 
     A step counts if the train moved: by the mean of the reference speeds at its ends, or by the mean speed of the
-    step where these are unknown or the step is longer than `reference_gap_s`.
+    step where these are unknown or the step is longer than `reference_gap_s`. Interpolated by time between known
+    positions; NaN before the first and after the last.
 
     Parameters
     ----------
@@ -168,11 +161,6 @@ def travelled(
     speed_mps : ndarray, shape (T,) [m/s]
         Of the reference; NaN where unknown.
     options : EvaluationOptions
-
-    Returns
-    -------
-    ndarray, shape (T,) [m]
-        Interpolated by time between known positions; NaN before the first and after the last.
     """
     at = np.flatnonzero(known)
     moved = np.full(len(time), np.nan)

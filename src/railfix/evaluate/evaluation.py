@@ -66,13 +66,10 @@ class RunAndReference:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluatedRun:
-    """Facts on the evaluation of one run.
+    """Facts on the evaluation of one run: name, configuration and line as in the tables.
 
     Attributes
     ----------
-    name, configuration, line : str
-        As in the tables.
-    path : Path
     table : str
         Table of positions.
     reference : str
@@ -85,10 +82,8 @@ class EvaluatedRun:
         Step of the log, by antenna.
     protection : mapping
         What its protection levels rest on, as ``run.json`` says.
-    settings : mapping
     inputs : tuple of mapping
         Files that were read, with size and hash.
-    notes : tuple of str
     """
 
     name: str

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.reasons import Status
-from railfix.evaluate.blocks import block_limits
+from railfix.evaluate.blocks import LIMIT_COLUMNS, block_limits
 from railfix.evaluate.options import EvaluationOptions
 from railfix.evaluate.run_folder import floats
 from railfix.evaluate.scores import WRONG_PLACE_M
@@ -74,22 +74,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "over_2_sigma": "above twice along_sigma",
     "over_3_sigma": "above three times along_sigma",
     "blocks": "blocks of time for the confidence limits below",
-    "mean_low_m": "limit of confidence",
-    "mean_high_m": "limit of confidence",
-    "rate_low": "limit of confidence",
-    "rate_high": "limit of confidence",
-    "p95_low_m": "limit of confidence",
-    "p95_high_m": "limit of confidence",
-    "normalised_p68_low": "limit of confidence",
-    "normalised_p68_high": "limit of confidence",
-    "normalised_p95_low": "limit of confidence",
-    "normalised_p95_high": "limit of confidence",
+    **dict.fromkeys(LIMIT_COLUMNS, "limit of confidence"),
 }
-_LIMITS: Final = tuple(
-    f"{name}_{end}{unit}"
-    for name, unit in (("mean", "_m"), ("rate", ""), ("p95", "_m"), ("normalised_p68", ""), ("normalised_p95", ""))
-    for end in ("low", "high")
-)
 #: Statuses of a position that passed every check, of single epochs and of the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
 #: Columns of the epochs that the figures are made of, beside the keys.
@@ -191,7 +177,7 @@ def series(epochs: pl.DataFrame, position: str, epochs_of: str) -> pl.DataFrame:
 
 
 def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options: EvaluationOptions) -> pl.DataFrame:
-    """Figures, a row for every grouping, group, antenna, kind of position and choice of epochs.
+    """Figures (`FIGURE_COLUMNS`), a row for every grouping, group, antenna, kind of position and choice of epochs.
 
     Parameters
     ----------
@@ -201,11 +187,6 @@ def figures_by(parts: Iterable[pl.DataFrame], groupings: Sequence[str], options:
     groupings : sequence of str
         Which classes: ``f"{grouping}_group"``.
     options : EvaluationOptions
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of `FIGURE_COLUMNS`.
     """
     kinds = [(position, "own") for position in POSITIONS] + [("constrained", "common"), ("conventional", "common")]
     tables: dict[str, list[list[pl.DataFrame]]] = {grouping: [[] for _ in kinds] for grouping in groupings}
@@ -286,7 +267,7 @@ def _with_limits(
     rows: list[dict[str, Any]] = []
     for key in table.select(by).iter_rows():
         if key not in groups:
-            rows.append({"blocks": None, **dict.fromkeys(_LIMITS)})
+            rows.append({"blocks": None, **dict.fromkeys(LIMIT_COLUMNS)})
             continue
         group = groups[key]
         limits = block_limits(
@@ -299,7 +280,6 @@ def _with_limits(
             seed=options.seed,
             confidence=options.confidence,
         )
-        values = (*limits.mean_m, *limits.rate, *limits.p95_m, *limits.normalised_p68, *limits.normalised_p95)
-        rows.append({"blocks": limits.blocks, **dict(zip(_LIMITS, values, strict=True))})
-    schema = {"blocks": pl.Int64} | dict.fromkeys(_LIMITS, pl.Float64)
-    return table.hstack(pl.DataFrame(rows, schema=schema).with_columns(pl.col(_LIMITS).fill_nan(None)))
+        rows.append(limits)
+    schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
+    return table.hstack(pl.DataFrame(rows, schema=schema).with_columns(pl.col(LIMIT_COLUMNS).fill_nan(None)))

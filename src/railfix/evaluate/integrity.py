@@ -95,16 +95,7 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class LevelledRun:
-    """A run with protection levels.
-
-    Attributes
-    ----------
-    name : str
-    kind : str
-        Kind of the levels; prefix of their columns.
-    alarm_limit_m : float or None
-        Alarm limit of the run.
-    """
+    """A run with protection levels of a kind, the prefix of their columns, and its alarm limit."""
 
     name: str
     kind: str
@@ -140,7 +131,7 @@ def counted_levels(
     *,
     levels_of: LevelsOf,
 ) -> Floats:
-    """Levels as counted: infinite where a position has no usable level, NaN without a position.
+    """Levels as counted, shape (T,) [m]: infinite where a position has no usable level, NaN without a position.
 
     Parameters
     ----------
@@ -150,13 +141,8 @@ def counted_levels(
         Epochs with a position.
     status, verdict : ndarray of str, shape (T,)
         Of the position (`railfix.core.reasons.Status`, `railfix.tracking.TrackStatus`), of the level
-        (`railfix.integrity.protection.Status`);
-        blank where there is none.
+        (`railfix.integrity.protection.Status`); blank where there is none.
     levels_of : {"usable", "all"}
-
-    Returns
-    -------
-    ndarray, shape (T,) [m]
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
@@ -179,15 +165,7 @@ def epochs_diagram(
 ) -> Stanford:
     """Stanford diagram of the epochs of one antenna of one run that lie inside the reference.
 
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        `railfix.evaluate.EPOCH_COLUMNS` and the levels, in order of time.
-    kind : str
-        Kind of the levels.
-    alarm_limit_m : float [m]
-    levels_of : {"usable", "all"}
-    options : EvaluationOptions
+    Of `railfix.evaluate.EPOCH_COLUMNS` and the levels of a kind, in order of time.
     """
     columns = (level_name(kind), f"{kind}_protection_status")
     spanned = epochs.select(*_JUDGED, *(name for name in columns if name in epochs.columns)).filter("in_reference")
@@ -213,13 +191,7 @@ def positions_diagram(
 ) -> Stanford:
     """Stanford diagram of a run without a reference: availability and continuity only.
 
-    Parameters
-    ----------
-    positions : polars.DataFrame
-        Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`, in order of time.
-    alarm_limit_m : float [m]
-    levels_of : {"usable", "all"}
-    options : EvaluationOptions
+    Of one antenna, columns of `railfix.pipeline.tables.POSITION_COLUMNS`, in order of time.
     """
     level = counted_levels(
         floats(positions, "protection_level_m"),
@@ -245,17 +217,10 @@ def _sorted(
 
 
 def integrity_of(epochs: pl.DataFrame, runs: Sequence[LevelledRun], options: EvaluationOptions) -> dict[str, Integrity]:
-    """Levels against errors by kind; empty where no run has levels.
+    """Levels against errors by kind, of all runs; empty where no run has levels.
 
     Every run is counted at the alarm limits of the options and at those of all runs, so that rows of several runs
     together include each of them.
-
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        `railfix.evaluate.EPOCH_COLUMNS` and the levels, of all runs.
-    runs : sequence of LevelledRun
-    options : EvaluationOptions
     """
     own = {run.alarm_limit_m for run in runs if run.alarm_limit_m is not None}
     limits = sorted({*options.alarm_limits_m, *own})

@@ -31,19 +31,10 @@ _OF: Final = ("run", "antenna")
 
 
 def interval_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame:
-    """Distribution of the intervals of each kind of position.
+    """Distribution of the intervals of each kind of position: columns `by` and `INTERVAL_COLUMNS`.
 
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        `railfix.evaluate.epochs.EPOCH_COLUMNS`; an interval lies within one run and antenna.
-    by : list of str
-        Columns whose values are kept apart, ``configuration`` among them.
-
-    Returns
-    -------
-    polars.DataFrame
-        `by` and `INTERVAL_COLUMNS`; before_first_s and after_last_s are the largest of the runs.
+    An interval lies within one run and antenna. The values of the columns `by`, ``configuration`` among them, are kept
+    apart; before_first_s and after_last_s are the largest of the runs.
     """
     return pl.concat(
         _of_position(epochs.lazy().filter(configuration=name), position, by)

@@ -27,15 +27,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
 
 
 def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
-    """Counts of every protection level; None where a run has none.
-
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        `railfix.evaluate.epochs.EPOCH_COLUMNS` and the levels.
-    by : list of str
-        Columns whose values are kept apart.
-    """
+    """Counts of every protection level of the epochs, by the values of some columns; None where a run has none."""
     tables = []
     for level in level_columns(epochs):
         if epochs[level].null_count() == len(epochs):

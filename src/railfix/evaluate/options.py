@@ -20,13 +20,7 @@ Number = TypeVar("Number", int, float)
 
 
 def _rising(edges: tuple[Number, ...]) -> tuple[Number, ...]:
-    """The edges themselves, if they rise.
-
-    Raises
-    ------
-    ValueError
-        They do not.
-    """
+    """The edges themselves; ValueError where they do not rise."""
     if any(high <= low for low, high in pairwise(edges)):
         raise ValueError("rising numbers expected")
     return edges
@@ -38,32 +32,18 @@ RisingCounts = Annotated[tuple[Annotated[int, Field(gt=0)], ...], Field(min_leng
 
 
 class EvaluationOptions(Settings):
-    """Settings of an evaluation.
+    """Settings of an evaluation; the options of `railfix evaluate` say what most are.
 
     Attributes
     ----------
-    method : {"auto", "chainage", "trajectory"}
-        Errors as differences of chainage, or along the trajectory from the reference position; "auto" takes
-        differences of chainage where possible.
-    reference_sigma_m : float [m]
-        Epochs whose reference has a larger standard deviation have no error.
-    reference_gap_s : float [s]
-        Longest gap of the reference that is interpolated over.
-    standing_mps : float [m/s]
-        The train is at standstill below this speed.
-    section_m : float [m]
-        Length of the sections of the line.
-    speed_edges_kmh, satellite_edges : tuple
-        Limits between the classes of speed [km/h] and of satellites used.
+    satellite_edges : tuple
+        Limits between the classes of satellites used.
     over_m : tuple of float [m]
         Error sizes; the share of errors above each is counted.
-    alarm_limits_m : tuple of float [m]
-        A position is available where its protection level is within the alarm limit. The run's own limit
-        is added.
     block_s : float [s]
         Length of the blocks of time that are resampled for confidence limits.
-    replicates, seed : int
-        Number of resamples, and seed of the random numbers.
+    replicates : int
+        Number of resamples.
     confidence : float
         Probability of the confidence limits, between 0 and 1.
     """

@@ -37,11 +37,7 @@ _USED: Final = (
 def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     """Stretches without satellites with the filter's errors, in order of time; None without a table of the filter.
 
-    Parameters
-    ----------
-    epochs : polars.DataFrame
-        `railfix.evaluate.epochs.EPOCH_COLUMNS` of all runs; single epochs have no position in these stretches and
-        are left out.
+    Single epochs have no position in these stretches and are left out.
     """
     filtered = epochs.select(*KEYS, *_USED).filter(OF_FILTER)
     if not len(filtered):

@@ -34,16 +34,7 @@ _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Files that replace those named in ``run.json``, and options for reading the track.
-
-    Attributes
-    ----------
-    track : tuple of Path
-        Empty: the files of the run.
-    vehicle : Path or None
-    reading : TrackReading
-        Its `reference` is not used: the run's own is.
-    """
+    """Files in place of those that ``run.json`` names, and options for reading the track (but `reading.reference`)."""
 
     track: tuple[Path, ...] = option(
         "Track in place of the one that run.json names.", (), metavar="TRACK", panel=INPUTS
@@ -77,21 +68,19 @@ class Answers:
 
 @dataclass(frozen=True, kw_only=True)
 class Errors:
-    """Signed errors of one antenna, T epochs.
+    """Signed errors of one antenna, T epochs, + toward the end of the line.
 
     Attributes
     ----------
     method : {"chainage", "trajectory"}
     error_m, conventional_error_m : ndarray, shape (T,) [m]
-        + toward the end of the line.
     distance_m : ndarray, shape (T,) [m]
         Straight distance between the position on the map and the reference: its point on the map where the
         trajectory is read, else its own position.
     reference_chainage_m : ndarray, shape (T,) [m]
         Of the reference; from the map where the reference has no chainage.
-    files : tuple of Path
+    files : tuple of (str, Path)
         Track and vehicle, if they were read.
-    notes : tuple of str
     """
 
     method: Method

@@ -16,7 +16,7 @@ from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.core.reasons import Status
 from railfix.pipeline.level_stage import KINDS
-from railfix.run.folder import RunRecord, read_parquet, read_record
+from railfix.run.folder import RunRecord, read_parquet, read_record, reading_table
 
 #: Columns that every table of positions has.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
@@ -186,8 +186,7 @@ def read_run(
         Which table of positions. A table other than "positions" takes the satellites used and the conventional
         position from the single-epoch positions of the same time and antenna.
     conventional : Path, optional
-        Folder of another run on the same log, whose conventional positions are compared with instead: a run with
-        `screens` elevation and C/N0 alone gives those of P1.
+        See `railfix.evaluate.RunAndReference`.
     columns : polars selector, optional
         Columns to read beside those that every table of positions has; all without.
 
@@ -230,16 +229,7 @@ def read_table(
 ) -> tuple[Path, pl.DataFrame]:
     """Return the file and the rows of one table of a run, in order of time.
 
-    Parameters
-    ----------
-    path : Path
-        Folder of the run.
-    name : str
-        Of the table, without its ending.
-    needed : sequence of str
-        Columns that it must have.
-    columns : polars selector, optional
-        Columns to read beside those; all without.
+    `needed` are the columns that it must have, `columns` those to read beside them, all without.
 
     Raises
     ------
@@ -264,15 +254,12 @@ def read_table(
 
 
 def _table(file: Path, columns: cs.Selector | None) -> pl.DataFrame:
-    try:
-        if file.suffix == ".parquet":
-            table = read_parquet(file, columns=columns)
-        else:
+    if file.suffix == ".parquet":
+        table = read_parquet(file, columns=columns)
+    else:
+        with reading_table(file):
             table = pl.read_csv(file, schema_overrides={"time_gpst": pl.Datetime("ns")}, infer_schema_length=None)
             table = table if columns is None else table.select(columns)
-    except (PolarsError, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputFileError(file, f"cannot be read as a table ({reason}); run railfix run again") from error
     numbers = [
         name
         for name, kind in table.schema.items()

@@ -44,14 +44,7 @@ class Score:
 
 
 def score(error_m: Floats, observed: Masks) -> Score:
-    """Figures of merit from signed errors.
-
-    Parameters
-    ----------
-    error_m : ndarray, shape (T,) [m]
-        NaN where there is no position.
-    observed : ndarray of bool, shape (T,)
-        Epochs with observations inside the time of the reference.
+    """Figures of merit from signed errors, NaN where there is no position, at the epochs that are observed.
 
     Raises
     ------

@@ -46,17 +46,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """What a chunk of one antenna gives to the results.
-
-    Attributes
-    ----------
-    positions : DataFrame
-    train, observations : DataFrame or None
-        None where they are not wanted.
-    tally : AntennaTally
-        Counts up to the end of the chunk.
-    notes : tuple of str
-    """
+    """What a chunk of one antenna gives to the results: tables, None where not wanted, and counts up to its end."""
 
     positions: pl.DataFrame
     train: pl.DataFrame | None
@@ -66,16 +56,7 @@ class Rows:
 
 
 def write_rows(rows: Sequence[Rows], line: sources.Line, folder: OutputFolder) -> None:
-    """Write the rows of one chunk of all antennas, in order of time.
-
-    Parameters
-    ----------
-    rows : sequence of Rows
-        By antenna.
-    line : Line
-        Rows get their tracks where it is a route of a network.
-    folder : OutputFolder
-    """
+    """Write the rows of one chunk of all antennas, in order of time, with their tracks on a route of a network."""
     tables = {}
     for table in ("positions", "train", "observations"):
         if parts := [part for of_antenna in rows if (part := getattr(of_antenna, table)) is not None]:
@@ -93,17 +74,8 @@ def write_rows(rows: Sequence[Rows], line: sources.Line, folder: OutputFolder) -
 class AntennaRun:
     """The run of one antenna in this process: `ChunkSteps` of one chunk after the other.
 
-    Parameters
-    ----------
-    name : str
-    processor : EpochProcessor
-    log : Log
-    sensors : SensorSamples
-        Of the whole run.
-    observations : bool
-        Whether rows of observations are wanted.
-    smooth : bool
-        Whether what the filter was given is kept, for `smoothed`.
+    `sensors` are of the whole run; `observations`: whether rows of observations are wanted; `smooth`: whether what the
+    filter was given is kept, for `smoothed`.
     """
 
     def __init__(
@@ -207,14 +179,8 @@ class Replays:
 class OtherProcess:
     """The run of one antenna in a process of its own, which does the same at the same time.
 
-    It is forked from this one, so it must be started before threads are (`processes`). An error there is raised here
-    by the call that asks for its answer. Leaving the context ends it.
-
-    Parameters
-    ----------
-    name : str
-    make : callable
-        Returns the `AntennaRun`; called there.
+    It is forked from this one, so it must be started before threads are (`processes`), and calls `make` there. An error
+    there is raised here by the call that asks for its answer. Leaving the context ends it.
     """
 
     def __init__(self, name: Antenna, make: Callable[[], AntennaRun]) -> None:
@@ -310,12 +276,9 @@ class OtherProcess:
 
 
 def processes(asked: int) -> int:
-    """Return how many processes a run may have.
+    """Return how many processes a run may have, 1 or 2.
 
-    Parameters
-    ----------
-    asked : int
-        0: 2 on Linux with two processors, where this process has no other threads; otherwise 1.
+    `asked` 0: 2 on Linux with two processors, where this process has no other threads; otherwise 1.
 
     Raises
     ------

@@ -72,17 +72,7 @@ _ONE: Final = ("vehicle", "tachometer", "inertial", "radar")
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignRun:
-    """One run of a campaign.
-
-    Attributes
-    ----------
-    fields : mapping of str to str
-        Values of the fields, in the order of the pattern of the front antenna.
-    inputs : RunInputs
-    config : Config
-    options : RunOptions
-    out : Path
-    """
+    """One run of a campaign; `fields` are in the order of the pattern of the front antenna."""
 
     fields: Mapping[str, str]
     inputs: RunInputs
@@ -187,10 +177,8 @@ def run_campaign(
 
     Raises
     ------
-    InputFileError, SettingsError
-        See `read_campaign`.
-    OutputError
-        The folder has other files in it.
+    InputFileError, SettingsError, OutputError
+        See `read_campaign`; the folder has other files in it.
     """
     runs = read_campaign(path, out)
     if out.is_dir() and any(out.iterdir()) and not (out / "runs").is_dir():

@@ -34,13 +34,7 @@ def navigation_span(navigation: Navigation) -> tuple[np.datetime64, np.datetime6
 
 
 def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
-    """Raise where the navigation records and the log are of different times.
-
-    Raises
-    ------
-    MismatchError
-        Not one pseudorange was used, and the log lies further than `reach` from every record.
-    """
+    """Raise MismatchError where no pseudorange was used and the log lies further than `reach` from every record."""
     if any(antenna.used for antenna in tally.antennas.values()):
         return
     span = navigation_span(navigation)
@@ -58,19 +52,10 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
 
 
 def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
-    """Raise where all conventional positions lie far from the line.
+    """Raise MismatchError where all conventional positions lie further than `ANOTHER_PLACE_M` from the line.
 
-    Parameters
-    ----------
-    tally : Tally
-    antennas : {"all", "any"}
-        Whether every antenna must be elsewhere (during a run, after a few positions of
-        each), or one is enough (at the end).
-
-    Raises
-    ------
-    MismatchError
-        There are conventional positions, none within `ANOTHER_PLACE_M`.
+    `antennas`: whether every antenna must be elsewhere (during a run, after a few positions of each), or one is enough
+    (at the end).
     """
     enough = ENOUGH_TO_STOP if antennas == "all" else 1
     elsewhere = [
@@ -88,12 +73,7 @@ def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -
 
 
 def check_same_time(tally: Tally) -> None:
-    """Raise where the logs of two antennas have no time in common.
-
-    Raises
-    ------
-    MismatchError
-    """
+    """Raise MismatchError where the logs of two antennas have no time in common."""
     spans = {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
     if len(spans) < 2:
         return
@@ -105,12 +85,7 @@ def check_same_time(tally: Tally) -> None:
 
 
 def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
-    """Raise where not one message of the SBAS was received during a log.
-
-    Raises
-    ------
-    MismatchError
-    """
+    """Raise MismatchError where not one message of the SBAS was received during a log."""
     for name, antenna in tally.antennas.items():
         if sbas is None or antenna.first is None or antenna.last is None:
             continue
@@ -123,12 +98,7 @@ def check_sbas_time(sbas: SbasCorrections | None, tally: Tally) -> None:
 
 
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
-    """Raise where a sensor has not one sample during the logs.
-
-    Raises
-    ------
-    MismatchError
-    """
+    """Raise MismatchError where a sensor has not one sample during the logs."""
     spans = [(a.first, a.last) for a in tally.antennas.values() if a.first is not None and a.last is not None]
     for sensor in fields(sensors):
         time = getattr(sensors, sensor.name).time
@@ -139,14 +109,21 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> None:
             )
 
 
-def check_positions(tally: Tally) -> None:
-    """Raise where a run has not one position.
+def check_whole_run(
+    navigation: Navigation, tally: Tally, *, sbas: SbasCorrections | None = None, sensors: SensorSamples | None = None
+) -> None:
+    """Raise MismatchError where the inputs of a whole run do not match, NoPositionError where it has no position."""
+    check_same_time(tally)
+    check_same_day(navigation, tally, reach=RECORD_REACH)
+    check_same_place(tally)
+    check_sbas_time(sbas, tally)
+    if sensors is not None:
+        check_sensor_time(sensors, tally)
+    check_positions(tally)
 
-    Raises
-    ------
-    NoPositionError
-        Names the commonest status and the commonest reason.
-    """
+
+def check_positions(tally: Tally) -> None:
+    """Raise NoPositionError, with the commonest status and reason, where a run has not one position."""
     if tally.positioned:
         return
     if not tally.epochs:

@@ -22,13 +22,7 @@ def _spacing_ns(time: Datetimes) -> int:
 
 
 class Pieces:
-    """The log of one antenna, read piece by piece and taken chunk by chunk.
-
-    Parameters
-    ----------
-    parts : iterator of Observations
-        In order of time.
-    """
+    """The log of one antenna in order of time, read piece by piece and taken chunk by chunk."""
 
     def __init__(self, parts: Iterator[Observations]) -> None:
         self._parts = parts
@@ -59,16 +53,11 @@ class Pieces:
 
 
 def cuts(logs: Mapping[str, Callable[[], Datetimes | None]]) -> Iterator[dict[str, Datetimes]]:
-    """Time tags of chunks that cover the same span of time for every antenna.
+    """Time tags of chunks that cover the same span of time for every antenna, of `Pieces.more` of each.
 
     Each antenna keeps its own epochs. A chunk ends where the first of the current parts ends;
     what the others have beyond waits for the next chunk. Epochs that belong together but are
     tagged a little apart (`SAME_INSTANT_NS`) stay in one chunk.
-
-    Parameters
-    ----------
-    logs : mapping of str to callable
-        `Pieces.more` of each antenna.
 
     Yields
     ------
@@ -111,18 +100,7 @@ def cuts(logs: Mapping[str, Callable[[], Datetimes | None]]) -> Iterator[dict[st
 
 
 def aligned(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
-    """Chunks of observations that cover the same span of time for every antenna, as `cuts` has them.
-
-    Parameters
-    ----------
-    logs : mapping of str to iterator of Observations
-        Parts of the log of each antenna, in order of time.
-
-    Yields
-    ------
-    dict of str to Observations
-        All antennas that have been seen so far; one without epochs in the span has zero length.
-    """
+    """Chunks of observations that cover the same span of time for every antenna seen so far, as `cuts` has them."""
     pieces = {name: Pieces(parts) for name, parts in logs.items()}
     for cut in cuts({name: own.more for name, own in pieces.items()}):
         yield {name: pieces[name].take(len(times)) for name, times in cut.items()}

@@ -23,15 +23,7 @@ from railfix.pipeline.config import Config
 from railfix.pipeline.level_stage import basis_of, level_facts, risk_of, standing
 from railfix.pipeline.processor import EpochProcessor
 from railfix.run.antennas import AntennaRun, OtherProcess, processes, write_rows
-from railfix.run.checks import (
-    RECORD_REACH,
-    check_positions,
-    check_same_day,
-    check_same_place,
-    check_same_time,
-    check_sbas_time,
-    check_sensor_time,
-)
+from railfix.run.checks import check_same_day, check_same_place, check_whole_run
 from railfix.run.chunks import cuts
 from railfix.run.inputs import Antenna, RunInputs
 from railfix.run.options import RunOptions
@@ -98,7 +90,7 @@ def run_files(
     asked: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Position the logs of one run along its line and write the results.
+    """Position the logs of one run along its line and write the results into the folder `out`.
 
     Parameters
     ----------
@@ -106,15 +98,10 @@ def run_files(
     config : Config, optional
         Settings used; the defaults unless given.
     out : Path
-        Folder for the results.
     options : RunOptions, optional
     asked : mapping, optional
         Settings that were given, as opposed to defaults; goes into ``run.json``.
     progress : Progress, optional
-
-    Returns
-    -------
-    RunSummary
 
     Raises
     ------
@@ -151,12 +138,7 @@ def run_files(
         tally = _position(runs, line, processor, folder, beside, progress)
         if smooth:
             add_smoothed(runs, folder)
-        check_same_time(tally)
-        check_same_day(navigation, tally, reach=RECORD_REACH)
-        check_same_place(tally)
-        check_sbas_time(processor.received.sbas, tally)
-        check_sensor_time(sensors, tally)
-        check_positions(tally)
+        check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors)
         sigma, found_levels = along_sigma(folder), levels(folder)
         tracks = filtered(folder) if config.filter == "track" else {}
         notes = (
@@ -194,21 +176,7 @@ def run_files(
 
 
 def open_inputs(inputs: RunInputs, options: RunOptions, config: Config) -> tuple[Navigation, Line, dict[Antenna, Log]]:
-    """Read navigation and line, and open the logs; find the route in a network of tracks.
-
-    Parameters
-    ----------
-    inputs : RunInputs
-    options : RunOptions
-    config : Config
-        Of the positions that a route is found from.
-
-    Returns
-    -------
-    Navigation
-    Line
-    dict of str to Log
-        By antenna.
+    """Read navigation and line, and open the logs, by antenna; find the route in a network of tracks.
 
     Raises
     ------
@@ -345,17 +313,7 @@ def _position(
 def notes_of(
     line: Line, navigation: Navigation, tally: Tally, logs: Mapping[Antenna, Log], *, note_statistic: float
 ) -> tuple[str, ...]:
-    """Return the notes of a run, each once.
-
-    Parameters
-    ----------
-    line : Line
-    navigation : Navigation
-    tally : Tally
-    logs : mapping of str to Log
-    note_statistic : float
-        Statistic of the test of the map from which on there is a note (`MapOffsetLimits.note_threshold`).
-    """
+    """Return the notes of a run, each once; of the map from `MapOffsetLimits.note_threshold` of its test on."""
     notes = [*line.notes, *_map_notes(line), *navigation.notes, *_broken_notes(logs), *tally.all_notes]
     for name, antenna in tally.antennas.items():
         notes += [

@@ -26,27 +26,13 @@ WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """Record of a run: ``run.json`` in the folder that `run_files` wrote.
-
-    Attributes
-    ----------
-    path : Path
-        The folder.
-    record : mapping
-        ``run.json``.
-    """
+    """Record of a run: ``run.json`` in the folder that `run_files` wrote."""
 
     path: Path
     record: Mapping[str, Any]
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return a table of the record.
-
-        Raises
-        ------
-        InputFileError
-            It is missing or not a table.
-        """
+        """Return a table of the record; InputFileError where it is missing or not a table."""
         table = self.record.get(name)
         if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
@@ -56,12 +42,8 @@ class RunRecord:
     def config(self) -> Config:
         """Settings that were used, with the files they name where these are now.
 
-        Settings that earlier versions recorded and that never changed a result are left out.
-
-        Raises
-        ------
-        InputFileError
-            The record lacks them, or they are not settings of this version.
+        Settings that earlier versions recorded and that never changed a result are left out. InputFileError: the record
+        lacks them, or they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
         for group, name in WITHOUT_EFFECT:
@@ -93,15 +75,7 @@ class RunRecord:
             raise InputFileError(path, f"does not fit this version ({error}); repeat the run with it") from None
 
     def check_inputs(self) -> None:
-        """Check that the input files are there and unchanged.
-
-        Raises
-        ------
-        InputFileError
-            One is missing.
-        MismatchError
-            One has changed since the run.
-        """
+        """Check that the input files are there (InputFileError) and unchanged since the run (MismatchError)."""
         self.inputs.check()
         for entry in self.entries:
             path = located(entry, self.path)
@@ -116,13 +90,7 @@ class RunRecord:
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:
-        """Input files with kind, path and SHA-256.
-
-        Raises
-        ------
-        InputFileError
-            The record has no such list.
-        """
+        """Input files with kind, path and SHA-256; InputFileError where the record has no such list."""
         entries = self.record.get("inputs", [])
         complete = isinstance(entries, list) and all(
             isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
@@ -135,22 +103,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run.
-
-    Parameters
-    ----------
-    folder : Path
-        That `railfix run` wrote.
-
-    Returns
-    -------
-    RunRecord
-
-    Raises
-    ------
-    InputFileError
-        There is no record, or it is not one.
-    """
+    """Read the record of a run in the folder that `railfix run` wrote; InputFileError where there is none."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; name that")
@@ -161,13 +114,7 @@ def read_record(folder: Path) -> RunRecord:
 
 
 def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFrame:
-    """Read a table that a run wrote: all columns, or those selected.
-
-    Raises
-    ------
-    InputFileError
-        It cannot be read as Parquet.
-    """
+    """Read a table that a run wrote: all columns, or those selected; InputFileError where it is not Parquet."""
     with reading_table(path):
         if columns is None:
             return pl.read_parquet(path)

@@ -68,13 +68,7 @@ class InputFiles(Settings):
         return tuple(path for _, path in self.named())
 
     def check_files(self) -> None:
-        """Check that every file is there and can be opened.
-
-        Raises
-        ------
-        InputFileError
-            A file is missing, a folder, or cannot be opened.
-        """
+        """Raise InputFileError where a file is missing, a folder, or cannot be opened."""
         for name, path in self.named():
             _check_file(f"--{name.replace('_', '-')}", path)
 
@@ -87,29 +81,10 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run.
+    """Input files of a run; the options of `railfix run` say what each is.
 
-    Attributes
-    ----------
-    front, rear : tuple of Path
-        RINEX observation files of each antenna, in order of time; `rear` may be empty.
-    nav, sp3 : tuple of Path
-        Navigation files; precise orbits, which may be empty.
-    track : tuple of Path
-        Track map, joined to a route in this order.
-    heights : Path or None
-        Heights of a track map without.
-    vehicle : Path or None
-    tachometer, inertial, radar, ranging : Path or None
-        Tables of the sensors on board.
-    ranging_units : Path or None
-        Surveyed positions of the ground units that `ranging` names.
-    truth : Path or None
-        Reference positions, for `ablate` alone.
-    config : Path or None
-    cn0_curve, error_model : Path or None
-    sbas : tuple of Path
-        Named by the settings (`with_settings`).
+    `truth` is for `ablate` alone; `config`, `cn0_curve`, `error_model` and `sbas` are named by the settings
+    (`with_settings`).
     """
 
     front: tuple[Path, ...] = input_option(
@@ -154,10 +129,7 @@ class RunInputs(InputFiles):
     def with_own_sbas(self, config: Config) -> Config:
         """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.
 
-        Raises
-        ------
-        SettingsError
-            None of the logs is a receiver's.
+        SettingsError: none of the logs is a receiver's.
         """
         if config.sbas != "stream":
             return config
@@ -172,13 +144,7 @@ class RunInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Check every file before the work begins.
-
-        Raises
-        ------
-        InputFileError
-            A file is missing, a folder, or cannot be opened; or the same log is given twice.
-        """
+        """Raise InputFileError where a file is missing, a folder, cannot be opened, or the same log is given twice."""
         self.check_files()
         check_given_once((f"--{name}", path) for name, paths in self.logs.items() for path in paths)
 
@@ -190,12 +156,7 @@ def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Ant
 
 
 def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
-    """Raise where the same file is given twice, by whichever options and names.
-
-    Raises
-    ------
-    InputFileError
-    """
+    """Raise InputFileError where the same file is given twice, by whichever options and names."""
     seen: dict[Path, tuple[str, Path]] = {}
     for name, path in files:
         resolved = path.resolve()

@@ -23,12 +23,7 @@ from railfix.run.sources import Log
 
 
 class LocateInputs(InputFiles):
-    """Input files of `railfix locate`.
-
-    Attributes
-    ----------
-    log, nav : tuple of Path
-    """
+    """Input files of `railfix locate`."""
 
     log: tuple[Path, ...] = input_option("Observations of one receiver: RINEX, UBX, RTCM 3.", metavar="OBS")
     nav: tuple[Path, ...] = input_option("Navigation files.", metavar="NAV")
@@ -57,9 +52,8 @@ def locate_files(
 
     Raises
     ------
-    InputFileError, SettingsError, OutputError
-    NoPositionError
-        No epoch has a position.
+    InputFileError, SettingsError, OutputError, NoPositionError
+        No epoch has a position, or a file is not what it should be.
     """
     inputs.check_files()
     date = (reading or LogReading()).instant

@@ -25,14 +25,8 @@ READY: Final = "ready"
 
 @dataclass(frozen=True, kw_only=True)
 class Staging:
-    """A hidden folder inside a results folder, and the lock that holds it.
-
-    Attributes
-    ----------
-    path : Path
-        For files that are being written.
-    lock : file
-        Open and locked; holds the number of the process.
+    """A hidden folder inside a results folder, and the open, locked file that holds it, with the number of the
+    process.
     """
 
     path: Path
@@ -49,13 +43,7 @@ class Staging:
 
 
 def make_staging(folder: Path) -> Staging:
-    """Return a new staging folder inside a folder, locked by this process.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be written.
-    """
+    """Return a new staging folder inside a folder, locked by this process; OSError where that cannot be written."""
     while True:
         name = folder / f"{_PREFIX}{secrets.token_hex(4)}"
         path, staging = name.with_name(name.name + _LOCK), None
@@ -80,12 +68,7 @@ def make_staging(folder: Path) -> Staging:
 def clean_up(folder: Path) -> None:
     """Remove what killed processes left in a folder; finish what they had only to move in place.
 
-    Raises
-    ------
-    OutputError
-        A living process is writing to the folder.
-    OSError
-        The folder cannot be read or written.
+    OutputError: a living process is writing to the folder.
     """
     for path in [p for p in folder.iterdir() if p.name.startswith(_PREFIX)]:
         if path.name.endswith(_LOCK):

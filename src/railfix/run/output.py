@@ -106,10 +106,7 @@ class OutputFolder:
     def staged(self, name: str) -> Path:
         """Return the temporary path at which to write one file; `commit` moves it in place.
 
-        Raises
-        ------
-        OutputError
-            The file would overwrite an input, or a folder of that name is there.
+        OutputError: the file would overwrite an input, or a folder of that name is there.
         """
         target = self.path / name
         check_not_input(target, self._inputs)
@@ -173,17 +170,9 @@ class OutputFolder:
             self.staged(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
-        """Join the pieces and move every file in place.
+        """Join the pieces and move every file in place; return where each stands, by its name.
 
-        Parameters
-        ----------
-        metadata : mapping of str to str, optional
-            Written into the footer of each Parquet file.
-
-        Returns
-        -------
-        dict of str to Path
-            Where each file stands, by its name.
+        `metadata` is written into the footer of each Parquet file.
         """
         staging = self._staging.path
         with _writing(self.path):
@@ -200,12 +189,9 @@ class OutputFolder:
 
 
 def check_folder(path: Path, *, overwrite: Overwrite) -> None:
-    """Clean up a results folder after killed processes, and raise where it must not be written.
+    """Clean up a results folder after killed processes, and raise OutputError where it must not be written.
 
-    Raises
-    ------
-    OutputError
-        It is a file, is being written by another process, or has files in it that must not be replaced.
+    It is a file, is being written by another process, or has files in it that must not be replaced.
     """
     with _writing(path):
         if path.exists() and not path.is_dir():
@@ -217,35 +203,17 @@ def check_folder(path: Path, *, overwrite: Overwrite) -> None:
 
 
 def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
-    """Raise where a file to be written is an input, under whichever name.
-
-    Raises
-    ------
-    OutputError
-    """
+    """Raise OutputError where a file to be written is an input, under whichever name."""
     for path in inputs:
         if target.resolve() == path.resolve() or (target.exists() and path.exists() and target.samefile(path)):
             raise OutputError(f"{target}: is an input, which is never overwritten; name another output")
 
 
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
-    """Raise where a single file cannot or must not be written.
+    """Raise OutputError where a single file of a kind cannot or must not be written.
 
-    Parameters
-    ----------
-    target : Path
-    overwrite : {"refuse", "replace"}
-        What to do with a file that is already there.
-    inputs : sequence of Path
-        Files that are read: they are never overwritten.
-    kind : {"page", "csv", "pos", "picture", "png", "any"}
-        What is written; programs that open the file take it for what the ending of its name says.
-
-    Raises
-    ------
-    OutputError
-        The folder does not exist or cannot be written, the file is there already, or is an input, or the ending of
-        its name is that of another kind of file.
+    The folder does not exist or cannot be written, the file is there already, or is one of `inputs`, or the ending of
+    its name, which programs go by, is that of another kind of file.
     """
     with _writing(target):
         check_not_input(target, inputs)

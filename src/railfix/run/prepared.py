@@ -51,18 +51,7 @@ def cache_folder() -> Path:
 
 
 class PreparedLines:
-    """Prepared lines of one command.
-
-    Parameters
-    ----------
-    use : bool
-        False: nothing is found, nothing is kept.
-
-    Attributes
-    ----------
-    notes : list of str
-        What was damaged and could not be written, one sentence each.
-    """
+    """Prepared lines of one command; `notes` say what was damaged and could not be written."""
 
     def __init__(self, *, use: bool = True) -> None:
         self.notes: list[str] = []

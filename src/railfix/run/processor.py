@@ -25,16 +25,7 @@ def processor_of(
 ) -> EpochProcessor:
     """Return a processor with all navigation records and the contents of the files that the settings name.
 
-    Parameters
-    ----------
-    config : Config
-    navigation : Navigation
-    trajectories : mapping of str to Trajectory
-        By antenna.
-    track : Track, optional
-        The line itself, for places by its features.
-    units : GroundUnits, optional
-        Surveyed stations of two-way ranges.
+    `track` is the line itself, for places by its features; `units` are the surveyed stations of two-way ranges.
 
     Raises
     ------

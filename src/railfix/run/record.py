@@ -6,6 +6,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
+from types import MappingProxyType
 from typing import Any, Final
 
 import polars as pl
@@ -128,12 +129,12 @@ def run_record(
     line: Mapping[str, Any],
     navigation: Navigation,
     tally: Tally,
-    sigma: Mapping[str, AlongSigma],
-    protection: Mapping[str, Any],
-    found_levels: Mapping[str, Levels],
-    found_tracks: Mapping[str, Filtered],
     notes: Sequence[str],
     wall_s: float,
+    protection: Mapping[str, Any] = MappingProxyType({}),
+    sigma: Mapping[str, AlongSigma] = MappingProxyType({}),
+    found_levels: Mapping[str, Levels] = MappingProxyType({}),
+    found_tracks: Mapping[str, Filtered] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the content of ``run.json`` as plain values.
 
@@ -143,28 +144,17 @@ def run_record(
         Inputs with size and hash.
     packages : mapping of str to str
         `package_versions`.
-    command : sequence of str
-    asked, used : mapping
-        Settings as given, and all settings that were in force.
-    options : mapping
-        Choices of the run that are no settings of the positions.
+    asked, used, options : mapping
+        Settings as given, all settings that were in force, and choices that are no settings of the positions.
     line : mapping
         Facts of the track map, the vehicle and the trajectories.
-    navigation : Navigation
-    tally : Tally
-    sigma : mapping of str to AlongSigma
     protection : mapping
         Assumptions of the protection levels (`railfix.pipeline.level_stage.level_facts`).
-    found_levels : mapping of str to Levels
-    found_tracks : mapping of str to Filtered
-        Empty without the filter along the track.
-    notes : sequence of str
-    wall_s : float
-
-    Returns
-    -------
-    dict
+    sigma, found_levels, found_tracks : mapping of str to AlongSigma, Levels, Filtered
+        By antenna; empty where there are none.
     """
+    observed = sum(antenna.observed for antenna in tally.antennas.values())
+    ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
     return {
         "versions": {"railfix": __version__, "python": platform.python_version(), **packages},
         "platform": platform.platform(),
@@ -183,8 +173,8 @@ def run_record(
         },
         "protection": dict(protection),
         "notes": list(notes),
-        "positioning_rate": _overall_rate(tally),
-        "ok_rate": _overall_ok_rate(tally),
+        "positioning_rate": tally.positioned / observed if observed else None,
+        "ok_rate": ok / observed if observed else None,
         "antennas": {
             name: {
                 **antenna.as_dict(),
@@ -201,16 +191,6 @@ def run_record(
             "positioning_s": [round(spent, 6) for _, _, spent in tally.chunks],
         },
     }
-
-
-def _overall_rate(tally: Tally) -> float | None:
-    observed = sum(a.observed for a in tally.antennas.values())
-    return tally.positioned / observed if observed else None
-
-
-def _overall_ok_rate(tally: Tally) -> float | None:
-    observed = sum(a.observed for a in tally.antennas.values())
-    return sum(a.status[Status.OK.text] for a in tally.antennas.values()) / observed if observed else None
 
 
 def package_versions() -> dict[str, str]:

@@ -96,17 +96,14 @@ class RouteOfLog:
 
     Attributes
     ----------
-    network : Network
     tracks : tuple of int
         Of the route, in order.
     left_out : tuple of int
         Tracks of the most probable sequence that no route joins to those: the train turned back over them.
     log : PlanLog
         Positions that were matched, in the frame of the network.
-    matched : Matched
     time : datetime64
         Of the frame's epoch.
-    reading : TrackReading
     """
 
     network: Network
@@ -199,21 +196,9 @@ class RouteOfLog:
         }
 
     def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """A table of positions with its tracks, and every track near each position.
+        """A table of positions with `ON_TRACK_COLUMNS`, and every track near each position (`TRACK_COLUMNS`).
 
-        Parameters
-        ----------
-        table : polars.DataFrame
-            With time_gpst, antenna, chainage_m and ECEF coordinates.
-        line : Track
-            The route, whose sections are its tracks.
-
-        Returns
-        -------
-        polars.DataFrame
-            `table` with `ON_TRACK_COLUMNS`.
-        polars.DataFrame
-            `TRACK_COLUMNS`; no rows where there is no position.
+        `line` is the route, whose sections are its tracks. There are no rows of tracks where there is no position.
         """
         chainage = table["chainage_m"].to_numpy()
         ecef = table.select("x_m", "y_m", "z_m").to_numpy()
@@ -282,20 +267,7 @@ def find_route(
     time: np.datetime64,
     reading: TrackReading,
 ) -> RouteOfLog:
-    """Find the route of a log through a network.
-
-    Parameters
-    ----------
-    network : Network
-    parts : iterable of Observations
-        The log, in order of time.
-    navigation : Navigation
-    config : Config
-    path : str
-        Of the log, for messages.
-    time : datetime64
-        Of the frame's epoch.
-    reading : TrackReading
+    """Find the route of a log through a network; `path` names the log in messages, `time` is that of the frame.
 
     Raises
     ------

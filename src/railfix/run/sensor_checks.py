@@ -25,15 +25,8 @@ _LAG_S: Final = 0.3
 def sensor_notes(samples: SensorSamples, train: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
     """Return a sentence on each sensor whose speeds are in another unit, late, or off in scale.
 
-    Parameters
-    ----------
-    samples : SensorSamples
-        Of the whole run.
-    train : polars.DataFrame
-        Filtered positions of one antenna (`railfix.pipeline.train_table.TRAIN_COLUMNS`): their speeds count where
-        Dopplers were used.
-    tachometer : TachometerLimits
-        Wheel as entered.
+    `train` has the filtered positions of one antenna (`railfix.pipeline.train_table.TRAIN_COLUMNS`): their speeds count
+    where Dopplers were used. `tachometer` is the wheel as entered.
     """
     known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
     right_time = known["time_gpst"].to_numpy().astype("datetime64[ns]")

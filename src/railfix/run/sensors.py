@@ -43,10 +43,7 @@ def read_sensors(
 ) -> SensorSamples:
     """Read the tables of the sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
 
-    Raises
-    ------
-    InputFileError
-        A file is no such table, or its times fall.
+    InputFileError: a file is no such table, or its times fall.
     """
     values: dict[str, Any] = {}
     if tachometer is not None:
@@ -84,10 +81,7 @@ def read_sensors(
 def read_units(path: Path) -> GroundUnits:
     """Read the surveyed positions of ground units: ``unit,x_m,y_m,z_m``, ECEF of the line's frame.
 
-    Raises
-    ------
-    InputFileError
-        No such table, or a unit twice.
+    InputFileError: no such table, or a unit twice.
     """
     table = _columns(path, "ranging_units")
     names = table["unit"].cast(pl.String)
@@ -99,12 +93,7 @@ def read_units(path: Path) -> GroundUnits:
 
 
 def check_units(samples: SensorSamples, units: GroundUnits | None, path: Path | None) -> None:
-    """Check that every unit with a range has been surveyed.
-
-    Raises
-    ------
-    MismatchError
-    """
+    """Raise MismatchError where a unit with a range has not been surveyed."""
     measured = set(samples.ranging.station.tolist())
     missing = sorted(measured - set([] if units is None else units.name.tolist()))
     if missing:

@@ -14,14 +14,7 @@ if TYPE_CHECKING:
 
 
 def add_smoothed(runs: Mapping[str, AntennaRun | OtherProcess], folder: OutputFolder) -> None:
-    """Write `train.*` again with the columns of the smoother.
-
-    Parameters
-    ----------
-    runs : mapping of str to AntennaRun or OtherProcess
-        By antenna, after the last chunk.
-    folder : OutputFolder
-    """
+    """Write `train.*` again with the columns of the smoother, after the last chunk."""
     smoothed = {name: run.smoothed() for name, run in runs.items()}
     done = dict.fromkeys(smoothed, 0)
 

@@ -39,9 +39,6 @@ class Line:
 
     Attributes
     ----------
-    track : Track
-    vehicle : Vehicle or None
-    trajectories : dict of str to Trajectory
     frame : FrameShift or None
         How the track was moved to the frame of the satellites; None where no time was given.
     route : RouteOfLog or None
@@ -211,9 +208,6 @@ class Log:
 
     Attributes
     ----------
-    paths : tuple of Path
-    chunk_epochs : int
-    broken_lines : {"stop", "count"}
     start, end : datetime or None
         First epoch, and the time before which the last one lies.
     date : datetime64 or None
@@ -237,13 +231,7 @@ class Log:
     skipped: Counter[str] = field(default_factory=Counter)
 
     def parts(self) -> Iterator[Observations]:
-        """Pieces of the log in order of time.
-
-        Raises
-        ------
-        InputFileError, MismatchError
-            See `railfix.io.rinex.scan_observations`.
-        """
+        """Pieces of the log in order of time; errors as of `railfix.io.rinex.scan_observations`."""
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,

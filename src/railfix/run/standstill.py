@@ -97,10 +97,7 @@ def standstill_codes(
 ) -> StandstillCodes:
     """Codes, and beside a base station phases, of an antenna at rest about an origin, by default its mean place.
 
-    Raises
-    ------
-    MismatchError
-        The antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
+    MismatchError: the antenna moves, its log has no place, or it shares no epoch or satellite with the base station.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = antenna_ranges(obs, received, config, book)

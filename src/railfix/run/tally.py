@@ -21,14 +21,7 @@ _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetFound:
-    """Mean offset of the 3-D positions from the line at the end of one window.
-
-    Attributes
-    ----------
-    time : datetime64[ns]
-    across_m, up_m, across_sigma_m, up_sigma_m : float [m]
-    statistic : float
-    """
+    """Mean offset of the 3-D positions from the line at the end of one window [m]."""
 
     time: np.datetime64
     across_m: float

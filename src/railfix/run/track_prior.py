@@ -38,13 +38,7 @@ class TrackPrior:
 
 
 def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path) -> None:
-    """Write the probabilities of all tracks, as the prior of the next start-up.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write the probabilities of all tracks, as the prior of the next start-up; OutputError where it cannot."""
     shares = dict(zip(posterior.names, posterior.probability.tolist(), strict=True))
     write_whole(path, json.dumps({"time_gpst": str(time), "probability": shares}, indent=2) + "\n")
 
@@ -52,24 +46,10 @@ def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path)
 def prior_of_last_place(
     path: Path, network: Network, *, moved_m: float, missed_move: float, unmapped: float
 ) -> TrackPrior:
-    """Prior of tracks from the last place and the distance moved since.
+    """Prior of tracks from the last place (`write_last_place`) and the distance moved since [m].
 
-    Parameters
-    ----------
-    path : Path
-        That `write_last_place` wrote.
-    network : Network
-    moved_m : float [m]
-        Distance moved since, by cold-movement detection or odometer.
-    missed_move : float
-        Probability that the train was moved unnoticed, anywhere.
-    unmapped : float
-        Prior of a track that the map lacks, for a train that was moved.
-
-    Raises
-    ------
-    InputFileError
-        The file is not a last place on this network.
+    `missed_move` is the probability that the train was moved unnoticed, anywhere; `unmapped` the prior of a track that
+    the map lacks, for a train that was moved. InputFileError: the file is not a last place on this network.
     """
     record = read_json_object(path, what="the last place of a train")
     stated = record.get("probability")
@@ -110,10 +90,7 @@ def _reached(network: Network, track: int, within_m: float) -> list[str]:
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     """Weights of the tracks that the interlocking states, of ``NAME=WEIGHT,...``.
 
-    Raises
-    ------
-    SettingsError
-        It is not such a text, or names a track that the map lacks.
+    SettingsError: it is not such a text, or names a track that the map lacks.
     """
     weights = {}
     for pair in text.split(","):

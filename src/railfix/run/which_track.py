@@ -40,13 +40,7 @@ _MOST_TRACKS: Final = 64
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Tracks of a network near a place in its frame, east and north of it.
-
-    Raises
-    ------
-    MismatchError
-        There is no track within 60 m.
-    """
+    """Tracks of a network near a place in its frame, east and north of it; MismatchError without one within 60 m."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
     near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
     numbers = sorted(int(t) for t in near.track[0] if t >= 0)
@@ -70,20 +64,9 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackDecision:
-    """Posterior over time and the decision.
+    """Posterior at each look, with the time at rest, shape (L,) [s], and the decision.
 
-    Attributes
-    ----------
-    seconds : ndarray, shape (L,)
-        Time at rest at each look.
-    posteriors : tuple of TrackPosterior
-    track : str
-        Name, ``"none"``, or ``"undecided"``.
-    decided_s : float
-        NaN where undecided.
-    notes : tuple of str
-    end : datetime64
-        Last epoch.
+    `track` is a name, ``"none"``, or ``"undecided"``, with NaN for `decided_s`; `end` is the last epoch.
     """
 
     seconds: Floats
@@ -107,14 +90,9 @@ def decide_track(
 ) -> TrackDecision:
     """Look at the posterior from time to time and decide when the risk of another track is below a bound.
 
-    Parameters
-    ----------
-    tracks, antennas, arms_m, errors, prior
-        As for `track_posterior`; all antennas about the same origin.
-    risk : float
-        Bound of the probability that the track is another one.
-    least_s, every_s : float [s]
-        Time before the first look, and between looks.
+    `tracks`, `antennas` (all about the same origin), `arms_m`, `errors` and `prior` are as for `track_posterior`.
+    `risk` bounds the probability that the track is another one; the first look is after `least_s`, the next ones are
+    `every_s` apart [s].
     """
     start = max(codes.time[0] for codes in antennas)
     length = float((min(codes.time[-1] for codes in antennas) - start) / np.timedelta64(1, "s"))
@@ -151,13 +129,7 @@ def decide_track(
 
 
 class WhichTrackInputs(InputFiles):
-    """Input files of `railfix which-track`.
-
-    Attributes
-    ----------
-    front, rear, base, nav, map : tuple of Path
-    last : Path or None
-    """
+    """Input files of `railfix which-track`."""
 
     front: tuple[Path, ...] = input_option("Observations of the front, or only, antenna.", metavar="OBS")
     rear: tuple[Path, ...] = input_option("Observations of the rear antenna.", (), metavar="OBS")
@@ -168,23 +140,7 @@ class WhichTrackInputs(InputFiles):
 
 
 class WhichTrackOptions(Settings):
-    """Options of `railfix which-track`.
-
-    Attributes
-    ----------
-    spacing : float [m]
-    base_place : str or None
-    risk, least_s : float
-    prior : str or None
-    moved : float or None [m]
-    missed_move : float
-    start, end : datetime or None
-    same_frame : {"no", "yes"}
-        Whether the place of the base station, and so the train's, is in the frame of the map.
-    reading : TrackReading
-    logs : LogReading
-    errors : StandstillErrors
-    """
+    """Options of `railfix which-track`, which say what each is; `same_frame` is also of the train's place."""
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
     base_place: str | None = option("Place of the base station: latitude, longitude, height.", None, metavar="L,L,H")
@@ -212,12 +168,7 @@ class WhichTrackOptions(Settings):
 
 
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
-    """Read logs and map, and decide on which track the train stands.
-
-    Raises
-    ------
-    InputFileError, SettingsError, MismatchError
-    """
+    """Read logs and map, and decide on which track the train stands."""
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
         raise SettingsError("a base station needs both --base and --base-place")

@@ -12,7 +12,7 @@ from railfix.core.arrays import Datetimes, Floats, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Reason
-from railfix.core.timescale import seconds
+from railfix.evaluate.bracket import bracket
 from railfix.evaluate.range_errors.robust_clock import robust_clock
 from railfix.gnss.observations import Observations
 from railfix.io.logs import scan_observations
@@ -55,18 +55,11 @@ class BaseStation:
         NaN for satellites that the station does not see, outside its log and in gaps.
         """
         column = {name: i for i, name in enumerate(self.satellite.tolist())}
+        known = [k for k, name in enumerate(satellite.tolist()) if name in column]
         result = np.full((len(time), len(satellite)), np.nan)
-        if len(self.time) < 2:
-            return result
-        base, wanted = seconds(self.time - self.time[0]), seconds(time - self.time[0])
-        after = np.clip(np.searchsorted(base, wanted, side="right"), 1, len(base) - 1)
-        step = base[after] - base[after - 1]
-        part = (wanted - base[after - 1]) / step
-        inside = (part >= 0.0) & (part <= 1.0) & (step <= largest_gap_s)
-        for k, name in enumerate(satellite.tolist()):
-            if name in column:
-                series = self.error_m[:, column[name]]
-                result[:, k] = np.where(inside, (1.0 - part) * series[after - 1] + part * series[after], np.nan)
+        if len(self.time) > 1:
+            chosen = self.error_m[:, [column[str(name)] for name in satellite[known]]]
+            result[:, known] = bracket(time, self.time, largest_gap_s=largest_gap_s).of(chosen)
         return result
 
 
@@ -86,10 +79,6 @@ def base_station(
         Of the train; its settings, ephemerides, ionosphere and SBAS also correct the station's pseudoranges.
     position_ecef_m : ndarray, shape (3,) [m]
     name : str
-
-    Returns
-    -------
-    BaseStation
     """
     latitude, longitude, height = (float(x) for x in geodetic_from_ecef(position_ecef_m))
     ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)

@@ -76,24 +76,10 @@ def error_model_from_runs(
     limits: GatherLimits | None = None,
     progress: OnChunk | None = None,
 ) -> tuple[ErrorModel, ErrorSamples]:
-    """Error model of the pseudoranges of several runs, before and after the screens.
+    """Error model of the pseudoranges of several runs, before and after the screens, and its samples.
 
     Each run is processed again with its own settings, which gives corrected pseudoranges, satellites and the
-    verdict of every screen.
-
-    Parameters
-    ----------
-    inputs : sequence of ModelInputs
-        All with a reference station, or all without.
-    fit : ErrorModelFit, optional
-    limits : GatherLimits, optional
-    progress : callable, optional
-
-    Returns
-    -------
-    ErrorModel
-    ErrorSamples
-        The samples that the model was fitted to.
+    verdict of every screen. All runs have a reference station, or none has.
 
     Raises
     ------

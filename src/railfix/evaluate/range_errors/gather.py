@@ -88,7 +88,7 @@ def range_errors(
     limits: GatherLimits | None = None,
     block_s: float = 30.0,
 ) -> RangeErrors:
-    """Pseudorange errors of one antenna over one chunk.
+    """Pseudorange errors of one antenna over one chunk of T epochs.
 
     The clock of each constellation is the robust mean of the ranges that passed the screens. Each range
     contributes to its clock estimate, which shrinks its residual; ``1 / sqrt(1 - share)`` restores the size. An
@@ -97,7 +97,6 @@ def range_errors(
     Parameters
     ----------
     result : AntennaResult
-        T epochs.
     trajectory : Trajectory
         Of the antenna; gives the azimuth of the vehicle.
     reference : AntennaReference
@@ -106,10 +105,6 @@ def range_errors(
     limits : GatherLimits, optional
     block_s : float [s]
         Length of the blocks of `ErrorSamples.block`.
-
-    Returns
-    -------
-    RangeErrors
 
     Raises
     ------

@@ -37,17 +37,12 @@ def robust_clock(
 
     Parameters
     ----------
-    residual_m : ndarray, shape (T, K) [m]
+    residual_m, sigma_m : ndarray, shape (T, K) [m]
         Range errors plus the clock; NaN is ignored.
-    sigma_m : ndarray, shape (T, K) [m]
     groups : tuple of slice
         Channels of one receiver clock.
     least_ranges : int
         Fewest ranges from which a clock is estimated.
-
-    Returns
-    -------
-    RobustClock
     """
     clock = np.full((len(residual_m), len(groups)), np.nan)
     share = np.zeros(residual_m.shape)
