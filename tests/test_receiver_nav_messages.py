@@ -100,6 +100,13 @@ def test_gps_lnav(seed: int) -> None:
     assert values["group_delay_1_s"][0] == pytest.approx(ephemeris.tgd[0] if bits[160:168].any() else 0.0, rel=1e-14)
 
 
+def test_leap_seconds_of_gps() -> None:
+    """IS-GPS-200, figure 20-1, sheet 8: bits 241 to 248 of 300, first of word 9; A1 and A0 stand before."""
+    bits = np.ones((1, 240), dtype=np.uint8)
+    put(bits[0], 8 * 24, 8, 18)
+    assert nav_messages.fields(bits, nav_messages.LNAV[4])["leap_seconds"].tolist() == [18.0]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_galileo_inav(seed: int) -> None:
     rtk = rtklib()

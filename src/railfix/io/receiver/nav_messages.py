@@ -70,7 +70,7 @@ LNAV: Final[dict[int, dict[str, Field]]] = {
             f"ion{k}": (56 + 8 * k, 8, factor, "s")
             for k, factor in enumerate(_p(-30, -27, -24, -24) + _p(11, 14, 16, 16))
         },
-        "leap_seconds": (144, 8, 1.0, "s"),
+        "leap_seconds": (192, 8, 1.0, "s"),
     },
 }
 #: Galileo I/NAV words of 128 bits, by word type.
@@ -119,7 +119,7 @@ INAV: Final[dict[int, dict[str, Field]]] = {
         "week": (73, 12, 1.0, "u"),
         "tow_s": (85, 20, 1.0, "u"),
     },
-    6: {"leap_seconds": (63, 8, 1.0, "s"), "tow_s": (105, 20, 1.0, "u")},
+    6: {"tow_s": (105, 20, 1.0, "u")},
 }
 #: BeiDou: seconds of week and subframe number of D1 and D2 (10 words of 30 bits, parity included).
 BDS_HEAD: Final[dict[str, Field]] = {"tow_s": (((18, 8), (30, 12)), 20, 1.0, "u"), "subframe": (15, 3, 1.0, "u")}
