@@ -234,7 +234,7 @@ def test_damage_gives_no_false_observation(recordings: Path, block: int) -> None
         assert piece.bytes == len(broken)
         assert state.rest == b""
         frames = find_frames(np.frombuffer(broken, np.uint8))
-        overhead = {"ubx": (6, 2), "rtcm3": (3, 3), "sbf": (8, 0), "nmea": (0, 3)}
+        overhead = {"ubx": (6, 2), "rtcm3": (3, 3), "sbf": (8, 0), "nmea": (0, 5)}
         inside = sum(
             int(last - first) + sum(overhead[protocol])
             for first, last, protocol in zip(frames.start, frames.end, frames.protocol.tolist(), strict=True)
@@ -255,6 +255,19 @@ def test_protocols_in_one_stream(recordings: Path) -> None:
     assert len(mixed) == expected
     assert len(alone[2]) == 1
     assert np.count_nonzero(mixed.protocol == "nmea") == 2
+
+
+def test_text_between_messages_is_no_damage() -> None:
+    """Lines of NMEA with their ends are frames, however they are cut, and no byte 36 of a damaged message is one."""
+    nmea = b"$GPGGA,092750.000,5321.6802,N,00630.3372,W,1,8,1.03,61.7,M,55.2,M,,*76"
+    stream = np.frombuffer(nmea + b"\r\n" + nmea + b"\n" + nmea + b"$\x07\x80*00" + nmea + b"\r\n", np.uint8)
+    frames = find_frames(stream)
+    assert (len(frames), frames.skipped_bytes, frames.bad_checksums) == (4, 6, 0)
+    for cut in range(len(stream)):
+        first = find_frames(stream[:cut], at_end=False)
+        second = find_frames(stream[first.consumed :])
+        assert len(first) + len(second) == 4
+        assert first.skipped_bytes + second.skipped_bytes == 6
 
 
 def test_crc24q_by_hand() -> None:

@@ -21,7 +21,10 @@ from railfix.core.arrays import Bytes, Indices, Integers, Masks, Strings
 #: Bytes of the longest frame: RTCM 3 has 1029, UBX and SBF up to 65 543; receivers stay below 16 KiB.
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
+_LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _CRC24_POLYNOMIAL: Final = 0x1864CFB
+#: Whether a byte can be the first and the second of the address of an NMEA sentence; 0 stands beyond the buffer's end.
+_ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +41,8 @@ class Frames:
         UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0.
     start, end : ndarray of int, shape (N,)
         Payload in `data`: UBX without header and checksum; RTCM 3 likewise (message number included);
-        SBF from the time stamp on (after the 8 bytes of header); NMEA from ``$`` up to, not including, ``*``.
+        SBF from the time stamp on (after the 8 bytes of header); NMEA from ``$`` up to, not including, ``*``
+        (the end of its line belongs to the frame).
     frame_start : ndarray of int, shape (N,)
         First byte of the frame, its sync included.
     consumed : int
@@ -100,7 +104,7 @@ def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
     Frames
     """
     data = np.asarray(data, dtype=np.uint8)
-    candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data)]
+    candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data, at_end=at_end)]
     incomplete = [c.frame[c.frame_end > len(data)] for c in candidates]
     complete = [c.frame_end <= len(data) for c in candidates]
     frame = np.concatenate([c.frame[k] for c, k in zip(candidates, complete, strict=True)])
@@ -249,21 +253,26 @@ def _sbf(data: Bytes) -> _Candidates:
     return _Candidates("sbf", frame, kind, frame + 8, end, end, valid)
 
 
-def _nmea(data: Bytes) -> _Candidates:
+def _nmea(data: Bytes, *, at_end: bool) -> _Candidates:
     dollar = np.flatnonzero(data == ord("$"))
-    dollar = dollar[_at(data, dollar + 1) != ord("@")]
+    # An address begins with a letter and a letter or digit; any other byte 36 is one of a damaged message.
+    dollar = dollar[_ADDRESS[0, _at(data, dollar + 1)] & _ADDRESS[1, _at(data, dollar + 2)]]
     star = np.flatnonzero(data == ord("*"))
     after = np.searchsorted(star, dollar)
     has = after < len(star)
     end = np.where(has, star[np.minimum(after, len(star) - 1)] if len(star) else 0, len(data))
     near = end - dollar < _NMEA_LONGEST
-    frame, end = dollar[near & has], end[near & has]
+    frame, end = dollar[near], end[near]
     sums = np.concatenate([[0], np.bitwise_xor.accumulate(data)]) if len(data) else np.zeros(1, np.uint8)
     complete = end + 3 <= len(data)
     valid = np.zeros(len(frame), dtype=bool)
     first, stop = frame[complete] + 1, end[complete]
     valid[complete] = (sums[stop] ^ sums[first]) == (_hex(data[stop + 1]) << 4 | _hex(data[stop + 2]))
-    return _Candidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, end + 3, valid)
+    line_end = end + 3 + (_at(data, end + 3) == ord("\r"))
+    frame_end = line_end + (_at(data, line_end) == ord("\n"))
+    if not at_end:  # a sentence whose line may go on waits for the rest of it
+        frame_end = np.where(line_end >= len(data), len(data) + 1, frame_end)
+    return _Candidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
 
 def _hex(digit: Bytes) -> Integers:
