@@ -200,6 +200,34 @@ def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None
 
 @with_numba
 @pytest.mark.requirement("A7")
+def test_code_on_disk_with_types_of_an_older_version_is_compiled_anew(tmp_path: Path) -> None:
+    """A table of arguments was renamed since: numba cannot read the index of the code on disk."""
+    (tmp_path / "tables.py").write_text("from typing import NamedTuple\nclass Old(NamedTuple):\n    x: float\n")
+    program = """
+import sys
+import railfix.kernels.forgetting
+from railfix.kernels import compiling
+function = compiling.COMPILED[0]
+index = function._cache._cache_file
+if len(sys.argv) > 1:
+    sys.path.insert(0, sys.argv[1])
+    from tables import Old
+    index._save_index({Old: "x.nbc"})
+    assert index._load_index()
+else:
+    assert index._load_index() == {}, "an index that names what is gone"
+    index.save("now", b"code")
+    assert index.load("now") == b"code"
+"""
+    for arguments in ([str(tmp_path)], []):
+        subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            check=True, env={**os.environ, kernels.VARIABLE: "numba", "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+        )  # fmt: skip
+
+
+@with_numba
+@pytest.mark.requirement("A7")
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_terminal_is_told_of_compilation_once(terminal: bool) -> None:
     program = """

@@ -161,7 +161,7 @@ def test_what_is_passed_over_by_its_bound_is_closed(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(open_places, "_risk_of_block", counted)
     bounded = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), sides, rows)
     assert 0 < sum(looked_at) < 0.3 * len(rows)
-    monkeypatch.setattr(open_places, "risk_off_tangent", lambda *arrays: np.full(len(arrays[0]), 1.0))
+    monkeypatch.setattr(open_places, "risk_off_tangent", lambda _, scale, *__: np.full(len(scale), 1.0))
     every = places_beyond_the_level(SearchIndex(path), arc, model, level, scale, systems, RiskBudget(), sides, rows)
     np.testing.assert_array_equal(bounded, every)
     assert every.any() == (share < 1.0)

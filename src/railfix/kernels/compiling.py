@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar, cast
 
 import numba
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
 from numba.core.options import DefaultOptions
 
 from railfix.core.errors import SettingsError
@@ -44,9 +45,26 @@ def kernel(function: Function) -> Function:
             "written, or RAILFIX_KERNELS=numpy"
         ) from error
     module = function.__module__.removeprefix("railfix.kernels.")
-    made._cache._cache_file._source_stamp = stamp(Path(__file__).parent, module)
+    cache = made._cache
+    cache._cache_file = _Index(  # type: ignore[no-untyped-call]
+        cache._cache_path, cache._impl.filename_base, stamp(Path(__file__).parent, module)
+    )
     COMPILED.append(made)
     return cast(Function, made)
+
+
+class _Index(IndexDataCacheFile):
+    """Index of the code on disk, empty where an older railfix wrote it with types of arguments that are gone.
+
+    numba unpickles the types before it looks whether the index is of this code.
+    """
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            index: dict[Any, str] = super()._load_index()  # type: ignore[no-untyped-call]
+        except (AttributeError, ImportError):
+            return {}
+        return index
 
 
 def inner(function: Function) -> Function:
@@ -84,17 +102,17 @@ class _Announcement(event.Listener):
 event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
 
 
-def _files(room: Path, module: str) -> set[Path]:
-    """Return the file of a module of this room and those of all that it imports from the room."""
-    path = room / f"{module.replace('.', '/')}.py"
+def _files(package: Path, module: str) -> set[Path]:
+    """Return the file of a module of this package and those of all that it imports from the package."""
+    path = package / f"{module.replace('.', '/')}.py"
     imported = re.findall(r"^from railfix\.kernels\.([\w.]+) import", path.read_text(encoding="utf-8"), re.MULTILINE)
-    return {path}.union(*(_files(room, name) for name in imported))
+    return {path}.union(*(_files(package, name) for name in imported))
 
 
 @cache
-def stamp(room: Path, module: str) -> str:
+def stamp(package: Path, module: str) -> str:
     """Return the hash of all that the compiled code of a module depends on: its files, and the constants."""
-    files = [*sorted(_files(room, module)), room.parent / "core" / "constants.py"]
+    files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -142,13 +143,7 @@ def _of_sides(
 
 @kernel
 def risk_off_tangent(
-    root_weight: Floats,
-    clock: Indices,
-    clock_covariance_m2: Floats,
-    design: Floats,
-    covariance_m2: Floats,
-    map_prior: Floats,
-    misfit: Floats,
+    model: Any,
     scale: Floats,
     likely: Floats,
     sides: Masks,
@@ -159,6 +154,7 @@ def risk_off_tangent(
     enough: float,
 ) -> Floats:
     """Return an upper bound of the probability that the true place lies off the tangent beyond a distance."""
+    root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
     epochs, channels = root_weight.shape
     clocks, total = clock_covariance_m2.shape[1], np.empty(epochs)
     used, prior, leverage = np.empty(channels, dtype=np.intp), np.empty(channels), np.empty(channels)

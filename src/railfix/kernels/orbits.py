@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
-from railfix.core.arrays import Floats, Indices, Integers, Masks
+from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.kernels.compiling import inner, kernel
 
@@ -45,28 +46,12 @@ def _rotated(sine: float, cosine: float, angle: float) -> tuple[float, float]:
 
 @kernel
 def kepler_channels(
-    time_ns: Integers,
-    code_m: Floats,
-    channel: Indices,
-    rows: Integers,
-    usable: Masks,
-    toe_ns: Integers,
-    orbits: Floats,
-    clocks: Floats,
-    ahead_s: Floats,
-    accuracies_m: Floats,
-    signal: Integers,
-    delays_s: Floats,
-    flagged: Masks,
-    position: Floats,
-    velocity: Floats,
-    clock_m: Floats,
-    age_s: Floats,
-    accuracy_m: Floats,
-    delay_m: Floats,
-    unhealthy: Masks,
+    time_ns: Integers, code_m: Floats, channels: Any, records: Any, states: Any
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Masks]:
     """Compute states of channels, element by element (`railfix.gnss.orbits.kepler.kepler_state`)."""
+    channel, rows, usable, signal = channels
+    toe_ns, orbits, clocks, ahead_s, accuracies_m, delays_s, flagged = records
+    position, velocity, clock_m, age_s, accuracy_m, delay_m, unhealthy = states
     for t in range(len(time_ns)):
         for k in range(len(channel)):
             if not usable[k, t]:

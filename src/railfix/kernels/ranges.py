@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -111,16 +112,9 @@ def _tie(
 
 
 @kernel
-def reduced_equations(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-) -> tuple[Floats, Floats, Floats, Masks]:
+def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Masks]:
     """Compute the normal equations of place and residual with the clocks eliminated; channel by channel."""
+    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
     groups, no = len(starts), np.empty(0)
     tied = len(offset_m) == epochs
@@ -136,17 +130,9 @@ def reduced_equations(
 
 
 @kernel
-def misfits(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    epochs: Indices,
-) -> Floats:
+def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
     """Compute weighted sums of squared residuals at places; place by place."""
+    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     channels, groups = weight.shape[1], len(starts)
     tied = len(offset_m) == len(code_m)
     result, residual = np.zeros(len(epochs)), np.empty(channels)
@@ -212,18 +198,10 @@ def _invert(matrix: Floats, inverse: Floats) -> None:
 
 @kernel
 def iterated_points(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    start_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    enough: Masks,
-    tolerance_m: float,
-    most: int,
+    ranges: Any, start_ecef_m: Floats, enough: Masks, tolerance_m: float, most: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Iterate the 3-D positions; epoch by epoch."""
+    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
     groups, no = len(starts), np.empty(0)
     tied = len(offset_m) == epochs
@@ -299,24 +277,11 @@ def _along(
 
 @kernel
 def iterated_along(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    start_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    tangent: Floats,
-    across: Floats,
-    up: Floats,
-    length_m: Floats,
-    vertex: Indices,
-    plan_m: float,
-    height_m: float,
-    tolerance_m: float,
-    most: int,
+    ranges: Any, line: Any, vertex: Indices, tolerance_m: float, most: int
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
     """Iterate the positions along the line; epoch by epoch."""
+    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
+    start_ecef_m, tangent, across, up, length_m, plan_m, height_m = line
     epochs, channels = weight.shape
     groups, no, last = len(starts), np.empty(0), len(length_m) - 1
     tied = len(offset_m) == epochs

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Indices, Masks
+from railfix.core.arrays import Floats, Masks
 from railfix.kernels.compiling import kernel
 from railfix.kernels.sight import sight
 
@@ -16,13 +17,8 @@ _LEAST_SCALE = 0.05
 
 @kernel
 def reweighted(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
+    ranges: Any,
     place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
     information: Floats,
     correction: Floats,
     keep: float,
@@ -30,6 +26,7 @@ def reweighted(
     iterations: int,
 ) -> tuple[Masks, Floats, Masks]:
     """Reweight ranges by their residuals; epoch by epoch, directions and misfits computed once."""
+    sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
     groups = len(starts)
     tied, informed = len(offset_m) == epochs, len(information) == epochs

@@ -10,6 +10,7 @@ covariance as their prior, which is the same thing (the matrix inversion lemma).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -17,7 +18,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.core.settings import Settings
 from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import Ranges, after_step, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import RangeArrays, Ranges, after_step, inverse_3x3, reduced_equations
 from railfix.track.trajectory import Trajectory
 
 
@@ -160,49 +161,46 @@ def _from(
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
     """`iterated_along` of a trajectory, from points of it."""
     return iterated_along(
-        *ranges.arrays(trajectory.ecef_m[:-1]),
-        trajectory.tangent,
-        trajectory.across,
-        trajectory.up,
-        trajectory.length_m,
+        ranges.arrays,
+        SectionArrays(
+            trajectory.ecef_m[:-1],
+            trajectory.tangent,
+            trajectory.across,
+            trajectory.up,
+            trajectory.length_m,
+            trajectory.sigma_plan_m,
+            trajectory.sigma_height_m,
+        ),
         vertex,
-        trajectory.sigma_plan_m,
-        trajectory.sigma_height_m,
         limits.tolerance_m,
         limits.max_iterations,
     )
 
 
+class SectionArrays(NamedTuple):
+    """Sections of a line, S of them, and the sigmas of its map."""
+
+    start_ecef_m: Floats  # (S, 3)
+    tangent: Floats  # (S, 3)
+    across: Floats  # (S, 3)
+    up: Floats  # (S, 3)
+    length_m: Floats  # (S,)
+    plan_m: float
+    height_m: float
+
+
 @compiled_by("ranges")
 def iterated_along(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    start_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    tangent: Floats,
-    across: Floats,
-    up: Floats,
-    length_m: Floats,
-    vertex: Indices,
-    plan_m: float,
-    height_m: float,
-    tolerance_m: float,
-    most: int,
+    ranges: RangeArrays, line: SectionArrays, vertex: Indices, tolerance_m: float, most: int
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """Iterate positions along the line; the ranges as `reduced_equations` takes them.
+    """Iterate positions along the line.
 
     Parameters
     ----------
-    start_ecef_m, tangent, across, up : ndarray, shape (S, 3)
-        Of each section: its first point [m], and unit vectors.
-    length_m : ndarray, shape (S,) [m]
+    ranges : RangeArrays
+    line : SectionArrays
     vertex : ndarray of int, shape (T,)
         Point to start from; -1: none.
-    plan_m, height_m : float [m]
-        Sigmas of the map.
     tolerance_m, most
         Last step, and number of steps.
 
@@ -215,12 +213,13 @@ def iterated_along(
     clock_m, residual_m, iterations
         Of `Constrained`.
     """
-    epochs, channels = code_m.shape
+    start_ecef_m, tangent, across, up, length_m, plan_m, height_m = line
+    epochs, channels = ranges.code_m.shape
     chosen, iterations = np.full(epochs, -1, dtype=np.intp), np.zeros(epochs, dtype=np.int64)
-    clock, residual = np.full((epochs, len(starts)), np.nan), np.full((epochs, channels), np.nan)
+    clock, residual = np.full((epochs, len(ranges.starts)), np.nan), np.full((epochs, channels), np.nan)
     solved = np.full((6, epochs), np.nan)
     solved[4] = 0.0
-    tied, last = len(offset_m) == epochs, len(length_m) - 1
+    last = len(length_m) - 1
 
     active = np.flatnonzero(vertex >= 0)
     section = np.minimum(vertex[active], last)
@@ -230,11 +229,8 @@ def iterated_along(
         if not len(active):
             break
         some = slice(None) if len(active) == epochs else active
-        ties = (offset_m[some], sigma_m[some]) if tied else (offset_m, sigma_m)
         place = start_ecef_m[section] + along[:, None] * tangent[section]
-        system, means, rows, seen = reduced_equations(
-            sat_ecef_m[some], code_m[some], weight[some], place, starts, *ties
-        )
+        system, means, rows, seen = reduced_equations(ranges.take(some), place)
         axes = np.stack([tangent[section], across[section], up[section]], axis=1)
         step, deviation, exact, least = _along(system, axes, plan_m, height_m)
         target = along + step
@@ -263,9 +259,8 @@ def iterated_along(
     # Sigma along the line for ranges of unit sigma and an exact map: geometry alone.
     at = np.flatnonzero(chosen >= 0)
     place = start_ecef_m[chosen[at]] + solved[0, at, None] * tangent[chosen[at]]
-    ties = (offset_m[at], sigma_m[at]) if tied else (offset_m, sigma_m)
-    unit = (weight[at] > 0).astype(np.float64)
-    system = reduced_equations(sat_ecef_m[at], code_m[at], unit, place, starts, *ties)[0]
+    unit = ranges.take(at)
+    system = reduced_equations(unit._replace(weight=(unit.weight > 0).astype(np.float64)), place)[0]
     information = np.einsum("ti,tij,tj->t", tangent[chosen[at]], system[:, :3, :3], tangent[chosen[at]])
     with np.errstate(divide="ignore"):
         solved[5, at] = 1.0 / np.sqrt(np.maximum(information, 0.0))

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -48,6 +48,27 @@ class ClockTies:
     def take(self, epochs: Masks | Indices) -> ClockTies:
         """The ties of some epochs, by mask or index."""
         return ClockTies(offset_m=self.offset_m[epochs], sigma_m=self.sigma_m[epochs])
+
+
+class RangeArrays(NamedTuple):
+    """Arrays of `Ranges` in C order, as compiled functions take them: T epochs, M channels, G groups."""
+
+    sat_ecef_m: Floats  # (T, M, 3)
+    code_m: Floats  # (T, M)
+    weight: Floats  # (T, M)
+    starts: Indices  # (G,) first channel of each group
+    offset_m: Floats  # (T, G), of `ClockTies`; (0, G) without ties
+    sigma_m: Floats  # likewise
+
+    @property
+    def tied(self) -> bool:
+        """Whether anything is known of the offsets between the clocks."""
+        return len(self.offset_m) == len(self.code_m)
+
+    def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
+        """The arrays of some epochs."""
+        ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
+        return RangeArrays(self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], self.starts, *ties)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,16 +109,15 @@ class Ranges:
             ties=None if self.ties is None else self.ties.take(epochs),
         )
 
-    def arrays(self, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Floats, Indices, Floats, Floats]:
-        """Return what `reduced_equations` takes, at one place an epoch, shape (T, 3) [m]."""
-        offset_m, sigma_m = np.empty((2, 0, len(self.groups)))
-        if self.ties is not None:
-            offset_m, sigma_m = self.ties.offset_m, self.ties.sigma_m
-        floats = (self.sat_ecef_m, self.code_m, self.weight, place_ecef_m, offset_m, sigma_m)
-        sat_ecef_m, code_m, weight, place, offset_m, sigma_m = (
-            np.ascontiguousarray(array, dtype=np.float64) for array in floats
+    @cached_property
+    def arrays(self) -> RangeArrays:
+        """The same as plain arrays."""
+        ties = np.empty((2, 0, len(self.groups))) if self.ties is None else (self.ties.offset_m, self.ties.sigma_m)
+        sat_ecef_m, code_m, weight, *known = (
+            np.ascontiguousarray(array, dtype=np.float64)
+            for array in (self.sat_ecef_m, self.code_m, self.weight, *ties)
         )
-        return sat_ecef_m, code_m, weight, place, self.starts, offset_m, sigma_m
+        return RangeArrays(sat_ecef_m, code_m, weight, self.starts, *known)
 
     @cached_property
     def n_used(self) -> Integers:
@@ -183,7 +203,7 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
     -------
     NormalEquations
     """
-    system, means, rows, seen = reduced_equations(*ranges.arrays(place_ecef_m))
+    system, means, rows, seen = reduced_equations(ranges.arrays, np.ascontiguousarray(place_ecef_m, dtype=np.float64))
     return NormalEquations(
         matrix=system[:, :3, :3],
         vector=system[:, :3, 3],
@@ -196,26 +216,15 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 
 
 @compiled_by("ranges")
-def reduced_equations(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-) -> tuple[Floats, Floats, Floats, Masks]:
-    """Compute the normal equations of place and residual with the clocks eliminated; arrays in C order.
+def reduced_equations(ranges: RangeArrays, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Masks]:
+    """Compute the normal equations of place and residual with the clocks eliminated.
 
     Parameters
     ----------
-    sat_ecef_m : ndarray, shape (T, M, 3) [m]
-    code_m, weight : ndarray, shape (T, M)
+    ranges : RangeArrays
+        T epochs.
     place_ecef_m : ndarray, shape (T, 3) [m]
-    starts : ndarray of int, shape (G,)
-        First channel of each group.
-    offset_m, sigma_m : ndarray, shape (T, G) [m], or (0, G)
-        Of `ClockTies`; (0, G) without ties.
+        In C order.
 
     Returns
     -------
@@ -228,13 +237,14 @@ def reduced_equations(
     seen : ndarray of bool, shape (T, G)
         Groups with weight.
     """
-    distance, los = range_with_rotation(sat_ecef_m, place_ecef_m[:, None, :])
+    weight, starts = ranges.weight, ranges.starts
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
     used = (weight > 0)[:, None]
     sizes = np.diff(np.append(starts, weight.shape[1]))
     # Rows: the design -u (three) and the residual; channels side by side, as sums run over them.
     rows = np.empty((len(weight), 4, weight.shape[1]))
     np.negative(los.swapaxes(1, 2), out=rows[:, :3])
-    np.subtract(code_m, distance, out=rows[:, 3])
+    np.subtract(ranges.code_m, distance, out=rows[:, 3])
     weighted = rows * weight[:, None]
     totals = np.add.reduceat(weight, starts, axis=1)
     seen = totals > 0
@@ -243,11 +253,11 @@ def reduced_equations(
     rows *= used
     np.multiply(rows, weight[:, None], out=weighted)
     system = np.matmul(weighted, rows.swapaxes(1, 2))
-    if len(offset_m) == len(weight):
-        apart, mass = _between_clocks(means, totals, ClockTies(offset_m=offset_m, sigma_m=sigma_m))
+    if ranges.tied:
+        apart, mass = _between_clocks(means, totals, ranges.offset_m, ranges.sigma_m)
         system += np.matmul(apart * mass[:, None], apart.swapaxes(1, 2))
         # A clock lies between the estimates from its own satellites and from the others.
-        shift = apart / (totals * sigma_m**2 + 1.0)[:, None]
+        shift = apart / (totals * ranges.sigma_m**2 + 1.0)[:, None]
         means -= shift
         rows += np.repeat(shift, sizes, axis=2) * used
     return system, means, rows, seen
@@ -275,7 +285,7 @@ def after_step(means: Floats, rows: Floats, seen: Masks, step_m: Floats) -> tupl
     return clock, rows[:, 3] - np.matmul(step, rows[:, :3])[:, 0]
 
 
-def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Floats, Floats]:
+def _between_clocks(means: Floats, totals: Floats, offset_m: Floats, sigma_m: Floats) -> tuple[Floats, Floats]:
     """Means of the groups (last row: residual) less the common clock, and the weight of each.
 
     Parameters
@@ -283,7 +293,8 @@ def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Flo
     means : ndarray, shape (T, C, G)
     totals : ndarray, shape (T, G) [1/m^2]
         Weight of each mean, 0 where the group has no satellite.
-    ties : ClockTies
+    offset_m, sigma_m : ndarray, shape (T, G) [m]
+        Of `ClockTies`.
 
     Returns
     -------
@@ -291,9 +302,9 @@ def _between_clocks(means: Floats, totals: Floats, ties: ClockTies) -> tuple[Flo
     mass : ndarray, shape (T, G) [1/m^2]
     """
     apart = means.copy()
-    apart[:, -1] -= ties.offset_m
+    apart[:, -1] -= offset_m
     seen = totals > 0
-    mass = np.where(seen, 1.0 / (1.0 / np.where(seen, totals, 1.0) + ties.sigma_m**2), 0.0)
+    mass = np.where(seen, 1.0 / (1.0 / np.where(seen, totals, 1.0) + sigma_m**2), 0.0)
     total = mass.sum(axis=1)
     common = np.matmul(apart, mass[..., None]) / np.where(total > 0, total, 1.0)[:, None, None]
     apart -= common
@@ -318,31 +329,23 @@ def fit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> 
     -------
     ndarray, shape (n,)
     """
-    return misfits(*ranges.arrays(place_ecef_m), np.arange(len(ranges)) if epochs is None else epochs)
+    place = np.ascontiguousarray(place_ecef_m, dtype=np.float64)
+    return misfits(ranges.arrays, place, np.arange(len(ranges)) if epochs is None else epochs)
 
 
 @compiled_by("ranges")
-def misfits(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    epochs: Indices,
-) -> Floats:
-    """Compute `fit` of arrays as `reduced_equations` takes them, but for one place for each of `epochs`."""
-    weight = weight[epochs]
-    distance, _ = range_with_rotation(sat_ecef_m[epochs], place_ecef_m[:, None, :])
-    residual = code_m[epochs] - distance
+def misfits(ranges: RangeArrays, place_ecef_m: Floats, epochs: Indices) -> Floats:
+    """Compute `fit` of arrays in C order, with a place for each of `epochs`."""
+    some = ranges.take(epochs)
+    weight, starts = some.weight, some.starts
+    distance, _ = range_with_rotation(some.sat_ecef_m, place_ecef_m[:, None, :])
+    residual = some.code_m - distance
     totals = np.add.reduceat(weight, starts, axis=1)
     means = np.add.reduceat(weight * residual, starts, axis=1) / np.where(totals > 0, totals, 1.0)
     residual -= np.repeat(means, np.diff(np.append(starts, weight.shape[1])), axis=1)
     result = np.einsum("pm,pm,pm->p", weight, residual, residual)
-    if len(offset_m) == len(code_m):
-        ties = ClockTies(offset_m=offset_m[epochs], sigma_m=sigma_m[epochs])
-        apart, mass = _between_clocks(means[:, None], totals, ties)
+    if ranges.tied:
+        apart, mass = _between_clocks(means[:, None], totals, some.offset_m, some.sigma_m)
         result += (mass * apart[:, 0] ** 2).sum(axis=1)
     return np.asarray(result)
 

@@ -18,7 +18,7 @@ from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import range_with_rotation
 from railfix.core.settings import Settings
 from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import Ranges, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import RangeArrays, Ranges, inverse_3x3, reduced_equations
 from railfix.track.trajectory import Trajectory
 
 #: Median of the absolute value of a standard normal variable.
@@ -103,7 +103,8 @@ def robust_fit(
         return RobustFit(kept=used, variance=np.full(len(ranges), np.nan), freedom=nothing)
     freedom = ranges.n_used - ranges.n_clocks - (3 if information is None else 1)
     kept, wsse, solved = reweighted(
-        *ranges.arrays(place_ecef_m),
+        ranges.arrays,
+        np.ascontiguousarray(place_ecef_m, dtype=np.float64),
         np.empty((0, 3, 3)) if information is None else np.ascontiguousarray(information),
         np.sqrt(ranges.n_used / np.maximum(freedom, 1)) / _NORMAL_MEDIAN,
         limits.keep,
@@ -119,23 +120,21 @@ def robust_fit(
 
 @compiled_by("robust")
 def reweighted(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
+    ranges: RangeArrays,
     place_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
     information: Floats,
     correction: Floats,
     keep: float,
     reject: float,
     iterations: int,
 ) -> tuple[Masks, Floats, Masks]:
-    """Reweight ranges by their residuals; arrays in C order, up to `sigma_m` as `reduced_equations` takes them.
+    """Reweight ranges by their residuals.
 
     Parameters
     ----------
+    ranges : RangeArrays
+    place_ecef_m : ndarray, shape (T, 3) [m]
+        In C order.
     information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
     correction : ndarray, shape (T,)
         Scale of the residuals over their median.
@@ -150,17 +149,16 @@ def reweighted(
     solved : ndarray of bool, shape (T,)
         False where the last step was not determined.
     """
+    weight, starts = ranges.weight, ranges.starts
     used, prior = weight > 0, information if len(information) == len(weight) else 0.0
     n_used = np.count_nonzero(used, axis=1)
-    distance, los = range_with_rotation(sat_ecef_m, place_ecef_m[:, None, :])
-    root, misfit = np.sqrt(weight), code_m - distance
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
+    root, misfit = np.sqrt(weight), ranges.code_m - distance
     sizes = np.diff(np.append(starts, weight.shape[1]))
     middle = np.minimum(n_used // 2, used.shape[1] - 1)[:, None]
     factor = used.astype(np.float64)
     for _ in range(iterations):
-        system, means, _, seen = reduced_equations(
-            sat_ecef_m, code_m, weight * factor, place_ecef_m, starts, offset_m, sigma_m
-        )
+        system, means, _, seen = reduced_equations(ranges._replace(weight=weight * factor), place_ecef_m)
         step = np.einsum("tij,tj->ti", inverse_3x3(system[:, :3, :3] + prior), system[:, :3, 3])
         clock = np.where(seen, means[:, 3], np.nan) - np.matmul(step[:, None, :], means[:, :3])[:, 0]
         residual = misfit + np.einsum("tmi,ti->tm", los, step) - np.repeat(clock, sizes, axis=1)

@@ -14,7 +14,7 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.core.settings import Settings
 from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import Ranges, after_step, inverse_3x3, reduced_equations
+from railfix.positioning.normal_equations import RangeArrays, Ranges, after_step, inverse_3x3, reduced_equations
 
 
 class SinglePointLimits(Settings):
@@ -78,7 +78,8 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
     """
     limits = limits or SinglePointLimits()
     place, clock, matrix, covariance, wsse, residual = iterated_points(
-        *ranges.arrays(start_ecef_m),
+        ranges.arrays,
+        np.ascontiguousarray(start_ecef_m, dtype=np.float64),
         np.asarray(ranges.n_used - ranges.n_clocks >= 3),
         limits.tolerance_m,
         limits.max_iterations,
@@ -90,21 +91,14 @@ def single_point(ranges: Ranges, start_ecef_m: Floats, *, limits: SinglePointLim
 
 @compiled_by("ranges")
 def iterated_points(
-    sat_ecef_m: Floats,
-    code_m: Floats,
-    weight: Floats,
-    start_ecef_m: Floats,
-    starts: Indices,
-    offset_m: Floats,
-    sigma_m: Floats,
-    enough: Masks,
-    tolerance_m: float,
-    most: int,
+    ranges: RangeArrays, start_ecef_m: Floats, enough: Masks, tolerance_m: float, most: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Iterate 3-D positions; up to `sigma_m` as `reduced_equations` takes them.
+    """Iterate 3-D positions.
 
     Parameters
     ----------
+    ranges : RangeArrays
+    start_ecef_m : ndarray, shape (T, 3) [m]
     enough : ndarray of bool, shape (T,)
         Epochs with satellites for a position; the others are NaN.
     tolerance_m, most
@@ -115,22 +109,18 @@ def iterated_points(
     ecef_m, clock_m, matrix, covariance_m2, wsse, residual_m
         Of `SinglePoint`.
     """
-    epochs, channels = code_m.shape
-    groups = len(starts)
+    epochs, channels = ranges.code_m.shape
+    groups = len(ranges.starts)
     place, clock = np.full((epochs, 3), np.nan), np.full((epochs, groups), np.nan)
     matrix, covariance = np.full((2, epochs, 3, 3), np.nan)
     wsse, residual = np.full(epochs, np.nan), np.full((epochs, channels), np.nan)
-    tied = len(offset_m) == epochs
     active = np.flatnonzero(enough)
     current = start_ecef_m[active]
     for _ in range(most):
         if not len(active):
             break
         some = slice(None) if len(active) == epochs else active
-        ties = (offset_m[some], sigma_m[some]) if tied else (offset_m, sigma_m)
-        system, means, rows, seen = reduced_equations(
-            sat_ecef_m[some], code_m[some], weight[some], current, starts, *ties
-        )
+        system, means, rows, seen = reduced_equations(ranges.take(some), current)
         vector, inverse = system[:, :3, 3], inverse_3x3(system[:, :3, :3])
         step = np.einsum("tij,tj->ti", inverse, vector)
         length = np.sqrt(np.einsum("ti,ti->t", step, step))

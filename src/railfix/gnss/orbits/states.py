@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -196,24 +196,17 @@ def _fill_kepler(
     kepler_channels(
         time.astype("datetime64[ns]").astype(np.int64),
         code_m,
-        channels,
-        rows,
-        usable,
-        table.lookup.toe.astype("datetime64[ns]").astype(np.int64),
-        table.orbits.table,
-        table.clock,
-        table.toe_after_toc_s,
-        table.navigation.kepler.accuracy_m,
-        plan.signal,
-        plan.group_delay_s,
-        plan.unhealthy,
-        states.position_ecef_m,
-        states.velocity_ecef_mps,
-        states.clock_m,
-        states.age_s,
-        states.accuracy_m,
-        states.group_delay_m,
-        states.unhealthy,
+        KeplerChannels(channels, rows, usable, plan.signal),
+        KeplerRecords(
+            table.lookup.toe.astype("datetime64[ns]").astype(np.int64),
+            table.orbits.table,
+            table.clock,
+            table.toe_after_toc_s,
+            table.navigation.kepler.accuracy_m,
+            plan.group_delay_s,
+            plan.unhealthy,
+        ),
+        KeplerStates(*(getattr(states, name) for name in KeplerStates._fields)),
     )
     if record is not None:
         # The newest record decides on health, also where a correction refers to an older one.
@@ -221,29 +214,43 @@ def _fill_kepler(
         states.unhealthy[:, channels] |= newest_unhealthy.T
 
 
+class KeplerChannels(NamedTuple):
+    """Channels on Keplerian records, K of the M, T epochs."""
+
+    channel: Indices  # (K,) which of the M
+    row: Integers  # (K, T) of the record
+    usable: Masks  # (K, T)
+    signal: Integers  # (K,) row of `KeplerRecords.group_delay_s`
+
+
+class KeplerRecords(NamedTuple):
+    """Keplerian records, R of them, as arrays."""
+
+    toe_ns: Integers  # (R,) since 1970
+    orbits: Floats  # (R, 20) `Orbits.table`
+    clock: Floats  # (3, R) clock polynomial
+    toe_after_toc_s: Floats  # (R,)
+    accuracy_m: Floats  # (R,)
+    group_delay_s: Floats  # (signals, R), of `ChannelRecords`
+    unhealthy: Masks  # (signals, R), likewise
+
+
+class KeplerStates(NamedTuple):
+    """Arrays of `SatelliteStates` that `kepler_channels` fills in."""
+
+    position_ecef_m: Floats
+    velocity_ecef_mps: Floats
+    clock_m: Floats
+    age_s: Floats
+    accuracy_m: Floats
+    group_delay_m: Floats
+    unhealthy: Masks
+
+
 @compiled_by("orbits")
 def kepler_channels(
-    time_ns: Integers,
-    code_m: Floats,
-    channel: Indices,
-    rows: Integers,
-    usable: Masks,
-    toe_ns: Integers,
-    orbits: Floats,
-    clocks: Floats,
-    ahead_s: Floats,
-    accuracies_m: Floats,
-    signal: Integers,
-    delays_s: Floats,
-    flagged: Masks,
-    position: Floats,
-    velocity: Floats,
-    clock_m: Floats,
-    age_s: Floats,
-    accuracy_m: Floats,
-    delay_m: Floats,
-    unhealthy: Masks,
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Masks]:
+    time_ns: Integers, code_m: Floats, channels: KeplerChannels, records: KeplerRecords, states: KeplerStates
+) -> KeplerStates:
     """Compute the states of channels on Keplerian records.
 
     Parameters
@@ -251,30 +258,25 @@ def kepler_channels(
     time_ns : ndarray of int, shape (T,)
         Time tags since 1970.
     code_m : ndarray, shape (T, M) [m]
-    channel : ndarray of int, shape (K,)
-        Which of the M channels.
-    rows, usable : ndarray of int and bool, shape (K, T)
-        Row of the record, and whether it is to be used.
-    toe_ns, orbits, clocks, ahead_s, accuracies_m : ndarray, shapes (R,), (R, 20), (3, R), (R,), (R,)
-        Of each record: toe since 1970, `Orbits.table`, clock polynomial, toe after toc, accuracy.
-    signal, delays_s, flagged
-        Signal of each channel, group delay and health of signals and records: of `ChannelRecords`.
-    position, velocity, clock_m, age_s, accuracy_m, delay_m, unhealthy : ndarray, shapes (T, M, 3) and (T, M)
-        As in `SatelliteStates`; filled in place, and returned.
+    channels : KeplerChannels
+    records : KeplerRecords
+    states : KeplerStates
+        Filled in place; its arrays are returned.
     """
-    for k, t, row in _groups(rows, usable):
-        m = channel[k]
-        age = seconds((time_ns[t] - toe_ns[row]).astype("timedelta64[ns]"))
-        since_toe, clock, ahead = age - code_m[t, m] / SPEED_OF_LIGHT, clocks[:, row], ahead_s[row]
+    for k, t, row in _groups(channels.row, channels.usable):
+        m, signal = channels.channel[k], channels.signal[k]
+        age = seconds((time_ns[t] - records.toe_ns[row]).astype("timedelta64[ns]"))
+        since_toe, clock = age - code_m[t, m] / SPEED_OF_LIGHT, records.clock[:, row]
+        ahead = records.toe_after_toc_s[row]
         since_toe = since_toe - _polynomial(clock, since_toe + ahead)
-        place, speed, relativity = kepler_state(Orbits.of_table(orbits[row]), since_toe)
+        place, speed, relativity = kepler_state(Orbits.of_table(records.orbits[row]), since_toe)
         for i in range(3):
-            position[t, m, i], velocity[t, m, i] = place[i], speed[i]
-        clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
-        age_s[t, m], accuracy_m[t, m] = age, accuracies_m[row]
-        delay_m[t, m] = SPEED_OF_LIGHT * delays_s[signal[k], row]
-        unhealthy[t, m] = flagged[signal[k], row]
-    return position, velocity, clock_m, age_s, accuracy_m, delay_m, unhealthy
+            states.position_ecef_m[t, m, i], states.velocity_ecef_mps[t, m, i] = place[i], speed[i]
+        states.clock_m[t, m] = SPEED_OF_LIGHT * (_polynomial(clock, since_toe + ahead) + relativity)
+        states.age_s[t, m], states.accuracy_m[t, m] = age, records.accuracy_m[row]
+        states.group_delay_m[t, m] = SPEED_OF_LIGHT * records.group_delay_s[signal, row]
+        states.unhealthy[t, m] = records.unhealthy[signal, row]
+    return states
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:

@@ -34,6 +34,7 @@ from railfix.integrity.protection.risk import MOST_TOGETHER, RiskBudget
 from railfix.integrity.protection.separation import all_in_view, without_group, without_map
 from railfix.integrity.protection.tails import lowered
 from railfix.integrity.raim import LinearModel
+from railfix.integrity.raim.model import ModelArrays
 from railfix.kernels import compiled_by
 
 #: Numbers of a pair array that a block of epochs holds.
@@ -246,18 +247,6 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
     return (rows[first : first + size] for first in range(0, len(rows), size))
 
 
-class Positions(NamedTuple):
-    """Fields of `LinearModel` that hypotheses ask for, T epochs by M channels, in C order."""
-
-    root_weight: Floats
-    clock: Indices
-    clock_covariance_m2: Floats
-    design: Floats
-    covariance_m2: Floats
-    prior: Floats
-    misfit: Floats
-
-
 class Errors(NamedTuple):
     """Parameters of `along_track_level` of the same names; of shape (T, 0) for none."""
 
@@ -286,10 +275,9 @@ def _level_of_block(
     result: ProtectionLevel, rows: Indices, model: LinearModel, plan: Allocation, given: Errors
 ) -> None:
     """Levels of a block of epochs with positions; written into `result`."""
-    positions = Positions(*(np.ascontiguousarray(getattr(model, name)) for name in Positions._fields))
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(np.count_nonzero(model.used, axis=1).max())
-    channel, offset, sigma, weight, separation = hypotheses(positions, of_block, asked := _asked(plan, rows, n))
+    channel, offset, sigma, weight, separation = hypotheses(model.arrays, of_block, asked := _asked(plan, rows, n))
     share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
     level, spender, part, k, worst = lowered(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
 
@@ -375,7 +363,7 @@ def _sets(n: int, size: int) -> Indices:
 
 
 @compiled_by("hypotheses")
-def hypotheses(model: Positions, errors: Errors, asked: Asked) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+def hypotheses(model: ModelArrays, errors: Errors, asked: Asked) -> tuple[Indices, Floats, Floats, Floats, Floats]:
     """Return the tails of all hypotheses of a block of epochs.
 
     Returns
@@ -388,7 +376,7 @@ def hypotheses(model: Positions, errors: Errors, asked: Asked) -> tuple[Indices,
         `ProtectionLevel.separation`.
     """
     epochs = len(errors.scale)
-    whole = LinearModel(**model._asdict(), freedom=np.zeros(epochs, dtype=np.int64), interest=1)
+    whole = LinearModel.on_line(model)
     full = all_in_view(whole, errors.scale, errors.least_sigma_m, errors.bias_m, errors.map_bias_m)
     n = full.channel.shape[1]
     prior = np.take_along_axis(asked.prior, full.channel, axis=1) * full.used

@@ -18,7 +18,7 @@ from railfix.integrity.protection.risk import one_sided_k, pair_sum
 from railfix.integrity.protection.separation import one_after_the_other
 from railfix.integrity.raim import LinearModel
 from railfix.integrity.raim.exclusion import LEAST_REDUNDANCY
-from railfix.integrity.raim.model import Compact, compact
+from railfix.integrity.raim.model import Compact, ModelArrays, compact
 from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import inverse_3x3
 
@@ -115,13 +115,7 @@ def whitened(model: LinearModel, plan: float, height: float, scale: Floats) -> t
 
 @compiled_by("off_tangent")
 def risk_off_tangent(
-    root_weight: Floats,
-    clock: Indices,
-    clock_covariance_m2: Floats,
-    design: Floats,
-    covariance_m2: Floats,
-    map_prior: Floats,
-    misfit: Floats,
+    model: ModelArrays,
     scale: Floats,
     likely: Floats,
     sides: Masks,
@@ -141,8 +135,8 @@ def risk_off_tangent(
 
     Parameters
     ----------
-    root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit : ndarray
-        Fields of `LinearModel`, T epochs by M channels, in C order.
+    model : ModelArrays
+        T epochs by M channels.
     scale : ndarray, shape (T,)
     likely : ndarray, shape (M,)
         Probability of a fault of each channel.
@@ -161,18 +155,7 @@ def risk_off_tangent(
     ndarray, shape (T,)
         Summed over no fault, one faulty satellite, two and those of a side.
     """
-    model = LinearModel(
-        root_weight=root_weight,
-        clock=clock,
-        clock_covariance_m2=clock_covariance_m2,
-        design=design,
-        covariance_m2=covariance_m2,
-        prior=map_prior,
-        misfit=misfit,
-        freedom=np.zeros(len(scale), dtype=np.int64),
-        interest=1,
-    )
-    parts, rows, none = whitened(model, sigma_plan_m, sigma_height_m, scale)
+    parts, rows, none = whitened(LinearModel.on_line(model), sigma_plan_m, sigma_height_m, scale)
     prior = np.where(parts.used, likely[parts.channel], 0.0)
     side = without_sides(parts, rows, none, sides, side_prior)
     of_sides = _bounded(

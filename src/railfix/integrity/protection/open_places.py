@@ -8,10 +8,10 @@ is evaluated along the line around the position, where a bound does not rule suc
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.special import ndtr
@@ -110,19 +110,18 @@ def places_beyond_the_level(
     for first in range(0, len(rows), size):
         block = rows[first : first + size]
         part, noise = model.take(block), np.maximum(scale[block], 1.0)
-        arrays: Iterable[Any] = (
-            *(part.root_weight, part.clock, part.clock_covariance_m2, part.design, part.covariance_m2, part.prior),
-            *(part.misfit, noise, likely, sides[block]),
-        )
-        arrays = (
-            *map(np.ascontiguousarray, arrays),
+        bound = risk_off_tangent(
+            part.arrays,
+            noise,
+            likely,
+            np.ascontiguousarray(sides[block]),
             risk.side_prior,
             _off_tangent_m(index, arc_m[block]),
             line.sigma_plan_m,
             line.sigma_height_m,
             risk.risk_per_sample,
         )
-        near = np.flatnonzero(risk_off_tangent(*arrays) > risk.risk_per_sample)
+        near = np.flatnonzero(bound > risk.risk_per_sample)
         for some in np.array_split(near, 1 + 9 * len(near) // size) if len(near) else ():
             rest = block[some]
             parts, design, none = whitened(part.take(some), line.sigma_plan_m, line.sigma_height_m, noise[some])

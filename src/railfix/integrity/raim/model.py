@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,18 @@ from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotati
 from railfix.kernels import compiled_by
 from railfix.positioning.normal_equations import Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
+
+
+class ModelArrays(NamedTuple):
+    """Arrays of `LinearModel` in C order, as compiled functions take them."""
+
+    root_weight: Floats
+    clock: Indices
+    clock_covariance_m2: Floats
+    design: Floats
+    covariance_m2: Floats
+    prior: Floats
+    misfit: Floats
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +88,16 @@ class LinearModel:
         common = ("clock", "prior", "interest")
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return LinearModel(**{name: v if name in common else v[epochs] for name, v in values.items()})
+
+    @property
+    def arrays(self) -> ModelArrays:
+        """The same as plain arrays, without `freedom` and `interest`."""
+        return ModelArrays(*(np.ascontiguousarray(getattr(self, name)) for name in ModelArrays._fields))
+
+    @classmethod
+    def on_line(cls, arrays: ModelArrays) -> LinearModel:
+        """The model on the line that these are of, its `freedom` not known."""
+        return cls(**arrays._asdict(), freedom=np.full(len(arrays.misfit), -1), interest=1)
 
     @property
     def used(self) -> Masks:
