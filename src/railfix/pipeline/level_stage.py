@@ -18,12 +18,16 @@ from railfix.integrity.protection import (
     along_track_level,
     availability,
 )
+from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.protection.risk import SUPPORTED_SIDE_PRIOR
-from railfix.integrity.raim import LinearModel
+from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges
 from railfix.pipeline.results import ProtectionResult, RaimResult
+from railfix.pipeline.solve import Place
 from railfix.positioning.map_offset import MapOffset
+from railfix.positioning.normal_equations import Ranges
+from railfix.positioning.section_search import SearchIndex
 
 #: Basis of a level: the integrity of an SBAS and fault hypotheses of local causes; or hypotheses of
 #: satellites' own faults as well (ARAIM).
@@ -155,6 +159,50 @@ def protection_levels(
     )
     status = availability(level.level_m, config.alarm_limit_m, consistent=level.consistent)
     return ProtectionResult(level=level, status=status, kind=kind_of(config), basis=basis_of(config))
+
+
+def places_left_open(
+    corrected: CorrectedRanges,
+    ranges: Ranges,
+    index: SearchIndex,
+    place: Place,
+    model: LinearModel,
+    protection: ProtectionResult,
+    scale: Floats,
+    sides: Masks,
+    config: Config,
+) -> Masks:
+    """Return the epochs where the ranges leave open, at the risk of a sample, a place beyond the level, shape (T,).
+
+    Parameters
+    ----------
+    corrected, model, scale, sides, config
+        As for `protection_levels`.
+    ranges : Ranges
+        That `place` was found from.
+    index : SearchIndex
+    place : Place
+        Epochs that are ambiguous already are not looked at.
+    protection : ProtectionResult
+    """
+    constrained = place.constrained
+    if config.error_model is not None:
+        sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
+        weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
+        section = np.maximum(constrained.section, 0)
+        model = constrained_model(replace(ranges, weight=weight), index.trajectory, constrained.arc_m, section=section)
+        scale = np.ones(len(ranges))
+    return places_beyond_the_level(
+        index,
+        constrained.arc_m,
+        model,
+        protection.level.level_m,
+        scale,
+        [name[0] for name in corrected.satellite.tolist()],
+        risk_of(config),
+        sides,
+        np.flatnonzero(place.section.excess > config.section.threshold),
+    )
 
 
 def low_sides(corrected: CorrectedRanges, heading_deg: Floats, elevation_deg: float) -> Masks:

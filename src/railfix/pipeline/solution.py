@@ -8,16 +8,15 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import chdtri, expit
 
-from railfix.core.arrays import Codes, Floats, Masks
+from railfix.core.arrays import Codes, Floats, Masks, changed
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason, Status
-from railfix.integrity.protection.open_places import places_beyond_the_level
 from railfix.integrity.raim import LinearModel, constrained_model
 from railfix.pipeline.carrier_stage import CarrierState, code_and_phase
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, without
 from railfix.pipeline.fault_exclusion import fault_free, with_p4_level
-from railfix.pipeline.level_stage import low_sides, protection_levels, risk_of
+from railfix.pipeline.level_stage import low_sides, places_left_open, protection_levels
 from railfix.pipeline.off_map import off_map_epochs
 from railfix.pipeline.reason_table import alone_on_their_clocks
 from railfix.pipeline.results import AntennaState, ProtectionResult, RaimResult, patched
@@ -137,25 +136,7 @@ def solve(
         heading = trajectory.heading_deg[np.maximum(constrained.section, 0)]
         sides = low_sides(corrected, heading, config.risk.side_elevation_deg)
         level = protection_levels(corrected, model, offset, raim, scale, sides, config)
-        systems = [name[0] for name in corrected.satellite.tolist()]
-        bounding, bounding_scale = model, scale
-        if config.error_model is not None:
-            sigma = np.maximum(corrected.bound_sigma_m, scale[:, None] * corrected.sigma_m)
-            weight = np.where(ranges.weight > 0, 1.0 / sigma**2, 0.0)
-            section = np.maximum(constrained.section, 0)
-            bounding = constrained_model(replace(ranges, weight=weight), trajectory, constrained.arc_m, section=section)
-            bounding_scale = np.ones(len(ranges))
-        open_elsewhere = places_beyond_the_level(
-            index,
-            constrained.arc_m,
-            bounding,
-            level.level.level_m,
-            bounding_scale,
-            systems,
-            risk_of(config),
-            sides,
-            np.flatnonzero(place.section.excess > config.section.threshold),
-        )
+        open_elsewhere = places_left_open(corrected, ranges, index, place, model, level, scale, sides, config)
     own_sigma = own_sigma_m(redundancy, constrained.wsse, constrained.exact_map_sigma_m, scale)
     arc, exact, total = constrained.arc_m, constrained.exact_map_sigma_m, constrained.sigma_m
     variance = epoch_variance(scale, constrained.wsse, redundancy, limits=config.noise_scale)
@@ -176,7 +157,7 @@ def solve(
         place=place,
         ties=ties,
         raim=raim,
-        status=_status(corrected, ranges, place, raim, judged, arc, off_map, offset, open_elsewhere, config),
+        status=np.full(len(ranges), Status.OK, dtype=np.int8),
         noise_scale=scale,
         own_sigma_m=own_sigma,
         arc_m=arc,
@@ -186,6 +167,7 @@ def solve(
         map_offset=offset,
         off_map=away,
     )
+    solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
     noise = state.noise
     if len(time):
         age = noise_age(time, noise, limits=config.noise_scale)
@@ -294,25 +276,22 @@ def _off_map(ranges: Ranges, trajectory: Trajectory, place: Place, arc: Floats, 
 def _status(
     corrected: CorrectedRanges,
     ranges: Ranges,
-    place: Place,
-    raim: RaimResult,
+    solution: Solution,
     sigma: Floats,
-    arc: Floats,
     off_map: Masks,
-    offset: MapOffset,
     open_elsewhere: Masks,
     config: Config,
 ) -> Codes:
     """Return the status of each epoch, shape (T,): the first condition that holds, the most serious first."""
-    redundancy, constrained, section = redundancy_of(ranges), place.constrained, place.section
+    redundancy, constrained, section = redundancy_of(ranges), solution.place.constrained, solution.place.section
     conditions = [
         (~np.isfinite(corrected.code_m).any(axis=1), Status.NO_OBSERVATION),
         ((ranges.n_used < config.min_satellites) | (redundancy < 0), Status.TOO_FEW_SATELLITES),
         (constrained.dilution > config.dilution_limit, Status.UNOBSERVABLE),
-        (~np.isfinite(arc), Status.NO_CONVERGENCE),
+        (~np.isfinite(solution.arc_m), Status.NO_CONVERGENCE),
         (off_map, Status.OFF_MAP),
-        (beyond_threshold(offset, config.map_offset), Status.MAP_OFFSET),
-        (raim.faulty, Status.INCONSISTENT),
+        (beyond_threshold(solution.map_offset, config.map_offset), Status.MAP_OFFSET),
+        (solution.raim.faulty, Status.INCONSISTENT),
         (sigma > config.largest_sigma_m, Status.UNCERTAIN),
         (
             (section.excess <= config.section.threshold) | (redundancy < config.section.redundancy) | open_elsewhere,
