@@ -123,6 +123,16 @@ def test_response_rate_and_round_trip_of_a_lossy_link() -> None:
     assert meter.coverage[3, 1][1] == 20  # 300 to 400 m, one frame each 5 m
 
 
+def test_a_frame_without_a_place_counts_in_the_rate_and_not_in_the_coverage() -> None:
+    meter = LinkMeter()
+    meter.sent(1, 0.0, chainage_m=None, direction=1)
+    meter.sent(2, 0.0, chainage_m=0.0, direction=1)
+    meter.answered(1, 0.1, 0.1)
+    meter.settle(5.0)
+    assert meter.response_rate == 0.5
+    assert meter.coverage == {(0, 1): (0, 1)}
+
+
 def test_coverage_adds_the_meters_of_a_bearer_up() -> None:
     first, second = (LinkMeter(coverage={(3, 1): (8, 10), (4, place): (1, 2)}) for place in (1, -1))
     assert coverage([first, second]) == {1: {3: (16, 20), 4: (1, 2)}, -1: {4: (1, 2)}}

@@ -60,12 +60,13 @@ class LinkMeter:
     misses: int = 0
     good: int = 0
     coverage: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
-    _open: dict[int, tuple[float, tuple[int, int]]] = field(default_factory=dict)
+    _open: dict[int, tuple[float, tuple[int, int] | None]] = field(default_factory=dict)
     _results: deque[tuple[float, float]] = field(default_factory=deque)
 
-    def sent(self, sequence: int, now_s: float, *, chainage_m: float = 0.0, direction: int = 0) -> None:
-        """Note a frame that was sent."""
-        self._open[sequence] = (now_s, (int(chainage_m // self.limits.place_m), direction))
+    def sent(self, sequence: int, now_s: float, *, chainage_m: float | None = None, direction: int = 0) -> None:
+        """Note a frame that was sent; from a place that is not known it is not in the coverage."""
+        place = None if chainage_m is None else (int(chainage_m // self.limits.place_m), direction)
+        self._open[sequence] = (now_s, place)
 
     def answered(self, sequence: int, now_s: float, round_trip_s: float) -> None:
         """Note the echo of a frame; one that is too late, or comes twice, is none."""
@@ -84,10 +85,12 @@ class LinkMeter:
             self.misses, self.good = self.misses + 1, 0
             self._note(waiting, float("nan"))
 
-    def _note(self, waiting: tuple[float, tuple[int, int]], round_trip_s: float) -> None:
-        answered, sent = self.coverage.get(waiting[1], (0, 0))
-        self.coverage[waiting[1]] = (answered + (round_trip_s == round_trip_s), sent + 1)
-        self._results.append((waiting[0], round_trip_s))
+    def _note(self, waiting: tuple[float, tuple[int, int] | None], round_trip_s: float) -> None:
+        sent_s, place = waiting
+        if place is not None:
+            answered, sent = self.coverage.get(place, (0, 0))
+            self.coverage[place] = (answered + (round_trip_s == round_trip_s), sent + 1)
+        self._results.append((sent_s, round_trip_s))
         if len(self._results) > self.limits.window:
             self._results.popleft()
 

@@ -97,7 +97,7 @@ class TrainLinks:
             self.protocols.pop(name, None)
             await asyncio.sleep(RETRY_S)
 
-    def send(self, payload: bytes, *, chainage_m: float = 0.0, direction: int = 0) -> None:
+    def send(self, payload: bytes, *, chainage_m: float | None = None, direction: int = 0) -> None:
         """Send a payload: with its echo on both links; in mode "spare" only the active one carries the payload."""
         now_ns, now_s = time.monotonic_ns(), time.monotonic()
         self._sequence += 1

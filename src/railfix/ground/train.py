@@ -111,7 +111,8 @@ class _Desk:
                 self._on_board.turned(message.facing, front)
         if self._on_board is not None:
             self._on_board.reported(self._sequence, now_s)
-        links.send(encode(message), chainage_m=(message.chainage_cm or 0) / 100.0, direction=message.facing)
+        place = None if message.chainage_cm is None else message.chainage_cm / 100.0
+        links.send(encode(message), chainage_m=place, direction=message.facing)
 
     def received(self, payload: bytes) -> None:
         """Take an authority from the links."""
