@@ -146,6 +146,16 @@ def test_version_2_gps(tmp_path: Path) -> None:
     assert kepler.toe[1] == np.datetime64("1999-12-26T00:00:00", "ns")
 
 
+def test_version_2_with_a_letter_has_its_columns_one_further(tmp_path: Path) -> None:
+    """RINEX 2.12 of QZSS as JAXA published it: ``J 1 12 10 31 ...``, further lines indented by four."""
+    text = record("J 1", time="20  6 26  8  0  0.0")
+    kepler = read(tmp_path, header(2.12) + text).kepler
+    assert kepler.satellite.tolist() == ["J01"]
+    assert kepler.toe[0] == np.datetime64("2020-06-26T08:00:00", "ns")
+    assert kepler.sqrt_a[0] == 5153.7
+    assert kepler.af0_s[0] == -1.234567890123e-04
+
+
 def test_version_2_glonass_counts_the_seconds_of_the_day(tmp_path: Path) -> None:
     times = ["20  6 26  7 45  0.0", "20  6 26  0  0  0.0"]
     text = header(2.11, "GLONASS NAV DATA") + record_2(" 5", {"message_time": 27000.0}, time=times[0], system="R")
@@ -166,6 +176,7 @@ def test_version_4_reads_the_classic_messages_and_counts_the_rest(tmp_path: Path
     text = header(4.02) + eph("G01", "LNAV") + eph("G01", "CNAV", 1) + eph("E03", "INAV") + eph("E03", "FNAV")
     text += eph("C20", "D1") + eph("C03", "D2") + eph("C20", "CNV1", 2) + eph("J02", "LNAV") + eph("R05", "FDMA", 1)
     text += "> STO G01 LNAV\n    2020 06 26 00 00 00 GPUT\n" + "> EOP J02 CNVX\n    2020 06 26 00 00 00\n"
+    text += "> STO E   IFNV\n    2020 06 26 00 00 00 GAGP\n" + "> STO R   FDMA\n    2020 06 26 00 00 00 GLGP\n"
     text += eph("S22", "SBAS") + eph("I02", "LNAV")
     navigation = read(tmp_path, text)
     assert list(zip(navigation.kepler.satellite.tolist(), navigation.kepler.message.tolist(), strict=True)) == [
@@ -173,7 +184,7 @@ def test_version_4_reads_the_classic_messages_and_counts_the_rest(tmp_path: Path
     ]  # fmt: skip
     assert navigation.glonass.satellite.tolist() == ["R05"]
     assert navigation.skipped == {
-        "G CNAV": 1, "C CNV1": 1, "STO": 1, "EOP": 1, "S SBAS": 1, "I LNAV": 1,
+        "G CNAV": 1, "C CNV1": 1, "STO": 3, "EOP": 1, "S SBAS": 1, "I LNAV": 1,
     }  # fmt: skip
 
 

@@ -39,8 +39,8 @@ _MESSAGES: Final = {"G": ("LNAV",), "J": ("LNAV",), "E": ("INAV", "FNAV"), "C": 
 _SKIPPED: Final = ("S", "I")
 #: Width of a number.
 _WIDTH: Final = 19
-#: ``> EPH G01 LNAV`` (RINEX 4.02, table A7).
-_TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z][ \d]\d) *(\S*)")
+#: ``> EPH G01 LNAV`` (RINEX 4.02, table A7); time offsets (STO) may name a constellation alone: ``> STO E   IFNV``.
+_TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
 
 def read_navigation(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> Navigation:
@@ -186,12 +186,13 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
             path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
+    lettered = version >= 3.0 or first[:1].isalpha()  # RINEX 2.12: a letter before the number shifts all by a column
     try:
-        epoch = _epoch_2(first) if version < 3.0 else _epoch_3(first)
+        epoch = _epoch_3(first) if version >= 3.0 else _epoch_2(first[lettered:])
     except ValueError:
-        what = f"epoch {first[3 : 22 if version < 3.0 else 23].strip()!r} of {satellite} is not a date and time"
+        what = f"epoch {first[3 : 23 if lettered else 22].strip()!r} of {satellite} is not a date and time"
         raise InputFileError(path, what, line=block.line) from None
-    numbers = _numbers(path, block, satellite, shift=19 if version >= 3.0 else 18)
+    numbers = _numbers(path, block, satellite, shift=19 if lettered else 18)
     record = RawRecord(system, satellite, block.message, epoch, numbers, version)
     fault_at = first_fault(record)
     if fault_at is not None:
