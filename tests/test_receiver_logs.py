@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import gzip
 import shutil
 import subprocess
@@ -363,6 +364,34 @@ def test_sbas_messages_of_a_receiver(recordings: Path, tmp_path: Path) -> None:
     assert read.type.tolist() == known.type[kept].tolist()
     assert np.array_equal(read.bits[:, :28], known.bits[kept, :28])
     assert set(read.parity_bits.tolist()) == {24}
+
+
+def msm4(number: int, time_field: int) -> bytes:
+    """A multiple signal message (RTCM 10403.3, 3.5.16) of satellite 5 alone, its first signal at 70.5 ms."""
+    fields = [(number, 12), (0, 12), (time_field, 30), (0, 19), (1 << 59, 64), (1 << 30, 32), (1, 1)]
+    fields += [(70, 8), (512, 10), (0, 15), (0, 22), (5, 4), (0, 1), (40, 6)]
+    bits = "".join(f"{value:0{length}b}" for value, length in fields)
+    body = int(bits.ljust(-len(bits) // 8 * -8, "0"), 2).to_bytes(-(-len(bits) // 8), "big")
+    framed = b"\xd3" + len(body).to_bytes(2, "big") + body
+    octets = np.frombuffer(framed, np.uint8)
+    return framed + int(crc24q(octets, np.array([0]), np.array([len(octets)]))[0]).to_bytes(3, "big")
+
+
+@pytest.mark.parametrize("day", [2, 0, 7])
+def test_day_of_glonass_messages(day: int) -> None:
+    """Their day of the week may be unknown (7) or left at 0; all messages of an instant are one epoch."""
+    tow_ms = 204_236_600
+    glonass = day << 27 | (tow_ms - 18_000 + 3 * 3_600_000) % 86_400_000
+    stream = b"".join(
+        msm4(1074, tow_ms + k) + msm4(1084, glonass + k) + msm4(1124, tow_ms + k - 14_000) for k in (0, 200)
+    )
+    piece, _ = decode(stream, StreamState(time=np.datetime64("2019-01-20", "ns")), at_end=True)
+    observations, _ = observations_of(piece.measurements)
+    assert observations.satellite.tolist() == ["C05", "G05", "R05"]
+    assert observations.time.astype("M8[ms]").tolist() == [
+        datetime.datetime(2019, 1, 22, 8, 43, 56, 600_000), datetime.datetime(2019, 1, 22, 8, 43, 56, 800_000)
+    ]  # fmt: skip
+    assert np.isfinite(observations.code_m).all()
 
 
 def test_messages_whose_masks_do_not_fit_are_counted() -> None:

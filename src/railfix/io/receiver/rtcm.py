@@ -69,15 +69,19 @@ def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
     -------
     Measurements
     """
-    parts = [part for number in MSM_NUMBERS for part in _of_number(frames, number, near)]
+    parts = [
+        (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))
+        for number in MSM_NUMBERS
+        for order, rows in _of_number(frames, number, near)
+    ]
     messages = len(frames.of("rtcm3", *MSM_NUMBERS))
     if not parts:
         return replace(_no_measurements(), skipped={"broken MSM": messages} if messages else {})
-    order = np.concatenate([order for order, _ in parts])
-    rows = joined([rows for _, rows in parts])
+    order = np.concatenate([order for order, _, _ in parts])
+    rows = joined([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
-    time = rows.time[by_stream]
+    time = _glonass_days(rows.time[by_stream], np.concatenate([g for _, _, g in parts])[by_stream])
     starts = np.concatenate([[True], time[1:] != time[:-1]])
     epoch_of = np.empty(len(order), dtype=np.intp)
     epoch_of[by_stream] = np.cumsum(starts) - 1
@@ -89,6 +93,19 @@ def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
         receiver="RTCM 3",
         skipped={"broken MSM": broken} if broken else {},
     )
+
+
+def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
+    """Move times of GLONASS messages by whole days to those of the message before (the first: after) them.
+
+    They carry the day of the week, which some encoders leave at 0 and the standard lets be unknown (DF416 is 7).
+    """
+    others = np.flatnonzero(~glonass)
+    if not len(others) or not glonass.any():
+        return time
+    at = others[np.maximum(np.searchsorted(others, np.arange(len(time)), side="right") - 1, 0)]
+    day = np.timedelta64(1, "D").astype("timedelta64[ns]")
+    return np.asarray(time + np.rint((time[at] - time) / day).astype(np.int64) * day)
 
 
 _ROW_NAMES: Final = (
