@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.stats import chi2
 from pipeline_cases import clean_navigation, clean_observations, clean_trajectories, front_alone, only, with_code
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason, Status
+from railfix.gnss.observations import Observations
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.integrity.protection import Cause, LevelStatus
 from railfix.integrity.raim import Outcome
@@ -23,20 +25,28 @@ from railfix.positioning.normal_equations import Ranges
 from railfix.positioning.robust_fit import RobustFit
 from railfix.ranges.error_model import BinStatistics, ErrorBins, ErrorModel
 
-#: Forty epochs in the open, and the satellite that gets a fault.
-FRONT = clean_observations()["front"][400:440]
 BASE = {"screens": ["elevation", "raim"]}
-FAULTY = front_alone(FRONT, BASE)
+
+
+@cache
+def front() -> Observations:
+    """Forty epochs in the open."""
+    return clean_observations()["front"][400:440]
+
+
+@cache
+def fault_free() -> AntennaResult:
+    return front_alone(front(), BASE)
 
 
 def used_satellite() -> int:
     """Column of a GPS satellite that is used throughout and stands high."""
-    good = (FAULTY.reason == 0).all(axis=0) & np.char.startswith(FRONT.satellite, "G")
-    return int(np.flatnonzero(good)[np.argmax(FAULTY.elevation_deg[0, good])])
+    good = (fault_free().reason == 0).all(axis=0) & np.char.startswith(front().satellite, "G")
+    return int(np.flatnonzero(good)[np.argmax(fault_free().elevation_deg[0, good])])
 
 
 def with_fault(size_m: float) -> np.ndarray:
-    change = np.zeros(FRONT.code_m.shape)
+    change = np.zeros(front().code_m.shape)
     change[:, used_satellite()] = size_m
     return change
 
@@ -44,8 +54,8 @@ def with_fault(size_m: float) -> np.ndarray:
 @pytest.mark.requirement("C2")
 def test_an_excluded_satellite_counts_in_the_risk() -> None:
     """The level after an exclusion is larger than the level of the same ranges without a fault found among them."""
-    excluded = front_alone(with_code(FRONT, with_fault(80.0)), BASE)
-    absent = front_alone(with_code(FRONT, with_fault(np.nan)), BASE)
+    excluded = front_alone(with_code(front(), with_fault(80.0)), BASE)
+    absent = front_alone(with_code(front(), with_fault(np.nan)), BASE)
     assert (excluded.raim.outcome == Outcome.EXCLUDED_ONE).all()
     assert (excluded.reason[:, used_satellite()] == Reason.FAULT_EXCLUDED).all()
     np.testing.assert_allclose(excluded.chainage_m[0], absent.chainage_m[0], atol=1e-3)
@@ -82,13 +92,13 @@ def test_the_bias_of_the_error_model_is_in_the_level() -> None:
         model = error_model(bias_m)
         path = {"front": clean_trajectories()["front"]}
         processor = EpochProcessor(config, path, navigation=clean_navigation(), error_model=model)
-        return processor.process({"front": FRONT})[0].antennas["front"]
+        return processor.process({"front": front()})[0].antennas["front"]
 
     without, three, six = (level(bias).protection for bias in (0.0, 3.0, 6.0))
     assert without is not None
     assert three is not None
     assert six is not None
-    assert np.array_equal(level(3.0).chainage_m, FAULTY.chainage_m)
+    assert np.array_equal(level(3.0).chainage_m, fault_free().chainage_m)
     added = three.level.fault_free_m - without.level.fault_free_m
     assert (added > 1.0).all()
     np.testing.assert_allclose(six.level.fault_free_m - without.level.fault_free_m, 2.0 * added, rtol=1e-9)
@@ -105,7 +115,7 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
         return original(*arguments, **options)
 
     monkeypatch.setattr(level_stage, "along_track_level", spied)
-    result = front_alone(FRONT, BASE)
+    result = front_alone(front(), BASE)
     (sides,) = caught
     line, columns = clean_trajectories()["front"], result.columns
     section = result.constrained.section
@@ -120,7 +130,7 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
     assert np.array_equal((sides[:, 1] & used), low & right & used)
     assert np.array_equal((sides[:, 0] & used), low & ~right & used)
     assert result.protection is not None
-    more = front_alone(FRONT, BASE | {"risk": {"side_prior": 1e-4}}).protection
+    more = front_alone(front(), BASE | {"risk": {"side_prior": 1e-4}}).protection
     assert more is not None
     assert (more.level.level_m > result.protection.level.level_m).all()
 
@@ -128,18 +138,18 @@ def test_a_reflection_takes_the_low_satellites_of_a_side(monkeypatch: pytest.Mon
 @pytest.mark.requirement("C2")
 def test_no_level_reaches_into_a_stretch_without_one() -> None:
     """Positions whose level touches the stretch have none; the verdict is unavailable, positions stay."""
-    middle = float(np.median(FAULTY.chainage_m))
-    assert FAULTY.protection is not None
-    before = FAULTY.protection.level.level_m
-    found = front_alone(FRONT, BASE | {"no_level_m": [[middle, middle + 5.0]]})
+    middle = float(np.median(fault_free().chainage_m))
+    assert fault_free().protection is not None
+    before = fault_free().protection.level.level_m
+    found = front_alone(front(), BASE | {"no_level_m": [[middle, middle + 5.0]]})
     assert found.protection is not None
-    touched = (FAULTY.chainage_m + before > middle) & (FAULTY.chainage_m - before < middle + 5.0)
+    touched = (fault_free().chainage_m + before > middle) & (fault_free().chainage_m - before < middle + 5.0)
     assert touched.any()
     assert np.array_equal(np.isinf(found.protection.level.level_m), touched)
     assert (found.protection.level.cause[touched] == Cause.UNBOUNDED).all()
     assert (found.protection.status[touched] == LevelStatus.UNAVAILABLE).all()
-    assert np.array_equal(found.chainage_m, FAULTY.chainage_m)
-    far = front_alone(FRONT, BASE | {"no_level_m": [[middle + 1e4, middle + 2e4]]}).protection
+    assert np.array_equal(found.chainage_m, fault_free().chainage_m)
+    far = front_alone(front(), BASE | {"no_level_m": [[middle + 1e4, middle + 2e4]]}).protection
     assert far is not None
     assert np.array_equal(far.level.level_m, before)
 
@@ -158,7 +168,7 @@ def test_sigmas_of_the_level_are_the_larger_of_model_and_receiver() -> None:
             navigation=clean_navigation(),
             error_model=replace(model, after=wide),
         )
-        protection = processor.process({"front": FRONT})[0].antennas["front"].protection
+        protection = processor.process({"front": front()})[0].antennas["front"].protection
         assert protection is not None
         return protection.level.fault_free_m
 
@@ -176,13 +186,13 @@ def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.Mo
     def worse(*arguments: Any, **options: Any) -> Any:
         place = original(*arguments, **options)
         wsse = place.constrained.wsse.copy()
-        if len(wsse) == len(FRONT):
+        if len(wsse) == len(front()):
             wsse[::2] = 1e4
             solved.append(len(wsse))
         return replace(place, constrained=replace(place.constrained, wsse=wsse))
 
     monkeypatch.setattr(fault_exclusion, "place_on_line", worse)
-    found = front_alone(with_code(FRONT, with_fault(80.0)), BASE)
+    found = front_alone(with_code(front(), with_fault(80.0)), BASE)
     assert solved
     assert (found.raim.outcome[::2] == Outcome.UNRESOLVED).all()
     assert (found.raim.outcome[1::2] == Outcome.EXCLUDED_ONE).all()
@@ -190,9 +200,9 @@ def test_the_ranges_left_by_an_exclusion_are_tested_again(monkeypatch: pytest.Mo
 
 def faults(*sizes_m: float) -> np.ndarray:
     """Errors of as many satellites as sizes, the one of `used_satellite` first."""
-    good = np.flatnonzero((FAULTY.reason == 0).all(axis=0)).tolist()
+    good = np.flatnonzero((fault_free().reason == 0).all(axis=0)).tolist()
     channels = [used_satellite(), *(c for c in good if c != used_satellite())]
-    change = np.zeros(FRONT.code_m.shape)
+    change = np.zeros(front().code_m.shape)
     for channel, size in zip(channels, sizes_m, strict=False):
         change[:, channel] = size
     return change
@@ -201,7 +211,7 @@ def faults(*sizes_m: float) -> np.ndarray:
 @pytest.mark.requirement("B4")
 def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two that disagree with the rest the rest can be faulty: nothing is excluded, and a check has failed."""
-    observations, original = with_code(FRONT, faults(60.0, 90.0)), solution.robust_fit
+    observations, original = with_code(front(), faults(60.0, 90.0)), solution.robust_fit
     believed = front_alone(observations, BASE)
     assert (believed.raim.outcome == Outcome.EXCLUDED_TWO).all()
 
@@ -221,17 +231,17 @@ def test_a_pair_that_the_robust_fit_keeps_is_not_believed(monkeypatch: pytest.Mo
 def test_an_unresolved_fault_leaves_the_ranges_of_the_robust_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three faults are more than RAIM excludes: the position is that of the rest, and its status a failed check."""
     change, original = faults(60.0, 90.0, 130.0), solution.robust_fit
-    faulty = (change != 0)[:, FAULTY.columns]
+    faulty = (change != 0)[:, fault_free().columns]
 
     def rejects_them(ranges: Ranges, *args: Any, **options: Any) -> RobustFit:
         return replace(original(ranges, *args, **options), kept=(ranges.weight > 0) & ~faulty)
 
     monkeypatch.setattr(solution, "robust_fit", rejects_them)
-    found = front_alone(with_code(FRONT, change), BASE | {"noise_scale": {"prior": 1e6}})
+    found = front_alone(with_code(front(), change), BASE | {"noise_scale": {"prior": 1e6}})
     assert (found.raim.outcome == Outcome.UNRESOLVED).all()
     assert (found.status == Status.INCONSISTENT).all()
-    assert np.array_equal(found.raim.excluded[:, FAULTY.columns], faulty)
-    assert np.abs(found.chainage_m - FAULTY.chainage_m).max() < 3.0
+    assert np.array_equal(found.raim.excluded[:, fault_free().columns], faulty)
+    assert np.abs(found.chainage_m - fault_free().chainage_m).max() < 3.0
 
 
 @pytest.mark.requirement("B3")
@@ -281,8 +291,8 @@ def test_the_noise_of_a_3d_fit_is_that_of_its_redundant_ranges() -> None:
     """Six satellites of one clock leave two redundant ranges, over which the misfit of the 3-D fit is divided."""
     rng = np.random.default_rng(5)
     log = clean_observations()["front"][300:500]
-    order = np.argsort(-FAULTY.elevation_deg[0])
-    gps = [s for s in FAULTY.satellite[order].tolist() if s[0] == "G"][:6]
+    order = np.argsort(-fault_free().elevation_deg[0])
+    gps = [s for s in fault_free().satellite[order].tolist() if s[0] == "G"][:6]
     noisy = with_code(only(log, gps), rng.normal(0.0, 40.0, (len(log), only(log, gps).code_m.shape[1])))
     found = front_alone(noisy, {"screens": ["elevation"]})
     shown = np.maximum(1.0, found.single_point.wsse / (found.n_used - 4))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,14 +30,22 @@ from railfix.track.trajectory import Trajectory
 pytestmark = pytest.mark.requirement("B7")
 
 MASK_ONLY = {"screens": ["elevation"]}
-#: Epochs of the simulated cases: the train runs, all satellites are there.
-FRONT = clean_observations()["front"][400:440]
-WHOLE = front_alone(FRONT, MASK_ONLY)
+
+
+@cache
+def front() -> Observations:
+    """Epochs of the simulated cases: the train runs, all satellites are there."""
+    return clean_observations()["front"][400:440]
+
+
+@cache
+def whole() -> AntennaResult:
+    return front_alone(front(), MASK_ONLY)
 
 
 def highest(system: str, count: int) -> list[str]:
-    order = np.argsort(-WHOLE.elevation_deg[0])
-    return [s for s in WHOLE.satellite[order].tolist() if s[0] == system][:count]
+    order = np.argsort(-whole().elevation_deg[0])
+    return [s for s in whole().satellite[order].tolist() if s[0] == system][:count]
 
 
 def all_are(found: AntennaResult, status: Status) -> None:
@@ -49,14 +58,14 @@ def line(points_ecef_m: np.ndarray) -> dict[str, Trajectory]:
 
 @pytest.mark.requirement("A3")
 def test_everything_there_is_ok():
-    all_are(WHOLE, Status.OK)
+    all_are(whole(), Status.OK)
 
 
 def test_nominal_errors_add_to_the_variance_along_the_line():
     """Without an error model the variance grows with the square of the nominal sigma, from that of the noise alone."""
     none = {"satellite_sigma_m": 0.0, "ionosphere_sigma_m": 0.0, "troposphere_sigma_m": 0.0}
     variance = [
-        front_alone(FRONT, MASK_ONLY | {"nominal": none | {"satellite_sigma_m": sigma}}).along_sigma_m ** 2
+        front_alone(front(), MASK_ONLY | {"nominal": none | {"satellite_sigma_m": sigma}}).along_sigma_m ** 2
         for sigma in (0.0, 1.0, 3.0)
     ]
     assert (variance[1] - variance[0] > 0.01).all()
@@ -64,7 +73,7 @@ def test_nominal_errors_add_to_the_variance_along_the_line():
 
 
 def test_no_observation():
-    gone = with_code(FRONT, np.where(np.arange(40)[:, None] == 7, np.nan, 0.0))
+    gone = with_code(front(), np.where(np.arange(40)[:, None] == 7, np.nan, 0.0))
     found = front_alone(gone, MASK_ONLY)
     assert np.flatnonzero(found.status == Status.NO_OBSERVATION).tolist() == [7]
     assert np.isnan(found.arc_m[7])
@@ -72,7 +81,7 @@ def test_no_observation():
 
 
 def test_too_few_satellites():
-    found = front_alone(only(FRONT, highest("G", 2)), MASK_ONLY)
+    found = front_alone(only(front(), highest("G", 2)), MASK_ONLY)
     all_are(found, Status.TOO_FEW_SATELLITES)
     assert np.isnan(found.arc_m).all()
     assert np.isnan(found.ecef_m).all()
@@ -81,7 +90,7 @@ def test_too_few_satellites():
 @pytest.mark.requirement("A4")
 def test_two_satellites_are_enough_when_allowed():
     """Fewer redundant ranges than a sure section asks for, so the position is there and no status says "ok"."""
-    found = front_alone(only(FRONT, highest("G", 2)), MASK_ONLY | {"min_satellites": 2})
+    found = front_alone(only(front(), highest("G", 2)), MASK_ONLY | {"min_satellites": 2})
     positioned = np.isfinite(found.arc_m)
     assert np.isin(found.status[positioned], sorted(set(POSITIONED) - {Status.OK})).all()
     assert positioned.mean() > 0.9
@@ -92,10 +101,10 @@ def test_two_satellites_are_enough_when_allowed():
 
 @pytest.mark.requirement("A3")
 def test_ambiguous_with_one_redundant_range():
-    found = front_alone(only(FRONT, highest("G", 3)), MASK_ONLY)
+    found = front_alone(only(front(), highest("G", 3)), MASK_ONLY)
     all_are(found, Status.AMBIGUOUS)
     assert np.isfinite(found.arc_m).all()
-    sure = front_alone(only(FRONT, highest("G", 3)), MASK_ONLY | {"section": {"redundancy": 1}})
+    sure = front_alone(only(front(), highest("G", 3)), MASK_ONLY | {"section": {"redundancy": 1}})
     assert (sure.status == Status.OK).any()
 
 
@@ -104,15 +113,15 @@ def test_ambiguous_where_the_line_comes_by_twice():
     """The line and the same line beside it, 3 m away: no range can tell."""
     there = clean_trajectories()["front"].ecef_m
     aside = there + 3.0 * np.r_[clean_trajectories()["front"].up[:1], clean_trajectories()["front"].up]
-    found = front_alone(FRONT, MASK_ONLY, trajectories=line(np.concatenate([there, aside[::-1]])))
-    one = front_alone(FRONT, MASK_ONLY, trajectories=line(there))
+    found = front_alone(front(), MASK_ONLY, trajectories=line(np.concatenate([there, aside[::-1]])))
+    one = front_alone(front(), MASK_ONLY, trajectories=line(there))
     assert (found.status == Status.AMBIGUOUS).mean() > 0.5
     all_are(one, Status.OK)
 
 
 def test_off_map_beyond_the_end():
-    here = int(np.searchsorted(clean_trajectories()["front"].arc_m, WHOLE.arc_m.min()))
-    found = front_alone(FRONT, MASK_ONLY, trajectories=line(clean_trajectories()["front"].ecef_m[: here - 8]))
+    here = int(np.searchsorted(clean_trajectories()["front"].arc_m, whole().arc_m.min()))
+    found = front_alone(front(), MASK_ONLY, trajectories=line(clean_trajectories()["front"].ecef_m[: here - 8]))
     all_are(found, Status.OFF_MAP)
     assert (found.constrained.overshoot_m > 5.0).all()
     assert np.all(found.arc_m == found.arc_m.max())
@@ -121,20 +130,20 @@ def test_off_map_beyond_the_end():
 def test_off_map_far_to_the_side():
     trajectory = clean_trajectories()["front"]
     aside = trajectory.ecef_m + 5000.0 * trajectory.across[len(trajectory) // 2]
-    all_are(front_alone(FRONT, MASK_ONLY, trajectories=line(aside)), Status.OFF_MAP)
+    all_are(front_alone(front(), MASK_ONLY, trajectories=line(aside)), Status.OFF_MAP)
 
 
 def test_unobservable():
     """A limit that the satellites cannot reach."""
-    found = front_alone(FRONT, MASK_ONLY | {"dilution_limit": 0.2})
+    found = front_alone(front(), MASK_ONLY | {"dilution_limit": 0.2})
     all_are(found, Status.UNOBSERVABLE)
     assert np.isnan(found.arc_m).all()
 
 
 def test_no_convergence():
     """One step allowed: epochs whose nearest point lies ahead of them would have had to walk into its section."""
-    found = front_alone(FRONT, MASK_ONLY | {"constrained": {"max_iterations": 1}})
-    walked = WHOLE.constrained.iterations > 1
+    found = front_alone(front(), MASK_ONLY | {"constrained": {"max_iterations": 1}})
+    walked = whole().constrained.iterations > 1
     assert 0 < walked.sum() < len(walked)
     assert np.array_equal(found.status == Status.NO_CONVERGENCE, walked)
     assert np.array_equal(np.isnan(found.arc_m), walked)
@@ -142,14 +151,14 @@ def test_no_convergence():
 
 def test_inconsistent():
     """Half of the satellites are wrong, each otherwise: no exclusion of two mends that."""
-    wrong = np.zeros(len(FRONT.satellite))
+    wrong = np.zeros(len(front().satellite))
     for i, name in enumerate(highest("G", 4) + highest("E", 2)):
-        wrong[channel(FRONT, name)] = 40.0 * (-1) ** i * (i + 1)
-    found = front_alone(with_code(FRONT, wrong), {"screens": ["elevation", "raim"]})
+        wrong[channel(front(), name)] = 40.0 * (-1) ** i * (i + 1)
+    found = front_alone(with_code(front(), wrong), {"screens": ["elevation", "raim"]})
     refused = found.status == Status.INCONSISTENT
     assert refused.mean() > 0.8
     assert np.isfinite(found.arc_m).all()
-    dropped = front_alone(with_code(FRONT, wrong), {"screens": ["elevation", "raim"], "failed_checks": "drop"})
+    dropped = front_alone(with_code(front(), wrong), {"screens": ["elevation", "raim"], "failed_checks": "drop"})
     assert np.array_equal(dropped.status, found.status)
     assert np.array_equal(np.isnan(dropped.arc_m), np.isin(found.status, CHECK_FAILED))
 
@@ -176,25 +185,31 @@ def changed_records(name: str, **values: Any) -> Navigation:
 
 def second_signal() -> Observations:
     """The first GPS satellite once more, on P(Y) as received by semi-codeless tracking."""
-    at = channel(FRONT, highest("G", 1)[0])
+    at = channel(front(), highest("G", 1)[0])
     names = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
-    twice = {name: np.concatenate([getattr(FRONT, name), getattr(FRONT, name)[:, [at]]], axis=1) for name in names}
-    satellite = np.append(FRONT.satellite, FRONT.satellite[at])
-    return replace(FRONT, satellite=satellite, signal=np.append(FRONT.signal, "1W"), **twice)
+    twice = {name: np.concatenate([getattr(front(), name), getattr(front(), name)[:, [at]]], axis=1) for name in names}
+    satellite = np.append(front().satellite, front().satellite[at])
+    return replace(front(), satellite=satellite, signal=np.append(front().signal, "1W"), **twice)
 
 
-TOP = highest("G", 1)[0]
-AT = channel(FRONT, TOP)
+def top() -> str:
+    return highest("G", 1)[0]
+
+
+def top_channel() -> int:
+    return channel(front(), top())
 
 
 def one_wrong(change_m: float, *, from_epoch: int = 0) -> Observations:
-    add = np.zeros(FRONT.code_m.shape)
-    add[from_epoch:, AT] = change_m
-    return with_code(FRONT, add)
+    add = np.zeros(front().code_m.shape)
+    add[from_epoch:, top_channel()] = change_m
+    return with_code(front(), add)
 
 
 def weak() -> Observations:
-    return replace(FRONT, cn0_dbhz=np.where(np.arange(len(FRONT.satellite)) == AT, 10.0, FRONT.cn0_dbhz))
+    return replace(
+        front(), cn0_dbhz=np.where(np.arange(len(front().satellite)) == top_channel(), 10.0, front().cn0_dbhz)
+    )
 
 
 def other_signals() -> dict[str, Any]:
@@ -203,42 +218,56 @@ def other_signals() -> dict[str, Any]:
 
 
 def on_e6() -> Observations:
-    return replace(FRONT, signal=np.where(FRONT.system == "E", "6C", FRONT.signal))
+    return replace(front(), signal=np.where(front().system == "E", "6C", front().signal))
 
 
-LONE = highest("E", 1)[0]
+def lone() -> str:
+    return highest("E", 1)[0]
+
 
 CASES: dict[Reason, Callable[[], tuple[AntennaResult, int, int]]] = {
     # Reason: result, channel, epoch at which it must stand alone.
-    Reason.NOT_OBSERVED: lambda: (front_alone(one_wrong(np.nan), MASK_ONLY), AT, 0),
-    Reason.IMPLAUSIBLE_CODE: lambda: (front_alone(one_wrong(-1.8e7), MASK_ONLY), AT, 0),
-    Reason.SYSTEM_NOT_SELECTED: lambda: (front_alone(FRONT, MASK_ONLY | {"systems": ["E"]}), AT, 0),
-    Reason.OTHER_SIGNAL_TAKEN: lambda: (front_alone(second_signal(), MASK_ONLY), len(FRONT.satellite), 0),
+    Reason.NOT_OBSERVED: lambda: (front_alone(one_wrong(np.nan), MASK_ONLY), top_channel(), 0),
+    Reason.IMPLAUSIBLE_CODE: lambda: (front_alone(one_wrong(-1.8e7), MASK_ONLY), top_channel(), 0),
+    Reason.SYSTEM_NOT_SELECTED: lambda: (front_alone(front(), MASK_ONLY | {"systems": ["E"]}), top_channel(), 0),
+    Reason.OTHER_SIGNAL_TAKEN: lambda: (front_alone(second_signal(), MASK_ONLY), len(front().satellite), 0),
     Reason.NO_EPHEMERIS: lambda: (
-        front_alone(FRONT, MASK_ONLY, navigation=changed_records(TOP, satellite="G31")),
-        AT,
+        front_alone(front(), MASK_ONLY, navigation=changed_records(top(), satellite="G31")),
+        top_channel(),
         0,
     ),
-    Reason.EPHEMERIS_TOO_OLD: lambda: (front_alone(FRONT, MASK_ONLY | {"max_ephemeris_age_s": 1.0}), AT, 0),
-    Reason.UNHEALTHY: lambda: (front_alone(FRONT, MASK_ONLY, navigation=changed_records(TOP, health=1)), AT, 0),
-    Reason.ELEVATION_MASK: lambda: (front_alone(FRONT, MASK_ONLY | {"elevation": {"mask_deg": 89.0}}), AT, 0),
+    Reason.EPHEMERIS_TOO_OLD: lambda: (
+        front_alone(front(), MASK_ONLY | {"max_ephemeris_age_s": 1.0}),
+        top_channel(),
+        0,
+    ),
+    Reason.UNHEALTHY: lambda: (
+        front_alone(front(), MASK_ONLY, navigation=changed_records(top(), health=1)),
+        top_channel(),
+        0,
+    ),
+    Reason.ELEVATION_MASK: lambda: (
+        front_alone(front(), MASK_ONLY | {"elevation": {"mask_deg": 89.0}}),
+        top_channel(),
+        0,
+    ),
     Reason.ALONE_ON_ITS_CLOCK: lambda: (
-        front_alone(only(FRONT, [*highest("G", 5), LONE]), MASK_ONLY),
-        channel(FRONT, LONE),
+        front_alone(only(front(), [*highest("G", 5), lone()]), MASK_ONLY),
+        channel(front(), lone()),
         0,
     ),
-    Reason.NO_CORRECTION: lambda: (front_alone(on_e6(), other_signals()), channel(FRONT, LONE), 0),
+    Reason.NO_CORRECTION: lambda: (front_alone(on_e6(), other_signals()), channel(front(), lone()), 0),
     Reason.CN0_FLOOR: lambda: (
         front_alone(weak(), {"screens": ["cn0"], "cn0": {"floor_dbhz": 30.0}}),
-        AT,
+        top_channel(),
         0,
     ),
     Reason.DOPPLER: lambda: (
         front_alone(one_wrong(60.0, from_epoch=20), {"screens": ["doppler"], "doppler": {"verdict": "reject"}}),
-        AT,
+        top_channel(),
         20,
     ),
-    Reason.FAULT_EXCLUDED: lambda: (front_alone(one_wrong(80.0), {"screens": ["elevation", "raim"]}), AT, 0),
+    Reason.FAULT_EXCLUDED: lambda: (front_alone(one_wrong(80.0), {"screens": ["elevation", "raim"]}), top_channel(), 0),
 }
 #: Reasons of screens that need more than one log and the settings; tested beside those screens, or below.
 ELSEWHERE = {Reason.CN0_CURVE, Reason.ANTENNA_PAIR, Reason.USED} | {r for r in Reason if r.name.startswith("SBAS_")}
@@ -262,7 +291,7 @@ def test_antenna_pair_is_given():
     pair = {"screens": ["elevation", "antenna_pair"], "antenna_pair": {"verdict": "reject"}}
     result, _ = processor(pair).process(parts)
     for found in result.antennas.values():
-        assert np.all(found.reason[:, AT] == Reason.ANTENNA_PAIR)
+        assert np.all(found.reason[:, top_channel()] == Reason.ANTENNA_PAIR)
 
 
 @pytest.mark.requirement("B0")
@@ -276,7 +305,7 @@ def test_a_suspicion_weighs_and_takes_nothing_away(screen: str):
     found, plain = result.antennas["front"], without.antennas["front"]
     assert np.array_equal(found.reason, plain.reason)
     at = 21
-    assert found.sigma_m[at, AT] == pytest.approx(np.hypot(plain.sigma_m[at, AT], 40.0), rel=0.05)
+    assert found.sigma_m[at, top_channel()] == pytest.approx(np.hypot(plain.sigma_m[at, top_channel()], 40.0), rel=0.05)
     unsuspected = ~found.screens[screen].reject[at]
     columns = found.columns
     assert np.array_equal(found.sigma_m[at, columns][unsuspected], plain.sigma_m[at, columns][unsuspected])
@@ -285,5 +314,5 @@ def test_a_suspicion_weighs_and_takes_nothing_away(screen: str):
 def test_reasons_gather():
     """A satellite can have several: unhealthy and below the mask."""
     settings = MASK_ONLY | {"elevation": {"mask_deg": 89.0}}
-    found = front_alone(FRONT, settings, navigation=changed_records(TOP, health=1))
-    assert np.all(found.reason[:, AT] == Reason.UNHEALTHY | Reason.ELEVATION_MASK)
+    found = front_alone(front(), settings, navigation=changed_records(top(), health=1))
+    assert np.all(found.reason[:, top_channel()] == Reason.UNHEALTHY | Reason.ELEVATION_MASK)
