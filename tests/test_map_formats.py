@@ -19,6 +19,7 @@ from railfix.track import read_track
 from railfix.track.elements import LAWS, PlanElement, ProfileElement, alignment_at
 from railfix.track.ifc_file import _plan, _profile, _Step, read_ifc_segments
 from railfix.track.read import read_segments
+from railfix.track.xml_files import read_xml_segments
 
 pyogrio = pytest.importorskip("pyogrio")
 shapely = pytest.importorskip("shapely")
@@ -239,6 +240,19 @@ def test_alignment_of_shared_ifc_files_lies_on_the_closed_forms(recordings: Path
     assert checked > 30
 
 
+@pytest.mark.parametrize("last", ["300.", "0.", "$", "1000."])
+def test_an_arc_of_ifc_is_an_arc_whatever_its_end_radius_says(tmp_path: Path, last: str) -> None:
+    path = tmp_path / "arc.ifc"
+    path.write_text(
+        "ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\n#28= IFCCARTESIANPOINT((0.,0.));\n"
+        f"#29= IFCALIGNMENTHORIZONTALSEGMENT($,$,#28,0.,300.,{last},100.,$,.CIRCULARARC.);\nENDSEC;\n"
+    )
+    step = _Step(path)
+    ((_, entity),) = step.of_kind("IFCALIGNMENTHORIZONTALSEGMENT")
+    end = _plan(step, entity, 1.0, 1.0).place_at(np.array([100.0]))[0]
+    assert end == pytest.approx([300.0 * np.sin(1 / 3), 300.0 * (1.0 - np.cos(1 / 3))], abs=1e-9)
+
+
 def _closed_form(way: np.ndarray, direction: float, k0: float, k1: float, length: float) -> np.ndarray:
     if k0 == k1 == 0.0:
         local = np.stack([way, 0.0 * way], axis=-1)
@@ -330,6 +344,47 @@ def test_landxml_alignment_is_its_circle_parabola_and_cant(tmp_path: Path) -> No
     top = np.argmin(np.abs(track.chainage_m - 100.0))
     assert track.height_m[top] == pytest.approx(501.0 - 60.0 * 0.015 / 8.0, abs=2e-3)
     assert track.height_m[-1] == pytest.approx(500.0 + 0.090 / 2.0, abs=1e-6)  # the middle between the rail tops
+
+
+def test_landxml_of_inframodel_is_read(tmp_path: Path) -> None:
+    """Extensions of a country are passed over; transitions are biquadratic parabolas; the cant is in metres."""
+    radius, length = 800.0, 160.0
+    transition = PlanElement(
+        x_m=650100.0, y_m=5320000.0, direction_rad=0.0, first=0.0, last=-1.0 / radius, length_m=length, law="helmert"
+    )
+    end_x, end_y = transition.place_at(np.array([length]))[0]
+    path = tmp_path / "line.xml"
+    path.write_text(
+        f"""<?xml version="1.0"?><LandXML xmlns="http://www.inframodel.fi/inframodel" version="1.2">
+<Units><Metric linearUnit="meter"/></Units><CoordinateSystem epsgCode="25832"/>
+<Alignments><Alignment name="T1" staStart="0"><CoordGeom>
+<Line><Start>5320000 650000</Start><End>5320000 650100</End></Line><!-- Q1 --><Feature code="IM_x"/>
+<Spiral length="160" radiusStart="INF" radiusEnd="800" rot="cw" spiType="biquadraticParabola">
+<Start>5320000 650100</Start><PI>5320000 650200</PI><End>{end_y:.6f} {end_x:.6f}</End></Spiral>
+</CoordGeom><Profile><ProfAlign name="p"><PVI>0 10</PVI><PVI>260 10</PVI><Feature code="IM_y"/></ProfAlign></Profile>
+<Cant rotationPoint="insideRail"><CantStation station="0" appliedCant="0" curvature="cw"/>
+<CantStation station="100" appliedCant="0" curvature="cw" transitionType="biquadraticParabola"/>
+<CantStation station="260" appliedCant="0.150" curvature="cw"/></Cant></Alignment></Alignments></LandXML>"""
+    )
+    (segment,) = read_xml_segments(path, height_datum="ellipsoidal")
+    assert any("at most 0.15 in the file, which is taken as a length in plan" in note for note in segment.notes)
+    assert not any("do not meet" in note for note in segment.notes)
+    assert segment.cant_m[-1] == pytest.approx(0.150)
+    assert segment.radius_m[-1] == pytest.approx(800.0)
+    # Helmert's law at a quarter of the transition: 2 t^2 = 1/8 of the cant and of the curvature.
+    x = 650100.0 + 40.0
+    east, _ = Transformer.from_crs(4326, 25832, always_xy=True).transform(segment.longitude_deg, segment.latitude_deg)
+    assert np.interp(x, east, segment.cant_m) == pytest.approx(0.150 / 8.0, abs=1e-3)
+
+
+def test_landxml_cant_of_an_unknown_transition_is_refused(tmp_path: Path) -> None:
+    text = LANDXML.format(end="5319900 650250").replace(
+        'appliedCant="0" c', 'transitionType="wienerBogen" appliedCant="0" c'
+    )
+    path = tmp_path / "line.xml"
+    path.write_text(text)
+    with pytest.raises(InputFileError, match=r"alignment 'T1': cant of transition type 'wienerBogen' is not read"):
+        read_track(path, height_datum="ellipsoidal")
 
 
 def test_railml_net_elements_are_lines(tmp_path: Path) -> None:

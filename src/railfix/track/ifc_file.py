@@ -189,6 +189,8 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
     point, direction, first, last, length = entity.values[2:7]
     x, y = step.at(point, what=entity.kind).values[0][:2]
     law = _law(step, entity, {k: v for k, v in _LAWS.items() if "CANT" not in k and k != "LINEARTRANSITION"})
+    if entity.values[-1] == ".CIRCULARARC.":
+        last = first  # some programs write 0, or the radius of the next element (IFC 4.3.2: both are the same)
     return PlanElement(
         x_m=x * scale,
         y_m=y * scale,

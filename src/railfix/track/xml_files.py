@@ -17,7 +17,14 @@ from railfix.track.segment import Segment
 from railfix.track.vector_file import INSTALL, plan_segment
 
 _UNITS: Final = {"meter": 1.0, "millimeter": 1e-3, "foot": 0.3048, "USSurveyFoot": 1200.0 / 3937.0}
-_SPIRALS: Final = {"clothoid": "linear", "bloss": "bloss", "cosine": "cosine", "sinusoid": "sine"}
+#: The biquadratic parabola (of InfraModel, Finland) is Helmert's law: the curvature runs by two parabolas.
+_SPIRALS: Final = {
+    "clothoid": "linear",
+    "bloss": "bloss",
+    "cosine": "cosine",
+    "sinusoid": "sine",
+    "biquadraticParabola": "helmert",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,9 +98,13 @@ def _landxml(path: str, root: Any, crs: str | None, height_datum: str | None, ge
         if geometry is None:
             continue
         try:
-            plan = [_landxml_plan(path, e, scale) for e in geometry if isinstance(e.tag, str)]
+            plan = [_landxml_plan(path, e, scale) for e in _elements(geometry)]
             profile = _landxml_profile(path, alignment.find(".//{*}ProfAlign"), scale, start)
-            cant = _landxml_cant(alignment.find(".//{*}Cant"), scale, start)
+            cant, notes = _landxml_cant(alignment.find(".//{*}Cant"), scale, start)
+        except KeyError as error:
+            raise InputFileError(
+                path, f"alignment {name!r}: cant of transition type {error} is not read; {', '.join(_SPIRALS)} are"
+            ) from None
         except (TypeError, ValueError, AttributeError):
             raise InputFileError(path, f"alignment {name!r}: an element lacks a number that LandXML 1.2 has") from None
         segments.append(
@@ -106,11 +117,17 @@ def _landxml(path: str, root: Any, crs: str | None, height_datum: str | None, ge
                 crs=crs or named,
                 height_datum=height_datum,
                 geoid=geoid,
+                notes=notes,
             )
         )
     if not segments:
         raise InputFileError(path, "there is no Alignment with CoordGeom in this LandXML file")
     return segments
+
+
+def _elements(parent: Any) -> list[Any]:
+    """Children that are neither comments nor extensions of a country or program (`Feature`)."""
+    return [e for e in parent if isinstance(e.tag, str) and e.tag.rsplit("}", 1)[-1] != "Feature"]
 
 
 def _point(element: Any, name: str, scale: float) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -162,9 +179,7 @@ def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> lis
     if profile is None:
         return []
     points = []
-    for element in profile:
-        if not isinstance(element.tag, str):
-            continue
+    for element in _elements(profile):
         kind = element.tag.rsplit("}", 1)[-1]
         if kind not in ("PVI", "ParaCurve", "CircCurve"):
             raise InputFileError(path, f"profile element {kind} is not read; PVI, ParaCurve and CircCurve are")
@@ -199,28 +214,36 @@ def _landxml_profile(path: str, profile: Any, scale: float, start: float) -> lis
     return elements
 
 
-def _landxml_cant(cant: Any, scale: float, start: float) -> list[CantElement]:
-    """Elements between cant stations: the applied cant [mm], about the rail or the middle that the file names.
+def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement], tuple[str, ...]]:
+    """Elements between cant stations, about the rail or the middle that the file names; and notes.
 
-    Without a name the outer rail is raised and the inner one stays at the profile, as track is built.
+    Without a name the outer rail is raised and the inner one stays at the profile, as track is built. A ramp runs by
+    the transition type of the station that it begins at, linearly without one. The applied cant is in millimetres, in
+    inches where lengths are in feet (LandXML 1.2), in metres in InfraModel.
     """
     if cant is None:
-        return []
+        return [], ()
     lowered = {"center": 0.5, "outsideRail": 1.0}.get(cant.get("rotationPoint", "insideRail"), 0.0)
-    stations = []
-    for element in cant.iterfind("{*}CantStation"):
-        value = float(element.get("appliedCant")) * 1e-3
+    found = list(cant.iterfind("{*}CantStation"))
+    applied = np.array([float(element.get("appliedCant")) for element in found])
+    unit = 25.4e-3 if 0.3 < scale < 0.31 else 1e-3
+    notes: tuple[str, ...] = ()
+    if 0.0 < np.abs(applied).max(initial=0.0) < 1.0:
+        unit = scale
+        notes = (f"cant: at most {np.abs(applied).max():g} in the file, which is taken as a length in plan, not as mm",)
+    stations, laws = [], []
+    for element, value in zip(found, applied * unit, strict=True):
         # clockwise is a curve to the right: the left rail is the outer one
         outer, inner = value * (1.0 - lowered), -value * lowered
         rails = (outer, inner) if element.get("curvature") == "cw" else (inner, outer)
         stations.append((float(element.get("station")) * scale - start, rails))
-    return [
-        CantElement(
-            start_m=a[0], length_m=b[0] - a[0], left_m=(a[1][0], b[1][0]), right_m=(a[1][1], b[1][1]), law="linear"
-        )
-        for a, b in pairwise(stations)
+        laws.append(_SPIRALS[element.get("transitionType", "clothoid")])
+    elements = [
+        CantElement(start_m=a[0], length_m=b[0] - a[0], left_m=(a[1][0], b[1][0]), right_m=(a[1][1], b[1][1]), law=law)
+        for (a, b), law in zip(pairwise(stations), laws, strict=False)
         if b[0] > a[0]
     ]
+    return elements, notes
 
 
 # --- railML ------------------------------------------------------------------
