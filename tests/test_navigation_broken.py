@@ -113,7 +113,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         read_navigation(tmp_path / "none.nav")
     with pytest.raises(InputFileError, match="folder"):
         read_navigation(tmp_path)
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="no file"):
         read_navigation([])
 
 

@@ -289,7 +289,7 @@ def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
         read_observations(write(tmp_path / "log", good_3()), **options)
     with pytest.raises(ValueError, match="at least one epoch"):
         scan_observations(tmp_path / "log", epochs=0)
-    with pytest.raises(ValueError, match="no observation file"):
+    with pytest.raises(ValueError, match="no file"):
         read_observations([])
 
 

@@ -27,7 +27,7 @@ import subprocess
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from os import PathLike
 from pathlib import Path
@@ -38,6 +38,8 @@ import ncompress
 from railfix.core.errors import InputFileError, OutputError
 
 FilePath = str | PathLike[str]
+#: One file, or several.
+Paths = FilePath | Sequence[FilePath]
 #: What a reader does with a broken line: stop with an error, or leave it out and count it.
 BrokenLines = Literal["stop", "count"]
 
@@ -133,6 +135,14 @@ class _HatanakaStream(ByteStream):
         reason = what.group(1).strip().rstrip(".") if what else "the decoder crx2rnx gives no reason"
         place = f" at line {where.group(1)} of the compressed text" if where else ""
         return f"the Hatanaka (CRX) data are cut short or damaged{place}: {reason}; download it again"
+
+
+def listed(paths: Paths) -> list[str]:
+    """One or several paths as a list of texts; ValueError where there is none."""
+    names = [paths] if isinstance(paths, str | PathLike) else list(paths)
+    if not names:
+        raise ValueError("no file was given")
+    return [str(name) for name in names]
 
 
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:

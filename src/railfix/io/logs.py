@@ -6,21 +6,26 @@ functions here have the arguments of `railfix.io.rinex` and hand each file to it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from os import PathLike
 
 import numpy as np
 
 from railfix.core.errors import MismatchError
-from railfix.core.files import BrokenLines, FilePath
+from railfix.core.files import BrokenLines, Paths, listed
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
 from railfix.io.receiver.recognise import head_of, is_receiver_log
-from railfix.io.rinex.observations import DEFAULT_EPOCHS, in_pieces, with_break_at_gap, without_empty_channels
+from railfix.io.rinex.observations import (
+    DEFAULT_EPOCHS,
+    in_pieces,
+    of_channels,
+    with_break_at_gap,
+    without_empty_channels,
+)
 
-Paths = FilePath | Sequence[FilePath]
 Time = np.datetime64 | str | None
 
 
@@ -70,7 +75,7 @@ def scan_observations(
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
     """Observations of one receiver in pieces of `epochs` epochs; see `read_observations`."""
-    paths = _listed(path)
+    paths = listed(path)
     receiver = [is_receiver_log(head_of(p)) for p in paths]
     if not any(receiver):
         return rinex.scan_observations(
@@ -83,13 +88,6 @@ def scan_observations(
         )
     limits = (_instant(start), _instant(end), _instant(date))
     return in_pieces(_receiver_runs(paths, systems, limits, progress), epochs)
-
-
-def _listed(path: Paths) -> list[str]:
-    paths = [path] if isinstance(path, str | PathLike) else list(path)
-    if not paths:
-        raise ValueError("no file was given")
-    return [str(p) for p in paths]
 
 
 def _instant(time: Time) -> np.datetime64 | None:
@@ -141,35 +139,20 @@ def _in_order(paths: list[str], date: np.datetime64 | None) -> list[str]:
 
 
 def _of_systems(run: Observations, letters: list[str]) -> Observations:
-    chosen = np.isin(run.system, letters)
-    arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
-    return without_empty_channels(
-        replace(
-            run,
-            satellite=run.satellite[chosen],
-            signal=run.signal[chosen],
-            **{name: getattr(run, name)[:, chosen] for name in arrays},
-        )
-    )
+    return without_empty_channels(of_channels(run, np.isin(run.system, letters)))
 
 
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
     """Navigation records from RINEX navigation files and receiver logs, mixed at will.
 
-    Parameters
-    ----------
-    paths : path or sequence of path
-    broken_lines : {"stop", "count"}
-        As `railfix.io.rinex.read_navigation`.
-    date : datetime64 or str, optional
-        Some time within half a week of RTCM 3 logs.
+    `broken_lines` is as for `railfix.io.rinex.read_navigation`; `date` is some time within half a week of RTCM 3 logs.
 
     Raises
     ------
     InputFileError
         A file cannot be read or holds no usable record.
     """
-    names = _listed(paths)
+    names = listed(paths)
     receiver = [is_receiver_log(head_of(name)) for name in names]
     parts = []
     if not all(receiver):
@@ -190,16 +173,12 @@ def _joined(parts: list[Navigation]) -> Navigation:
         names = table.__dataclass_fields__
         return {name: np.concatenate([getattr(getattr(part, kind), name) for part in parts]) for name in names}
 
-    counts: dict[str, int] = {}
-    for part in parts:
-        for what, number in part.skipped.items():
-            counts[what] = counts.get(what, 0) + number
     return Navigation(
         kepler=KeplerRecords(**rows("kepler", KeplerRecords)),
         glonass=GlonassRecords(**rows("glonass", GlonassRecords)),
         klobuchar={letter: value for part in reversed(parts) for letter, value in part.klobuchar.items()},
         leap_seconds=next((part.leap_seconds for part in parts if part.leap_seconds is not None), None),
-        skipped=counts,
+        skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),
         notes=tuple(note for part in parts for note in part.notes),
         sources=tuple(source for part in parts for source in part.sources),
     )

@@ -25,16 +25,13 @@ _BLOCK: Final = 4096
 
 @dataclass(frozen=True, kw_only=True)
 class NamedColumns:
-    """A table as text, with the line number of each row.
+    """A table as text, with the line number of each row, from 1.
 
     Attributes
     ----------
-    path : str
     metadata : dict of str
         ``# key: value`` comments above the header; of a repeated key the values, joined by "; ".
-    header_line : int
     line : ndarray of int, shape (n,)
-        1-based line number of each row.
     cells : dict of polars.Series of str
         Cells of each column, stripped.
     """
@@ -58,16 +55,8 @@ class NamedColumns:
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse one column as finite numbers.
 
-        Parameters
-        ----------
-        name : str
-        blank : float, optional
-            Value of an empty cell, and ``nan`` is allowed; without it both are errors.
-
-        Raises
-        ------
-        InputFileError
-            A cell is empty, not a number, or not finite (``inf`` is allowed where `blank` is infinite).
+        `blank` is the value of an empty cell, and allows ``nan``; without it both are errors. InputFileError: a cell is
+        empty, not a number, or not finite (``inf`` is allowed where `blank` is infinite).
         """
         given = self.cells[name].str.len_bytes().to_numpy() > 0
         cells = self.cells[name].to_list()
@@ -103,10 +92,7 @@ def _split_comment(line: str) -> tuple[str, str] | None:
 def read_named_columns(path: FilePath) -> NamedColumns:
     """Read a comma-separated table with a header line of column names.
 
-    Raises
-    ------
-    InputFileError
-        The file is not text, has no header or a repeated column name, or a row has another number of cells.
+    InputFileError: the file is not text, has no header or a repeated column name, or a row has another number of cells.
     """
     return parse_named_columns(text_lines(path), path)
 

@@ -72,8 +72,7 @@ def read_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | No
     ----------
     path : path
     columns : mapping of str, optional
-        For CSV with other column names: name in railfix to name in the file, for example
-        ``{"latitude_deg": "Lat"}``.
+        For CSV with other column names: name in railfix to name in the file, such as ``{"latitude_deg": "Lat"}``.
 
     Raises
     ------
@@ -194,15 +193,11 @@ def _times(texts: list[str]) -> Datetimes:
 
 
 def read_rtklib_positions(path: str | PathLike[str]) -> PositionLog:
-    """Read RTKLIB's solution format in any of its time and coordinate forms.
+    """Read RTKLIB's solution format in any of its time and coordinate forms (manual 2.4.2, appendix B.1).
 
     Time as week and seconds or as calendar date, in GPST, UTC or JST; coordinates as degrees,
     as degrees, minutes, seconds, or ECEF. Baselines (e/n/u) and heights above the geoid are
     rejected, because they do not give an ellipsoidal position.
-
-    References
-    ----------
-    RTKLIB manual 2.4.2, appendix B.1.
     """
     lines = read_text(path).splitlines()
     header = [line for line in lines if line.startswith("%")]

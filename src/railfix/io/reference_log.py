@@ -109,8 +109,8 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
     Returns
     -------
     dict of str to AntennaReference
-        One entry for each of `antennas`. Of rows with the same time the first is used. ``source`` is
-        that of the file; else "truth" for files of the simulator, "rtk" for position logs.
+        Of rows with the same time the first is used. ``source`` is that of the file; else "truth" for files of the
+        simulator, "rtk" for position logs.
 
     Raises
     ------
@@ -174,13 +174,7 @@ def _of_antenna(
 
 
 def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaReference]) -> None:
-    """Write references as CSV (`COLUMNS`), sorted by time; a failed write leaves no file.
-
-    Parameters
-    ----------
-    path : path
-    references : mapping of str to AntennaReference
-        By antenna.
+    """Write references by antenna as CSV (`COLUMNS`), sorted by time; a failed write leaves no file.
 
     Raises
     ------

@@ -29,8 +29,6 @@ class Pulses:
 
     Attributes
     ----------
-    path : str
-    time : ndarray of datetime64[ns], shape (P,)
     count : ndarray, shape (P,)
         Falling where the train runs backward, if the table has the direction.
     kind : {"count", "pulse", "distance"}
@@ -58,15 +56,9 @@ class Pulses:
 
 @dataclass(frozen=True, kw_only=True)
 class Acceleration:
-    """Longitudinal acceleration toward the vehicle's front, A rows.
+    """Longitudinal acceleration toward the vehicle's front, A rows [m/s2].
 
-    Attributes
-    ----------
-    path : str
-    time : ndarray of datetime64[ns], shape (A,)
-    acceleration_mps2 : ndarray, shape (A,) [m/s2]
-    kind : {"motion", "specific_force"}
-        Acceleration of the motion, or specific force, which includes gravity on gradients.
+    `kind`: acceleration of the "motion", or "specific_force", which includes gravity on gradients.
     """
 
     path: str
@@ -91,13 +83,9 @@ class Acceleration:
 def read_pulses(path: str | PathLike[str]) -> Pulses:
     """Read a tachometer table: CSV (or the same as .parquet) with ``time_gpst`` and the count.
 
-    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the
-    distance run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign.
-
-    Raises
-    ------
-    InputFileError
-        No such table, times that do not rise, a direction other than 1 and -1.
+    ``count`` is the reading of a counter (falling when running backward, never wrapping), ``distance_m`` the distance
+    run; with neither, each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. InputFileError: no such
+    table, times that do not rise, a direction other than 1 and -1.
     """
     table = _table(path)
     time = _rising_times(table)
@@ -122,11 +110,7 @@ def read_acceleration(path: str | PathLike[str]) -> Acceleration:
 
     ``specific_force_mps2`` and ``force_forward_mps2`` (of the simulator) are measured by an accelerometer and
     include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is that of the motion.
-
-    Raises
-    ------
-    InputFileError
-        None or several of the columns, or times that do not rise.
+    InputFileError: none or several of the columns, or times that do not rise.
     """
     table = _table(path)
     kinds = {

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from os import PathLike
 from typing import Final
 
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import FilePath, read_text_lines
+from railfix.core.files import FilePath, Paths, listed, read_text_lines
 from railfix.core.timescale import bdt_to_gpst, utc_to_gpst
 from railfix.gnss.navigation import PreciseEphemeris
 from railfix.gnss.orbits.precise import POINTS
@@ -33,18 +31,10 @@ class _States:
     numbers: list[list[float]] = field(default_factory=list)
 
 
-def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
-    """Read positions and clocks of one or several SP3 files, joined in order of time.
+def read_sp3(paths: Paths) -> PreciseEphemeris:
+    """Read positions and clocks of one or several SP3 files (plain, gzip, compress), joined in order of time.
 
-    Parameters
-    ----------
-    paths : path or sequence of paths
-        Plain, gzip, compress.
-
-    Returns
-    -------
-    PreciseEphemeris
-        Where files overlap, the file given first takes precedence.
+    Where files overlap, the file given first takes precedence.
 
     Raises
     ------
@@ -52,13 +42,11 @@ def read_sp3(paths: FilePath | Sequence[FilePath]) -> PreciseEphemeris:
         A file is missing, is not an SP3 file, is in an unknown time system, or is broken; or all files
         together have fewer epochs than the interpolation needs.
     """
-    files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
-    if not files:
-        raise ValueError("at least one SP3 file is needed")
+    files = listed(paths)
     states = _States()
     for path in files:
         _read_file(path, states)
-    source = ", ".join(str(p) for p in files)
+    source = ", ".join(files)
     times, row = np.unique(np.array(states.epoch, dtype=np.int64), return_inverse=True)
     satellites, column = np.unique(np.array(states.satellite, dtype="<U3"), return_inverse=True)
     if len(times) < POINTS:

@@ -22,12 +22,7 @@ def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
     """Read the track points of a GPX 1.0 or 1.1 file; times are UTC there.
 
     Heights are above the geoid by the standard; the point's ``geoidheight`` is added where it has one, else the height
-    is kept with a note.
-
-    Raises
-    ------
-    InputFileError
-        This is not GPX, or a point has no latitude.
+    is kept with a note. InputFileError: this is not GPX, or a point has no latitude.
     """
     try:
         root = ElementTree.fromstring(read_text(path))
@@ -77,10 +72,7 @@ def read_gpx_positions(path: str | PathLike[str]) -> PositionLog:
 def read_novatel_positions(path: str | PathLike[str]) -> PositionLog:
     """Read the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN).
 
-    Raises
-    ------
-    InputFileError
-        There is no such log in the file, or one is broken.
+    InputFileError: there is no such log in the file, or one is broken.
     """
     rows: list[tuple[float, ...]] = []
     lines: list[int] = []
@@ -91,17 +83,13 @@ def read_novatel_positions(path: str | PathLike[str]) -> PositionLog:
         header, body = (part.split(",") for part in line.split("*")[0].split(";", 1))
         try:
             week, seconds = header[1:3] if name == "INSPVASA" else header[5:7]
-            if name.endswith("POSA"):
-                if body[0] != "SOL_COMPUTED":
-                    continue
+            if name.endswith("POSA") and body[0] != "SOL_COMPUTED":
+                continue
+            if name not in ("INSPVAA", "INSPVASA"):
                 kind = next((q for word, q in _QUALITY.items() if word in body[1]), 5)
                 latitude, longitude, level, undulation = (float(v) for v in body[2:6])
-                sigmas = tuple(float(v) for v in body[7:10])
-                rows.append((float(week), float(seconds), latitude, longitude, level + undulation, kind, *sigmas))
-            elif name == "INSPVAXA":
-                kind = next((q for word, q in _QUALITY.items() if word in body[1]), 5)
-                latitude, longitude, level, undulation = (float(v) for v in body[2:6])
-                sigmas = tuple(float(v) for v in body[12:15])
+                first = 7 if name.endswith("POSA") else 12
+                sigmas = tuple(float(v) for v in body[first : first + 3])
                 rows.append((float(week), float(seconds), latitude, longitude, level + undulation, kind, *sigmas))
             else:
                 latitude, longitude, height = (float(v) for v in body[2:5])

@@ -153,14 +153,9 @@ def encode(message: TrainMessage) -> bytes:
 
 
 def decode(data: bytes) -> TrainMessage:
-    """A message from CBOR.
+    """A message from CBOR; keys that this version does not know are skipped.
 
-    Keys that this version does not know are skipped.
-
-    Raises
-    ------
-    MessageError
-        The bytes are not CBOR, not a message, of another version, too long, or hold values out of range.
+    MessageError: the bytes are not CBOR, not a message, of another version, too long, or hold values out of range.
     """
     import cbor2
 
@@ -207,13 +202,7 @@ def to_json(message: TrainMessage) -> str:
 
 
 def from_json(line: str) -> TrainMessage:
-    """A message from its line of JSON.
-
-    Raises
-    ------
-    MessageError
-        As `decode`.
-    """
+    """A message from its line of JSON; MessageError as `decode`."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):

@@ -39,17 +39,7 @@ def sign_magnitude(bits: Bytes, first: int, length: int) -> Integers:
 
 
 def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
-    """All fields of a layout, scaled.
-
-    Parameters
-    ----------
-    bits : ndarray of uint8, shape (N, bits)
-    layout : mapping of str to Field
-
-    Returns
-    -------
-    dict of str to ndarray, shape (N,)
-    """
+    """All fields of a layout, scaled, shape (N,) each, of bits of shape (N, bits)."""
     values = {}
     for name, (where, length, factor, coding) in layout.items():
         if isinstance(where, tuple):

@@ -7,6 +7,7 @@ earlier pieces left unfinished, so that a stream cut anywhere gives the same rec
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
@@ -33,12 +34,8 @@ _SAME_STRINGS_S: Final = 15.0
 class Unfinished:
     """What the subframes so far left.
 
-    Attributes
-    ----------
-    latest : mapping
-        Fields of the latest subframe by satellite and number (with the time it was received).
-    issued : mapping of str to tuple
-        What tells the last record of a satellite from the next.
+    `latest` has the fields of the latest subframe by satellite and number, with the time it was received; `issued` what
+    tells the last record of a satellite from the next.
     """
 
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
@@ -47,17 +44,9 @@ class Unfinished:
 
 @dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """Records of a piece of a stream.
+    """Records of a piece of a stream, in the order in which they became complete.
 
-    Attributes
-    ----------
-    records : tuple of RawRecord
-        In the order in which they became complete.
-    complete_at : ndarray of datetime64[ns], shape (len(records),)
-        Receiver's time of the subframe that completed each; NaT before the receiver knew the time.
-    klobuchar : mapping of str to ndarray, shape (8,)
-    leap_seconds : int or None
-    skipped : mapping of str to int
+    `complete_at` is the receiver's time of the subframe that completed each; NaT before the receiver knew the time.
     """
 
     records: tuple[RawRecord, ...]
@@ -68,68 +57,31 @@ class Assembled:
 
 
 def assembled(subframes: Subframes, time: Datetimes, state: Unfinished | None = None) -> tuple[Assembled, Unfinished]:
-    """Ephemerides that a piece of a stream completes.
+    """Ephemerides that a piece of a stream completes, and what it leaves unfinished.
 
-    Parameters
-    ----------
-    subframes : Subframes
-    time : ndarray of datetime64[ns], shape (N,)
-        When each was received, to within some seconds: resolves weeks and days.
-    state : Unfinished, optional
-
-    Returns
-    -------
-    Assembled
-    Unfinished
+    `time`, when each subframe was received, to within some seconds, shape (N,), resolves weeks and days.
     """
-    state = state or Unfinished()
-    builder = _Builder(dict(state.latest), dict(state.issued))
+    builder = _Builder(state or Unfinished())
     pages, counts = _pages(subframes)
     for row, satellite, number, values in pages:
         builder.add(satellite, number, values, time[row])
-    for raw, why in builder.rejected:
-        _count(counts, f"{raw.satellite[0]} {why}", 1)
-    result = Assembled(
-        records=tuple(builder.records),
-        complete_at=np.array(builder.times, dtype="datetime64[ns]"),
-        klobuchar=builder.klobuchar,
-        leap_seconds=builder.leap_seconds,
-        skipped=counts,
-    )
-    return result, Unfinished(latest=builder.latest, issued=builder.issued)
+    return builder.result(counts)
 
 
 def assembled_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished | None = None
 ) -> tuple[Assembled, Unfinished]:
-    """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`), repeated ones once.
-
-    Parameters
-    ----------
-    messages : iterable of (place in the stream, message number, fields)
-    time : ndarray of datetime64[ns], shape (number of messages,)
-    state : Unfinished, optional
-    """
-    state = state or Unfinished()
-    builder = _Builder(dict(state.latest), dict(state.issued))
-    counts: dict[str, int] = {}
+    """Ephemerides of RTCM 3 messages (`rtcm.ephemeris_fields`) received at times, shape (N,), repeated ones once."""
+    builder = _Builder(state or Unfinished())
+    counts = Counter[str]()
     for (_, kind, values), at in zip(messages, time, strict=True):
         letter = _RTCM_SYSTEMS.get(kind, "")
         if not letter:
-            _count(counts, f"RTCM {kind}", 1)
+            counts[f"RTCM {kind}"] += 1
             continue
         satellite = f"{letter}{int(values['number']):02d}"
         builder.issue(satellite, _rtcm_record(satellite, values, at), at)
-    for raw, why in builder.rejected:
-        _count(counts, f"{raw.satellite[0]} {why}", 1)
-    result = Assembled(
-        records=tuple(builder.records),
-        complete_at=np.array(builder.times, dtype="datetime64[ns]"),
-        klobuchar={},
-        leap_seconds=None,
-        skipped=counts,
-    )
-    return result, Unfinished(latest=builder.latest, issued=builder.issued)
+    return builder.result(counts)
 
 
 def _rtcm_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
@@ -157,9 +109,9 @@ def navigation_of(parts: Assembled, *, sources: tuple[str, ...] = ()) -> Navigat
     )
 
 
-def _pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], dict[str, int]]:
+def _pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
     """Decoded pages in the order of the stream: row, satellite, number, fields."""
-    counts: dict[str, int] = dict(subframes.skipped)
+    counts = Counter(subframes.skipped)
     pages: list[tuple[int, str, int, Values]] = []
     letters = subframes.satellite.astype("<U1")
     for letter, decode in (("G", _lnav), ("J", _lnav), ("E", _inav), ("C", _beidou), ("R", _glonass)):
@@ -178,14 +130,13 @@ def _rows(bits: Bytes, rows: np.ndarray, layout: Mapping[str, Field]) -> Iterato
         yield row, {name: float(values[k]) for name, values in table.items()}
 
 
-def _count(counts: dict[str, int], what: str, number: int) -> None:
-    if number:
-        counts[what] = counts.get(what, 0) + number
+def _nonzero(counts: Counter[str]) -> dict[str, int]:
+    return {what: number for what, number in counts.items() if number}
 
 
-def _lnav(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+def _lnav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
     civil = part.signal == 0
-    _count(counts, f"{part.satellite[0][0]} CNAV", int(np.count_nonzero(~civil)))
+    counts[f"{part.satellite[0][0]} CNAV"] += int(np.count_nonzero(~civil))
     bits = packed_words(part.words, drop=6, keep=24)
     number = unsigned(bits, 43, 3)
     valid = civil & (unsigned(bits, 0, 8) == 0x8B)
@@ -196,11 +147,11 @@ def _lnav(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, V
             yield row, k, values
 
 
-def _inav(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+def _inav(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
     inav = np.isin(part.signal, (1, *_UBX_E5B))
-    _count(counts, "E F/NAV", int(np.count_nonzero(~inav)))
+    counts["E F/NAV"] += int(np.count_nonzero(~inav))
     bits, valid = nav_messages.inav_words(part.words)
-    _count(counts, "E pages without valid CRC", int(np.count_nonzero(inav & ~valid)))
+    counts["E pages without valid CRC"] += int(np.count_nonzero(inav & ~valid))
     kind = unsigned(bits, 0, 6)
     e5b = np.isin(part.signal, _UBX_E5B)
     for k in range(1, 7):
@@ -208,9 +159,9 @@ def _inav(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, V
             yield row, k, {**values, "source": float(_E5B_SOURCE if e5b[row] else _E1B_SOURCE)}
 
 
-def _beidou(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+def _beidou(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
     legacy = np.isin(part.signal, (0, 1, 2, 3, 4, 10))
-    _count(counts, "C CNAV", int(np.count_nonzero(~legacy)))
+    counts["C CNAV"] += int(np.count_nonzero(~legacy))
     bits = packed_words(part.words, drop=0, keep=30)
     number = np.array([int(name[1:]) for name in part.satellite.tolist()])
     geo = (number <= 5) | (number >= 59)
@@ -228,10 +179,10 @@ def _beidou(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int,
             yield row, 100 + k, {**head, "page": packed}  # the page whole: its fields go over page ends
 
 
-def _glonass(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int, Values]]:
+def _glonass(part: Subframes, counts: Counter[str]) -> Iterator[tuple[int, int, Values]]:
     bits = packed_words(part.words[:, :3], drop=0, keep=32)[:, :85]
     valid = nav_messages.glonass_hamming(bits)
-    _count(counts, "R strings without valid code", int(np.count_nonzero(~valid)))
+    counts["R strings without valid code"] += int(np.count_nonzero(~valid))
     number = unsigned(bits, 1, 4)
     for k in (1, 2, 3, 4):
         for row, values in _rows(bits, np.flatnonzero(valid & (number == k)), nav_messages.GLONASS[k]):
@@ -241,13 +192,25 @@ def _glonass(part: Subframes, counts: dict[str, int]) -> Iterator[tuple[int, int
 class _Builder:
     """Latest subframes of all satellites, and the records they complete."""
 
-    def __init__(self, latest: dict[tuple[str, int], Values], issued: dict[str, tuple[float, ...]]) -> None:
-        self.latest, self.issued = latest, issued
+    def __init__(self, state: Unfinished) -> None:
+        self.latest, self.issued = dict(state.latest), dict(state.issued)
         self.records: list[RawRecord] = []
         self.times: list[np.datetime64] = []
         self.rejected: list[tuple[RawRecord, str]] = []
         self.klobuchar: dict[str, np.ndarray] = {}
         self.leap_seconds: int | None = None
+
+    def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
+        """The records, with what is counted and what is left unfinished."""
+        counts.update(f"{raw.satellite[0]} {why}" for raw, why in self.rejected)
+        records = Assembled(
+            records=tuple(self.records),
+            complete_at=np.array(self.times, dtype="datetime64[ns]"),
+            klobuchar=self.klobuchar,
+            leap_seconds=self.leap_seconds,
+            skipped=_nonzero(counts),
+        )
+        return records, Unfinished(latest=self.latest, issued=self.issued)
 
     def add(self, satellite: str, number: int, values: Values, time: np.datetime64) -> None:
         """Take one subframe; a record it completes is appended."""
@@ -331,18 +294,15 @@ class _Builder:
 
 def merged(parts: list[Assembled]) -> Assembled:
     """Records of several pieces of one stream."""
-    counts: dict[str, int] = {}
     klobuchar: dict[str, np.ndarray] = {}
     leap: int | None = None
     for part in parts:
         klobuchar |= part.klobuchar
         leap = part.leap_seconds if part.leap_seconds is not None else leap
-        for what, number in part.skipped.items():
-            _count(counts, what, number)
     return Assembled(
         records=tuple(record for part in parts for record in part.records),
         complete_at=np.concatenate([part.complete_at for part in parts]) if parts else np.zeros(0, "datetime64[ns]"),
         klobuchar=klobuchar,
         leap_seconds=leap,
-        skipped=counts,
+        skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),
     )

@@ -91,17 +91,9 @@ class _Candidates:
 
 
 def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
-    """Frames in a buffer.
+    """Frames in a buffer of uint8.
 
-    Parameters
-    ----------
-    data : ndarray of uint8
-    at_end : bool
-        Whether nothing follows: then an incomplete frame at the end is skipped, not kept for the next buffer.
-
-    Returns
-    -------
-    Frames
+    `at_end`: nothing follows, so that an incomplete frame at the end is skipped, not kept for the next buffer.
     """
     data = np.asarray(data, dtype=np.uint8)
     candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data, at_end=at_end)]
@@ -214,16 +206,8 @@ _CRC24: Final = _crc24_table()
 
 
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
-    """CRC-24Q of many stretches of a buffer, byte by byte over all of them together.
-
-    Parameters
-    ----------
-    data : ndarray of uint8
-    start, end : ndarray of int, shape (N,)
-
-    Returns
-    -------
-    ndarray of int64, shape (N,)
+    """CRC-24Q of many stretches of a buffer, from `start` to `end`, shape (N,), byte by byte over all of them
+    together.
     """
     crc = np.zeros(len(start), dtype=np.int64)
     order = np.argsort(start - end, kind="stable")  # longest first: the ones still running are a prefix

@@ -25,16 +25,7 @@ _BLOCK_BYTES: Final = 1 << 22
 
 @dataclass(frozen=True, kw_only=True)
 class Piece:
-    """What one block of a receiver log holds.
-
-    Attributes
-    ----------
-    measurements : Measurements
-    ephemerides : Assembled
-    sbas : SbasFrames
-    skipped_bytes, bad_checksums, bytes : int
-        Bytes outside frames, candidates whose checksum failed, bytes read.
-    """
+    """What one block of a receiver log holds, with bytes outside frames, failed checksums, and bytes read."""
 
     measurements: Measurements
     ephemerides: Assembled
@@ -57,14 +48,8 @@ class StreamState:
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
     """Measurements and ephemerides of a block of bytes; a stream cut anywhere gives the same.
 
-    Parameters
-    ----------
-    data : bytes
-    state : StreamState
-        Left by the block before; its `time` (of the last epoch, or a date known otherwise) resolves the week
-        that RTCM 3 leaves out.
-    at_end : bool
-        Whether nothing follows.
+    The `time` of the state that the block before left (of the last epoch, or a date known otherwise) resolves the week
+    that RTCM 3 leaves out. `at_end`: nothing follows.
     """
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
@@ -74,7 +59,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
     raw = _raw_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
-    msm = _without(frames) if np.isnat(time) else rtcm.msm_measurements(frames, time)
+    msm = rtcm.msm_measurements(frames, time)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
     records, sbas, subframes, messages = _navigation(frames, raw, state)
@@ -98,20 +83,6 @@ def _raw_measurements(frames: Frames) -> Measurements:
         if not len(frames.of("sbf", sbf.MEAS_EPOCH))
         else sbf.meas_epoch_measurements(frames)
     )
-
-
-def _without(frames: Frames) -> Measurements:
-    """No measurements, where RTCM 3 has no week to be resolved with; the messages are counted."""
-    empty = rtcm.msm_measurements(_none(frames), np.datetime64("NaT", "ns"))
-    count = len(frames.of("rtcm3", *rtcm.MSM_NUMBERS))
-    return Measurements(
-        **{name: getattr(empty, name) for name in Measurements.__dataclass_fields__ if name != "skipped"},
-        skipped={"RTCM 3 observations without a date": count} if count else {},
-    )
-
-
-def _none(frames: Frames) -> Frames:
-    return find_frames(frames.data[:0])
 
 
 def _navigation(
@@ -141,16 +112,10 @@ def _time_at(places: np.ndarray, epochs_at: np.ndarray, epochs: Datetimes, befor
 def scan_pieces(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[Piece]:
-    """Pieces of a receiver log, block by block.
+    """Pieces of a receiver log, plain or packed, block by block.
 
-    Parameters
-    ----------
-    path : path
-        Plain or packed.
-    date : datetime64, optional
-        Some time within half a week of the log, for RTCM 3, whose observations carry no week.
-    progress : callable, optional
-        Called with the part of the file that has been read.
+    `date` is some time within half a week of the log, for RTCM 3, whose observations carry no week; `progress` is
+    called with the part of the file that has been read.
     """
     state = StreamState() if date is None else StreamState(time=date.astype("datetime64[ns]"))
     with open_stream(path, content="bytes") as stream:
@@ -169,10 +134,7 @@ def scan_receiver_log(
 ) -> Iterator[Observations]:
     """Observations of a receiver log in pieces of one block.
 
-    Raises
-    ------
-    InputFileError
-        No frame has a valid checksum, or no observation can be dated.
+    InputFileError: no frame has a valid checksum, or no observation can be dated.
     """
     tracking = Tracking()
     epochs = frames_seen = 0
@@ -180,7 +142,7 @@ def scan_receiver_log(
     for piece in scan_pieces(path, date=date, progress=progress):
         observations, tracking = observations_of(piece.measurements, tracking)
         frames_seen += piece.bytes - piece.skipped_bytes
-        undated += piece.measurements.skipped.get("RTCM 3 observations without a date", 0)
+        undated += piece.measurements.skipped.get(rtcm.UNDATED, 0)
         counts = {"bytes outside messages": piece.skipped_bytes, "messages with a bad checksum": piece.bad_checksums}
         skipped = {**observations.skipped, **{what: n for what, n in counts.items() if n}}
         epochs += len(observations)
@@ -197,18 +159,9 @@ def scan_receiver_log(
 
 
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
-    """Navigation records of receiver logs.
+    """Navigation records of receiver logs; InputFileError where no log holds a whole ephemeris.
 
-    Parameters
-    ----------
-    paths : iterable of path
-    date : datetime64, optional
-        As in `scan_pieces`; without it the newest week that is not after today is taken for RTCM 3.
-
-    Raises
-    ------
-    InputFileError
-        No log holds a whole ephemeris.
+    `date` is as in `scan_pieces`; without it the newest week that is not after today is taken for RTCM 3.
     """
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]

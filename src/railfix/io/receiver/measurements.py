@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -60,14 +61,8 @@ class Measurements:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """What the epochs so far left.
-
-    Attributes
-    ----------
-    last : datetime64[ns]
-        Last epoch, NaT before the first.
-    lock : mapping of str to tuple of float
-        Lock time [s] and polarity of the last phase of each channel (satellite and signal joined).
+    """What the epochs so far left: the last one, NaT before the first, and lock time [s] and polarity of the last phase
+    of each channel (satellite and signal joined).
     """
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
@@ -75,22 +70,10 @@ class Tracking:
 
 
 def observations_of(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
-    """Observations on the grid of epochs by channels.
+    """Observations on the grid of epochs by channels, sorted by satellite, then signal, and the state that they leave.
 
     An epoch that is not after the one before it (a repeated message, a receiver that was restarted
     with an older time) is passed over and counted.
-
-    Parameters
-    ----------
-    measurements : Measurements
-    tracking : Tracking, optional
-        Left by the piece before.
-
-    Returns
-    -------
-    Observations
-        Channels sorted by satellite, then signal.
-    Tracking
     """
     tracking = tracking or Tracking()
     rising = rising_epochs(measurements.time, None if np.isnat(tracking.last) else tracking.last)
@@ -114,13 +97,11 @@ def observations_of(measurements: Measurements, tracking: Tracking | None = None
     lock, polarity = np.vstack([before[:, 0], lock]), np.vstack([before[:, 1], polarity])
     slipped = slips(lock, polarity)[1:]
     indicator = _SLIP * slipped + _HALF_CYCLE * half
-    skipped = dict(measurements.skipped)
-    for what, count in (
-        ("epochs not after the one before", int(np.count_nonzero(~rising))),
-        ("measurements of unknown signals", int(np.count_nonzero(~known))),
-    ):
-        if count:
-            skipped[what] = skipped.get(what, 0) + count
+    counts = {
+        "epochs not after the one before": int(np.count_nonzero(~rising)),
+        "measurements of unknown signals": int(np.count_nonzero(~known)),
+    }
+    skipped = dict(Counter(measurements.skipped) + Counter(counts))
     satellite, signal = channels.astype("<U3"), np.array([name[3:] for name in channels.tolist()], dtype="<U2")
     observations = Observations(
         time=measurements.time[rising],
@@ -160,13 +141,8 @@ def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
 def slips(lock_s: Floats, polarity: Floats) -> Masks:
     """Epochs whose phase is not continuous with the channel's last one, shape (T, M).
 
-    Lock time zero or less than before, or a change of polarity. The first phase of a channel counts as
-    continuous unless its lock time is zero.
-
-    Parameters
-    ----------
-    lock_s, polarity : ndarray, shape (T, M)
-        NaN where there is no phase.
+    Lock time zero or less than before, or a change of polarity; both are NaN where there is no phase. The first phase
+    of a channel counts as continuous unless its lock time is zero.
     """
     present = ~np.isnan(lock_s)
     epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
@@ -199,10 +175,6 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
         return parts[0]
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     arrays = "satellite signal code_m phase_cycles doppler_hz cn0_dbhz lock_s half_cycle polarity glonass_channel"
-    counts: dict[str, int] = {}
-    for part in parts:
-        for what, number in part.skipped.items():
-            counts[what] = counts.get(what, 0) + number
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
     return Measurements(
         time=np.concatenate([part.time for part in parts]),
@@ -210,5 +182,5 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays.split()},
         leap_seconds=leap[-1] if leap else None,
         receiver=next((part.receiver for part in parts if part.receiver), ""),
-        skipped=counts,
+        skipped=dict(sum((Counter(part.skipped) for part in parts), Counter())),
     )

@@ -14,24 +14,11 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Positions in a receiver's log as the receiver computed them.
+    """Positions in a receiver's log, plain or packed, as the receiver computed them; `line` counts the positions.
 
-    Parameters
-    ----------
-    path : path
-        Plain or packed. SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it.
-    date : datetime64, optional
-        Some time within half a week, for UBX logs without a NAV-PVT that has a date.
-
-    Returns
-    -------
-    PositionLog
-        Qualities as RTKLIB counts them, 1 an RTK solution with fixed ambiguities; `line` counts the positions.
-
-    Raises
-    ------
-    InputFileError
-        The log has no position, or none that can be dated.
+    SBF PVTGeodetic, or PVTCartesian without it; UBX NAV-HPPOSLLH, or NAV-PVT without it. Qualities as RTKLIB counts
+    them. `date` is some time within half a week, for UBX logs without a NAV-PVT that has a date. InputFileError: the
+    log has no position, or none that can be dated.
     """
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")

@@ -22,15 +22,10 @@ _MOSCOW_S: Final = 3 * 3600.0
 
 
 def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record | None:
-    """Record of GPS or QZSS from the fields of its message.
+    """Record of GPS or QZSS from the fields of LNAV subframes 1 to 3, or of RTCM 1019 or 1044 (which have no
+    ``tow_s``).
 
-    Parameters
-    ----------
-    satellite : str
-    values : mapping of str to float
-        Of LNAV subframes 1 to 3, or of RTCM 1019 or 1044 (which have no ``tow_s``).
-    time : datetime64[ns]
-        Within some years: resolves the week.
+    `time`, within some years, resolves the week.
     """
     if np.isnat(time):
         return None

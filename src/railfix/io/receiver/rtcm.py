@@ -43,6 +43,8 @@ _LAYOUT: Final = {
     7: (20, 2.0**-29, 24, 2.0**-31, 10, 10, 0.0625, True),
 }
 MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
+#: Count of messages that no week can be resolved for.
+UNDATED: Final = "RTCM 3 observations without a date"
 _MOSCOW_S: Final = 10_800.0
 _GLONASS_RANGE: Final = range(-7, 7)
 
@@ -59,24 +61,17 @@ def _lock_table(bits: int) -> Floats:
 def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
     """Measurements of all MSM4 to MSM7 messages; messages of one instant make one epoch.
 
-    Parameters
-    ----------
-    frames : Frames
-    near : datetime64[ns]
-        A time within half a week of the log, GPS time: the messages carry the time of week only.
-
-    Returns
-    -------
-    Measurements
+    The messages carry the time of week only: `near` is a time within half a week of the log, GPS time; NaT gives none.
     """
+    messages = len(frames.of("rtcm3", *MSM_NUMBERS))
     parts = [
         (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))
-        for number in MSM_NUMBERS
+        for number in (() if np.isnat(near) else MSM_NUMBERS)
         for order, rows in _of_number(frames, number, near)
     ]
-    messages = len(frames.of("rtcm3", *MSM_NUMBERS))
     if not parts:
-        return replace(_no_measurements(), skipped={"broken MSM": messages} if messages else {})
+        what = UNDATED if np.isnat(near) else "broken MSM"
+        return replace(_no_measurements(), skipped={what: messages} if messages else {})
     order = np.concatenate([order for order, _, _ in parts])
     rows = joined([rows for _, rows, _ in parts])
     # Messages of one instant become one epoch; instants stay in the order of the stream.

@@ -108,8 +108,7 @@ _NAMES: Final = _names()
 
 def _signal_names() -> Strings:
     table = np.full(64, "", dtype="<U3")
-    for number, name in SIGNALS.items():
-        table[number] = name
+    table[list(SIGNALS)] = list(SIGNALS.values())
     return table
 
 
@@ -325,10 +324,7 @@ def _words_of_30(words: Words) -> Words:
 def positions(frames: Frames) -> dict[str, np.ndarray]:
     """The receiver's own positions: of PVTGeodetic blocks where it sends them, else of PVTCartesian.
 
-    Returns
-    -------
-    dict
-        ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts), ``sigma_m`` (shape (N, 3), NaN).
+    ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts), ``sigma_m`` (shape (N, 3), NaN).
     """
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     chosen = frames.of("sbf", PVT_GEODETIC if geodetic else PVT_CARTESIAN)

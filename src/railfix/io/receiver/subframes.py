@@ -16,10 +16,8 @@ class Subframes:
 
     Attributes
     ----------
-    satellite : ndarray of str, shape (N,)
     signal : ndarray of int, shape (N,)
         Signal number (UBX sigId; other formats are translated to it).
-    glonass_channel : ndarray of int, shape (N,)
     words : ndarray of uint32, shape (N, 10)
         Words of 30 or 32 bits, right-aligned; unused ones 0.
     order : ndarray of int, shape (N,)
@@ -71,7 +69,6 @@ class SbasFrames:
     time : ndarray of datetime64[ns], shape (N,)
         1 ns after the receiver's epoch before the message, because that epoch came too early to use it; NaT before the
         receiver knew the time.
-    prn : ndarray of int, shape (N,)
     octets : ndarray of uint8, shape (N, 32)
         The 250 bits from the first preamble bit on, zero behind.
     """

@@ -5,6 +5,7 @@ Source: u-blox F9 HPG 1.32 interface description (UBX-22008968), sections 3.15 (
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -24,41 +25,14 @@ NAV_HPPOSLLH: Final = 0x0114
 #: Constellation letter by gnssId.
 SYSTEMS: Final = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}
 #: RINEX signal by gnssId and sigId (section 1.5.4 of the interface description, "Signal identifiers").
-SIGNALS: Final = {
-    (0, 0): "1C",
-    (0, 3): "2L",
-    (0, 4): "2S",
-    (0, 6): "5I",
-    (0, 7): "5Q",
-    (1, 0): "1C",
-    (2, 0): "1C",
-    (2, 1): "1B",
-    (2, 3): "5I",
-    (2, 4): "5Q",
-    (2, 5): "7I",
-    (2, 6): "7Q",
-    (2, 8): "6B",
-    (2, 9): "6C",
-    (2, 10): "6A",
-    (3, 0): "2I",
-    (3, 1): "2I",
-    (3, 2): "7I",
-    (3, 3): "7I",
-    (3, 4): "6I",
-    (3, 5): "1P",
-    (3, 6): "1D",
-    (3, 7): "5P",
-    (3, 8): "5D",
-    (3, 10): "6I",
-    (5, 0): "1C",
-    (5, 1): "1Z",
-    (5, 4): "2S",
-    (5, 5): "2L",
-    (5, 8): "5I",
-    (5, 9): "5Q",
-    (6, 0): "1C",
-    (6, 2): "2C",
-    (7, 0): "5A",
+SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
+    0: {0: "1C", 3: "2L", 4: "2S", 6: "5I", 7: "5Q"},
+    1: {0: "1C"},
+    2: {0: "1C", 1: "1B", 3: "5I", 4: "5Q", 5: "7I", 6: "7Q", 8: "6B", 9: "6C", 10: "6A"},
+    3: {0: "2I", 1: "2I", 2: "7I", 3: "7I", 4: "6I", 5: "1P", 6: "1D", 7: "5P", 8: "5D", 10: "6I"},
+    5: {0: "1C", 1: "1Z", 4: "2S", 5: "2L", 8: "5I", 9: "5Q"},
+    6: {0: "1C", 2: "2C"},
+    7: {0: "5A"},
 }
 #: One measurement of RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
@@ -183,8 +157,8 @@ def rawx_measurements(frames: Frames) -> Measurements:
 
 def _signal_table() -> Strings:
     table = np.full((8, 16), "", dtype="<U2")
-    for (system, number), name in SIGNALS.items():
-        table[system, number] = name
+    for system, names in SIGNALS.items():
+        table[system, list(names)] = list(names.values())
     return table
 
 
@@ -222,18 +196,9 @@ def sfrbx_subframes(frames: Frames) -> Subframes:
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
     """The receiver's own positions: of NAV-HPPOSLLH where it is sent, else of NAV-PVT.
 
-    Parameters
-    ----------
-    frames : Frames
-    near : datetime64[ns]
-        A time within half a week where no NAV-PVT with a date comes before (`date_of`); NaT: without it there is no
-        position.
-
-    Returns
-    -------
-    dict
-        ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts, of the NAV-PVT of the same instant; 5
-        without one), ``sigma_m`` (shape (N, 3), north, east, up).
+    ``time``, ``ecef_m`` (shape (N, 3)), ``quality`` (as RTKLIB counts, of the NAV-PVT of the same instant; 5 without
+    one), ``sigma_m`` (shape (N, 3), north, east, up). `near` is a time within half a week where no NAV-PVT with a date
+    comes before (`date_of`); with NaT there is no position.
     """
     coarse = frames.of("ubx", NAV_PVT)
     coarse = coarse[frames.end[coarse] - frames.start[coarse] >= _PVT.itemsize]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 
+from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError
 from railfix.core.files import ByteStream
 from railfix.gnss.observations import ObservationHeader
@@ -43,8 +44,6 @@ class RinexHeader:
     ----------
     system : str
         Constellation letter of the file, "M" when mixed.
-    time_system : str
-        One of `TIME_SYSTEMS`.
     types : mapping of str to tuple of str
         Declared types by constellation letter; RINEX 2 has one entry, `ALL`.
     scale : mapping of (str, str) to float
@@ -72,10 +71,7 @@ class RinexHeader:
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
     """Read the lines of the header up to END OF HEADER, and the bytes read after it.
 
-    Raises
-    ------
-    InputFileError
-        The file is no RINEX observation file, or its header does not end.
+    InputFileError: the file is no RINEX observation file, or its header does not end.
     """
     data = b""
     found = -1
@@ -109,22 +105,11 @@ def _check_kind(path: str, line: str) -> None:
 
 
 def parse_header(path: str, lines: Sequence[str], *, notes: list[str] | None = None) -> RinexHeader:
-    """Parse the header of an observation file.
+    """Parse the header of an observation file, its lines up to END OF HEADER.
 
-    Parameters
-    ----------
-    path : str
-        For error messages.
-    lines : sequence of str
-        Lines up to END OF HEADER.
-    notes : list of str, optional
-        If given, unreadable records that do not affect how the file is read (INTERVAL, APPROX POSITION
-        XYZ, ...) are noted here and skipped instead of raised.
-
-    Raises
-    ------
-    InputFileError
-        Version not supported, types missing or miscounted, or an invalid number.
+    Unreadable records that do not affect how the file is read (INTERVAL, APPROX POSITION XYZ, ...) are skipped and put
+    into `notes` where that is given, else raised. InputFileError: version not supported, types missing or miscounted,
+    or an invalid number.
     """
     version = _version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
@@ -191,9 +176,10 @@ class _Records:
         text = f"{line[:60]:<60}"
         if label in _LAYOUT:
             _LAYOUT[label](self, text)
-        elif label in _OTHER:
+        elif label in _VALUES:
+            name, read = _VALUES[label]
             try:
-                _OTHER[label](self, text)
+                self._changes[name] = read(text)
             except ValueError as error:
                 message = f"{label}: '{text.strip()}' cannot be read as the numbers expected"
                 if self._notes is None:
@@ -297,40 +283,6 @@ class _Records:
         for satellite, channel in re.findall(r"R([ \d]\d)\s+([+-]?\d+)", text[3:]):
             self._channels[f"R{int(satellite):02d}"] = int(channel)
 
-    def position(self, text: str) -> None:
-        """APPROX POSITION XYZ."""
-        xyz = _three(text)
-        self._changes["approximate_ecef_m"] = xyz if xyz.any() else np.full(3, np.nan)
-
-    def delta(self, text: str) -> None:
-        """ANTENNA: DELTA H/E/N."""
-        self._changes["antenna_delta_hen_m"] = _three(text)
-
-    def interval(self, text: str) -> None:
-        """INTERVAL."""
-        value = float(text[:10])
-        self._changes["interval_s"] = value if value > 0.0 and math.isfinite(value) else math.nan
-
-    def leap_seconds(self, text: str) -> None:
-        """LEAP SECONDS."""
-        self._changes["leap_seconds"] = int(text[:6])
-
-    def clock_applied(self, text: str) -> None:
-        """RCV CLOCK OFFS APPL."""
-        self._changes["receiver_clock_applied"] = int(text[:6]) == 1
-
-    def marker(self, text: str) -> None:
-        """MARKER NAME."""
-        self._changes["marker"] = text.strip()
-
-    def receiver(self, text: str) -> None:
-        """REC # / TYPE / VERS."""
-        self._changes["receiver"] = text[20:40].strip()
-
-    def antenna(self, text: str) -> None:
-        """ANT # / TYPE."""
-        self._changes["antenna"] = text[20:40].strip()
-
 
 _LAYOUT: Final = {
     "# / TYPES OF OBSERV": _Records.types_2,
@@ -338,25 +290,39 @@ _LAYOUT: Final = {
     "SYS / SCALE FACTOR": _Records.scale_factor,
     "TIME OF FIRST OBS": _Records.time_of_first,
     "SIGNAL STRENGTH UNIT": _Records.strength_unit,
-}
-_OTHER: Final = {
     "GLONASS SLOT / FRQ #": _Records.glonass_slots,
-    "APPROX POSITION XYZ": _Records.position,
-    "ANTENNA: DELTA H/E/N": _Records.delta,
-    "INTERVAL": _Records.interval,
-    "LEAP SECONDS": _Records.leap_seconds,
-    "RCV CLOCK OFFS APPL": _Records.clock_applied,
-    "MARKER NAME": _Records.marker,
-    "REC # / TYPE / VERS": _Records.receiver,
-    "ANT # / TYPE": _Records.antenna,
 }
 
 
-def _three(text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _three(text: str) -> Floats:
     values = np.array([float(text[k : k + 14]) for k in (0, 14, 28)])
     if not np.isfinite(values).all():
         raise ValueError("not finite")
     return values
+
+
+def _place(text: str) -> Floats:
+    """Three coordinates; NaN where they are 0, which means unknown."""
+    xyz = _three(text)
+    return xyz if xyz.any() else np.full(3, np.nan)
+
+
+def _interval(text: str) -> float:
+    value = float(text[:10])
+    return value if value > 0.0 and math.isfinite(value) else math.nan
+
+
+#: Records that become one value of `ObservationHeader` each, and what reads it.
+_VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
+    "APPROX POSITION XYZ": ("approximate_ecef_m", _place),
+    "ANTENNA: DELTA H/E/N": ("antenna_delta_hen_m", _three),
+    "INTERVAL": ("interval_s", _interval),
+    "LEAP SECONDS": ("leap_seconds", lambda text: int(text[:6])),
+    "RCV CLOCK OFFS APPL": ("receiver_clock_applied", lambda text: int(text[:6]) == 1),
+    "MARKER NAME": ("marker", str.strip),
+    "REC # / TYPE / VERS": ("receiver", lambda text: text[20:40].strip()),
+    "ANT # / TYPE": ("antenna", lambda text: text[20:40].strip()),
+}
 
 
 def _signals(header: RinexHeader) -> dict[str, tuple[str, ...]]:

@@ -8,13 +8,7 @@ PROGRAM = "railfix"
 
 
 def header_line(text: str, label: str) -> str:
-    """Format one header record of 80 columns with its line end.
-
-    Raises
-    ------
-    ValueError
-        The text is longer than 60 characters or not ASCII.
-    """
+    """Format one header record of 80 columns with its line end; ValueError for more than 60 characters or no ASCII."""
     if len(text) > 60 or not text.isascii():
         raise ValueError(f"{label}: {text!r} is not ASCII of at most 60 characters")
     return f"{text:<60}{label:<20}\n"

@@ -7,16 +7,15 @@ GPS, QZSS, Galileo, BeiDou and GLONASS records in the messages that carry the cl
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
-from os import PathLike
 from typing import Final
 
 import numpy as np
 
 from railfix.core.errors import InputFileError
-from railfix.core.files import BrokenLines, read_text_lines
+from railfix.core.files import BrokenLines, FilePath, Paths, listed, read_text_lines
 from railfix.gnss.navigation import Navigation
 from railfix.io.rinex.navigation_header import NavigationContent, read_header
 from railfix.io.rinex.navigation_records import (
@@ -27,8 +26,6 @@ from railfix.io.rinex.navigation_records import (
     kepler_records,
     number,
 )
-
-FilePath = str | PathLike[str]
 
 #: Fewest and most lines of a record, the epoch line included, by constellation (RINEX 2.11, tables A4 and
 #: A11; 3.05, tables A6 to A16: GLONASS has a fifth line since 3.05, whose flags are not needed).
@@ -43,13 +40,12 @@ _WIDTH: Final = 19
 _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
 
-def read_navigation(paths: FilePath | Sequence[FilePath], *, broken_lines: BrokenLines = "stop") -> Navigation:
-    """Read all records of one or several navigation files.
+def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navigation:
+    """Read all records of one or several navigation files: plain, gzip, compress.
 
     Parameters
     ----------
     paths : path or sequence of paths
-        Plain, gzip, compress.
     broken_lines : {"stop", "count"}
         A broken record stops the reading, or is counted in `skipped` and described in `notes`.
 
@@ -64,14 +60,12 @@ def read_navigation(paths: FilePath | Sequence[FilePath], *, broken_lines: Broke
         A file is missing, is no navigation file, or (with "stop") a record is broken; or no file has
         a usable record.
     """
-    files = [paths] if isinstance(paths, (str, PathLike)) else list(paths)
-    if not files:
-        raise ValueError("at least one navigation file is needed")
+    files = listed(paths)
     content = NavigationContent(broken_lines=broken_lines)
     for path in files:
         _read_file(path, content)
     if not content.records:
-        names = ", ".join(str(p) for p in files)
+        names = ", ".join(files)
         raise InputFileError(names, "has no usable GPS, QZSS, Galileo, BeiDou or GLONASS record")
     return Navigation(
         kepler=kepler_records([r for r in content.records if r.system != "R"]),
@@ -80,7 +74,7 @@ def read_navigation(paths: FilePath | Sequence[FilePath], *, broken_lines: Broke
         leap_seconds=content.leap_seconds,
         skipped=dict(content.skipped),
         notes=tuple(dict.fromkeys(content.notes)),
-        sources=tuple(str(p) for p in files),
+        sources=tuple(files),
     )
 
 

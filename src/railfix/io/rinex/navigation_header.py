@@ -21,18 +21,8 @@ _ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
 class NavigationContent:
     """Records and header content collected from one or several files.
 
-    Attributes
-    ----------
-    broken_lines : {"stop", "count"}
-        A broken record stops the reading, or is counted and noted.
-    records : list of RawRecord
-    klobuchar : dict of str to list of float
-        Eight coefficients by constellation, as received.
-    leap_seconds : int or None
-    skipped : Counter of str
-    notes : list of str
-    seen : set
-        Content of the records, to find duplicates.
+    `klobuchar` has eight coefficients by constellation, as received; `seen` the content of the records, to find
+    duplicates.
     """
 
     broken_lines: BrokenLines
@@ -80,10 +70,7 @@ class NavigationContent:
 def read_header(path: FilePath, lines: list[str], content: NavigationContent) -> tuple[float, str, int]:
     """Read version, file type letter and index of the first line after the header.
 
-    Raises
-    ------
-    InputFileError
-        The file is not a RINEX navigation file of version 2, 3 or 4, or its header is broken.
+    InputFileError: the file is not a RINEX navigation file of version 2, 3 or 4, or its header is broken.
     """
     version, kind = _version(path, lines[0] if lines else "")
     for i, line in enumerate(lines):

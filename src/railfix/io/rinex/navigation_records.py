@@ -76,10 +76,7 @@ class RawRecord:
 def number(text: str) -> float:
     """Parse one FORTRAN number; blank and 0.9999E9 are the same NaN object, so that equal records compare equal.
 
-    Raises
-    ------
-    ValueError
-        The text is not a finite number.
+    ValueError: the text is not a finite number.
     """
     text = text.strip()
     if not text:

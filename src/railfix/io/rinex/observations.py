@@ -23,16 +23,16 @@ An error in the header that changes how the file is read is always raised.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from os import PathLike
 from typing import Final, get_args
 
 import numpy as np
 
+from railfix.core.arrays import Masks
 from railfix.core.errors import InputFileError, MismatchError
-from railfix.core.files import BrokenLines, FilePath
+from railfix.core.files import BrokenLines, Paths, listed
 from railfix.gnss.observations import Observations, channels_with_data, concatenate
 from railfix.io.rinex.observations_blocks import BlockReader, Selection
 from railfix.io.rinex.observations_signals import SYSTEMS
@@ -42,8 +42,6 @@ DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
 #: A step between files is a gap when it is longer than this many intervals.
 _GAP_INTERVALS: Final = 1.5
-
-Paths = FilePath | Sequence[FilePath]
 
 
 def read_observations(
@@ -85,7 +83,7 @@ def read_observations(
     Use `scan_observations` for logs that do not fit into memory.
     """
     selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return concatenate(list(_runs(_as_list(path), selection)))
+    return concatenate(list(_runs(listed(path), selection)))
 
 
 def scan_observations(
@@ -98,12 +96,11 @@ def scan_observations(
     end: np.datetime64 | str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[Observations]:
-    """Read the observation file or files of one receiver piece by piece.
+    """Read the observation file or files of one receiver piece by piece; the other arguments are as
+    `read_observations`.
 
     Parameters
     ----------
-    path, broken_lines, systems, start, end
-        As `read_observations`; the pieces concatenated equal its result.
     epochs : int
         Epochs of a piece; the last may have fewer.
     progress : callable, optional
@@ -112,7 +109,8 @@ def scan_observations(
     Yields
     ------
     Observations
-        Each piece has the channels that occur in it. Memory is that of a piece and one block of text.
+        Each piece has the channels that occur in it; concatenated they are the log. Memory is that of a piece and one
+        block of text.
 
     Raises
     ------
@@ -122,14 +120,7 @@ def scan_observations(
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was asked for")
     selection = _selection(broken_lines=broken_lines, systems=systems, start=start, end=end)
-    return in_pieces(_runs(_as_list(path), selection, progress), epochs)
-
-
-def _as_list(path: Paths) -> list[str]:
-    paths = [path] if isinstance(path, str | PathLike) else list(path)
-    if not paths:
-        raise ValueError("no observation file was given")
-    return [str(p) for p in paths]
+    return in_pieces(_runs(listed(path), selection, progress), epochs)
 
 
 def _selection(
@@ -231,12 +222,15 @@ def without_empty_channels(observations: Observations) -> Observations:
     """Drop the channels that have neither an observation nor a loss-of-lock digit."""
     arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")
     used = channels_with_data([getattr(observations, name) for name in arrays], observations.loss_of_lock)
-    if used.all():
-        return observations
+    return observations if used.all() else of_channels(observations, used)
+
+
+def of_channels(observations: Observations, kept: Masks) -> Observations:
+    """Some of the channels, shape (M,)."""
+    arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
     return replace(
         observations,
-        satellite=observations.satellite[used],
-        signal=observations.signal[used],
-        loss_of_lock=observations.loss_of_lock[:, used],
-        **{name: getattr(observations, name)[:, used] for name in arrays},
+        satellite=observations.satellite[kept],
+        signal=observations.signal[kept],
+        **{name: getattr(observations, name)[:, kept] for name in arrays},
     )

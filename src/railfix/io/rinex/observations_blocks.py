@@ -32,13 +32,8 @@ _BEFORE_ALL: Final = np.iinfo(np.int64).min
 class Selection:
     """Selection of constellations and time span, and treatment of broken lines.
 
-    Attributes
-    ----------
-    broken_lines : {"stop", "count"}
-    systems : frozenset of str or None
-        Constellation letters; None for all.
-    start_ns, end_ns : int
-        Time tags from `start_ns` up to, not including, `end_ns`, since 1970 in GPS time.
+    `systems` are letters, None for all; time tags are from `start_ns` up to, not including, `end_ns`, since 1970 in GPS
+    time.
     """
 
     broken_lines: BrokenLines = "stop"
@@ -50,13 +45,7 @@ class Selection:
 class BlockReader:
     """Reader of one file from beginning to end.
 
-    Parameters
-    ----------
-    path : path-like
-    selection : Selection
-    after_ns : int, optional
-        Time tags must be later than this one (of the file before).
-    block_bytes : int, optional
+    `after_ns`: time tags must be later than this one (of the file before).
 
     Attributes
     ----------

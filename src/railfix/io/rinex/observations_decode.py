@@ -32,16 +32,8 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 class Rows:
     """Satellites of a run of epochs, shape (n,) each.
 
-    Attributes
-    ----------
-    epoch : ndarray of int64
-        Index of the epoch.
-    letter : ndarray of uint8
-        Constellation letter.
-    number : ndarray of int64
-        Satellite number; -1 where the name cannot be read.
-    line : ndarray of int64
-        Index of the (first) line of observations.
+    Index of the epoch, constellation letter (uint8), satellite number (-1 where the name cannot be read), and index of
+    the (first) line of observations.
     """
 
     epoch: Integers
@@ -255,22 +247,18 @@ def _scatter(parts: list[tuple[str, Rows, Fields, tuple[Column, ...]]], epochs: 
 def placed_fields(
     kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
 ) -> tuple[Floats, Bytes]:
-    """Put fields in their places of the dense arrays; zeros are absent.
+    """Put fields in their places of the dense arrays, which are filled in place and returned; zeros are absent.
 
     Parameters
     ----------
     kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
-        By kind of observable; filled in place.
+        By kind of observable.
     cell : ndarray of int, shape (n,)
         Epoch times M plus the first channel of the satellite, of each line.
     kind, signal : ndarray of int, shape (k,)
         Of each field: its kind of observable, and its channel among those of the satellite.
     value, digit : ndarray, shape (n, k)
         Values, and loss-of-lock digits.
-
-    Returns
-    -------
-    kinds, lock
     """
     flat, flat_lock = kinds.reshape(len(kinds), -1), lock.reshape(-1)
     for j in range(len(kind)):

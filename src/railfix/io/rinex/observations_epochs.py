@@ -19,13 +19,7 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 class Epochs:
     """Epochs and events of a block in the order of the file, shape (n,) each.
 
-    Attributes
-    ----------
-    line : ndarray of int64
-        Index of the epoch line.
-    flag, count : ndarray of int64
-    time_ns : ndarray of int64
-        Time tag since 1970 in the file's time system (0 for events).
+    `line` is the index of the epoch line, `time_ns` the tag since 1970 in the file's time system (0 for events).
     """
 
     line: Integers
@@ -45,17 +39,8 @@ def find_epochs(
 ) -> tuple[Epochs, int]:
     """Find the complete epochs and events of a block, and the number of lines they and broken lines take.
 
-    Parameters
-    ----------
-    lines : Lines
-        Complete lines, from the first line of a record.
-    version : float
-        RINEX version.
-    lines_per_satellite : int
-        RINEX 2: number of lines of five observations of a satellite.
-    at_end : bool
-        Whether the file ends with these lines; if not, the last epoch waits for the next block.
-    log : FaultLog
+    `lines` are complete ones from the first of a record; where the file does not end with them (`at_end`) the last
+    epoch waits for the next block. `lines_per_satellite` is for RINEX 2, with lines of five observations.
     """
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
@@ -78,11 +63,11 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
     if waits:
         done = int(line[-1])
         line, room = line[:-1], room[:-1]
-        head = _first(head, len(line))
+        head = head[: len(line)]
     broken = head.flaw != 0
     if at_end and len(line) and not room[-1] and lines.length[line[-1]] < epoch_width(version):
         log.fault(EPOCHS, int(lines.number[-1]), _CUT_EPOCH_LINE)
-        line, room, broken, head = line[:-1], room[:-1], broken[:-1], _first(head, len(line) - 1)
+        line, room, broken, head = line[:-1], room[:-1], broken[:-1], head[: len(line) - 1]
     log.faults(
         EPOCHS,
         lines.number[line[broken]],
@@ -113,7 +98,7 @@ def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log:
     read = read_epoch_lines(lines, likely, version=2.0)
     fine = read.flaw == 0
     line = likely[fine]
-    head = EpochLines(*(getattr(read, name)[fine] for name in ("flag", "count", "time_ns", "flaw")))
+    head = read[fine]
     event = (head.flag >= 2) & (head.flag <= 5)
     satellite_lines = np.maximum(-(-head.count // 12), 1) - 1 + head.count * lines_per_satellite
     following = line + 1 + np.where(event, head.count, satellite_lines)
@@ -220,10 +205,6 @@ class _Walk:
 def _none() -> Epochs:
     nothing = np.zeros(0, dtype=np.int64)
     return Epochs(nothing, nothing, nothing, nothing)
-
-
-def _first(head: EpochLines, count: int) -> EpochLines:
-    return EpochLines(head.flag[:count], head.count[:count], head.time_ns[:count], head.flaw[:count])
 
 
 def _no_epoch(lines: Lines, line: int, version: float) -> str:

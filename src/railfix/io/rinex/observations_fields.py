@@ -72,11 +72,11 @@ class Fields:
 
     Attributes
     ----------
-    value : ndarray of float64, shape (n, k)
+    value : ndarray of float64
         NaN where blank, and where `bad`.
-    lock : ndarray of uint8, shape (n, k)
+    lock : ndarray of uint8
         Loss-of-lock digit, 0 where blank.
-    bad : ndarray of bool, shape (n, k)
+    bad : ndarray of bool
         The field is neither blank nor a number, or one of its two indicators is no digit.
     """
 
@@ -125,20 +125,9 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
 
 
 def read_fields(data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats) -> Fields:
-    """Read fields of lines.
+    """Read some fields of lines (`index`, shape (k,)); `data`, `start` and `length` are as for `gather`.
 
-    Parameters
-    ----------
-    data, start, length
-        As for `gather`.
-    index : ndarray of int, shape (k,)
-        Which fields of each line.
-    divisor : ndarray, shape (k,)
-        Divisor of the written value (SYS / SCALE FACTOR; 1 where there is none).
-
-    Returns
-    -------
-    Fields
+    Values are divided by `divisor`, shape (k,) (SYS / SCALE FACTOR; 1 where there is none).
     """
     value, lock, odd = decoded_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
@@ -158,14 +147,8 @@ def decoded_fields(
 ) -> tuple[Floats, Bytes, Masks]:
     """Decode the fields of the usual form, shape (n, k); the arguments are those of `read_fields`.
 
-    Returns
-    -------
-    value : ndarray of float64
-        NaN where blank or of another form.
-    lock : ndarray of uint8
-        Loss-of-lock digit; 255 where the last two characters are neither blanks nor digits.
-    odd : ndarray of bool
-        The field has another form.
+    Values, NaN where blank or of another form; loss-of-lock digits (uint8), 255 where the last two characters are
+    neither blanks nor digits; and which fields have another form.
     """
     words = gather(data, start, length, int(index.max()) + 1)
     if len(index) < words.shape[1]:

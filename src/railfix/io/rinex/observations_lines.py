@@ -60,16 +60,9 @@ class Lines:
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block into lines; what follows its last line end belongs to none.
+    """Split a block, followed by `PADDING` blanks, into lines; what follows its last line end belongs to none.
 
-    Parameters
-    ----------
-    text : bytes
-        Followed by `PADDING` blanks.
-    first_number : int
-        Line number of the first line.
-    keep_blank : bool
-        Whether empty lines are kept (RINEX 2: a satellite without observations).
+    Empty lines are kept for RINEX 2, where they are satellites without observations.
     """
     data = np.frombuffer(text, dtype=np.uint8)
     end = line_ends(data)
@@ -94,20 +87,17 @@ def line_ends(data: Bytes) -> Integers:
 class EpochLines:
     """Numbers of epoch lines, shape (n,) each.
 
-    Attributes
-    ----------
-    flag, count : ndarray of int64
-        Epoch flag, and number of satellites (or of records, for events); -1 where unreadable.
-    time_ns : ndarray of int64
-        Time tag since 1970 in the file's time system; 0 where unreadable.
-    flaw : ndarray of int64
-        Index into `FLAWS`, 0 for a valid line.
+    Epoch flag and number of satellites (or of records, for events), -1 where unreadable; time tag since 1970 in the
+    file's time system, 0 where unreadable; index into `FLAWS`, 0 for a valid line.
     """
 
     flag: Integers
     count: Integers
     time_ns: Integers
     flaw: Integers
+
+    def __getitem__(self, which: slice | Masks) -> EpochLines:
+        return EpochLines(self.flag[which], self.count[which], self.time_ns[which], self.flaw[which])
 
 
 FLAWS: Final = (

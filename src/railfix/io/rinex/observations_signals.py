@@ -55,18 +55,8 @@ _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "
 class Column:
     """Column of an observation type in the satellite lines of a constellation.
 
-    Attributes
-    ----------
-    index : int
-        Position among the declared types.
-    name : str
-        The type as declared, "C1C" or "P2".
-    kind : int
-        Position in `KINDS`.
-    signal : str
-        "1C".
-    divisor : float
-        Divisor of the written value.
+    Position among the declared types, type as declared ("C1C" or "P2"), position in `KINDS`, signal ("1C"), and divisor
+    of the written value.
     """
 
     index: int
@@ -79,16 +69,7 @@ class Column:
 def signal_of(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
     """Return the signal of an observation type; None for types of no signal (X1, T1, I1).
 
-    Parameters
-    ----------
-    name : str
-        "C1C" (RINEX 3, 4), "P2" (RINEX 2).
-    system : str
-        Constellation letter.
-    version : float
-        RINEX version.
-    declared : sequence of str
-        All types of the header for this constellation.
+    The type is "C1C" (RINEX 3, 4) or "P2" (RINEX 2); `declared` are all types of the header for the constellation.
     """
     if version >= 3.0:
         if name[0] not in KINDS:

@@ -39,16 +39,8 @@ def packing_of(path: FilePath) -> Packing:
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
     """Open a stream whose bytes are packed into a file; the file appears where the block ends without error.
 
-    Parameters
-    ----------
-    path : path-like
-    packing : {"plain", "gz", "crx", "crx.gz"}, optional
-        By default from the file name (`packing_of`). "crx" takes RINEX observation text.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written, or `rnx2crx` rejects the text.
+    The packing is by default that of the file name (`packing_of`); "crx" takes RINEX observation text. OutputError: the
+    file cannot be written, or `rnx2crx` rejects the text.
     """
     kind = packing_of(path) if packing is None else packing
     if kind not in get_args(Packing):

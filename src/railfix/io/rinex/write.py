@@ -106,13 +106,6 @@ def _columns(first: Observations, given: Mapping[str, Sequence[str]] | None) -> 
 # ---------------------------------------------------------------- header
 
 
-def _calendar(time: np.datetime64) -> tuple[int, int, int, int, int, int]:
-    """Split one time into year, month, day, hour, minute and the rest in 100 ns."""
-    values = _split_time(np.array([time], dtype="datetime64[ns]"))
-    year, month, day, hour, minute, ticks = (int(v[0]) for v in values)
-    return year, month, day, hour, minute, ticks
-
-
 def _observation_header(
     first: Observations,
     header: ObservationHeader,
@@ -124,7 +117,7 @@ def _observation_header(
     systems = list(columns)
     letter = systems[0] if len(systems) == 1 else "M"
     place = np.nan_to_num(header.approximate_ecef_m)
-    year, month, day, hour, minute, ticks = _calendar(first.time[0])
+    year, month, day, hour, minute, ticks = (int(part[0]) for part in _split_time(first.time[:1]))
     date = f"{year:6d}{month:6d}{day:6d}{hour:6d}{minute:6d}{ticks // 10_000_000:5d}.{ticks % 10_000_000:07d}"
     lines = [
         header_line(f"{version:>9}{'':11}{'OBSERVATION DATA':<20}{letter:<20}", "RINEX VERSION / TYPE"),
