@@ -165,23 +165,23 @@ def test_neighbours_pass_with_their_speed_and_headway() -> None:
         chainage_m=np.full(n, 300.0), height_m=4.0, x=np.full(n, ray.x[0]), y=np.full(n, ray.y[0]),
         z=np.full(n, ray.z[0]), wavelength_m=np.full(n, WAVE),
     )  # fmt: skip
-    v = neighbour_clearance(train, many, time, side=1.0)
+    v = neighbour_clearance(train, many, time)
     assert (v > 0.0).mean() == pytest.approx(0.1, abs=0.003)
     np.testing.assert_allclose(v[:-500], v[500:], atol=1e-6)
     # At 20 m/s toward rising chainage: a second later it is the same 20 m further on.
-    further = neighbour_clearance(train, replace(many, chainage_m=np.full(n, 320.0)), time + 1.0, side=1.0)
+    further = neighbour_clearance(train, replace(many, chainage_m=np.full(n, 320.0)), time + 1.0)
     np.testing.assert_allclose(further, v, atol=1e-6)
     # 2.5 m off, 2 m over the antenna: hides up to atan(2 / 2.5) = 38.7 deg; left of the train nothing.
     inside = float(time[np.argmax(v)])
     for elevation, hidden in ((37.0, True), (41.0, False)):
-        there = neighbour_clearance(train, rays(300.0, elevation, 90.0), np.array([inside]), side=1.0)[0]
+        there = neighbour_clearance(train, rays(300.0, elevation, 90.0), np.array([inside]))[0]
         assert (there > 0.0) == hidden
-    assert neighbour_clearance(train, rays(300.0, 10.0, -90.0), np.array([inside]), side=1.0)[0] == -99.0
+    assert neighbour_clearance(train, rays(300.0, 10.0, -90.0), np.array([inside]))[0] == -99.0
     # A satellite on the left is mirrored in its side: 2 * 2.5 m * cos(10 deg) further, when a train is there.
-    amplitude, extra, _ = neighbour_reflection(train, rays(300.0, 10.0, -90.0), np.array([inside]), side=1.0)
+    amplitude, extra, _ = neighbour_reflection(train, rays(300.0, 10.0, -90.0), np.array([inside]))
     assert amplitude[0] == pytest.approx(train.reflection, rel=1e-6)
     assert extra[0] == pytest.approx(5.0 * np.cos(np.radians(10.0)))
-    away = neighbour_reflection(train, rays(300.0, 10.0, -90.0), np.array([inside + 25.0]), side=1.0)
+    away = neighbour_reflection(train, rays(300.0, 10.0, -90.0), np.array([inside + 25.0]))
     assert away[0][0] < 0.01
 
 

@@ -53,30 +53,17 @@ GRADIENT: Final = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Alignment:
+class Alignment(Knots):
     """A line of given elements.
 
     Attributes
     ----------
     settings : LineSettings
-    knot_m : ndarray, shape (K,) [m]
-        Chainage of the elements' ends, beginning with 0.
-    curvature : ndarray, shape (K,) [1/m]
-        In plan, positive to the right, linear between knots.
-    lean_m : ndarray, shape (K,) [m]
-        Cant, positive where the vehicle leans to the right, linear between knots.
-    grade_knot_m, grade : ndarray, shape (G,)
-        Chainage [m] and gradient [m/m, climb over plan length], linear between.
     file : FileLine or None
         The curve through the points of a track file, in place of the integrated one.
     """
 
     settings: LineSettings
-    knot_m: Floats
-    curvature: Floats
-    lean_m: Floats
-    grade_knot_m: Floats
-    grade: Floats
     file: FileLine | None = None
 
     @property
@@ -178,34 +165,20 @@ class Alignment:
 def build_alignment(settings: LineSettings) -> Alignment:
     """The line of a scenario, of any of the four kinds.
 
-    Raises
-    ------
-    SettingsError
-        The elements do not make a line.
-    InputFileError
-        The track file cannot be read, or is too rough for a line.
+    SettingsError: when the elements do not make a line. InputFileError: when the track file cannot be read, or is too
+    rough for a line.
     """
     if settings.kind == "file":
         assert settings.file is not None
         line = line_of_file(settings.file)
-        return _of_knots(settings, line.knots, line)
+        return Alignment(settings=settings, file=line, **vars(line.knots))
     if settings.kind == "elements":
-        return _of_knots(settings, knots_of_elements(settings.elements, settings.gradients))
-    if settings.kind == "generated":
-        return _of_knots(settings, generated_knots(settings))
-    return _of_knots(settings, _pattern_knots(settings.length_m))
-
-
-def _of_knots(settings: LineSettings, knots: Knots, file: FileLine | None = None) -> Alignment:
-    return Alignment(
-        settings=settings,
-        knot_m=knots.knot_m,
-        curvature=knots.curvature,
-        lean_m=knots.lean_m,
-        grade_knot_m=knots.grade_knot_m,
-        grade=knots.grade,
-        file=file,
-    )
+        knots = knots_of_elements(settings.elements, settings.gradients)
+    elif settings.kind == "generated":
+        knots = generated_knots(settings)
+    else:
+        knots = _pattern_knots(settings.length_m)
+    return Alignment(settings=settings, **vars(knots))
 
 
 def _pattern_knots(length_m: float) -> Knots:

@@ -45,25 +45,17 @@ def antenna_truth(
     sway_rad: Floats | float = 0.0,
     pitch_rad: Floats | None = None,
 ) -> AntennaTruth:
-    """True position of an antenna.
+    """True position of an antenna at n positions of the vehicle's middle.
 
     Parameters
     ----------
-    line : Alignment
-    vehicle : VehicleSettings
     offset_m : tuple of float
         Along, across to the right, above the rail tops [m].
     middle_m : ndarray, shape (n,) [m]
         Chainage midway between the bogies' chainages.
-    sway_rad : ndarray, shape (n,), or float [rad]
-        Lean to the right beyond that of the cant.
-    pitch_rad : ndarray, shape (n,) [rad], optional
-        Pitch beyond that of the gradient, about the point between the bogies at the rail tops; positive where
-        the front rises.
-
-    Returns
-    -------
-    AntennaTruth
+    sway_rad, pitch_rad : ndarray, shape (n,), or float [rad]
+        Lean to the right beyond that of the cant; pitch beyond that of the gradient, about the point between the
+        bogies at the rail tops, positive where the front rises.
     """
     middle = np.asarray(middle_m, dtype=np.float64)
     half = np.full(middle.shape, vehicle.bogie_distance_m / 2.0)

@@ -26,15 +26,7 @@ _MARGIN_S: Final = 2.0
 
 
 class BodyMotion:
-    """Roll and pitch of a scenario's vehicle over time.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Its `seed` decides.
-    motion : Motion
-        Of the vehicle's middle.
-    """
+    """Roll and pitch of a scenario's vehicle over time; the seed of the scenario decides."""
 
     def __init__(self, scenario: Scenario, motion: Motion) -> None:
         vehicle = self._vehicle = scenario.vehicle

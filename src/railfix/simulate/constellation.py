@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from railfix.core.constants import BDT_MINUS_GPST_S, EARTH_ROTATION_RATE, GM_GPS
-from railfix.core.timescale import gpst_minus_utc, to_week
+from railfix.core.timescale import gpst_minus_utc, timedelta, to_week
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.kepler import GM, ROTATION
 from railfix.simulate.navigation_file import navigation_of_file, no_glonass
@@ -49,11 +49,7 @@ def simulated_navigation(scenario: Scenario) -> Navigation:
 
     All values are already rounded to the digits of the file, so that the file and the arrays are the
     same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.navigation_file`).
-
-    Raises
-    ------
-    InputFileError, MismatchError
-        The navigation file cannot be read, or does not serve the scenario's time.
+    InputFileError, MismatchError: when that file cannot be read, or does not serve the scenario's time.
     """
     if scenario.sky.nav is not None:
         return navigation_of_file(scenario, scenario.sky.nav)
@@ -170,8 +166,8 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
     for k in range(count):
         sent_sow = first + k * every + _SENT_AFTER_S
         dt = first + (k + 1) * every - start_sow - shift
-        toe = scenario.start + _whole_seconds(dt)
-        _, toe_sow = to_week(toe + _whole_seconds(shift))
+        toe = scenario.start + timedelta(dt)
+        _, toe_sow = to_week(toe + timedelta(shift))
         # Longitude of the node at toe, and back to the start of the week as the records count it.
         node = orbit.node + (drift - rotation) * dt + rotation * float(toe_sow)
         ill = orbit.name in scenario.sky.unhealthy and sent_sow + every > start_sow
@@ -188,7 +184,7 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
             row
             | {
                 "satellite": orbit.name, "message": _MESSAGE[system], "toc": toe, "toe": toe,
-                "transmitted": scenario.start + _whole_seconds(sent_sow - start_sow),
+                "transmitted": scenario.start + timedelta(sent_sow - start_sow),
                 "health": _ill_health(system) if ill else 0,
                 "iode": issue + k, "iodc": issue + k, "data_source": _INAV_SOURCE if system == "E" else 0,
             }
@@ -199,10 +195,6 @@ def _issues(system: str, orbit: _Orbit, scenario: Scenario, rng: np.random.Gener
 def _ill_health(system: str) -> int:
     """As broadcast: all navigation data bad (GPS, QZSS), E1-B and E5b out of service (Galileo), SatH1 (BeiDou)."""
     return {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}[system]
-
-
-def _whole_seconds(value: float) -> np.timedelta64:
-    return np.timedelta64(round(value * 1e9), "ns")
 
 
 def _wrapped(angle: float) -> float:

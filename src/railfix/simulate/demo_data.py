@@ -22,10 +22,7 @@ DEMO_FILES: Final = {
 def demo_folder() -> Path:
     """Folder of the demonstration run: in an installed package, or in the clone it runs from.
 
-    Raises
-    ------
-    InputFileError
-        Neither has it, or a file is missing.
+    InputFileError: when neither has it, or a file is missing.
     """
     package = Path(__file__).resolve().parents[1]
     places = (package / "_demo", package.parents[1] / "data" / "demo")
@@ -41,10 +38,7 @@ def demo_folder() -> Path:
 def demo_files() -> dict[str, Path]:
     """Files of the demonstration run: ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``readme``.
 
-    Raises
-    ------
-    InputFileError
-        As `demo_folder`.
+    InputFileError: as `demo_folder`.
     """
     folder = demo_folder()
     return {name: folder / file for name, file in DEMO_FILES.items()}

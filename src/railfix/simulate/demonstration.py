@@ -9,13 +9,7 @@ from railfix.simulate.demo_data import demo_files
 
 
 def demo_inputs() -> RunInputs:
-    """The files of the demonstration run.
-
-    Raises
-    ------
-    InputFileError
-        They are not where the package or the clone has them.
-    """
+    """The files of the demonstration run; InputFileError where neither the package nor the clone has them."""
     files = demo_files()
     return RunInputs(
         front=(files["front"],),
@@ -27,11 +21,5 @@ def demo_inputs() -> RunInputs:
 
 
 def demo_truth() -> Path:
-    """File of the reference trajectory of the demonstration run, for `railfix.evaluate`.
-
-    Raises
-    ------
-    InputFileError
-        It is not where the package or the clone has it.
-    """
+    """File of the reference trajectory of the demonstration run, for `railfix.evaluate`; InputFileError without."""
     return demo_files()["truth"]

@@ -57,23 +57,12 @@ class Motion:
 
 
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
-    """Moving average of a motion over the time that keeps its jerk within a limit.
+    """Moving average of a motion of constant accelerations over the time that keeps its jerk within a limit.
 
     The average of the chainage over [t - T, t] has the speed ``(s(t) - s(t - T)) / T``, the acceleration
     ``(v(t) - v(t - T)) / T`` and the jerk ``(a(t) - a(t - T)) / T``: it never exceeds the motion's
     own largest speed and acceleration, stops at the same chainages, and is late by T / 2. A stop shorter than
     T is not reached.
-
-    Parameters
-    ----------
-    motion : Motion
-        Pieces of constant acceleration.
-    jerk_mps3 : float [m/s^3]
-
-    Returns
-    -------
-    Motion
-        Pieces of constant jerk.
     """
     start = motion.time_s
     duration = float(np.abs(np.diff(motion.acceleration_mps2, prepend=0.0)).max()) / jerk_mps3

@@ -31,9 +31,10 @@ class Knots:
     Attributes
     ----------
     knot_m, curvature, lean_m : ndarray, shape (K,)
-        Chainage from 0 [m]; right positive [1/m]; cant, positive where the vehicle leans right [m].
+        Chainage of the elements' ends from 0 [m]; in plan, right positive [1/m]; cant, positive where the vehicle
+        leans right [m].
     grade_knot_m, grade : ndarray, shape (G,)
-        Chainage [m] and gradient [m/m].
+        Chainage [m] and gradient [m/m, climb over plan length].
     """
 
     knot_m: Floats
@@ -46,11 +47,8 @@ class Knots:
 def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]) -> Knots:
     """Knots of a line of given elements.
 
-    Raises
-    ------
-    SettingsError
-        A curve meets a straight or another curve without a transition; two transitions in a row;
-        vertical curves that overlap or lie beyond the ends.
+    SettingsError: when a curve meets a straight or another curve without a transition, two transitions follow each
+    other, or vertical curves overlap or lie beyond the ends.
     """
     for k, (element, following) in enumerate(pairwise(elements)):
         both = {element.kind, following.kind}

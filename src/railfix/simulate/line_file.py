@@ -52,11 +52,8 @@ class FileLine:
 def line_of_file(settings: LineFile) -> FileLine:
     """The line through the points of a track file.
 
-    Raises
-    ------
-    InputFileError
-        The file is no track map, has fewer than four points in the part asked for, or bends too
-        sharply to be a line.
+    InputFileError: when the file is no track map, has fewer than four points in the part asked for, or bends too
+    sharply to be a line.
     """
     track = read_track(
         settings.path,

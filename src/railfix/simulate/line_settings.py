@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from railfix.simulate.setting_types import Between, Finite, NotNegative, Positive, ScenarioSettings, Seed
+from railfix.simulate.setting_types import (
+    Between,
+    Finite,
+    NotNegative,
+    Positive,
+    ScenarioSettings,
+    Seed,
+    at_least,
+    beyond_start,
+)
 
 #: Length of the pattern of P1's test line [m], and of a generated line, where none is given.
 PATTERN_LENGTH_M: Final = 756.0
@@ -82,19 +91,11 @@ class Terrain(ScenarioSettings):
     """
 
     from_m: NotNegative = 0.0
-    straight_m: Between = (200.0, 1500.0)
-    curve_m: Between = (100.0, 500.0)
-    radius_m: Between = (400.0, 1600.0)
+    straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)
+    curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
+    radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)
     permille: float = Field(default=10.0, ge=0.0, le=35.0)
-    gradient_m: Between = (400.0, 1500.0)
-
-    @field_validator("straight_m", "curve_m", "radius_m", "gradient_m")
-    @classmethod
-    def _long_enough(cls, pair: tuple[float, float], info: Any) -> tuple[float, float]:
-        least = {"radius_m": 100.0, "gradient_m": 200.0}.get(info.field_name, 1.0)
-        if pair[0] < least:
-            raise ValueError(f"must begin at {least:g} m or more")
-        return pair
+    gradient_m: Annotated[Between, at_least(200.0)] = (400.0, 1500.0)
 
 
 class GeneratedLine(ScenarioSettings):
@@ -147,12 +148,7 @@ class LineFile(ScenarioSettings):
     height_datum: str = ""
     geoid: str = ""
 
-    @field_validator("to_m")
-    @classmethod
-    def _beyond(cls, to_m: float, info: Any) -> float:
-        if not to_m > info.data.get("from_m", -math.inf):
-            raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
-        return to_m
+    _forward = field_validator("to_m")(beyond_start)
 
 
 class MapError(ScenarioSettings):

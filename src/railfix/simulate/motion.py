@@ -26,21 +26,8 @@ _RAIL_HEAD_M: Final = 0.070
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
     """Motion of the vehicle's middle: a shuttle, or a run curve where stations, limits or the like are given.
 
-    Parameters
-    ----------
-    line : Alignment
-    scenario : Scenario
-    duration_s : float, optional
-        Without it the scenario's; 0: one way, to the last stop and its stand.
-
-    Returns
-    -------
-    Motion
-
-    Raises
-    ------
-    SettingsError
-        The train has no room on the line.
+    Its duration is the scenario's unless given; 0: one way, to the last stop and its stand. SettingsError: when the
+    train has no room on the line.
     """
     settings = scenario.run
     scenario.check_room(line.length_m)
@@ -56,18 +43,7 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Motion between two chainages, standing at each, for at least a duration.
-
-    Parameters
-    ----------
-    first_m, last_m : float [m]
-    duration_s : float [s]
-    settings : RunSettings
-
-    Returns
-    -------
-    Motion
-    """
+    """Motion between two chainages, standing at each, for at least a duration."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
@@ -90,20 +66,9 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
 
 
 def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, contact_m: float) -> Motion:
-    """Motion from stop to stop at the highest allowed speed, for at least a duration.
+    """Motion from stop to stop at the highest allowed speed, for at least a duration and to the last stop at least.
 
-    Parameters
-    ----------
-    line : Alignment
-    settings : RunSettings
-    duration_s : float [s]
-        The train goes to its last stop at least.
-    contact_m : float [m]
-        Distance of the wheels' contact points, for the speed in canted curves.
-
-    Returns
-    -------
-    Motion
+    The distance of the wheels' contact points gives the speed in canted curves.
     """
     margin = settings.end_margin_m
     ends = (

@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Indices, Masks
 from railfix.core.errors import MismatchError
-from railfix.core.timescale import gpst_minus_utc
+from railfix.core.timescale import gpst_minus_utc, timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex import read_navigation
 from railfix.simulate.scenario import Scenario
@@ -31,14 +31,8 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
 
     A satellite takes part when at every moment of the run the newest record transmitted is within its
     validity. Galileo's are the I/NAV ones. A transmission time that is absent is set to
-    the constellation's usual one. Klobuchar's coefficients are GPS'; they serve all.
-
-    Raises
-    ------
-    InputFileError
-        The file is no navigation file.
-    MismatchError
-        The scenario's time is not within the file's records, or the file lacks Klobuchar's coefficients.
+    the constellation's usual one. Klobuchar's coefficients are GPS'; they serve all. InputFileError: when it is no
+    navigation file. MismatchError: when the scenario's time is not within its records, or it lacks the coefficients.
     """
     navigation = read_navigation(path)
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
@@ -89,10 +83,7 @@ def _believed(records: KeplerRecords, systems: str) -> KeplerRecords:
     for system in systems:
         usable |= (letter == system) & np.isin(records.message, _SIGNALS_MESSAGE[system]) & np.isfinite(delay)
     records, letter = _rows(records, usable), letter[usable]
-    serves, before = (
-        np.array([round(table[str(s)] * 1e9) for s in letter], dtype="timedelta64[ns]")
-        for table in (_SERVES_S, _SENT_BEFORE_S)
-    )
+    serves, before = (timedelta([table[str(s)] for s in letter]) for table in (_SERVES_S, _SENT_BEFORE_S))
     early = records.toe - records.transmitted
     plausible = ~np.isnat(records.transmitted) & (np.abs(early) <= serves)
     return replace(records, transmitted=np.where(plausible, records.transmitted, records.toe - before))
@@ -109,7 +100,7 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     if begin == 0 or not len(rows):
         return np.empty(0, dtype=np.intp)
     rows = rows[begin - 1 : end]
-    limit = np.timedelta64(round(_SERVES_S[satellite[0]] * 1e9), "ns")
+    limit = timedelta(_SERVES_S[satellite[0]])
     from_time = np.maximum(records.transmitted[rows], first)
     to_time = np.append(records.transmitted[rows][1:], last)
     served = (np.abs(from_time - records.toe[rows]) <= limit) & (np.abs(to_time - records.toe[rows]) <= limit)

@@ -16,14 +16,7 @@ from railfix.simulate.errors.settings import NoiseSettings, TrackingSettings
 class CarriedNoise:
     """Correlated noise of a receiver's channels, chunk by chunk; results do not depend on the chunks.
 
-    Parameters
-    ----------
-    settings : NoiseSettings
-    key : sequence of int
-        Seed, another one for each receiver.
-    channels : int
-    interval_s : float
-        Of the epochs.
+    The key is the seed, another one for each receiver.
     """
 
     def __init__(self, settings: NoiseSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:
@@ -61,16 +54,8 @@ class _FirstOrder:
 class CodeSmoothing:
     """Filter of first order on the code errors of a receiver's channels, restarted after each loss of lock.
 
-    ``y[k] = y[k-1] + (1 - exp(-interval / time)) (x[k] - y[k-1])``, y = x at the first epoch of a lock. The state is
-    carried from chunk to chunk.
-
-    Parameters
-    ----------
-    time_s : float
-        Time constant; 0: no filter.
-    channels : int
-    interval_s : float
-        Of the epochs.
+    ``y[k] = y[k-1] + (1 - exp(-interval / time)) (x[k] - y[k-1])``, y = x at the first epoch of a lock; a time constant
+    of 0 is no filter. The state is carried from chunk to chunk.
     """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
@@ -117,14 +102,7 @@ class LockState:
 class Tracking:
     """Loss of lock and re-acquisition of a receiver's channels; the state is carried from chunk to chunk.
 
-    Parameters
-    ----------
-    settings : TrackingSettings
-    key : sequence of int
-        Seed of the slips, another one for each receiver.
-    channels : int
-    interval_s : float
-        Of the epochs.
+    The key is the seed of the slips, another one for each receiver.
     """
 
     def __init__(self, settings: TrackingSettings, *, key: Sequence[int], channels: int, interval_s: float) -> None:

@@ -25,18 +25,9 @@ _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
 class Receiver:
-    """One receiver's channels, and its state that is carried between chunks.
+    """One receiver's channels (satellite and signal of each), and its state that is carried between chunks.
 
-    Parameters
-    ----------
-    scenario : Scenario
-    antenna : {"front", "rear"}
-    header : ObservationHeader
-    channels : sequence of (str, str)
-        Satellite and signal of each.
-    satellites : sequence of str
-        Columns of the sky, in alphabetical order.
-    common_errors : CommonErrors
+    The satellites are the columns of the sky, in alphabetical order.
     """
 
     def __init__(

@@ -32,16 +32,12 @@ _COMMENTS: Final = ("SIMULATED: NO RECEIVER HAS MEASURED ANYTHING OF THIS FILE",
 
 
 def truth_table(simulation: Simulation) -> pl.DataFrame:
-    """Ground truth of the antennas at the epochs of their receivers.
+    """Ground truth of the antennas at the epochs of their receivers, one row an epoch and antenna.
 
-    Returns
-    -------
-    polars.DataFrame
-        One row an epoch and antenna: `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point
-        abeam the antenna, on the track map's chainage), `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps`
-        (negative toward falling chainage), `acceleration_mps2` (along the line, positive toward rising
-        chainage), `environment` (kind of section, "open" outside all). The position is
-        that of the true instant, which is the tag less the receiver clock's bias.
+    `time_gpst` (the tag), `antenna`, `chainage_m` (centreline point abeam the antenna, on the track map's chainage),
+    `kilometrage_m`, `x_m`, `y_m`, `z_m`, `speed_mps` (negative toward falling chainage), `acceleration_mps2` (along the
+    line, positive toward rising chainage), `environment` (kind of section, "open" outside all). The position is
+    that of the true instant, which is the tag less the receiver clock's bias.
     """
     line, time = simulation.line, simulation.time()
     tags = seconds(time - simulation.scenario.start)

@@ -16,16 +16,7 @@ _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_er
 
 
 def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
-    """Text of a run's README.
-
-    Parameters
-    ----------
-    simulation : Simulation
-    files : dict of str to Path
-        As `railfix.simulate.write_run` gives them.
-    command : str
-        The command that made them; empty for a call from Python.
-    """
+    """Text of a run's README, for the files that `railfix.simulate.write_run` gives and the command that made them."""
     scenario = simulation.scenario
     made = f"Made by `{command}`.\n" if command else "Made by `railfix.simulate.write_run`.\n"
     satellites = {name for name, _ in simulation.channels}

@@ -13,7 +13,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats, Indices
 from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
-from railfix.core.timescale import seconds
+from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
 from railfix.gnss.orbits.kepler import Orbits, kepler_state
 
@@ -47,12 +47,7 @@ def record_state(
 ) -> tuple[Floats, Floats]:
     """Position in the Earth-fixed frame of the instant, shape (T, 3) [m], and clock with relativity, shape (T,) [s].
 
-    Parameters
-    ----------
-    records : KeplerRecords
-    row : ndarray of int, shape (T,)
-        Record of each instant.
-    since_toe_s, since_toc_s : ndarray, shape (T,) [s]
+    From one row of the records for each instant, at so many seconds after its times of ephemeris and clock.
     """
     position, _, relativity = kepler_state(Orbits.of_table(Orbits.from_records(records).table[row]), since_toe_s)
     dt = since_toc_s
@@ -68,22 +63,9 @@ def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> In
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Signals of a satellite that arrive at a receiver.
+    """Signals of a satellite that arrive at a receiver at T tags, `late_s` (the receiver clock's bias) before each.
 
     The light-time equation is solved by iteration, in the Earth-fixed frame of reception.
-
-    Parameters
-    ----------
-    records : KeplerRecords
-    satellite : str
-    tag : ndarray of datetime64[ns], shape (T,)
-    late_s : ndarray, shape (T,) [s]
-        Receiver clock bias: the signal arrives by this much before its tag.
-    receiver_ecef_m : ndarray, shape (T, 3) [m]
-
-    Returns
-    -------
-    Links
     """
     row = newest_record(records, satellite, tag)
     since_toe = seconds(tag - records.toe[row]) - late_s
@@ -106,17 +88,6 @@ class SatelliteTable:
 
     The distance differs from that of `links` by less than 1e-6 m. The pieces are fixed for the whole
     span, so results do not depend on how the instants are cut into chunks.
-
-    Parameters
-    ----------
-    records : KeplerRecords
-    satellites : sequence of str, length S
-    first, last : datetime64
-        First and last tag of the span; a tag outside raises ValueError.
-
-    Attributes
-    ----------
-    satellites : tuple of str
     """
 
     def __init__(
@@ -134,7 +105,7 @@ class SatelliteTable:
         ends = np.append(self._knots[1:], max(span, self._knots[-1]) + 1e-9)
         self._middle = (self._knots + ends) / 2.0
         self._half = _PIECE_S / 2.0 + 1.0
-        tag = self._start + np.round(self._knots * 1e9).astype("timedelta64[ns]")
+        tag = self._start + timedelta(self._knots)
         nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
         at = self._middle[:, None] + self._half * nodes
         values = np.empty((len(tag), _NODES, len(self.satellites), 4))
@@ -150,24 +121,9 @@ class SatelliteTable:
         self._powers = np.einsum("kn,pnsc->kpsc", to_powers, values)
 
     def links(self, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-        """Signals of all satellites that arrive at a receiver, as `links`.
+        """Signals of all satellites that arrive at a receiver, as `links`, shapes (T, S).
 
-        Parameters
-        ----------
-        tag : ndarray of datetime64[ns], shape (T,)
-        late_s : ndarray, shape (T,) [s]
-            Receiver clock bias: the signal arrives by this much before its tag.
-        receiver_ecef_m : ndarray, shape (T, 3) [m]
-
-        Returns
-        -------
-        Links
-            Shapes (T, S).
-
-        Raises
-        ------
-        ValueError
-            A tag is outside of the table's span.
+        ValueError: when a tag is outside of the table's span.
         """
         when = seconds(tag - self._start)
         if when.size and (when.min() < 0.0 or when.max() > self._end):

@@ -31,6 +31,7 @@ from railfix.simulate.setting_types import (
     ScenarioSettings,
     Seed,
     Three,
+    beyond_start,
 )
 
 #: Antennas of the vehicle, in the order in which they are written.
@@ -69,12 +70,7 @@ class SpeedLimit(ScenarioSettings):
     to_m: Finite
     limit_mps: Positive
 
-    @field_validator("to_m")
-    @classmethod
-    def _beyond(cls, to_m: float, info: Any) -> float:
-        if to_m <= info.data.get("from_m", -np.inf):
-            raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
-        return to_m
+    _forward = field_validator("to_m")(beyond_start)
 
 
 class RunSettings(ScenarioSettings):
@@ -326,13 +322,7 @@ class Scenario(ScenarioSettings):
         return self
 
     def check_room(self, length_m: float) -> None:
-        """Check that the train stays within a line of this length.
-
-        Raises
-        ------
-        SettingsError
-            The vehicle or a station would stand beyond an end.
-        """
+        """Raise `SettingsError` where the vehicle or a station would stand beyond an end of a line of this length."""
         if problem := self._room_problem(length_m):
             raise SettingsError(problem)
 

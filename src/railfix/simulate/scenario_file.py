@@ -77,20 +77,11 @@ class Recipe:
     tables: tuple[Mapping[str, Any], ...]
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
-        """Scenario of a run, counted from 0.
+        """Scenario of a run, counted from 0, with settings that override those of the file, in tables as the file has
+        them.
 
-        Parameters
-        ----------
-        number : int
-        changes : mapping, optional
-            Settings that override those of the file, in tables as the file has them.
-
-        Raises
-        ------
-        SettingsError
-            A setting is misspelt, of the wrong kind, or out of range.
-        InputFileError
-            The track file of a line whose run gives the duration cannot be read.
+        SettingsError: when a setting is misspelt, of the wrong kind, or out of range. InputFileError: when the track
+        file of a line whose run gives the duration cannot be read.
         """
         table = _over(self.tables[number], changes or {})
         to_the_end = table.get("duration_s") == WHOLE_RUN
@@ -122,13 +113,7 @@ def shipped_scenarios() -> dict[str, Path]:
 
 
 def find_scenario(name: str | PathLike[str]) -> Path:
-    """A scenario file by its path, or by the name of a shipped one.
-
-    Raises
-    ------
-    InputFileError
-        Neither.
-    """
+    """A scenario file by its path, or by the name of a shipped one; InputFileError when it is neither."""
     shipped, path = shipped_scenarios(), Path(name)
     if path.is_file() or (path.suffix and str(name) not in shipped):
         return path
@@ -138,19 +123,10 @@ def find_scenario(name: str | PathLike[str]) -> Path:
 
 
 def load_recipe(name: str | PathLike[str]) -> Recipe:
-    """Contents of a scenario file, one run or several.
+    """Contents of a scenario file (a path, or the name of a shipped scenario), one run or several.
 
-    Parameters
-    ----------
-    name : path-like
-        A path, or the name of a shipped scenario.
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, or no TOML.
-    SettingsError
-        A recipe is not one: names twice, other keys. Settings of a run are checked by `Recipe.scenario`.
+    InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a recipe is not one (names
+    twice, other keys); settings of a run are checked by `Recipe.scenario`.
     """
     path = find_scenario(name)
     table = read_toml(path, what="a scenario file")
@@ -194,19 +170,10 @@ def _run_table(
 
 
 def load_scenario(name: str | PathLike[str]) -> Scenario:
-    """The scenario of a file that holds one run.
+    """The scenario of a file (a path, or the name of a shipped scenario) that holds one run.
 
-    Parameters
-    ----------
-    name : path-like
-        A path, or the name of a shipped scenario.
-
-    Raises
-    ------
-    InputFileError
-        The file is missing, unreadable, or no TOML.
-    SettingsError
-        A setting is misspelt, of the wrong kind, or out of range; or the file lists many runs.
+    InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a setting is misspelt, of the
+    wrong kind, or out of range; or the file lists many runs.
     """
     recipe = load_recipe(name)
     if recipe.names[0]:

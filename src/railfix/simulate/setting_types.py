@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Annotated, Any, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, model_validator
+from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, ValidationInfo, model_validator
 
 from railfix.core.settings import Settings
 
@@ -27,6 +27,24 @@ def _rising(pair: tuple[float, float]) -> tuple[float, float]:
     if not pair[0] <= pair[1]:
         raise ValueError("must be two numbers, the smaller one first")
     return pair
+
+
+def beyond_start(to_m: float, info: ValidationInfo) -> float:
+    """Validate the end of a part of the line, whose start is `from_m`."""
+    if to_m <= info.data.get("from_m", -np.inf):
+        raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
+    return to_m
+
+
+def at_least(least: float) -> AfterValidator:
+    """Validator of a range of lengths that must begin at this length [m]."""
+
+    def check(pair: tuple[float, float]) -> tuple[float, float]:
+        if pair[0] < least:
+            raise ValueError(f"must begin at {least:g} m or more")
+        return pair
+
+    return AfterValidator(check)
 
 
 #: Least and greatest value of a uniform distribution.

@@ -12,7 +12,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.core.timescale import seconds
+from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.simulate.alignment import Alignment, build_alignment
@@ -178,7 +178,7 @@ class Simulation:
         """Satellite and signal of each channel: satellites above the cutoff at any time of the run."""
         scenario = self.scenario
         looks = np.append(np.arange(0.0, scenario.duration_s, _LOOK_S), scenario.duration_s)
-        tags = scenario.start + np.round(looks * 1e9).astype("timedelta64[ns]")
+        tags = scenario.start + timedelta(looks)
         place = self.truth(ANTENNAS[0], looks)[0].ecef_m
         names = []
         for satellite in sorted({str(s) for s in self.navigation.kepler.satellite}):
@@ -207,13 +207,7 @@ class Simulation:
         )
 
     def pieces(self, antenna: str, *, chunk_epochs: int = CHUNK_EPOCHS) -> Iterator[Piece]:
-        """Truth and observations of one antenna, piece by piece; any cutting gives the same numbers.
-
-        Parameters
-        ----------
-        antenna : {"front", "rear"}
-        chunk_epochs : int
-        """
+        """Truth and observations of one antenna, piece by piece; any cutting gives the same numbers."""
         receiver = Receiver(
             self.scenario,
             antenna,

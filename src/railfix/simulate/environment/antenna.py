@@ -9,21 +9,11 @@ from railfix.simulate.environment.settings import AntennaSettings
 
 
 def circular_reflection(cosine: Floats, permittivity: float) -> tuple[Floats, Floats]:
-    """Amplitudes that a smooth dielectric wall reflects of a right-handed circular wave.
+    """Amplitudes, right-handed and left-handed, that a smooth dielectric wall reflects of a right-handed circular wave.
 
-    ``G_perp = (c - r) / (c + r)``, ``G_par = (e c - r) / (e c + r)`` with c the cosine of incidence, e the
-    relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); right-handed ``|G_par + G_perp| / 2``, left-handed
-    ``|G_par - G_perp| / 2``: at normal incidence all is left-handed, at grazing incidence right-handed.
-
-    Parameters
-    ----------
-    cosine : ndarray
-        Of the angle of incidence from the wall's normal.
-    permittivity : float
-
-    Returns
-    -------
-    right, left : ndarray, shape as `cosine`
+    ``G_perp = (c - r) / (c + r)``, ``G_par = (e c - r) / (e c + r)`` with c the cosine of incidence from the wall's
+    normal, e the relative permittivity and ``r = sqrt(e - 1 + c^2)`` (Fresnel); right-handed ``|G_par + G_perp| / 2``,
+    left-handed ``|G_par - G_perp| / 2``: at normal incidence all is left-handed, at grazing incidence right-handed.
     """
     root = np.sqrt(permittivity - 1.0 + cosine**2)
     perpendicular = (cosine - root) / (cosine + root)
@@ -38,7 +28,10 @@ def received_amplitude(cosine: Floats, sine_elevation: Floats, antenna: AntennaS
     the sine of the elevation from horizon to zenith [dB].
     """
     right, left = circular_reflection(cosine, antenna.wall_permittivity)
-    loss_db = antenna.cross_polar_horizon_db + sine_elevation * (
-        antenna.cross_polar_zenith_db - antenna.cross_polar_horizon_db
-    )
-    return np.sqrt(right**2 + (left * 10.0 ** (-loss_db / 20.0)) ** 2)
+    return np.sqrt(right**2 + (left * cross_polar_gain(sine_elevation, antenna)) ** 2)
+
+
+def cross_polar_gain(sine_elevation: Floats | float, antenna: AntennaSettings) -> Floats:
+    """Amplitude received of left-handed signals over that of right-handed ones."""
+    horizon_db, zenith_db = antenna.cross_polar_horizon_db, antenna.cross_polar_zenith_db
+    return np.asarray(10.0 ** (-(horizon_db + sine_elevation * (zenith_db - horizon_db)) / 20.0))

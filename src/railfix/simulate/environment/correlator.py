@@ -64,25 +64,19 @@ def tracked(
 
     The loops lock to the strongest path; the code error about it stays within half the spacing.
     Fading faster than a loop's bandwidth is attenuated as by a loop of first order,
-    ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept.
+    ``1 / sqrt(1 + (f / loop_hz)^2)``; its power is kept. C/N0 is averaged as the code is.
 
     Parameters
     ----------
     field : ndarray of complex, shape (P, N)
         Relative to the unobstructed direct signal, without the phase of the extra path.
-    extra_m : ndarray, shape (P, N) [m]
-        Excess path.
-    rate_mps : ndarray, shape (P, N) [m/s]
-        Its rate.
+    extra_m, rate_mps : ndarray, shape (P, N)
+        Excess path and its rate.
     wavelength_m, chip_m : ndarray, shape (N,)
     spacing_chips : float
         Early to late.
     code_loop_hz, carrier_loop_hz : float
-        Bandwidths. C/N0 is averaged as the code is.
-
-    Returns
-    -------
-    Tracked
+        Bandwidths.
     """
     column = np.arange(field.shape[1])
     strength = np.sqrt(field.real**2 + field.imag**2)

@@ -14,17 +14,8 @@ CLEAR_V: Final = -0.78
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Fresnel parameter of a clearance of 1 m, the source infinitely far (P.526-15, 4.1).
-
-    Parameters
-    ----------
-    distance_m : ndarray [m]
-        From the antenna to the edge.
-    wavelength_m : ndarray [m]
-
-    Returns
-    -------
-    ndarray [1/m]
+    """Fresnel parameter [1/m] of a clearance of 1 m, the source infinitely far, the edge so far from the antenna
+    (P.526-15, 4.1).
     """
     return np.sqrt(2.0 / (wavelength_m * np.maximum(distance_m, 0.1)))
 
@@ -42,14 +33,8 @@ def edge_amplitude(v: Floats) -> Floats:
 def strip_field(v: Floats, width_v: Floats) -> Complexes:
     """Field that a strip removes from a wave of amplitude 1, by Kirchhoff and Babinet.
 
-    The field behind the strip is 1 minus this: ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip.
-
-    Parameters
-    ----------
-    v : ndarray
-        Fresnel parameter of the strip's middle.
-    width_v : ndarray
-        Its width in the same measure.
+    The field behind the strip is 1 minus this: ``(1 + j)/2 * integral of exp(-j pi t^2/2)`` over the strip, with its
+    middle and width as Fresnel parameters.
     """
     sine_1, cosine_1 = fresnel(v - 0.5 * width_v)
     sine_2, cosine_2 = fresnel(v + 0.5 * width_v)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,7 @@ from railfix.core.timescale import seconds
 from railfix.gnss.signals import carrier_frequency_hz
 from railfix.simulate.clear_sky import CN0_HORIZON_DBHZ, CN0_RISE_DB
 from railfix.simulate.disturbance import Disturbance, Geometry
-from railfix.simulate.environment.antenna import received_amplitude
+from railfix.simulate.environment.antenna import cross_polar_gain, received_amplitude
 from railfix.simulate.environment.correlator import Tracked, tracked
 from railfix.simulate.environment.diffraction import edge_amplitude, roughness_loss
 from railfix.simulate.environment.masts import Electrification
@@ -101,12 +101,7 @@ class Environment:
         ends = {"first_m": -BEYOND_M, "last_m": line_length_m + BEYOND_M}
         streets = settings.side_streets
         self._streets = (
-            None
-            if streets is None
-            else (
-                side_streets(streets, seed=seed, side=0, **ends),
-                side_streets(streets, seed=seed, side=1, **ends),
-            )
+            () if streets is None else tuple(side_streets(streets, seed=seed, side=side, **ends) for side in (0, 1))
         )
         self._ripple = _GainRipple(seed)
         self._conductors = None if settings.electrification is None else Electrification(settings.electrification)
@@ -184,8 +179,7 @@ class Environment:
         """Reflections by side streets, by both sides one after the other, and by vehicles on parallel tracks."""
         settings, antenna = self.settings, self.settings.antenna
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
-        if settings.side_streets is not None and self._streets is not None:
-            streets = settings.side_streets
+        if (streets := settings.side_streets) is not None:
             for amplitude, extra, growth, cosine in street_reflections(
                 self._streets, rays, candidates=streets.candidates, roughness_m=streets.roughness_m
             ):
@@ -194,10 +188,9 @@ class Environment:
         if settings.second_reflections == "opposite" and self.structures.walls:
             rows.append(second_reflection(self.structures.walls, rays, antenna))
         for neighbour in settings.neighbours:
-            side = 1.0 if neighbour.side == "right" else -1.0
-            amplitude, extra, growth = neighbour_reflection(neighbour, rays, clock_s, side=side)
+            amplitude, extra, growth = neighbour_reflection(neighbour, rays, clock_s)
             # Metal: all of it is left-handed but at grazing incidence.
-            gain = 1.0 if antenna is None else 10.0 ** (-antenna.cross_polar_horizon_db / 20.0)
+            gain = 1.0 if antenna is None else float(cross_polar_gain(0.0, antenna))
             rows.append((-amplitude * gain, extra, growth))
         return rows
 
@@ -210,8 +203,7 @@ class Environment:
         for row in self.structures.walls:
             v = np.maximum(v, shadow(row, rays))
         for neighbour in self.settings.neighbours:
-            side = 1.0 if neighbour.side == "right" else -1.0
-            v = np.maximum(v, neighbour_clearance(neighbour, rays, clock_s, side=side))
+            v = np.maximum(v, neighbour_clearance(neighbour, rays, clock_s))
         amplitude = edge_amplitude(v)
         if self.settings.equipment:
             amplitude = amplitude * equipment_amplitude(self.settings.equipment, rays)
@@ -244,17 +236,9 @@ class Environment:
             v = np.full(len(kept), FREE_V)
             for row in self.structures.walls:
                 v = np.maximum(v, shadow(row, some, x0=image.x_m[kept], y0=image.y_m[kept]))
-            back = Rays(
-                chainage_m=some.chainage_m,
-                height_m=some.height_m,
-                x=image.back_x[kept],
-                y=image.back_y[kept],
-                z=some.z,
-                wavelength_m=some.wavelength_m,
-            )
-            for q, row in enumerate(self.structures.walls):
-                if q < r:
-                    v = np.maximum(v, shadow(row, back))
+            back = replace(some, x=image.back_x[kept], y=image.back_y[kept])
+            for row in self.structures.walls[:r]:
+                v = np.maximum(v, shadow(row, back))
             open_above = np.ones(len(kept))
             for roofs in self.structures.roofs:
                 open_above = open_above * roof_amplitude(roofs, back)
@@ -263,12 +247,7 @@ class Environment:
 
 
 class _GainRipple:
-    """Gain of the antennas over azimuth, of standard deviation 1 at the horizon.
-
-    Parameters
-    ----------
-    seed : int
-    """
+    """Gain of the antennas over azimuth, of standard deviation 1 at the horizon."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, 7106])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from railfix.core.arrays import Floats
-from railfix.simulate.environment.antenna import circular_reflection
+from railfix.simulate.environment.antenna import circular_reflection, cross_polar_gain
 from railfix.simulate.environment.diffraction import edge_amplitude, roughness_loss
 from railfix.simulate.environment.settings import AntennaSettings
 from railfix.simulate.environment.structures import Strips
@@ -41,10 +41,7 @@ def second_reflection(
         amplitude = amplitude * roughness_loss(row.value["roughness_m"][wall], lateral, rays.wavelength_m)
     if antenna is not None:
         right, left = circular_reflection(lateral, antenna.wall_permittivity)
-        loss_db = antenna.cross_polar_horizon_db + rays.z * (
-            antenna.cross_polar_zenith_db - antenna.cross_polar_horizon_db
-        )
-        cross = 2.0 * right * left * 10.0 ** (-loss_db / 20.0)
+        cross = 2.0 * right * left * cross_polar_gain(rays.z, antenna)
         amplitude = amplitude * np.sqrt((right**2 + left**2) ** 2 + cross**2)
     image = -np.sign(rays.y) * 2.0 * (near + away)
     for other in rows:

@@ -84,22 +84,9 @@ TUNNEL_CROWN: Final = RoofSettings(inner_m=0.0, outer_m=200.0, height_m=6.5, los
 def drawn_sections(
     shares: Mapping[Kind, float], length_m: float, *, section_length_m: Between, seed: int
 ) -> tuple[SectionSettings, ...]:
-    """Sections with exactly the given shares of a line, in random order.
+    """Sections with exactly the given shares of a line, which add up to 1, in random order from 0 to its end.
 
-    Parameters
-    ----------
-    shares : mapping of kind to float
-        By kind; they add up to 1.
-    length_m : float
-        Of the line.
-    section_length_m : tuple of float
-        Approximate range of the sections' lengths; a small share gives one shorter section.
-    seed : int
-
-    Returns
-    -------
-    tuple of SectionSettings
-        From 0 to the end of the line.
+    `section_length_m` is the approximate range of their lengths; a small share gives one shorter section.
     """
     rng = np.random.default_rng([seed, 7101])
     low, high = section_length_m

@@ -33,11 +33,21 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import inf
-from typing import Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from railfix.simulate.setting_types import AngleBetween, Between, Finite, NotNegative, Positive, ScenarioSettings, Share
+from railfix.simulate.setting_types import (
+    AngleBetween,
+    Between,
+    Finite,
+    NotNegative,
+    Positive,
+    ScenarioSettings,
+    Share,
+    at_least,
+    beyond_start,
+)
 
 Kind = Literal["open", "suburban", "urban", "canyon", "cutting", "mountain", "station", "tunnel"]
 Sides = Literal["left", "right", "both"]
@@ -141,7 +151,7 @@ class RoofSettings(ScenarioSettings):
     inner_m: NotNegative = 1.8
     outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)
     height_m: Positive = 6.0
-    length_m: Between = (60.0, 120.0)
+    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)
     gap_m: Between = (10.0, 40.0)
     loss_db: NotNegative = 25.0
 
@@ -151,13 +161,6 @@ class RoofSettings(ScenarioSettings):
         if outer_m <= info.data.get("inner_m", 0.0):
             raise ValueError(f"must lie beyond inner_m of {info.data['inner_m']}")
         return outer_m
-
-    @field_validator("length_m")
-    @classmethod
-    def _long(cls, length_m: tuple[float, float]) -> tuple[float, float]:
-        if length_m[0] < 1.0:
-            raise ValueError("must begin at 1 m or more")
-        return length_m
 
 
 class SectionSettings(ScenarioSettings):
@@ -179,12 +182,7 @@ class SectionSettings(ScenarioSettings):
     rows: tuple[RowSettings, ...] | None = None
     roofs: tuple[RoofSettings, ...] | None = None
 
-    @field_validator("to_m")
-    @classmethod
-    def _beyond(cls, to_m: float, info: Any) -> float:
-        if to_m <= info.data.get("from_m", -inf):
-            raise ValueError(f"must lie beyond from_m of {info.data['from_m']}")
-        return to_m
+    _forward = field_validator("to_m")(beyond_start)
 
 
 class CorrelatorSettings(ScenarioSettings):
@@ -366,7 +364,7 @@ class EnvironmentSettings(ScenarioSettings):
     electrification: ElectrificationSettings | None = None
     sections: tuple[SectionSettings, ...] = ()
     shares: dict[Kind, Share] = Field(default_factory=dict)
-    section_length_m: Between = (150.0, 800.0)
+    section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)
     antenna_height_m: Positive = 4.0
     ground_reflection: Share = 0.5
     ground_roughness_m: NotNegative = 0.05
@@ -395,13 +393,6 @@ class EnvironmentSettings(ScenarioSettings):
         if shares and abs(sum(shares.values()) - 1.0) > 1e-6:
             raise ValueError(f"must add up to 1; they are {sum(shares.values()):g} together")
         return shares
-
-    @field_validator("section_length_m")
-    @classmethod
-    def _long(cls, section_length_m: tuple[float, float]) -> tuple[float, float]:
-        if section_length_m[0] < 20.0:
-            raise ValueError("must begin at 20 m or more")
-        return section_length_m
 
     @model_validator(mode="after")
     def _one_way(self) -> EnvironmentSettings:

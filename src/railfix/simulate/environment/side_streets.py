@@ -52,23 +52,15 @@ def side_streets(settings: SideStreetSettings, *, first_m: float, last_m: float,
 
 
 def street_reflections(
-    streets: tuple[SideStreets, SideStreets], rays: Rays, *, candidates: int, roughness_m: float
+    streets: tuple[SideStreets, ...], rays: Rays, *, candidates: int, roughness_m: float
 ) -> list[tuple[Floats, Floats, Floats, Floats]]:
     """Amplitude, extra path [m], growth [m/m] and cosine of incidence of each candidate street, shapes (N,).
 
     A satellite behind the train is reflected by a wall ahead that faces it, and the other way round: with the wall's
     plane at a distance D along the line and u the direction to the satellite, the extra path is ``2 D |u_x|``; the
     ray meets the wall ``D |u_y| / |u_x|`` to the side. It must meet the wall within the street, seen through the
-    street's mouth, and come in over the walls across the street.
-
-    Parameters
-    ----------
-    streets : (SideStreets, SideStreets)
-        Left and right.
-    rays : Rays
-    candidates : int
-        Number of streets that are tried for each ray, from the first that the ray can meet on.
-    roughness_m : float
+    street's mouth, and come in over the walls across the street. The streets are those on the left and on the right;
+    `candidates` of them are tried for each ray, from the first that the ray can meet on.
     """
     along, lateral = np.maximum(np.abs(rays.x), _LEAST), np.maximum(np.abs(rays.y), _LEAST)
     ahead = np.where(rays.x < 0.0, 1.0, -1.0)

@@ -75,20 +75,7 @@ class Structures:
 
 
 def build_structures(sections: Sequence[SectionSettings], line_length_m: float, seed: int) -> Structures:
-    """Walls and roofs of given sections.
-
-    Parameters
-    ----------
-    sections : sequence of SectionSettings
-        Rising.
-    line_length_m : float
-    seed : int
-        The same seed gives the same structures.
-
-    Returns
-    -------
-    Structures
-    """
+    """Walls and roofs of given sections, which rise; the same seed gives the same structures."""
     ends = np.array([section.to_m for section in sections])
     reach = 4.0 * (max(line_length_m, ends.max(initial=0.0)) + 2.0 * BEYOND_M)
     walls: dict[int, list[list[list[float]]]] = {}

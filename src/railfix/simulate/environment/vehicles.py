@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Final
+
 import numpy as np
 
 from railfix.core.arrays import Floats
 from railfix.simulate.environment.diffraction import edge_amplitude, per_metre
 from railfix.simulate.environment.settings import NeighbourSettings, RoofEquipment
-from railfix.simulate.environment.walls import Rays
+from railfix.simulate.environment.walls import FREE_V, Rays
 
 _LEAST: float = 1e-3
+#: Sign of the lateral component of rays toward a side.
+_SIDE: Final = {"right": 1.0, "left": -1.0}
 
 
-def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats, *, side: float) -> Floats:
+def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
     """Fresnel parameter of the vehicles on a parallel track, positive where they are in the way, shape (N,).
 
-    They follow each other at a constant headway and speed, so their places are a function of time alone.
-
-    Parameters
-    ----------
-    settings : NeighbourSettings
-    rays : Rays
-        Toward the vehicles' side where `side` times `y` is positive; others pass.
-    time_s : ndarray, shape (N,) [s]
-        On any scale that is the same for all calls.
-    side : {1.0, -1.0}
-        Right or left.
+    They follow each other at a constant headway and speed, so their places are a function of time alone, on any scale
+    that is the same for all calls. Rays to the other side pass.
     """
     lateral = np.maximum(np.abs(rays.y), _LEAST)
     far = settings.lateral_m / lateral
@@ -41,23 +37,13 @@ def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats,
     rise = lateral / np.sqrt(lateral**2 + rays.z**2)
     top = (settings.height_m - rays.height_m - far * rays.z) * rise
     v = np.minimum(top, ends * level) * per_metre(far, rays.wavelength_m)
-    return np.where(rays.y * side > 0.0, v, -99.0)
+    return np.where(rays.y * _SIDE[settings.side] > 0.0, v, FREE_V)
 
 
-def neighbour_reflection(
-    settings: NeighbourSettings, rays: Rays, time_s: Floats, *, side: float
-) -> tuple[Floats, Floats, Floats]:
+def neighbour_reflection(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> tuple[Floats, Floats, Floats]:
     """Amplitude, extra path [m] and growth [m/m] of reflections by the sides of vehicles on a parallel track."""
-    mirrored = Rays(
-        chainage_m=rays.chainage_m,
-        height_m=rays.height_m,
-        x=rays.x,
-        y=-rays.y,
-        z=rays.z,
-        wavelength_m=rays.wavelength_m,
-    )
-    v = neighbour_clearance(settings, mirrored, time_s, side=side)
-    amplitude = settings.reflection * np.where(rays.y * side < 0.0, edge_amplitude(-v), 0.0)
+    v = neighbour_clearance(settings, replace(rays, y=-rays.y), time_s)
+    amplitude = settings.reflection * np.where(rays.y * _SIDE[settings.side] < 0.0, edge_amplitude(-v), 0.0)
     return amplitude, 2.0 * settings.lateral_m * np.abs(rays.y), np.zeros(len(rays.x))
 
 

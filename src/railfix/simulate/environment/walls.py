@@ -6,7 +6,7 @@ line is taken as straight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -44,13 +44,9 @@ class Rays:
 
     def take(self, rows: Indices) -> Rays:
         """Rays of some rows."""
-        return Rays(
-            chainage_m=self.chainage_m[rows],
-            height_m=self.height_m,
-            x=self.x[rows],
-            y=self.y[rows],
-            z=self.z[rows],
-            wavelength_m=self.wavelength_m[rows],
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in ("chainage_m", "x", "y", "z", "wavelength_m")},
         )
 
 
@@ -84,12 +80,7 @@ def in_front(row: Strips, wall: Indices, rays: Rays, x: Floats, z: Floats, far_m
 def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | float = 0.0) -> Floats:
     """Fresnel parameter of the walls of a row that obstruct the satellites, shape (N,).
 
-    Parameters
-    ----------
-    row : Strips
-    rays : Rays
-    x0, y0 : ndarray or float [m]
-        Origin of the rays from the antenna: the mirror image of it for a reflection.
+    The rays begin at `x0`, `y0` from the antenna [m]: at its mirror image for a reflection.
     """
     side = (rays.y > 0.0).astype(np.intp)
     lateral = np.maximum(np.abs(rays.y), _LEAST_LATERAL)

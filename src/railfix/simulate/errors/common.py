@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 
 from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
-from railfix.core.timescale import seconds
+from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords
 from railfix.simulate.errors.processes import GaussMarkov, satellite_key
 from railfix.simulate.errors.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
@@ -60,18 +60,8 @@ def pierce_point_km(
 class CommonErrors:
     """Errors of satellites and atmosphere as functions of time and place.
 
-    Parameters
-    ----------
-    settings : ErrorSettings
-    seed : int
-    start : datetime64
-        Second 0, GPS time.
-    duration_s : float
-    origin_deg : (float, float)
-        Latitude and longitude where the vertical ionosphere is given.
-    records : KeplerRecords
-        Broadcast orbits, for the directions radial, along and cross.
-    satellites : sequence of str, length S
+    Second 0 is `start`, GPS time; the vertical ionosphere is given at `origin_deg`, latitude and longitude; the
+    broadcast orbits of the `records` give the directions radial, along and cross; S satellites.
     """
 
     def __init__(
@@ -128,7 +118,7 @@ class CommonErrors:
     def _axes(self) -> CubicSpline[np.float64]:
         """Radial, along and cross of each satellite in the Earth-fixed frame, shape (T, S, axis, xyz)."""
         nodes = np.arange(-2.0, self._duration_s / _AXES_S + 3.0) * _AXES_S
-        time = self._start + np.round(nodes * 1e9).astype("timedelta64[ns]")
+        time = self._start + timedelta(nodes)
         axes = np.empty((len(nodes), len(self._satellites), 3, 3))
         for k, name in enumerate(self._satellites):
             row = newest_record(self._records, name, time)
@@ -178,13 +168,7 @@ class CommonErrors:
     def path_m(self, time_s: Floats, sight: Floats, elevation_deg: Floats) -> Floats:
         """Orbit, clock and troposphere together, what they add to the ranges, shape (T, S) [m].
 
-        Parameters
-        ----------
-        time_s : ndarray, shape (T,) [s]
-            After the start.
-        sight : ndarray, shape (T, S, 3)
-            Unit vectors from the receiver to the satellites.
-        elevation_deg : ndarray, shape (T, S) [deg]
+        At T times after the start; `sight`, shape (T, S, 3): unit vectors from the receiver to the satellites.
         """
         added = -self.clock_error_m(time_s)
         if self._orbits:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy.signal import lfilter
 
-from railfix.core.arrays import Floats, Indices
+from railfix.core.arrays import Floats
 
 #: Nodes in one correlation time.
 _NODES_A_TIME: Final = 32
@@ -31,11 +31,7 @@ def satellite_key(satellite: str) -> tuple[int, int]:
 class Interpolated:
     """Columns given at even nodes, as functions of time with a continuous rate.
 
-    Parameters
-    ----------
-    nodes : ndarray, shape (K, C)
-        Values at ``(k - nodes_before(spacing_s)) * spacing_s``.
-    spacing_s : float
+    `nodes`, shape (K, C), are the values at ``(k - nodes_before(spacing_s)) * spacing_s``.
     """
 
     def __init__(self, nodes: Floats, spacing_s: float) -> None:
@@ -43,25 +39,23 @@ class Interpolated:
         self._spacing_s = spacing_s
         self._before = nodes_before(spacing_s)
 
-    def _place(self, time_s: Floats) -> tuple[Indices, Floats]:
+    def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """The four nodes about each time, shape (T, C), and the share of the cell, shape (T, 1)."""
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)
         if cell.size and (cell.min() < 1 or cell.max() > len(self._nodes) - 3):
             raise ValueError("a time is outside of the run that the errors were made for")
-        return cell, (place - cell)[:, None]
+        a, b, c, d = (self._nodes[cell + k] for k in (-1, 0, 1, 2))
+        return a, b, c, d, (place - cell)[:, None]
 
     def at(self, time_s: Floats) -> Floats:
         """Values, shape (T, C), at seconds after the start, shape (T,); ValueError far outside of the run."""
-        k, u = self._place(time_s)
-        n = self._nodes
-        a, b, c, d = n[k - 1], n[k], n[k + 1], n[k + 2]
+        a, b, c, d, u = self._place(time_s)
         return np.asarray(b + u / 2.0 * ((c - a) + u * (2.0 * a - 5.0 * b + 4.0 * c - d + u * (3.0 * (b - c) + d - a))))
 
     def rate(self, time_s: Floats) -> Floats:
         """Rates of change a second, shape (T, C)."""
-        k, u = self._place(time_s)
-        n = self._nodes
-        a, b, c, d = n[k - 1], n[k], n[k + 1], n[k + 2]
+        a, b, c, d, u = self._place(time_s)
         slope = (c - a) + u * (2.0 * (2.0 * a - 5.0 * b + 4.0 * c - d) + 3.0 * u * (3.0 * (b - c) + d - a))
         return np.asarray(slope / 2.0 / self._spacing_s)
 
@@ -77,16 +71,9 @@ def node_count(duration_s: float, spacing_s: float) -> int:
 
 
 class GaussMarkov(Interpolated):
-    """Independent Gauss-Markov processes, one a column.
+    """Independent Gauss-Markov processes, one a column, each with its own key as seed.
 
-    Parameters
-    ----------
-    keys : sequence of sequence of int, length C
-        Seed of each column.
-    sigma, time_s : float
-        Standard deviation and correlation time.
-    duration_s : float
-        The columns can be asked for from 0 to here; a longer run begins with the same values.
+    They can be asked for from 0 to `duration_s`; a longer run begins with the same values.
     """
 
     def __init__(self, keys: Sequence[Sequence[int]], *, sigma: float, time_s: float, duration_s: float) -> None:
@@ -112,15 +99,7 @@ def _interpolated_sigma(rho: float) -> float:
 class ClockWalk(Interpolated):
     """Variation of a receiver's clock [m]: random walks of bias and drift with nodes at the epochs, 0 at the start.
 
-    Parameters
-    ----------
-    key : sequence of int
-        Seed.
-    walk, frequency_walk : float
-        [m / sqrt(s)], [m/s / sqrt(s)].
-    interval_s : float
-        Of the epochs.
-    duration_s : float
+    `walk` in m / sqrt(s), `frequency_walk` in m/s / sqrt(s).
     """
 
     def __init__(

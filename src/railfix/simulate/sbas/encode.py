@@ -28,20 +28,10 @@ DEGRADATION: Final = {
 
 
 def message(kind: int, second: int, *fields: Field) -> Bytes:
-    """Message of a type, with the preamble of its second and its parity, shape (32,).
+    """Message of a type, with one of the three preambles by its second, and its parity, shape (32,).
 
-    Parameters
-    ----------
-    kind : int
-    second : int
-        Decides which of the three preambles it begins with.
-    fields : tuple of (value, length)
-        From bit 14 on, negative values in two's complement.
-
-    Raises
-    ------
-    ValueError
-        A value does not fit its field, or the fields are longer than a message.
+    The fields (value, length) lie from bit 14 on, negative values in two's complement. ValueError: when a value does
+    not fit its field, or the fields are longer than a message.
     """
     text = f"{PREAMBLES[second % 3]:08b}{kind:06b}"
     for value, length in fields:
@@ -81,7 +71,6 @@ def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0,
 
 
 def factors(second: int, indicator: Sequence[int], *, latency: int = 0, iodp: int = 0) -> Bytes:
-    """Type 7."""
     """Type 7: degradation indicator of all slots."""
     values = list(indicator) + [0] * (51 - len(indicator))
     return message(7, second, (latency, 4), (iodp, 2), (0, 2), *((v, 4) for v in values))

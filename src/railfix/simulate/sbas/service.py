@@ -166,11 +166,6 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
     Every 6 s the fast corrections of all satellites (types 2 to 5, 24); in the seconds between, in turn, the masks,
     long-term corrections, grid, degradation and integrity. All corrections undo the errors that `Scenario.errors` puts
     into clocks, group delays, orbits and ionosphere, to the messages' resolution (0.125 m); only GPS is corrected.
-
-    Parameters
-    ----------
-    simulation : Simulation
-    settings : SbasSettings
     """
     service, scenario = _Service(simulation, settings), simulation.scenario
     fast, slow = service.fast_messages(), service.slow_messages()
@@ -205,13 +200,7 @@ def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessage
 
 
 def write_sbas(messages: SbasMessages, path: str | PathLike[str]) -> None:
-    """Write messages as RTKLIB's .sbs, which `railfix run --sbas` reads.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write messages as RTKLIB's .sbs, which `railfix run --sbas` reads; OutputError when it cannot be written."""
     lines = []
     for time, prn, kind, bits in zip(messages.time, messages.prn, messages.type, messages.bits, strict=True):
         week, tow = to_week(time)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from railfix.core.arrays import Floats
 from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
+from railfix.core.timescale import timedelta
 from railfix.simulate.body_motion import FULL_SPEED_MPS
 from railfix.simulate.errors.processes import GaussMarkov
 from railfix.simulate.random_functions import RandomFunction
@@ -93,7 +94,7 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
     measured = _with_errors(true + _vibration(simulation, settings, time), time, settings, scenario.seed)
     names = ("force_forward_mps2", "force_right_mps2", "force_down_mps2", "roll_rate_radps", "pitch_rate_radps",
              "yaw_rate_radps")  # fmt: skip
-    tag = scenario.start + np.round(time * 1e9).astype("timedelta64[ns]")
+    tag = scenario.start + timedelta(time)
     return pl.DataFrame({"time_gpst": tag, **{name: measured[:, k] for k, name in enumerate(names)}})
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.core.timescale import timedelta
 from railfix.simulate.errors.processes import GaussMarkov
 from railfix.simulate.sensors.settings import RadarSettings
 
@@ -38,7 +39,7 @@ def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame
     blind = (np.abs(true) < settings.lowest_mps) | (np.abs(true) > settings.highest_mps)
     for start, end in dropouts(settings, scenario.seed, scenario.duration_s):
         blind |= (time >= start) & (time < end)
-    tag = scenario.start + np.round(time * 1e9).astype("timedelta64[ns]")
+    tag = scenario.start + timedelta(time)
     return pl.DataFrame({"time_gpst": tag, "speed_mps": np.where(blind, np.nan, speed)})
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.core.timescale import timedelta
 from railfix.simulate.sensors.settings import GroundUnit, RangingSettings
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def ranging_table(simulation: Simulation, settings: RangingSettings) -> pl.DataF
     time = np.arange(0.0, scenario.duration_s + 1e-9, settings.interval_s)
     offset = (settings.along_m, settings.across_m, settings.up_m)
     vehicle, _ = simulation.body_truth(offset, time)
-    tag = scenario.start + np.round(time * 1e9).astype("timedelta64[ns]")
+    tag = scenario.start + timedelta(time)
     schema = pl.Schema({"time_gpst": pl.Datetime("ns"), "unit": pl.String(), "range_m": pl.Float64()})
     tables = [pl.DataFrame(schema=schema)]
     for number, unit in enumerate(settings.units):

@@ -58,15 +58,8 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
 def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
     """Tables of the sensors that `Scenario.sensors` names; none where it is None.
 
-    Parameters
-    ----------
-    simulation : Simulation
-
-    Returns
-    -------
-    dict of str to polars.DataFrame
-        ``tachometer`` and ``wheel_slips`` (ground truth of its wheel), ``inertial``, ``radar``, ``ranging``
-        and ``ranging_units``; the columns are those of `COLUMNS`, all rows in order of `time_gpst`.
+    ``tachometer`` and ``wheel_slips`` (ground truth of its wheel), ``inertial``, ``radar``, ``ranging``
+    and ``ranging_units``; the columns are those of `COLUMNS`, all rows in order of `time_gpst`.
     """
     settings = simulation.scenario.sensors
     tables: dict[str, pl.DataFrame] = {}

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from railfix.core.arrays import Floats
+from railfix.core.timescale import timedelta
 from railfix.simulate.sensors.settings import DrawnSlips, SlipInterval, TachometerSettings
 
 if TYPE_CHECKING:
@@ -75,22 +76,10 @@ def pulse_times_s(
     *,
     tooth_errors: Floats | None = None,
 ) -> Floats:
-    """Exact times of the pulses [s after the start].
+    """Exact times of the pulses [s after the start], shape (P,).
 
-    Parameters
-    ----------
-    motion : Motion
-    settings : TachometerSettings
-    slips : list of SlipInterval
-    duration_s : float
-    phase : float
-        Part of a pulse's distance that the wheel turns before the first one, in [0, 1).
-    tooth_errors : ndarray, shape (pulses_per_turn,), optional
-        Displacement of each tooth as a share of their spacing.
-
-    Returns
-    -------
-    ndarray, shape (P,) [s]
+    `phase`, in [0, 1): part of a pulse's distance that the wheel turns before the first one. `tooth_errors`, shape
+    (pulses_per_turn,): displacement of each tooth as a share of their spacing.
     """
     # The motion's own corners are nodes too, so that without slips nothing is approximate.
     corner = motion.time_s[(motion.time_s > 0.0) & (motion.time_s < duration_s)]
@@ -158,7 +147,7 @@ def pulse_table(simulation: Simulation, settings: TachometerSettings) -> pl.Data
         time, direction = time[order], direction[order]
     if settings.resolution_s > 0.0:
         time = np.rint(time / settings.resolution_s) * settings.resolution_s
-    tag = scenario.start + np.round(time * 1e9).astype("timedelta64[ns]")
+    tag = scenario.start + timedelta(time)
     return pl.DataFrame(
         {"time_gpst": tag, "pulse": np.arange(1, len(time) + 1, dtype=np.int64), "direction": direction}
     )
@@ -168,9 +157,7 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
     """Truth of the wheel's slips and slides, see `railfix.simulate.sensors.tables.COLUMNS`."""
     scenario = simulation.scenario
     slips = wheel_slips(simulation, settings)
-    start, end = (
-        scenario.start + np.round(np.array(part, dtype=np.float64) * 1e9).astype("timedelta64[ns]")
-        for part in ([slip.start_s for slip in slips], [slip.end_s for slip in slips])
-    )
+    start = scenario.start + timedelta([slip.start_s for slip in slips])
+    end = scenario.start + timedelta([slip.end_s for slip in slips])
     ratio = np.array([slip.ratio for slip in slips], dtype=np.float64)
     return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
