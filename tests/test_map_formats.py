@@ -377,6 +377,27 @@ def test_landxml_of_inframodel_is_read(tmp_path: Path) -> None:
     assert np.interp(x, east, segment.cant_m) == pytest.approx(0.150 / 8.0, abs=1e-3)
 
 
+def test_a_landxml_parabola_is_laid_out_from_the_straight(tmp_path: Path) -> None:
+    """Towards a straight: the tangent from PI to End holds; that from Start to PI is off by the cube of the angle."""
+    element = PlanElement(
+        x_m=0.0, y_m=0.0, direction_rad=0.05, first=1.0 / 800.0, last=0.0, length_m=160.0, law="helmert"
+    )
+    x, y = element.place_at(np.array([160.0]))[0]
+    direction = element.direction_at(np.array([160.0]))[0]
+    path = tmp_path / "line.xml"
+    path.write_text(
+        '<LandXML><Alignments><Alignment name="T1"><CoordGeom><Spiral length="160" radiusStart="800" radiusEnd="INF" '
+        'rot="ccw" spiType="biquadraticParabola"><Start>5320000 650000</Start>'
+        f"<PI>{5320000 + y - 90.0 * np.sin(direction):.9f} {650000 + x - 90.0 * np.cos(direction):.9f}</PI>"
+        f"<End>{5320000 + y:.9f} {650000 + x:.9f}</End></Spiral></CoordGeom></Alignment></Alignments></LandXML>"
+    )
+    (segment,) = read_xml_segments(path, crs="EPSG:25832")
+    end = Transformer.from_crs(4326, 25832, always_xy=True).transform(
+        segment.longitude_deg[-1], segment.latitude_deg[-1]
+    )
+    assert end == pytest.approx([650000 + x, 5320000 + y], abs=1e-4)
+
+
 def test_landxml_cant_of_an_unknown_transition_is_refused(tmp_path: Path) -> None:
     text = LANDXML.format(end="5319900 650250").replace(
         'appliedCant="0" c', 'transitionType="wienerBogen" appliedCant="0" c'

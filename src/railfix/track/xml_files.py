@@ -158,8 +158,11 @@ def _landxml_plan(path: str, element: Any, scale: float) -> PlanElement:
             0.0 if element.get(k) == "INF" else side / (float(element.get(k)) * scale)
             for k in ("radiusStart", "radiusEnd")
         )
-        direction = np.arctan2(*(middle - start)[::-1])
         length, law = float(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
+        if last == 0.0:  # parabolas are laid out from the tangent at the straight; half the bend is turned by each law
+            direction = np.arctan2(*(end - middle)[::-1]) - first * length / 2.0
+        else:
+            direction = np.arctan2(*(middle - start)[::-1])
     else:
         kind = f"{kind} {element.get('spiType') or ''}".strip()
         raise InputFileError(path, f"element {kind} is not read; Line, Curve and Spiral ({', '.join(_SPIRALS)}) are")
