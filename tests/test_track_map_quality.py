@@ -175,6 +175,16 @@ def test_radius_of_the_wrong_side_or_impossible() -> None:
     assert "radius" in kinds(track_of(*points, radius_m=np.full(30, 30.0)))
 
 
+def test_a_reverse_curve_is_no_radius_of_the_wrong_side() -> None:
+    """A sharp curve to the left ends 2 m before one to the right, as on a line in Italy."""
+    way = np.arange(0.0, 80.0, 1.0)
+    radius = np.select([way < 39.0, way < 41.0], [-212.0, np.inf], 380.0)
+    heading = np.concatenate([[0.0], np.cumsum(np.diff(way) * (1.0 / radius[1:] + 1.0 / radius[:-1]) / 2.0)])
+    east, north = (np.concatenate([[0.0], np.cumsum(f(heading)[:-1])]) for f in (np.sin, np.cos))
+    assert kinds(track_of(east, north, radius_m=radius)) == {}
+    assert "radius side" in kinds(track_of(east, north, radius_m=-radius))
+
+
 def test_two_points_are_enough_and_all_equal_points_are_an_error() -> None:
     assert check_track(track_of(np.zeros(2), np.array([0.0, 10.0]))).findings == ()
     found = check_track(track_of(np.zeros(3), np.zeros(3))).errors

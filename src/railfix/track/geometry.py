@@ -34,7 +34,8 @@ class Geometry:
     height_spike_m : ndarray, shape (V,) [m]
         Height over the straight line between the neighbours; NaN at the ends.
     map_curvature, point_curvature : ndarray, shape (V,) [1/m]
-        Curvature from `Track.radius_m`, and from the points over about 40 m; positive to the right.
+        Mean curvature over about 40 m from `Track.radius_m`, NaN where it is not known throughout, and from the points;
+        positive to the right.
     """
 
     spacing_m: Floats
@@ -75,7 +76,7 @@ def geometry_of(track: Track) -> Geometry:
         mid_chord_m=_scatter(length**2 * curvature / 8.0, segments, len(spacing)),
         gradient_permille=_scatter(1e3 * climb / length, segments, len(spacing)),
         height_spike_m=_scatter(spike, points, len(track)),
-        map_curvature=curvature_of_map,
+        map_curvature=_mean_of_map(track, curvature_of_map),
         point_curvature=_bend(track, kept, turn),
     )
 
@@ -118,6 +119,20 @@ def _circle_curvature(plan: Floats) -> Floats:
     if not inner.size:
         return np.full(len(plan) + 1, np.nan)
     return np.concatenate([[np.nan], inner, [np.nan]])
+
+
+def _mean_of_map(track: Track, curvature: Floats) -> Floats:
+    """Compute the mean of the map's curvature over the same window, shape (V,) [1/m]; NaN where it is not known."""
+    along = track.chainage_m
+    low, high = np.maximum(along - _BEND_WINDOW_M / 2.0, along[0]), np.minimum(along + _BEND_WINDOW_M / 2.0, along[-1])
+    unknown = np.isnan(curvature)
+
+    def between(values: Floats) -> Floats:
+        total = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2.0 * np.diff(along))])
+        return np.asarray(np.interp(high, along, total) - np.interp(low, along, total))
+
+    whole, without = between(np.where(unknown, 0.0, curvature)), between(unknown.astype(np.float64))
+    return np.where((without > 0.0) | (high <= low), np.nan, whole / np.where(high > low, high - low, 1.0))
 
 
 def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
