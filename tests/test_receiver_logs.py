@@ -394,6 +394,24 @@ def test_day_of_glonass_messages(day: int) -> None:
     assert np.isfinite(observations.code_m).all()
 
 
+def test_time_of_week_beyond_the_week_is_broken() -> None:
+    piece, _ = decode(
+        msm4(1074, 0) + msm4(1124, (1 << 30) - 14_000), StreamState(time=np.datetime64("2019-01-20", "ns")), at_end=True
+    )
+    assert piece.measurements.satellite.tolist() == ["G05"]
+    assert piece.measurements.skipped == {"broken MSM": 1}
+
+
+def test_observations_of_old_kinds_are_named(tmp_path: Path) -> None:
+    """RTCM 3 before the multiple signal messages, and u-blox before the M8."""
+    body = (1004 << 4).to_bytes(2, "big") + bytes(20)
+    rtcm = b"\xd3" + len(body).to_bytes(2, "big") + body
+    rtcm += int(crc24q(np.frombuffer(rtcm, np.uint8), np.array([0]), np.array([len(rtcm)]))[0]).to_bytes(3, "big")
+    (tmp_path / "old.log").write_bytes(2 * rtcm + ubx_frame(0x0210, bytes(8)))
+    with pytest.raises(InputFileError, match=r"its RTCM 1004 \(2\), UBX RXM-RAW \(1\) are of kinds that are not read"):
+        railfix.read_observations(tmp_path / "old.log")
+
+
 def test_messages_whose_masks_do_not_fit_are_counted() -> None:
     """An MSM7 of 30 bytes whose masks are empty, parity right: no measurement, one broken message."""
     payload = bytes([1077 >> 4, (1077 & 15) << 4]) + bytes(28)

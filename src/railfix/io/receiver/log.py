@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -62,6 +63,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     msm = rtcm.msm_measurements(frames, time)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
+    measurements = replace(measurements, skipped={**measurements.skipped, **_of_old_kinds(frames)})
     records, sbas, subframes, messages = _navigation(frames, raw, state)
     last = measurements.time[-1] if len(measurements.time) else time
     piece = Piece(
@@ -74,6 +76,13 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
     )
     rest = buffer[frames.consumed :].tobytes()
     return piece, StreamState(rest=rest, subframes=subframes, messages=messages, time=last)
+
+
+def _of_old_kinds(frames: Frames) -> dict[str, int]:
+    """Messages with observations that are not read, counted by kind: RTCM 3 before MSM, u-blox before the M8."""
+    counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in (*range(1001, 1005), *range(1009, 1013))}
+    counts["UBX RXM-RAW"] = len(frames.of("ubx", ubx.RXM_RAW))
+    return {what: number for what, number in counts.items() if number}
 
 
 def _raw_measurements(frames: Frames) -> Measurements:
@@ -137,12 +146,13 @@ def scan_receiver_log(
     InputFileError: no frame has a valid checksum, or no observation can be dated.
     """
     tracking = Tracking()
-    epochs = frames_seen = 0
-    undated = 0
+    epochs = frames_seen = undated = 0
+    old: Counter[str] = Counter()
     for piece in scan_pieces(path, date=date, progress=progress):
         observations, tracking = observations_of(piece.measurements, tracking)
         frames_seen += piece.bytes - piece.skipped_bytes
         undated += piece.measurements.skipped.get(rtcm.UNDATED, 0)
+        old.update({kind: n for kind, n in piece.measurements.skipped.items() if kind.startswith(("RTCM 1", "UBX"))})
         counts = {"bytes outside messages": piece.skipped_bytes, "messages with a bad checksum": piece.bad_checksums}
         skipped = {**observations.skipped, **{what: n for what, n in counts.items() if n}}
         epochs += len(observations)
@@ -155,6 +165,9 @@ def scan_receiver_log(
             if undated
             else "holds no observations (UBX RXM-RAWX, SBF MeasEpoch, RTCM 3 MSM4 to MSM7)"
         )
+        if old:
+            has = ", ".join(f"{what} ({number})" for what, number in sorted(old.items()))
+            why += f"; its {has} are of kinds that are not read: give a RINEX file made of them (RTKLIB's convbin)"
         raise InputFileError(path, why)
 
 

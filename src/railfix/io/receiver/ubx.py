@@ -18,6 +18,8 @@ from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.subframes import Subframes
 
 RXM_RAWX: Final = 0x0215
+#: Raw measurements of receivers up to the u-blox 7; counted, not read.
+RXM_RAW: Final = 0x0210
 RXM_SFRBX: Final = 0x0213
 NAV_PVT: Final = 0x0107
 NAV_HPPOSLLH: Final = 0x0114
