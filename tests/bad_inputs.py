@@ -49,8 +49,10 @@ def desk_in(folder: Path) -> Desk:
     assert inputs.vehicle is not None
     shutil.copy(inputs.vehicle, folder / "train.toml")
     (folder / "line.geojson").write_text(_geojson(folder / "line.csv"))
-    (folder / "truth.csv").write_bytes(read_bytes(demo_truth()))
-    first = datetime.fromisoformat(pl.read_csv(folder / "truth.csv")["time_gpst"][0][:19])
+    truth = pl.read_csv(read_bytes(demo_truth()), infer_schema=False)
+    times = truth["time_gpst"].unique().sort()
+    truth.filter(pl.col("time_gpst") < times[10 * SECONDS]).write_csv(folder / "truth.csv")
+    first = datetime.fromisoformat(times[0][:19])
     here = inputs.replaced(
         front=(folder / "front.obs",),
         rear=(folder / "rear.obs",),

@@ -64,7 +64,10 @@ def test_a_mosaic_in_the_open(recordings):
 
 
 @pytest.mark.requirement("A5")
-@pytest.mark.parametrize(("name", "p50"), [("urbannav F9P", 0.95), ("urbannav M8T", 0.75), ("gsdc_pixel5_a", 0.9)])
+@pytest.mark.parametrize(
+    ("name", "p50"),
+    [("urbannav F9P", 0.95), pytest.param("urbannav M8T", 0.75, marks=pytest.mark.slow), ("gsdc_pixel5_a", 0.9)],
+)
 def test_in_towns_it_does_no_harm(recordings, name, p50):
     """Arcs of seconds, codes wrong by tens of metres: the median gains, the 95 % little."""
     got = scores(recorded(recordings, name))
@@ -78,10 +81,9 @@ def test_in_towns_it_does_no_harm(recordings, name, p50):
 def test_a_static_station_every_30_s(recordings):
     """P4's experiment has 30 s: Dopplers absent, ambiguities that walk 0.05 m between epochs."""
     code, live = [], []
-    for station in ("0759", "3040"):
-        for azimuth in (0, 90):
-            errors = recorded(recordings, f"geonet {station} {azimuth}").errors()
-            code.append(errors["code"])
-            live.append(errors["live"])
+    for station in ("0759 0", "3040 90"):
+        errors = recorded(recordings, f"geonet {station}").errors()
+        code.append(errors["code"])
+        live.append(errors["live"])
     assert np.percentile(np.abs(live), 95) < 1.05 * np.percentile(np.abs(code), 95)
     assert np.std(live) < np.std(code)

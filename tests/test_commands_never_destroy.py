@@ -237,7 +237,7 @@ KILLED: Final = {
 
 @pytest.mark.parametrize("name", ["run", "simulate"])
 def test_the_next_run_works_after_a_kill(desk: Desk, name: str) -> None:
-    _check_kills(desk, KILLED[name], 3, signal.SIGKILL, seed=1)
+    _check_kills(desk, KILLED[name], 2, signal.SIGKILL, seed=1)
 
 
 @pytest.mark.slow

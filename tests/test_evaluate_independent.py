@@ -39,6 +39,18 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def evaluated(demo: Path) -> tuple[Evaluation, tuple[dict, ...]]:
+    """The evaluation of the demonstration by both programs."""
+    truth = demo_files()["truth"]
+    return evaluate_run(demo, truth, options=OPTIONS), independent_evaluation.evaluated(demo, truth)
+
+
+@pytest.fixture(scope="module")
+def evaluated_worse(worse: tuple[Path, Path]) -> tuple[Evaluation, tuple[dict, ...]]:
+    return evaluate_run(*worse, options=OPTIONS), independent_evaluation.evaluated(*worse)
+
+
+@pytest.fixture(scope="module")
 def worse(demo: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same with lost epochs, lost positions, gross errors, and a reference with sigmas, places and a gap."""
     folder = tmp_path_factory.mktemp("worse") / "run"
@@ -152,10 +164,8 @@ def check_integrity(found: Evaluation, expected: tuple[dict, ...]) -> int:
 
 
 @pytest.mark.requirement("C4")
-def test_the_stanford_counts_of_a_run_with_holes(worse: tuple[Path, Path]):
-    folder, reference = worse
-    found = evaluate_run(folder, reference, options=OPTIONS)
-    expected = independent_evaluation.evaluated(folder, reference)
+def test_the_stanford_counts_of_a_run_with_holes(evaluated_worse: tuple[Evaluation, tuple[dict, ...]]):
+    found, expected = evaluated_worse
     assert check_integrity(found, expected) > 1000
     # The case has what it is meant to have: every region, some of the excess usable and some not.
     regions = {name for counts in expected[3].values() for name in independent_evaluation.REGIONS if counts[name]}
@@ -164,25 +174,19 @@ def test_the_stanford_counts_of_a_run_with_holes(worse: tuple[Path, Path]):
 
 
 @pytest.mark.requirement("C4")
-def test_the_stanford_counts_of_the_demonstration(demo: Path):
-    truth = demo_files()["truth"]
-    found = evaluate_run(demo, truth, options=OPTIONS)
-    expected = independent_evaluation.evaluated(demo, truth)
+def test_the_stanford_counts_of_the_demonstration(evaluated: tuple[Evaluation, tuple[dict, ...]]):
+    found, expected = evaluated
     assert check_integrity(found, expected) > 1000
     whole = expected[3]["all", "all", "front", "usable", 20.0]
     assert 0 < whole["kept_60_s"] < whole["kept_15_s"] < whole["windows_15_s"]
 
 
-def test_every_figure_of_the_demonstration(demo: Path):
-    truth = demo_files()["truth"]
-    found = evaluate_run(demo, truth, options=OPTIONS)
-    assert check(found, independent_evaluation.evaluated(demo, truth)) > 2000
+def test_every_figure_of_the_demonstration(evaluated: tuple[Evaluation, tuple[dict, ...]]):
+    assert check(*evaluated) > 2000
 
 
-def test_every_figure_of_a_run_with_holes(worse: tuple[Path, Path]):
-    folder, reference = worse
-    found = evaluate_run(folder, reference, options=OPTIONS)
-    expected = independent_evaluation.evaluated(folder, reference)
+def test_every_figure_of_a_run_with_holes(evaluated_worse: tuple[Evaluation, tuple[dict, ...]]):
+    found, expected = evaluated_worse
     assert check(found, expected) > 5000
     whole = expected[0]["all", "all", "front", "constrained", "own"]
     # The case has what it is meant to have.

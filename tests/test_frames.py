@@ -210,7 +210,7 @@ def test_a_station_on_a_line_in_its_own_frame(recordings: Path, tmp_path: Path) 
         rows = [f"{a:.10f},{b:.10f},{c:.4f}" for a, b, c in zip(*values, strict=True)]
         path.write_text(f"# crs: {crs}\nlatitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
         words = ["run", "--front", str(observations), "--nav", str(navigation), "--track", str(path)]
-        words += ["--end", "2020-06-25T02:00:00", "--set", "protection=off", "--out", str(tmp_path / name)]
+        words += ["--end", "2020-06-25T00:40:00", "--set", "protection=off", "--out", str(tmp_path / name)]
         done = RUNNER.invoke(app, words)
         assert done.exit_code == 0, done.output
         import polars as pl

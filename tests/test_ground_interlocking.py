@@ -162,8 +162,8 @@ def violations(seeds: range, steps: int, rules: frozenset[Rule] = ALL_RULES) -> 
 
 @pytest.mark.parametrize(
     ("seeds", "steps"),
-    [(range(24), 250), pytest.param(range(1000), 600, marks=pytest.mark.slow)],
-    ids=["24 runs", "1000 runs"],
+    [(range(12), 250), pytest.param(range(1000), 600, marks=pytest.mark.slow)],
+    ids=["12 runs", "1000 runs"],
 )
 def test_no_overlap_in_traffic_of_eight_trains(seeds: range, steps: int) -> None:
     """Loss 30 %, delays to 8 s, outages, stops of the centre, sensor failures."""

@@ -35,7 +35,7 @@ from railfix.simulate.demo_data import demo_files
 pytestmark = pytest.mark.requirement("A8")
 RUNNER = CliRunner(env={"COLUMNS": "100", "TERM": "dumb", "NO_COLOR": "1"})
 MS = 1_000_000
-EPOCHS = 150
+EPOCHS = 80
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +240,7 @@ async def serve_in_fragments(data: bytes, seed: int, server_ready: asyncio.Futur
 def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) -> None:
     """UBX with its own ephemerides over TCP in random fragments: the epochs of the file read live, bit for bit."""
     log = recordings / "live" / "16dBatt_no_interference_coldstart.ubx.gz"
-    data = gzip.decompress(log.read_bytes())[:1_200_000]
+    data = gzip.decompress(log.read_bytes())[:700_000]
     part = tmp_path / "part.ubx"
     part.write_bytes(data)
     trajectory = {"front": railfix.Trajectory.from_track(railfix.read_track([ubx_line(log, tmp_path)]))}
@@ -266,8 +266,8 @@ def test_a_stream_through_a_socket_is_the_log(recordings: Path, tmp_path: Path) 
     from_file, from_socket = asyncio.run(session(str(part))), asyncio.run(session(None))
     a, b = chainages(from_file, "front"), chainages(from_socket, "front")
     assert list(a) == list(b)
-    assert len(a) > 150
-    assert np.isfinite(list(a.values())).sum() > 100
+    assert len(a) > 80
+    assert np.isfinite(list(a.values())).sum() > 40
     assert np.array_equal(list(a.values()), list(b.values()), equal_nan=True)
 
 
@@ -365,7 +365,7 @@ def test_the_command_on_the_demonstration(tmp_path: Path) -> None:
     files = demo_files()
     parts = {name: tmp_path / f"{name}.rnx" for name in ("front", "rear")}
     for name, path in parts.items():
-        railfix.write_observations(railfix.read_observations(files[name])[:300], path)
+        railfix.write_observations(railfix.read_observations(files[name])[:120], path)
     lines, binary, out = tmp_path / "messages.jsonl", tmp_path / "messages.cbor", tmp_path / "out"
     common = ["--track", str(files["track"]), "--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
     log = ["--front", str(parts["front"]), "--rear", str(parts["rear"])]
@@ -379,7 +379,7 @@ def test_the_command_on_the_demonstration(tmp_path: Path) -> None:
     )
     # In the log also epochs without a single code have a row; receivers send none.
     rows = rows.join(live_rows.select("time_gpst", "antenna"), on=["time_gpst", "antenna"], how="semi")
-    assert live_rows.height == rows.height > 550
+    assert live_rows.height == rows.height > 220
     assert live_rows["status"].equals(rows["status"])
     difference = (live_rows["chainage_m"] - rows["chainage_m"]).fill_nan(None).abs().max()
     assert difference is not None

@@ -332,7 +332,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
     files = demo_files()
     parts = {name: tmp_path / f"{name}.rnx" for name in ("front", "rear")}
     for name, path in parts.items():
-        railfix.write_observations(railfix.read_observations(files[name])[:120], path)
+        railfix.write_observations(railfix.read_observations(files[name])[:70], path)
     common = ["--front", str(parts["front"]), "--rear", str(parts["rear"]), "--track", str(files["track"])]
     common += ["--vehicle", str(files["vehicle"]), "--nav", str(files["nav"])]
     common += ["--set", "tracking.level=on", "--reference", "centre"]
@@ -345,7 +345,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
     for name, table in batch.items():
         rows = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
         found = {(row["time_gpst"], row["antenna"]): row for row in rows}
-        assert len(found) == len(rows) > 200
+        assert len(found) == len(rows) > 130
         compared = 0
         times = table["time_gpst"].dt.strftime("%Y-%m-%dT%H:%M:%S%.9f").to_list()
         for time_gpst, row in zip(times, table.iter_rows(named=True), strict=True):
@@ -383,7 +383,7 @@ def test_messages_and_rows_of_the_filter_are_those_of_the_run(tmp_path: Path) ->
         assert (message.status is MessageStatus.COASTING) == (mine[0]["status"] == "coasting")
         assert message.status is not MessageStatus.POSITION or mine[0]["status"] == "tracking"
         checked += 1
-    assert checked > 100
+    assert checked > 60
 
 
 def up_cm(value: float) -> int:
@@ -497,6 +497,7 @@ def test_a_status_line_on_a_terminal_alone(tmp_path: Path) -> None:
     text = seen.decode(errors="replace")
     assert "GPST" in text
     assert "satellites" in text
-    plain = subprocess.run(program(*words), capture_output=True, text=True, timeout=60, check=True)
+    plain = RUNNER.invoke(app, ["live", *words])
+    assert plain.exit_code == 0, plain.output
     assert "satellites" not in plain.stderr
     assert "messages" in plain.stderr

@@ -37,10 +37,10 @@ def pixel(recordings: Path) -> integrity_tables.Case:
 
 @pytest.mark.requirement("C2")
 def test_no_ok_position_is_over_its_level_with_a_large_fault(pixel: integrity_tables.Case) -> None:
-    """Each satellite in turn 100 m too long from the middle on, some at a time when another one is off, too."""
+    """Every second satellite in turn 100 m too long from the middle on, some at a time when another one is off, too."""
     clean = pixel.solved()
     start, judged = len(clean) // 2, 0
-    for channel in np.flatnonzero((clean.reason == 0).mean(axis=0) > 0.2).tolist():
+    for channel in np.flatnonzero((clean.reason == 0).mean(axis=0) > 0.2)[::2].tolist():
         bias = np.zeros(pixel.observations.code_m.shape)
         bias[start:, pixel.observations.satellite == pixel.observations.satellite[channel]] = 100.0
         result = pixel.solved(bias_m=bias)

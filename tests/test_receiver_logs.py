@@ -220,7 +220,7 @@ def observed(observations: Observations) -> set[tuple[object, ...]]:
     return set(rows)
 
 
-@pytest.mark.parametrize("block", range(10))
+@pytest.mark.parametrize("block", [0, 1, 2, *(pytest.param(b, marks=pytest.mark.slow) for b in range(3, 10))])
 def test_damage_gives_no_false_observation(recordings: Path, block: int) -> None:
     """30 variants a block: no exception, nothing observed that the whole log does not have, counts add up."""
     data = gzip.decompress((recordings / "live" / TWO_BANDS).read_bytes())[:120_000]

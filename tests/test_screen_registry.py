@@ -49,7 +49,7 @@ def test_a_screen_is_one_file_and_one_line(tmp_path: Path) -> None:
     file, line = re.findall(r"```(?:python|text)\n(.*?)```", text, flags=re.DOTALL)[:2]
     assert line.count("\n") == 1
     package = tmp_path / "src" / "railfix"
-    shutil.copytree(ROOT / "src" / "railfix", package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "src" / "railfix", package, ignore=shutil.ignore_patterns("*.nbi", "*.nbc"))
     (package / "screens" / "large_sigma.py").write_text(file, encoding="utf-8")
     registry = package / "screens" / "registry.py"
     registry.write_text(registry.read_text().replace('    "raim",\n', f'{line}    "raim",\n'), encoding="utf-8")
@@ -63,7 +63,7 @@ def test_a_screen_is_one_file_and_one_line(tmp_path: Path) -> None:
 
     railfix(
         "run", "--front", DEMO / "front.crx.gz", "--nav", DEMO / "nav.rnx.gz", "--track", DEMO / "track.csv",
-        "--end", "2024-03-05T03:10:30", "--set", "large_sigma.limit_m=3", "--observations", "--out", tmp_path / "out",
+        "--end", "2024-03-05T03:10:10", "--set", "large_sigma.limit_m=3", "--observations", "--out", tmp_path / "out",
     )  # fmt: skip
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     assert record["settings_used"]["large_sigma"] == {"limit_m": 3.0}

@@ -120,16 +120,16 @@ def test_slips_and_slides_take_the_pulses_that_they_say(ratio: float) -> None:
 
 
 def test_drawn_slips_come_as_often_as_they_should() -> None:
-    """Over 200 hours of a shuttle; slips while it accelerates, slides while it brakes."""
+    """Over 100 hours of a shuttle; slips while it accelerates, slides while it brakes."""
     drawn = DrawnSlips(slip_chance=0.2, slide_chance=0.6, ratio=0.3, duration_s=3.0)
-    simulation = only(720_000.0, tachometer=TachometerSettings(drawn_slips=drawn))
+    simulation = only(360_000.0, tachometer=TachometerSettings(drawn_slips=drawn))
     assert simulation.scenario.sensors is not None
     assert simulation.scenario.sensors.tachometer is not None
     slips = wheel_slips(simulation, simulation.scenario.sensors.tachometer)
     ratio = np.array([s.ratio for s in slips])
     lasting = np.array([s.end_s - s.start_s for s in slips])
     stops = int(np.sum((simulation.motion.speed_mps[1:] == 0.0) & (simulation.motion.speed_mps[:-1] != 0.0)))
-    assert stops > 8000
+    assert stops > 4000
     assert (ratio > 0.0).sum() == pytest.approx(0.2 * stops, rel=0.05)
     assert (ratio < 0.0).sum() == pytest.approx(0.6 * stops, rel=0.05)
     # Even between a fifth and all.

@@ -47,7 +47,7 @@ def test_errors_of_the_filter_on_a_recording(recordings: Path, name: str) -> Non
 def test_half_a_day_at_rest_is_not_averaged_away(recordings: Path, azimuth_deg: float) -> None:
     """Errors of orbits and ionosphere last hours: a filter that averages over them states centimetres."""
     folder = recordings / "static" / "ESBC_2020177"
-    observations = read_observations(next(folder.glob("*_MO.crx.gz")))[:1440]
+    observations = read_observations(next(folder.glob("*_MO.crx.gz")), end="2020-06-25T12:00")
     place = observations.header.approximate_ecef_m
     trajectory = recordings_score.straight_line(place, azimuth_deg)
     config = Config(filter="track", elevation={"mask_deg": 10.0})

@@ -79,6 +79,7 @@ def test_the_city_is_as_bad_as_the_recordings_that_it_is_calibrated_on(calibrate
     assert off[:, 1].max() < 0.30
 
 
+@pytest.mark.slow
 def test_other_seeds_of_the_city_are_like_those_of_the_calibration(calibrated: Sample) -> None:
     ours, others = figures(calibrated), figures(city(seeds=VALIDATION_SEEDS))
     for name in ("p95_m", "p99_m", "over_20_m", "over_50_m", "beyond_5_sigma", "two_faults", "correlation_10_s"):

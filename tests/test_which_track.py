@@ -96,8 +96,8 @@ def _calibration(yards: int, common_m: float) -> dict[float, tuple[int, int]]:
 
 @pytest.mark.parametrize("common_m", [0.05, 1.0])
 def test_wrong_decisions_of_simulated_yards_are_within_the_risk(common_m: float) -> None:
-    for risk, (given, wrong) in _calibration(40, common_m).items():
-        assert given > 12
+    for risk, (given, wrong) in _calibration(24, common_m).items():
+        assert given > 7
         assert wrong <= binom.ppf(0.999, given, risk)
 
 
@@ -115,7 +115,7 @@ def test_phases_decide_more_and_never_wrongly() -> None:
     share = {}
     for method in ("model", "phase"):
         rows = [
-            decided(k, errors=StandstillErrors(), common_sigma_m=0.05, method=method, looks=looks) for k in range(24)
+            decided(k, errors=StandstillErrors(), common_sigma_m=0.05, method=method, looks=looks) for k in range(12)
         ]
         given = [(a[risk][0], own) for a, own in rows if risk in a]
         assert sum(name != own for name, own in given) <= binom.ppf(0.999, len(given), risk)
@@ -146,7 +146,7 @@ def test_wrong_decisions_with_phases_are_within_the_risk(half_cycle: bool) -> No
 
 def test_samples_counted_as_independent_decide_wrongly() -> None:
     """The naive method is over its risk by far on the same yards."""
-    rows = [decided(k, errors=StandstillErrors(), common_sigma_m=1.0, method="naive") for k in range(30)]
+    rows = [decided(k, errors=StandstillErrors(), common_sigma_m=1.0, method="naive") for k in range(18)]
     given = [(a[1e-3][0], own) for a, own in rows if 1e-3 in a]
     wrong = sum(name != own for name, own in given)
     assert wrong > binom.ppf(0.999, len(given), 1e-3)
@@ -154,10 +154,10 @@ def test_samples_counted_as_independent_decide_wrongly() -> None:
 
 def test_a_train_on_a_track_that_the_map_lacks_is_on_none() -> None:
     answers = [
-        decided(k, errors=StandstillErrors(), common_sigma_m=0.05, unmapped=True)[0].get(1e-2) for k in range(24)
+        decided(k, errors=StandstillErrors(), common_sigma_m=0.05, unmapped=True)[0].get(1e-2) for k in range(12)
     ]
     assert all(a is None or a[0] == "none" for a in answers)
-    assert sum(a is not None for a in answers) > 10
+    assert sum(a is not None for a in answers) > 5
 
 
 # --- the real roof -----------------------------------------------------------
@@ -193,9 +193,9 @@ def _from(codes: StandstillCodes, first: int, epochs: int) -> StandstillCodes:
 def test_roof_with_invented_yards_is_never_on_a_wrong_track(
     roof: dict[str, StandstillCodes], kind: str, decisions: float
 ) -> None:
-    """6 azimuths, starts every minute, yards of 5 tracks with the train on the middle or the edge."""
+    """3 azimuths, starts every minute, yards of 5 tracks with the train on the middle or the edge."""
     answers = []
-    for azimuth in range(0, 180, 30):
+    for azimuth in range(0, 180, 60):
         for start, own in ((0, 2), (60, 0), (120, 4), (180, 1), (240, 3)):
             yard = made_tracks(5, azimuth, np.zeros(2), own)
             result = decide_track(
@@ -243,7 +243,7 @@ def test_a_slip_ends_the_part_of_a_satellite_that_is_used(roof: dict[str, Stands
 
 
 def test_roof_between_tracks_of_a_map_that_lacks_its_own_is_on_none(roof: dict[str, StandstillCodes]) -> None:
-    for azimuth in range(0, 180, 30):
+    for azimuth in range(0, 180, 60):
         yard = [track for k, track in enumerate(made_tracks(5, azimuth, np.zeros(2), 2)) if k != 2]
         result = decide_track(yard, [roof["base"]], arms_m=(0.0,), errors=StandstillErrors(), risk=1e-2, every_s=60.0)
         assert result.track in ("none", "undecided")
