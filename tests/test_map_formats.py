@@ -253,6 +253,53 @@ def test_an_arc_of_ifc_is_an_arc_whatever_its_end_radius_says(tmp_path: Path, la
     assert end == pytest.approx([300.0 * np.sin(1 / 3), 300.0 * (1.0 - np.cos(1 / 3))], abs=1e-9)
 
 
+VIENNESE = """ISO-10303-21;
+HEADER;
+ENDSEC;
+DATA;
+#1= IFCALIGNMENT('a',$,'bend',$,$,$,$,$);
+#2= IFCALIGNMENTHORIZONTAL('b',$,$,$,$,$,$);
+#3= IFCALIGNMENTVERTICAL('c',$,$,$,$,$,$);
+#4= IFCALIGNMENTCANT('d',$,$,$,$,$,$,1.5);
+#5= IFCCARTESIANPOINT((500000.,5320000.));
+#11= IFCALIGNMENTHORIZONTALSEGMENT($,$,#5,0.,0.,300.,100.,1.8,.VIENNESEBEND.);
+#12= IFCALIGNMENTVERTICALSEGMENT($,$,0.,100.,10.,0.,0.,$,.CONSTANTGRADIENT.);
+#13= IFCALIGNMENTCANTSEGMENT($,$,0.,100.,0.,0.,0.,0.1,.VIENNESEBEND.);
+#21= IFCALIGNMENTSEGMENT('e',$,$,$,$,$,$,#11);
+#22= IFCALIGNMENTSEGMENT('f',$,$,$,$,$,$,#12);
+#23= IFCALIGNMENTSEGMENT('g',$,$,$,$,$,$,#13);
+#31= IFCRELNESTS('h',$,$,$,#1,(#2,#3,#4));
+#32= IFCRELNESTS('i',$,$,$,#2,(#21));
+#33= IFCRELNESTS('j',$,$,$,#3,(#22));
+#34= IFCRELNESTS('k',$,$,$,#4,(#23));
+ENDSEC;
+"""
+
+
+def test_a_viennese_bend_of_ifc_is_the_polynomial_of_its_standard(tmp_path: Path) -> None:
+    """The terms of order 2 to 7 of the curvature that buildingSMART's alignment test set has for this very element."""
+    path = tmp_path / "bend.ifc"
+    path.write_text(VIENNESE)
+    (segment,) = read_ifc_segments(path, crs="EPSG:32632", height_datum="ellipsoidal")
+    terms = {2: -125.657906854859, 3: 83.922298125931, 4: 64.2314061308743}
+    terms |= {5: -57.7378785242934, 6: 63.7638813456506, 7: -78.8880838459446}
+    east, north = Transformer.from_crs(4326, 32632, always_xy=True).transform(
+        segment.longitude_deg, segment.latitude_deg
+    )
+    way = np.linspace(0.0, 100.0, 200001)
+    heading = sum(np.sign(a) * way ** (k + 1) / (k + 1) / abs(a) ** (k + 1) for k, a in terms.items())
+    half = 0.5 * (heading[1:] + heading[:-1])
+    x = 500000.0 + np.concatenate([[0.0], np.cumsum(np.cos(half))]) * (way[1] - way[0])
+    y = 5320000.0 + np.concatenate([[0.0], np.cumsum(np.sin(half))]) * (way[1] - way[0])
+    assert np.abs(np.interp(east, x, y) - north).max() < 1e-5
+    assert north.min() < 5320000.0 - 0.002  # the track swings out first, as the vehicle begins to lean
+    assert segment.cant_m[-1] == pytest.approx(0.1)
+    curvature = np.gradient(heading, way)
+    expected = -1.0 / np.interp(east, x, curvature)
+    bent = np.abs(expected) < 2000.0
+    assert segment.radius_m[bent] == pytest.approx(expected[bent], rel=1e-3)
+
+
 def _closed_form(way: np.ndarray, direction: float, k0: float, k1: float, length: float) -> np.ndarray:
     if k0 == k1 == 0.0:
         local = np.stack([way, 0.0 * way], axis=-1)

@@ -1,8 +1,8 @@
 """Elements of an alignment in plan, profile and cant, as design files have them.
 
 In plan an element has a curvature that runs from its first to its last value by a law (straight, arc, clothoid,
-Bloss, cosine, sine, Helmert); the direction is its integral in closed form, the place that of the direction by
-Gauss-Legendre quadrature. Profile and cant are closed forms. Lengths are those of the plan, directions are
+Bloss, cosine, sine, Helmert, Viennese); the direction is its integral in closed form, the place that of the direction
+by Gauss-Legendre quadrature. Profile and cant are closed forms. Lengths are those of the plan, directions are
 counter-clockwise from the x axis (easting), curvature is positive to the left, as in IFC 4.3 and LandXML.
 """
 
@@ -31,6 +31,10 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
         lambda t: np.where(t < 0.5, 2.0 * t**2, -1.0 + 4.0 * t - 2.0 * t**2),
         lambda t: np.where(t < 0.5, 2.0 * t**3 / 3.0, 1.0 / 6.0 - t + 2.0 * t**2 - 2.0 * t**3 / 3.0),
     ),
+    "viennese": (
+        lambda t: t**4 * (35.0 - 84.0 * t + 70.0 * t**2 - 20.0 * t**3),
+        lambda t: t**5 * (7.0 - 14.0 * t + 10.0 * t**2 - 2.5 * t**3),
+    ),
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 #: Longest piece of one quadrature [rad of direction]; 12 nodes are exact to rounding below it.
@@ -57,6 +61,9 @@ class PlanElement:
     length_m : float [m]
     law : str
         Key of `LAWS`.
+    lean_m : float [m]
+        Of a Viennese bend: height of the centre of gravity times the change of the cant angle, positive where the right
+        rail rises. The law is of the way of the centre of gravity; the track lies beside it by so much.
     """
 
     x_m: float
@@ -66,14 +73,19 @@ class PlanElement:
     last: float
     length_m: float
     law: str = "linear"
+    lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
         """Curvature [1/m] at ways from the first point."""
-        return np.asarray(self.first + (self.last - self.first) * LAWS[self.law][0](way_m / self.length_m))
+        t = way_m / self.length_m
+        bend = self.lean_m / self.length_m**2 * 420.0 * t**2 * (1.0 - t) ** 2 * (1.0 - 2.0 * t)
+        return np.asarray(self.first + (self.last - self.first) * LAWS[self.law][0](t) - bend)
 
     def direction_at(self, way_m: Floats) -> Floats:
         """Direction [rad] at ways from the first point."""
-        change = (self.last - self.first) * self.length_m * LAWS[self.law][1](way_m / self.length_m)
+        t = way_m / self.length_m
+        change = (self.last - self.first) * self.length_m * LAWS[self.law][1](t)
+        change = change - self.lean_m / self.length_m * 140.0 * t**3 * (1.0 - t) ** 3
         return np.asarray(self.direction_rad + self.first * way_m + change)
 
     def place_at(self, way_m: Floats) -> Floats:

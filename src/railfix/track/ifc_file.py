@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any, Final
 
@@ -23,6 +23,7 @@ _LAWS: Final = {
     "COSINECURVE": "cosine",
     "SINECURVE": "sine",
     "HELMERTCURVE": "helmert",
+    "VIENNESEBEND": "viennese",
     "CONSTANTCANT": "linear",
     "LINEARTRANSITION": "linear",
 }
@@ -112,8 +113,12 @@ def read_ifc_segments(
         name = alignment.values[2] or f"alignment {len(segments) + 1}"
         try:
             plan = [_plan(step, e, scale, angle) for e in elements["IFCALIGNMENTHORIZONTAL"]]
+            heights = [e.values[7] for e in elements["IFCALIGNMENTHORIZONTAL"]]
             profile = [_profile(step, e, scale) for e in elements.get("IFCALIGNMENTVERTICAL", [])]
             cant = [_cant(step, e, scale) for e in elements.get("IFCALIGNMENTCANT", [])]
+            if cant:
+                gauge = step.at(layouts["IFCALIGNMENTCANT"], what="IFCALIGNMENTCANT").values[-1] * scale
+                plan = _leaning(plan, [(height or 0.0) * scale / gauge for height in heights], cant)
         except (TypeError, IndexError):
             raise InputFileError(path, f"alignment {name!r}: a segment lacks a number that IFC 4.3 requires") from None
         uneven = sum(_is_uneven(e) for e in elements.get("IFCALIGNMENTCANT", []))
@@ -200,6 +205,19 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
         length_m=length * scale,
         law=law,
     )
+
+
+def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
+    """Return the elements in plan, Viennese bends with the lean of their cant; `leans` are metres a metre of it."""
+    starts = np.concatenate([[0.0], np.cumsum([element.length_m for element in plan])])
+    result = []
+    for element, lean, start in zip(plan, leans, starts, strict=False):
+        if element.law == "viennese":
+            same = cant[int(np.argmin([abs(ramp.start_m - start) for ramp in cant]))]
+            rise = np.diff(same.right_m) - np.diff(same.left_m) if abs(same.start_m - start) < 0.1 else np.zeros(1)
+            element = replace(element, lean_m=float(lean * rise[0]))
+        result.append(element)
+    return result
 
 
 def _profile(step: _Step, entity: _Entity, scale: float) -> ProfileElement:
