@@ -98,7 +98,7 @@ def _check_kind(path: str, line: str) -> None:
             what = "an NMEA log" if line.startswith("$") else "a position log"
             raise InputFileError(path, f"looks like {what}, a RINEX observation file was expected", line=1)
         if re.match(r"# ?$|# Header Description|Raw,", line):
-            what = "looks like a log of Android's GnssLogger; a RINEX file was expected (GnssLogger writes one beside it)"
+            what = "looks like a log of Android's GnssLogger; give the RINEX file that GnssLogger writes beside it"
             raise InputFileError(path, what, line=1)
         raise InputFileError(path, "is not a RINEX file (its first line has no RINEX VERSION / TYPE)", line=1)
     kind = line[20:21].upper()
