@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Final, Literal, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from railfix.core.files import BrokenLines
 from railfix.core.settings import Settings, option
 from railfix.run.output import Overwrite
+from railfix.track.frames import MapMotion
 from railfix.track.vehicle import Reference
 
 #: Last whole year of times to the nanosecond in 64 bits.
@@ -51,8 +52,8 @@ class TrackReading(Settings):
     reference: Reference = option("Point of the vehicle whose chainage is given.", "antenna")
 
     @property
-    def motion(self) -> dict[str, Any]:
-        """What moves the track to the frame of the satellites: keywords of `railfix.track.frames.points_at`."""
+    def motion(self) -> MapMotion:
+        """What moves the track to the frame of the satellites."""
         return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
 
     cache: Literal["use", "skip"] = option(

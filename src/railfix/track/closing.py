@@ -19,11 +19,7 @@ _END_M: Final = 100.0
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
     """Return the arc lengths at which a closed line goes on before its start and after its end; NaN at an open end.
 
-    Parameters
-    ----------
-    arc_m : ndarray, shape (V,) [m]
-        Rising.
-    ecef_m : ndarray, shape (V, 3) [m]
+    From the rising arc lengths of V points and the points, shape (V, 3).
     """
     segment = np.diff(ecef_m, axis=0)
     segment /= np.linalg.norm(segment, axis=1, keepdims=True)

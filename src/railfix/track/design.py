@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 from pyproj import CRS, Transformer
 
-from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.arrays import Floats, Masks
+from railfix.core.errors import InputFileError
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, alignment_points
 from railfix.track.frames import frame_degrees, older_datum_note
-from railfix.track.heights import check_height_datum, ellipsoidal_heights
+from railfix.track.heights import stated_heights
 from railfix.track.segment import NO_HEIGHTS, Segment
 
 #: Margin about the area of use of a CRS [deg].
@@ -32,27 +32,12 @@ def segment_of_design(
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
-    """The points of one alignment as a segment.
+    """The points of one alignment as a segment, without heights where the profile is empty.
 
-    Parameters
-    ----------
-    path, name : str
-    plan, profile, cant : sequences of elements
-        The profile may be empty: the segment has no heights then.
-    crs : str or None
-        Of the grid; required.
-    height_datum, geoid : str or None
-        Of the profile.
-    grid : tuple of float, optional
-        Easting, northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into
-        those of the grid.
-
-    Raises
-    ------
-    InputFileError
-        The alignment has no element, or no grid.
-    SettingsError
-        The height datum is missing.
+    The CRS, which is required, is that of the grid, height datum and geoid those of the profile. `grid`: easting,
+    northing, height, cosine and sine of the rotation, and scale that turn the file's coordinates into those of the
+    grid. InputFileError: when the alignment has no element, or no grid. SettingsError: when the height datum is
+    missing.
     """
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
@@ -73,26 +58,12 @@ def segment_of_design(
         raise InputFileError(path, f"alignment {name!r}: coordinates lie outside the CRS {crs}; give the right --crs")
     height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
     if profile:
-        check_height_datum(height_datum)
-        if height_datum is None:
-            raise SettingsError(
-                f"{path}: the profile's height datum is missing; give --height-datum ellipsoidal or orthometric"
-            )
-        datum = height_datum
-        height, model = ellipsoidal_heights(
-            points.height_m + up, latitude, longitude, datum=datum, geoid=geoid, geoid_m=None, path=path
+        height, model, datum = stated_heights(
+            points.height_m + up, latitude, longitude, height_datum=height_datum, geoid=geoid, path=path
         )
     radius = np.full(len(latitude), np.inf)
     bent = np.abs(curvature) > 1e-9
     radius[bent] = -1.0 / curvature[bent] * scale
-    # the side of the cant follows from that of the curve; at the foot of a ramp it is that of the curve beside it
-    place = np.arange(len(radius))
-    side = np.ones(len(radius))
-    if bent.any():
-        nearest = np.searchsorted(place[bent], place).clip(0, bent.sum() - 1)
-        before = (nearest - 1).clip(0)
-        nearer = np.abs(place[bent][before] - place) < np.abs(place[bent][nearest] - place)
-        side = np.sign(curvature[bent])[np.where(nearer, before, nearest)]
     return Segment(
         source=f"{path} ({name})",
         file=path,
@@ -100,7 +71,7 @@ def segment_of_design(
         longitude_deg=longitude,
         height_m=height,
         kilometrage_m=np.full(len(latitude), np.nan),
-        cant_m=points.cant_m * side,
+        cant_m=points.cant_m * _side_of_curve(curvature, bent),
         radius_m=radius,
         gradient_permille=points.gradient * 1e3,
         crs=crs,
@@ -110,6 +81,17 @@ def segment_of_design(
         metadata={"name": name},
         notes=(*notes, *joints, *older_datum_note(crs)),
     )
+
+
+def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
+    """Side of the curve at each point, and of the nearest curve where the line is straight: at the foot of a ramp."""
+    if not bent.any():
+        return np.ones(len(curvature))
+    place = np.arange(len(curvature))
+    nearest = np.searchsorted(place[bent], place).clip(0, bent.sum() - 1)
+    before = (nearest - 1).clip(0)
+    nearer = np.abs(place[bent][before] - place) < np.abs(place[bent][nearest] - place)
+    return np.asarray(np.sign(curvature[bent])[np.where(nearer, before, nearest)])
 
 
 def _within(crs: str, xy: Floats) -> bool:

@@ -13,7 +13,7 @@ import warnings
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from os import PathLike
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypedDict, Unpack
 
 import numpy as np
 from pyproj import CRS, Transformer
@@ -94,13 +94,7 @@ def decimal_year(time: np.datetime64 | Datetimes) -> float:
 
 @lru_cache(maxsize=32)
 def kind_of_frame(crs: str) -> Kind:
-    """How a CRS is tied to the Earth.
-
-    Raises
-    ------
-    SettingsError
-        The CRS is unknown.
-    """
+    """How a CRS is tied to the Earth; SettingsError when it is unknown."""
     geodetic = _geodetic(crs)
     name = geodetic.name
     if name.startswith("WGS 84"):
@@ -112,12 +106,26 @@ def kind_of_frame(crs: str) -> Kind:
     return "older datum" if _operation(crs) is None else "moves with its plate"
 
 
-def _geodetic(crs: str) -> CRS:
+def known_crs(crs: str, *, path: str | PathLike[str] = "") -> CRS:
+    """The system of a name, asked for in a file; SettingsError when PROJ does not know it."""
     try:
-        system = CRS.from_user_input(crs)
+        return CRS.from_user_input(crs)
     except CRSError:
-        raise SettingsError(f"the CRS {crs!r} is unknown; give for example EPSG:4258 (ETRS89) or EPSG:9989") from None
-    geodetic = system.geodetic_crs
+        where = f"{path}: " if path else ""
+        raise SettingsError(
+            f"{where}the CRS {crs!r} is unknown; give for example EPSG:4326 (WGS 84), EPSG:4258 (ETRS89) or EPSG:6677"
+        ) from None
+
+
+def used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
+    """The CRS given for a file, or the one that it names itself; SettingsError when they contradict each other."""
+    if given is not None and named is not None and known_crs(given, path=path) != known_crs(named, path=path):
+        raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
+    return given or named
+
+
+def _geodetic(crs: str) -> CRS:
+    geodetic = known_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
     return geodetic
@@ -136,23 +144,12 @@ def _operation(crs: str) -> Transformer | None:
 
 
 def frame_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats, str]:
-    """Latitude and longitude of map coordinates [deg], and the frame they are in.
+    """Latitude and longitude of map coordinates (longitude and latitude, or easting and northing), and their frame's
+    code.
 
     Projected coordinates are turned into degrees of the frame they are based on; nothing is shifted between modern
     frames. Coordinates of an older datum (Tokyo, Belgian Datum 72) are transformed by PROJ to the modern frame of
     their region, with the accuracy that PROJ has for it.
-
-    Parameters
-    ----------
-    crs : str
-    x, y : ndarray, shape (n,)
-        Longitude and latitude, or easting and northing.
-
-    Returns
-    -------
-    latitude_deg, longitude_deg : ndarray, shape (n,)
-    frame : str
-        Code of the geographic CRS.
     """
     kind = kind_of_frame(crs)
     frame = _modern_frame(crs)[0] if kind == "older datum" else _frame_of(crs)
@@ -202,37 +199,32 @@ def older_datum_note(crs: str | None) -> tuple[str, ...]:
     return (f"map: {name} is an older datum, transformed to {to} by PROJ {size}{grid}",)
 
 
-def track_at(
-    track: Track,
-    time: np.datetime64,
-    *,
-    epoch: float | None = None,
-    plate: str | None = None,
-    parameters: str | PathLike[str] | None = None,
-) -> tuple[Track, FrameShift]:
-    """The track in the frame of the satellites at a time.
+class MapMotion(TypedDict, total=False):
+    """What moves coordinates of a map to the frame of the satellites, beside PROJ.
 
-    Parameters
+    Attributes
     ----------
-    track : Track
-        Coordinates in the frame that `Provenance.frame` names.
-    time, epoch, plate, parameters
-        As for `points_at`.
+    epoch : float or None [year]
+        Epoch of the map's coordinates, where its frame is an ITRF.
+    plate : str or None
+        Plate that moves coordinates of an ITRF from `epoch` to the time of the log: one of `PLATES`.
+    parameters : path or None
+        Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
+        deformation included; `epoch` is that of the file then, from which on the plate moves them.
+    """
 
-    Returns
-    -------
-    Track
-        With `Provenance.frame` the working frame's.
-    FrameShift
+    epoch: float | None
+    plate: str | None
+    parameters: str | PathLike[str] | None
 
-    Raises
-    ------
-    SettingsError
-        The plate is unknown, or `epoch` or `plate` is given for a frame that does not need it.
+
+def track_at(track: Track, time: np.datetime64, **motion: Unpack[MapMotion]) -> tuple[Track, FrameShift]:
+    """The track, moved from the frame that its `Provenance.frame` names to that of the satellites at a time.
+
+    Keywords (`epoch`, `plate`, `parameters`) and errors as for `points_at`.
     """
     provenance = track.provenance
-    how: dict[str, Any] = {"epoch": epoch, "plate": plate, "parameters": parameters}
-    moved, shift = points_at(track.ecef_m, provenance.frame, time, named=provenance.crs != UNNAMED, **how)
+    moved, shift = points_at(track.ecef_m, provenance.frame, time, named=provenance.crs != UNNAMED, **motion)
     if moved is track.ecef_m:
         return track, shift
     latitude, longitude, height = geodetic_from_ecef(moved)
@@ -241,46 +233,15 @@ def track_at(
 
 
 def points_at(
-    ecef_m: Floats,
-    crs: str,
-    time: np.datetime64,
-    *,
-    epoch: float | None = None,
-    plate: str | None = None,
-    parameters: str | PathLike[str] | None = None,
-    named: bool = True,
+    ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Points of a map in the frame of the satellites at a time.
+    """Points of a map, shape (n, 3), in the frame of the satellites at a time, and the shift at the middle one.
 
-    Parameters
-    ----------
-    ecef_m : ndarray, shape (n, 3) [m]
-    crs : str
-        Frame of the points.
-    time : datetime64
-        Of the log.
-    epoch : float, optional [year]
-        Epoch of the map's coordinates, where its frame is an ITRF.
-    plate : str, optional
-        Plate that moves coordinates of an ITRF from `epoch` to `time`: one of `PLATES`.
-    parameters : path, optional
-        Semi-dynamic correction of Japan (``SemiDynaEXE`` format) that moves coordinates in JGD2011 to its own epoch,
-        deformation included; `epoch` is that of the file then, from which on the plate moves them.
-    named : bool
-        Whether the map names its frame; else the size of the doubt is noted.
-
-    Returns
-    -------
-    ndarray, shape (n, 3) [m]
-        `ecef_m` itself where the frame is that of the satellites.
-    FrameShift
-        At the middle point.
-
-    Raises
-    ------
-    SettingsError
-        The plate is unknown, or `epoch` or `plate` is given for a frame that does not need it.
+    `crs` is their frame: where it is that of the satellites, they are returned as they are. `time` is that of the log.
+    Where the map does not name its frame itself, the size of the doubt is noted. SettingsError: when the plate is
+    unknown, or an epoch or plate is given for a frame that does not need it.
     """
+    epoch, plate, parameters = motion.get("epoch"), motion.get("plate"), motion.get("parameters")
     kind, frame, year = kind_of_frame(crs), _geodetic(crs), decimal_year(time)
     used = f"ITRF2020 at {year:.2f}"
     if plate is not None and plate not in PLATES:
@@ -306,9 +267,7 @@ def points_at(
     else:
         operation = _operation(crs)
         assert operation is not None
-        latitude, longitude, height = geodetic_from_ecef(ecef_m)
-        lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
-        moved, method, notes = ecef_from_geodetic(lat, lon, up), f"PROJ: {operation.description}", ()
+        moved, method, notes = _transformed(operation, ecef_m, year), f"PROJ: {operation.description}", ()
     at = geodetic_from_ecef(middle)
     east, north, up_m = (float(v) for v in enu_axes(float(at[0]), float(at[1])) @ (moved[len(ecef_m) // 2] - middle))
     shift = FrameShift(
@@ -317,31 +276,24 @@ def points_at(
     return moved, shift
 
 
+def _transformed(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
+    """Points after a transformation of PROJ at an epoch."""
+    latitude, longitude, height = geodetic_from_ecef(ecef_m)
+    lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), year))
+    return ecef_from_geodetic(np.asarray(lat), np.asarray(lon), np.asarray(up))
+
+
 def in_map_frame(
-    ecef_m: Floats,
-    crs: str,
-    time: np.datetime64,
-    *,
-    epoch: float | None = None,
-    plate: str | None = None,
-    parameters: str | PathLike[str] | None = None,
-    named: bool = True,
+    ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Positions from satellites in the frame of a map: the shift of `points_at` taken off.
+    """Positions from satellites, NaN where there is none, in the frame of a map: the shift of `points_at` taken off.
 
     A shift of metres changes by micrometres over its own length, so it is taken at the positions.
-
-    Parameters
-    ----------
-    ecef_m : ndarray, shape (n, 3) [m]
-        NaN where there is no position.
-    crs, time, epoch, plate, parameters, named
-        As for `points_at`.
     """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
     if not len(known):
         raise MismatchError("there is no position to move to the frame of the map")
-    moved, shift = points_at(ecef_m[known], crs, time, epoch=epoch, plate=plate, parameters=parameters, named=named)
+    moved, shift = points_at(ecef_m[known], crs, time, named=named, **motion)
     back = ecef_m.copy()
     back[known] = 2.0 * ecef_m[known] - moved
     return back, shift
@@ -353,10 +305,7 @@ def _from_dynamic(
     """Coordinates of an ITRF at an epoch, in the working frame at the log's."""
     name = _geodetic(crs).name
     operation = Transformer.from_crs(_geodetic(crs).to_3d(), WORKING_FRAME, always_xy=True)
-    at = year if epoch is None else epoch
-    latitude, longitude, height = geodetic_from_ecef(ecef_m)
-    lon, lat, up, _ = operation.transform(longitude, latitude, height, np.full(len(height), at))
-    moved = ecef_from_geodetic(np.asarray(lat), np.asarray(lon), np.asarray(up))
+    moved = _transformed(operation, ecef_m, year if epoch is None else epoch)
     if epoch is None:
         note = (
             f"map: coordinates in {name} move 1 to 8 cm a year; no epoch is named, that of the log ({year:.2f}) is used"

@@ -86,18 +86,8 @@ class Thinned:
 def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
     """Flag the rows at which the antenna is stationary: its horizontal displacement is below speed times window.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (n,)
-        Rising; rows without a time are never flagged.
-    ecef_m : ndarray, shape (n, 3) [m]
-    speed_mps : float [m/s]
-    window_s : float [s]
-        Before and after each row; shorter at the ends and at gaps.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
+    The window lies before and after each row, shorter at the ends and at gaps. Times rise; rows without one are never
+    flagged.
     """
     if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
         return np.zeros(len(time), dtype=np.bool_)
@@ -119,20 +109,11 @@ def thin(
     usable: Masks | None = None,
     limits: ThinningLimits | None = None,
 ) -> Thinned:
-    """Choose the positions that become points of a map.
+    """Choose the positions that become points of a map, out of the usable rows (NaN is not).
 
     Noise and drift of a stationary antenna make no loops: stationary rows are dropped first, and a point
     is kept only at full spacing from the last. The last usable position is kept where it is at least a
     fifth of the spacing further on.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (n,)
-    ecef_m : ndarray, shape (n, 3) [m]
-        Rows with NaN are dropped.
-    usable : ndarray of bool, shape (n,), optional
-        False drops a row for its quality.
-    limits : ThinningLimits, optional
     """
     limits = limits or ThinningLimits()
     finite = np.isfinite(ecef_m).all(axis=1)
@@ -277,26 +258,9 @@ def from_positions(
 ) -> Track:
     """Create a track from positions, thinned and without stationary positions.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (n,)
-        In the order of travel; NaT where unknown.
-    ecef_m : ndarray, shape (n, 3) [m]
-    spacing_m : float [m]
-        Ignored where `limits` is given.
-    usable : ndarray of bool, shape (n,), optional
-        False drops a row.
-    limits : ThinningLimits, optional
-
-    Returns
-    -------
-    Track
-        Its notes record that it is the path of the antenna, and its gaps and reversals.
-
-    Raises
-    ------
-    ValueError
-        Fewer than two points are left.
+    Its notes record that it is the path of the antenna, and its gaps and reversals. Times are in the order of travel,
+    NaT where unknown; `usable` drops rows; the spacing is ignored where limits are given. ValueError: when fewer than
+    two points are left.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
     return track_of(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
@@ -342,22 +306,9 @@ def track_of(
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
     """Flag the rows of a log that meet the quality limits.
 
-    Parameters
-    ----------
-    log : PositionLog
-    quality : sequence of int, optional
-        Accepted quality numbers; by default 1 (fix) where the log has a quality, else all rows.
-    max_sigma_m : float, optional [m]
-        Largest standard deviation in north, east and up; rows without one are rejected then.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-
-    Raises
-    ------
-    InputFileError
-        The log has no column for a filter that is given.
+    Accepted quality numbers are by default 1 (fix) where the log has a quality, else all rows; with a largest standard
+    deviation in north, east and up [m], rows without one are rejected. InputFileError: when the log has no column for a
+    filter that is given.
     """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
@@ -410,10 +361,7 @@ def from_position_log(
 ) -> tuple[Track, Thinned]:
     """Create a track from the accurate positions of a log, and report the selection of rows.
 
-    Raises
-    ------
-    InputFileError
-        Fewer than two points are left, or the log has no column for a filter.
+    InputFileError: when fewer than two points are left, or the log has no column for a filter.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)

@@ -8,15 +8,13 @@ from os import PathLike
 from typing import Any, Final
 
 import numpy as np
-from pyproj import CRS
-from pyproj.exceptions import CRSError
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
 from railfix.core.files import read_text
 from railfix.core.spelling import misspelt
-from railfix.track.csv_file import OPTIONAL_COLUMNS, straight_radius
-from railfix.track.frames import frame_degrees, older_datum_note
+from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
+from railfix.track.frames import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
 from railfix.track.segment import Segment
 
@@ -112,7 +110,7 @@ class _Line:
             return value
         raise self.error(f"{key} is {value!r}; a text was expected")
 
-    def array(self, key: str, *, blank: float) -> Floats | None:
+    def array(self, key: str, blank: float) -> Floats | None:
         """Return a property with one value per point; null is `blank`."""
         value = self.properties.get(key)
         if value is None:
@@ -139,17 +137,9 @@ def _crs_member(path: str, document: dict[str, Any]) -> str | None:
         raise InputFileError(path, "the 'crs' member has no properties.name; give --crs") from None
 
 
-def _crs(path: str, crs: str) -> CRS:
-    try:
-        return CRS.from_user_input(crs)
-    except CRSError:
-        raise SettingsError(f"{path}: the CRS {crs!r} is unknown; give for example EPSG:4326 or EPSG:6677") from None
-
-
 def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]:
     """Latitude, longitude and frame of coordinates in easting-northing or longitude-latitude order."""
-    system = _crs(path, crs)
-    if system.is_geographic:
+    if known_crs(crs, path=path).is_geographic:
         over = np.abs(values[:, 1]) > 90.0
         if over.any() or (np.abs(values[:, 0]) > 360.0).any():
             point = values[int(np.argmax(over))]
@@ -174,14 +164,8 @@ def read_geojson_segments(
 ) -> list[Segment]:
     """Read the lines of a GeoJSON file, in their order, as segments of a route.
 
-    Parameters
-    ----------
-    path : path
-    crs : str, optional
-        CRS of a file without one; an error where the file names another one.
-    height_datum, geoid : str, optional
-        Used where the file has no such member or property.
-    duplicates : {"reject", "keep"}
+    The CRS is that of a file without one (an error where the file names another one); height datum and geoid are used
+    where the file has no such member or property; duplicates as for `railfix.track.read_track`.
     """
     text = read_text(path)
     try:
@@ -192,10 +176,7 @@ def read_geojson_segments(
         raise InputFileError(path, "this JSON is nested too deeply for a GeoJSON object") from None
     if not isinstance(document, dict):
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
-    named = _crs_member(str(path), document)
-    if crs is not None and named is not None and _crs(str(path), crs) != _crs(str(path), named):
-        raise SettingsError(f"{path}: --crs {crs} contradicts the file's own CRS {named}")
-    used = crs or named or RFC_CRS
+    used = used_crs(path, crs, _crs_member(str(path), document)) or RFC_CRS
     return [_segment(line, used, height_datum, geoid, duplicates) for line in _lines(str(path), document, "", {})]
 
 
@@ -218,18 +199,12 @@ def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None,
             "'railfix map check' lists them all"
         )
     latitude, longitude, frame = _in_frame(line.source, crs, line.coordinates)
-    geoid_m = line.array("geoid_m", blank=np.nan) if datum == "orthometric" else None
+    geoid_m = line.array("geoid_m", np.nan) if datum == "orthometric" else None
     if geoid is None and datum == "orthometric" and geoid_m is None:
         geoid = line.text("geoid")
     height, model = ellipsoidal_heights(
         line.coordinates[:, 2], latitude, longitude, datum=datum, geoid=geoid, geoid_m=geoid_m, path=line.source
     )
-    attributes: dict[str, Floats] = {name: np.full(len(latitude), np.nan) for name, _, _ in OPTIONAL_COLUMNS.values()}
-    for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
-        values = line.array(column, blank=blank)
-        if values is not None:
-            attributes[name] = values * factor
-    attributes["radius_m"] = straight_radius(attributes["radius_m"])
     return Segment(
         source=line.source,
         file=line.path,
@@ -240,10 +215,7 @@ def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None,
         frame=frame,
         height_datum=datum,
         geoid=model,
-        kilometrage_m=attributes["kilometrage_m"],
-        cant_m=attributes["cant_m"],
-        radius_m=attributes["radius_m"],
-        gradient_permille=attributes["gradient_permille"],
         notes=older_datum_note(crs),
         metadata={key: str(line.properties[key]) for key in _MEMBERS if key in line.properties},
+        **attributes(len(latitude), line.array),
     )

@@ -148,12 +148,9 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 
 def windowed_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
-    """Compute the mean gradient of the attribute and of the heights over a window around each point.
+    """Mean gradient [permille] of the attribute and of the heights over a window around each point, shapes (V,).
 
-    Returns
-    -------
-    attribute_permille, height_permille : ndarray, shape (V,)
-        NaN where the window has points without a gradient, or less than half of it is on the track.
+    NaN where the window has points without a gradient, or less than half of it is on the track.
     """
     along, gradient = track.chainage_m, track.gradient_permille
     mean = (gradient[1:] + gradient[:-1]) / 2.0

@@ -40,20 +40,16 @@ def with_heights(
     height_datum: str | None = None,
     sigma_m: float | None = None,
 ) -> Track:
-    """The track with the heights of a second source, and their standard deviation.
+    """The track with the heights of a second source in place of its own, and their standard deviation.
 
     Parameters
     ----------
-    track : Track
-        With heights of 0, which are not used.
     path : path
         Raster (`RASTERS`); CSV with ``chainage_m`` or ``kilometrage_m`` and ``height_m`` (ellipsoidal) or
         ``elevation_m`` (orthometric), its accuracy as the column ``sigma_m`` or the line ``# sigma_m:``; or a log of
         positions as `railfix.io.nmea.read_any_positions` reads it.
-    geoid : str, optional
-        Of orthometric heights.
-    height_datum : {"ellipsoidal", "orthometric"}, optional
-        Of a raster, which needs it.
+    geoid, height_datum : str, optional
+        Geoid of orthometric heights; datum of a raster, which needs it.
     sigma_m : float, optional [m]
         Standard deviation of the heights, in place of that of the source; a raster needs it.
 

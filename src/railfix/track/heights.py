@@ -45,29 +45,11 @@ def check_height_datum(height_datum: str | None) -> None:
 
 
 def geoid_heights(geoid: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> tuple[Floats, str]:
-    """Compute the height of a geoid above the WGS 84 ellipsoid.
+    """Height of a geoid above the WGS 84 ellipsoid, shape (n,) [m], and the model used.
 
-    Parameters
-    ----------
-    geoid : str
-        A key of `JAPAN_MODELS`; a file or name of a pyproj grid (``.tif``, ``.gtx``); or a vertical or
-        compound CRS (``EPSG:5773``).
-    latitude_deg, longitude_deg : ndarray, shape (n,) [deg]
-    path : str
-        The map, for messages.
-
-    Returns
-    -------
-    geoid_m : ndarray, shape (n,) [m]
-    name : str
-        The model used.
-
-    Raises
-    ------
-    SettingsError
-        The model is unknown or its grid is not installed.
-    InputFileError
-        Points of the map lie outside the area of the model.
+    The geoid is a key of `JAPAN_MODELS`; a file or name of a pyproj grid (``.tif``, ``.gtx``); or a vertical or
+    compound CRS (``EPSG:5773``). SettingsError: when the model is unknown or its grid is not installed. InputFileError:
+    when points of the map lie outside the area of the model.
     """
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:
@@ -111,6 +93,25 @@ def _proj_transformer(geoid: str) -> tuple[str, Transformer]:
         ) from None
 
 
+def stated_heights(
+    heights_m: Floats,
+    latitude_deg: Floats,
+    longitude_deg: Floats,
+    *,
+    height_datum: str | None,
+    geoid: str | None,
+    path: str,
+) -> tuple[Floats, str, str]:
+    """Ellipsoidal heights of a file without a datum of its own, the geoid used, and the datum, which must be given."""
+    check_height_datum(height_datum)
+    if height_datum is None:
+        raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
+    height, model = ellipsoidal_heights(
+        heights_m, latitude_deg, longitude_deg, datum=height_datum, geoid=geoid, geoid_m=None, path=path
+    )
+    return height, model, height_datum
+
+
 def ellipsoidal_heights(
     heights_m: Floats,
     latitude_deg: Floats,
@@ -121,24 +122,10 @@ def ellipsoidal_heights(
     geoid_m: Floats | None,
     path: str,
 ) -> tuple[Floats, str]:
-    """Convert heights to ellipsoidal heights, and name the geoid used.
+    """Convert heights of a datum ("ellipsoidal", "orthometric") to ellipsoidal heights, and name the geoid used.
 
-    Parameters
-    ----------
-    heights_m, latitude_deg, longitude_deg : ndarray, shape (n,)
-    datum : str
-        ``"ellipsoidal"`` or ``"orthometric"``.
-    geoid : str or None
-        Model, if given.
-    geoid_m : ndarray, shape (n,) or None
-        Geoid heights of the map itself.
-    path : str
-        The map, for messages.
-
-    Raises
-    ------
-    InputFileError, SettingsError
-        Orthometric heights without a geoid, or with two; ellipsoidal heights with one.
+    `geoid` is the model, if given, `geoid_m` the geoid heights of the map itself. InputFileError, SettingsError:
+    orthometric heights without a geoid, or with two; ellipsoidal heights with one.
     """
     if datum == "ellipsoidal":
         if geoid is not None:

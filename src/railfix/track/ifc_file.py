@@ -81,22 +81,12 @@ def _values(text: str) -> list[Any]:
 def read_ifc_segments(
     path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
 ) -> list[Segment]:
-    """Read the alignments of an IFC file, one segment each.
+    """Read the alignments of an IFC file, one segment each; the CRS is that of the grid where it has no
+    IfcProjectedCRS.
 
     The height is that of the middle between the rail tops: the profile and half the sum of both rails' cant (IFC
     4.3.2, IfcSegmentedReferenceCurve). A constant cant whose two ends differ is taken as a linear transition.
-
-    Parameters
-    ----------
-    path : path
-    crs : str, optional
-        Of the grid, where the file has no IfcProjectedCRS.
-    height_datum, geoid : str, optional
-
-    Raises
-    ------
-    InputFileError
-        The file has no alignment, or one with elements that are not read.
+    InputFileError: when the file has no alignment, or one with elements that are not read.
     """
     step = _Step(path)
     nested = {entity.values[4]: entity.values[5] for _, entity in step.of_kind("IFCRELNESTS")}

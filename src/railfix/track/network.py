@@ -136,13 +136,7 @@ class Network:
 
     @property
     def frame(self) -> str:
-        """Geographic CRS of the coordinates.
-
-        Raises
-        ------
-        MismatchError
-            The tracks are in different ones.
-        """
+        """Geographic CRS of the coordinates; MismatchError when the tracks are in different ones."""
         return one_frame(self.tracks)
 
     @property
@@ -210,14 +204,7 @@ class Network:
         )
 
     def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-        """Chainage on given tracks and distance from them in plan, shapes (n,); NaN without track or position.
-
-        Parameters
-        ----------
-        track : ndarray of int, shape (n,)
-            -1 where there is none.
-        latitude_deg, longitude_deg : ndarray, shape (n,)
-        """
+        """Chainage on given tracks and distance from them in plan, shapes (n,); NaN without track (-1) or position."""
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         chainage, offset = np.full(len(track), np.nan), np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
@@ -238,13 +225,7 @@ class Network:
         return kilometrage
 
     def index_of(self, name: str) -> int:
-        """Number of the track of a name.
-
-        Raises
-        ------
-        SettingsError
-            There is no such track.
-        """
+        """Number of the track of a name; SettingsError when there is none."""
         if name not in self.names:
             close = [n for n in self.names if name.lower() in n.lower()][:3]
             hint = f"; similar names: {', '.join(close)}" if close else f"; there are {len(self.names)} tracks"
@@ -267,10 +248,7 @@ class Network:
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
         """Tracks of the shortest route that passes the given tracks in order, over navigable connections.
 
-        Raises
-        ------
-        MismatchError
-            No route leads from one to the next without turning back.
+        MismatchError: when no route leads from one to the next without turning back.
         """
         route = self.route_over(stops)
         if route is None:

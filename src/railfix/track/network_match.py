@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from railfix.core.geodesy import ecef_from_geodetic, geodetic_from_ecef
 from railfix.io.named_columns import read_named_columns
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import positions_times, renamed
-from railfix.track.frames import FrameShift, in_map_frame, kind_of_frame
+from railfix.track.frames import FrameShift, MapMotion, in_map_frame, kind_of_frame
 from railfix.track.network import Candidates, Network
 from railfix.track.track import SIGMA_PLAN_M
 
@@ -62,22 +62,11 @@ class PlanLog:
     longitude_deg: Floats
     sigma_m: Floats
 
-    def in_frame_of(
-        self,
-        network: Network,
-        *,
-        epoch: float | None = None,
-        plate: str | None = None,
-        parameters: str | PathLike[str] | None = None,
-    ) -> tuple[PlanLog, FrameShift]:
+    def in_frame_of(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
         """The positions, which are in the frame of the satellites, in that of the network.
 
-        Raises
-        ------
-        MismatchError
-            There is no position, or no time of the log in a network whose frame moves.
-        SettingsError
-            See `railfix.track.frames.points_at`.
+        MismatchError: when there is no position, or no time of the log in a network whose frame moves. SettingsError:
+        as for `railfix.track.frames.points_at`.
         """
         times = self.time[~np.isnat(self.time)]
         if not len(times) and kind_of_frame(network.frame) not in ("wgs84", "older datum"):
@@ -87,8 +76,7 @@ class PlanLog:
             )
         time = np.sort(times)[len(times) // 2] if len(times) else np.datetime64("now", "ns")
         ecef = ecef_from_geodetic(self.latitude_deg, self.longitude_deg, np.zeros(len(self.latitude_deg)))
-        how: dict[str, Any] = {"epoch": epoch, "plate": plate, "parameters": parameters}
-        moved, shift = in_map_frame(ecef, network.frame, time, named=network.named, **how)
+        moved, shift = in_map_frame(ecef, network.frame, time, named=network.named, **motion)
         latitude, longitude, _ = geodetic_from_ecef(moved)
         return replace(self, latitude_deg=latitude, longitude_deg=longitude), shift
 
@@ -121,16 +109,8 @@ class Matched:
 def read_plan_positions(path: str | PathLike[str], *, columns: Mapping[str, str] | None = None) -> PlanLog:
     """Read positions in plan: any log of positions, or a CSV of latitude and longitude without heights.
 
-    Parameters
-    ----------
-    path : path
-    columns : mapping of str, optional
-        For CSV: name in railfix (``latitude_deg``, ``longitude_deg``, ``time_gpst``) to name in the file.
-
-    Raises
-    ------
-    InputFileError
-        The file is not a log of positions.
+    The columns of a CSV are given by their names in railfix (``latitude_deg``, ``longitude_deg``, ``time_gpst``).
+    InputFileError: when the file is not a log of positions.
     """
     if ending(path) == ".csv":
         table = renamed(read_named_columns(path), dict(columns or {}))
@@ -162,7 +142,6 @@ def match(
 
     Parameters
     ----------
-    network : Network
     log : PlanLog
         In the order of travel, in the frame of the network.
     sigma_m : float, optional [m]
@@ -172,10 +151,6 @@ def match(
         Farthest track considered.
     correlation_s : float [s]
         Time over which position errors persist.
-
-    Returns
-    -------
-    Matched
 
     Raises
     ------
@@ -215,24 +190,19 @@ def match(
 def _spread(matched: Matched, rows: Indices, count: int) -> Matched:
     """Matched positions put on their rows of a log, the others without."""
 
-    def over(values: Floats, empty: float) -> Floats:
-        full = np.full((count, *values.shape[1:]), empty)
-        full[rows] = values
-        return full
-
-    def tracks(values: Indices) -> Indices:
-        full = np.full((count, *values.shape[1:]), -1, dtype=np.intp)
+    def over(values: Any, empty: float) -> Any:
+        full = np.full((count, *values.shape[1:]), empty, dtype=values.dtype)
         full[rows] = values
         return full
 
     near = matched.candidates
     return Matched(
-        track=tracks(matched.track),
+        track=over(matched.track, -1),
         chainage_m=over(matched.chainage_m, np.nan),
         offset_m=over(matched.offset_m, np.nan),
         probability=over(matched.probability, np.nan),
         candidates=Candidates(
-            track=tracks(near.track), chainage_m=over(near.chainage_m, np.nan), offset_m=over(near.offset_m, np.inf)
+            track=over(near.track, -1), chainage_m=over(near.chainage_m, np.nan), offset_m=over(near.offset_m, np.inf)
         ),
         probabilities=over(matched.probabilities, np.nan),
     )
@@ -319,17 +289,12 @@ def _normal(weights: Floats) -> Floats:
 
 
 def route_of(network: Network, matched: Matched) -> tuple[list[int], list[int]]:
-    """Tracks that a run passed, and those that it may have passed but no route can join to them.
+    """Tracks that a run passed, in the order of travel, and those that it may have passed but no route can join to
+    them.
 
     Gaps are filled with the shortest way over navigable connections. A train that runs back over tracks it has
     passed stays on the same route; where it runs back over others, or the map has a gap, the less probable ones are
-    left out.
-
-    Returns
-    -------
-    route : list of int
-        In the order of travel; empty where no position is on a track.
-    left_out : list of int
+    left out. The route is empty where no position is on a track.
     """
     seen = matched.track[matched.track >= 0]
     if not len(seen):

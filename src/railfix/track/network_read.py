@@ -36,21 +36,10 @@ def read_network(
     geoid: str | None = None,
     tolerance_m: float = TOLERANCE_M,
 ) -> Network:
-    """Read a network of tracks from map files.
+    """Read a network of tracks from map files, as `railfix.track.read_track` reads them.
 
-    Parameters
-    ----------
-    paths : sequence of paths
-        As `railfix.track.read.read_segments` reads them.
-    crs, height_datum, geoid : str, optional
-        As for `railfix.track.read_track`.
-    tolerance_m : float [m]
-        Where the files state no connections: ends nearer than this are one point, and a track on which the end of
-        another lies is divided there.
-
-    Raises
-    ------
-    InputFileError, SettingsError
+    Where the files state no connections, ends nearer than the tolerance are one point, and a track on which the end of
+    another lies is divided there. InputFileError, SettingsError.
     """
     tracks: list[Segment] = []
     for path in paths:

@@ -17,10 +17,7 @@ _CHUNK = 2_000_000
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
     """Find the nearest point of segments: its fraction of the segment in [0, 1], and the distance.
 
-    Parameters
-    ----------
-    points_m, start_m, step_m : ndarray, shapes that broadcast to (..., 3) [m]
-        Position, first point of the segment, and first to last point.
+    Position, first point of the segment, and first to last point are of shapes that broadcast to (..., 3).
     """
     offset = points_m - start_m
     squared = np.einsum("...i,...i->...", step_m, step_m)
@@ -30,15 +27,11 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
 
 
 class NearestOnPolyline:
-    """Search structure for nearest points of a polyline.
+    """Search structure for nearest points of a polyline of V points, shape (V, 3).
 
     The polyline is sampled so that each of its points is within `reach_m` of a sample of the same
     segment. The segment of the nearest point therefore has a sample within the best distance found
     plus `reach_m`, which either proves the result or requires more candidates.
-
-    Parameters
-    ----------
-    points_m : ndarray, shape (V, 3) [m]
     """
 
     def __init__(self, points_m: Floats) -> None:

@@ -126,15 +126,7 @@ class TrackQuality:
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
     """Check the quality of a track map.
 
-    Parameters
-    ----------
-    track : Track
-        Read with ``duplicates="keep"`` so that duplicates are findings instead of an error.
-    limits : MapLimits, optional
-
-    Returns
-    -------
-    TrackQuality
+    Read it with ``duplicates="keep"`` so that duplicates are findings instead of an error.
     """
     limits = limits or MapLimits()
     geometry = geometry_of(track)

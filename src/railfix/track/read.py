@@ -142,16 +142,7 @@ def read_segments(
 ) -> list[Segment]:
     """Read the lines of one map file in their order; a file without heights gives segments without.
 
-    Parameters
-    ----------
-    file : path
-    crs, height_datum, geoid, duplicates
-        As for `read_track`.
-
-    Raises
-    ------
-    InputFileError
-        The file is not a map.
+    Options as for `read_track`. InputFileError: when the file is not a map.
     """
     kind = ending(file)
     if kind == ".csv":

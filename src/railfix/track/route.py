@@ -27,18 +27,10 @@ def _ends(segment: Segment) -> Floats:
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Orient segments so that each begins where the one before ends.
+    """Orient segments, in the order of the route, so that each begins where the one before ends.
 
-    Parameters
-    ----------
-    segments : sequence of Segment
-        In the order of the route; the first is reversed only where its start, not its end, meets the second.
-    max_gap_m : float [m]
-
-    Raises
-    ------
-    InputFileError
-        Two neighbours are further apart than `max_gap_m` in any orientation.
+    The first is reversed only where its start, not its end, meets the second. InputFileError: when two neighbours are
+    further apart than `max_gap_m` in any orientation.
     """
     gap = first_gap(segments, max_gap_m=max_gap_m)
     if gap is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from railfix.core.arrays import Floats
 
@@ -52,20 +52,12 @@ class Segment:
 
     def reversed(self) -> Segment:
         """Return the segment in the opposite direction; the signs of radius and gradient change."""
-        return Segment(
-            source=self.source,
-            file=self.file,
-            latitude_deg=self.latitude_deg[::-1],
-            longitude_deg=self.longitude_deg[::-1],
-            height_m=self.height_m[::-1],
-            kilometrage_m=self.kilometrage_m[::-1],
-            cant_m=self.cant_m[::-1],
-            radius_m=-self.radius_m[::-1],
-            gradient_permille=-self.gradient_permille[::-1],
-            crs=self.crs,
-            frame=self.frame,
-            height_datum=self.height_datum,
-            geoid=self.geoid,
-            metadata=self.metadata,
+        turned = {
+            name: getattr(self, name)[::-1] for name in ("latitude_deg", "longitude_deg", "height_m", *ATTRIBUTES)
+        }
+        turned |= {name: -turned[name] for name in ("radius_m", "gradient_permille")}
+        return replace(
+            self,
+            **turned,
             notes=(*self.notes, f"{self.source} is used against the order of its points"),
         )

@@ -133,17 +133,7 @@ class Track(NotebookTable):
         sigma_height_m: float = SIGMA_HEIGHT_M,
         provenance: Provenance | None = None,
     ) -> Track:
-        """Create a track from geodetic coordinates; attributes not given are NaN.
-
-        Parameters
-        ----------
-        latitude_deg, longitude_deg, height_m : array_like, shape (V,)
-            WGS 84, ellipsoidal height.
-
-        Returns
-        -------
-        Track
-        """
+        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height); attributes not given are NaN."""
         latitude = np.array(latitude_deg, dtype=np.float64)
 
         def floats(values: ArrayLike | None) -> Floats:
@@ -218,17 +208,10 @@ class Track(NotebookTable):
 
 
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
-    """Flag the segments in which the kilometrage jumps.
+    """Flag the segments in which the kilometrage jumps, shape (V - 1,).
 
-    Parameters
-    ----------
-    chainage_m, kilometrage_m : ndarray, shape (V,) [m]
-
-    Returns
-    -------
-    ndarray of bool, shape (V - 1,)
-        True where the change of kilometrage, in either direction, differs from the length of the
-        segment by more than `KILOMETRAGE_BREAK_M` and a twentieth; False where it is NaN.
+    There its change, in either direction, differs from the length of the segment by more than `KILOMETRAGE_BREAK_M` and
+    a twentieth; False where it is NaN.
     """
     length = np.diff(chainage_m)
     change = np.abs(np.diff(kilometrage_m))
@@ -237,21 +220,10 @@ def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """Interpolate the kilometrage at chainages.
+    """Interpolate the kilometrage, known at V rising chainages, at others; NaN where the nearer point has none.
 
     Linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is
     extrapolated in its own direction, never interpolated across the jump.
-
-    Parameters
-    ----------
-    chainage_m : array_like, any shape [m]
-    known_chainage_m, known_kilometrage_m : ndarray, shape (V,) [m]
-        Rising chainage, and the kilometrage there.
-
-    Returns
-    -------
-    ndarray, same shape as `chainage_m` [m]
-        NaN where the nearer point has no kilometrage, and for NaN.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     index = np.clip(np.searchsorted(known_chainage_m, at, side="right") - 1, 0, len(known_chainage_m) - 2)

@@ -13,14 +13,12 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-from pyproj import CRS
-from pyproj.exceptions import CRSError
 
 from railfix.core.arrays import Floats
-from railfix.core.errors import InputFileError, SettingsError
+from railfix.core.errors import InputFileError
 from railfix.core.files import ending
-from railfix.track.frames import frame_degrees, older_datum_note
-from railfix.track.heights import check_height_datum, ellipsoidal_heights
+from railfix.track.frames import frame_degrees, older_datum_note, used_crs
+from railfix.track.heights import check_height_datum, stated_heights
 from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, Segment
 from railfix.track.track import UNNAMED
 
@@ -34,23 +32,10 @@ _OSM_RAILWAYS: Final = ("rail", "light_rail", "subway", "tram", "narrow_gauge", 
 
 
 def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
-    """Read all features of a kind of geometry.
+    """Read all features of a kind of geometry ("LineString", "Point"); multi-part lines are taken apart.
 
-    Parameters
-    ----------
-    path : path
-    geometry : {"LineString", "Point"}
-        Multi-part lines are taken apart.
-
-    Returns
-    -------
-    list of (crs, properties, geometries)
-        One entry a layer: CRS or None, properties of each feature, shapely geometries.
-
-    Raises
-    ------
-    InputFileError
-        pyogrio is missing, or GDAL cannot read the file.
+    One entry a layer: CRS or None, properties of each feature, shapely geometries. InputFileError: when pyogrio is
+    missing, or GDAL cannot read the file.
     """
     try:
         import pyogrio
@@ -79,22 +64,13 @@ def read_vector_segments(
 ) -> list[Segment]:
     """Read the lines of a map file as segments, in the order of the file.
 
-    Parameters
-    ----------
-    path : path
-    crs : str, optional
-        CRS of a file without one; an error where the file names another one.
-    height_datum, geoid : str, optional
-        Of coordinates with heights; a segment whose heights are all 0 counts as one without.
-
-    Raises
-    ------
-    InputFileError, SettingsError
+    The CRS is that of a file without one (an error where the file names another one); height datum and geoid are those
+    of coordinates with heights: a segment whose heights are all 0 counts as one without. InputFileError, SettingsError.
     """
     check_height_datum(height_datum)
     segments: list[Segment] = []
     for named, rows, shapes in read_layers(path, geometry="LineString"):
-        used = _used_crs(path, crs, named)
+        used = used_crs(path, crs, named)
         for row, shape in zip(rows, shapes, strict=True):
             if not _is_track(row):
                 continue
@@ -139,13 +115,8 @@ def plan_segment(
         raise InputFileError(source, f"some coordinates lie outside the CRS {used}; is it the right one?")
     height, model, datum = np.full(len(values), np.nan), "", NO_HEIGHTS
     if values.shape[1] == 3 and np.isfinite(values[:, 2]).all() and values[:, 2].any():
-        if height_datum is None:
-            raise SettingsError(
-                f"{source}: the height datum is missing; give --height-datum ellipsoidal or orthometric"
-            )
-        datum = height_datum
-        height, model = ellipsoidal_heights(
-            values[:, 2], latitude, longitude, datum=datum, geoid=geoid, geoid_m=None, path=source
+        height, model, datum = stated_heights(
+            values[:, 2], latitude, longitude, height_datum=height_datum, geoid=geoid, path=source
         )
     return Segment(
         source=source,
@@ -161,18 +132,6 @@ def plan_segment(
         notes=older_datum_note(crs),
         **{key: np.full(len(values), np.nan) for key in ATTRIBUTES},
     )
-
-
-def _used_crs(path: str | PathLike[str], given: str | None, named: str | None) -> str | None:
-    if given is None or named is None:
-        return given or named
-    try:
-        same = CRS.from_user_input(given) == CRS.from_user_input(named)
-    except CRSError:
-        raise SettingsError(f"{path}: the CRS {given!r} is unknown; give for example EPSG:4258") from None
-    if not same:
-        raise SettingsError(f"{path}: --crs {given} contradicts the file's own CRS {named}")
-    return given
 
 
 def _name(row: Mapping[str, Any], *, fallback: str) -> str:

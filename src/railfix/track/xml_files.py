@@ -65,13 +65,7 @@ def _root(path: str | PathLike[str]) -> Any:
 def read_xml_segments(
     path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
 ) -> list[Segment]:
-    """Read the lines of a LandXML or railML 3 file as segments.
-
-    Raises
-    ------
-    InputFileError
-        The file is neither, or has no line.
-    """
+    """Read the lines of a LandXML or railML 3 file as segments; InputFileError when it is neither, or has no line."""
     root = _root(path)
     kind = str(root.tag).rsplit("}", 1)[-1]
     if kind == "LandXML":
