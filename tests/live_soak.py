@@ -81,13 +81,13 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
             memory.append(resident_mb())
             print(f"{len(memory):3d} h  {memory[-1]:7.1f} MB  state {counts['saved'] / 1e3:.0f} kB", flush=True)
 
-    async def received(name: str, source: str, state: ReceiverState, *_: object) -> AsyncIterator[Received]:
-        last = start
+    async def arrivals(source: str, state: ReceiverState, _: object) -> AsyncIterator[Received]:
+        last, front = start, source == str(files["front"])
         for piece in railfix.scan_observations(source, epochs=100):
             for epoch in single_epochs(piece):
                 now, heard = epoch.time[0], None
-                new = sent_by(navigation, last, now) if name == "front" else None
-                if messages is not None and name == "front":
+                new = sent_by(navigation, last, now) if front else None
+                if messages is not None and front:
                     heard = between(messages, last, now)
                 last = now
                 if heard is not None:
@@ -97,7 +97,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False) -> d
 
     async def run() -> None:
         sink = await open_sink(f"json@{folder / 'messages.jsonl'}", full="wait", overwrite="replace")
-        with patch.object(session, "_received", received):
+        with patch.object(session, "arrivals", arrivals):
             sources = {name: str(files[name]) for name in ("front", "rear")}
             await run_session(engine, sources, [sink], speed=None, hooks=Hooks(observe=observe))
         sink.close()

@@ -67,7 +67,7 @@ def tag_ns(epoch: Observations) -> int:
 
 
 def played(
-    engine: LiveEngine | TwoChannels, arrivals: Iterable[tuple[int, str, Observations]], *, until: int | None = None
+    engine: LiveEngine, arrivals: Iterable[tuple[int, str, Observations]], *, until: int | None = None
 ) -> list[LiveOutput]:
     """Outputs of epochs that arrive at given instants [ns]; the clock steps by 5 ms between."""
     arrivals = sorted(arrivals, key=lambda arrival: arrival[0])
@@ -303,7 +303,7 @@ def test_two_channels_agree_and_a_difference_stops(logs: dict[str, tuple[Observa
         arrivals = [(tag_ns(epoch), "front", epoch) for epoch in logs["front"][:40]]
         assert digests(played(channels, arrivals)) == digests(played(alone, arrivals))
         # A fault in one channel alone: its engine gets an epoch that the other does not.
-        channels.engine.push("front", logs["front"][40], now_ns=tag_ns(logs["front"][40]))
+        LiveEngine.push(channels, "front", logs["front"][40], now_ns=tag_ns(logs["front"][40]))
         with pytest.raises(ChannelsDisagreeError, match="messages in one"):
             channels.poll(now_ns=tag_ns(logs["front"][40]))
     finally:

@@ -6,11 +6,11 @@ what its trains know.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from railfix.ground.authority import Authority
 from railfix.ground.centre import CentreLimits, TrainRecord, TrainState, time_passed
 from railfix.ground.interlocking import interval_of
 from railfix.ground.interlocking_text import from_json, to_json
@@ -46,7 +46,7 @@ class ControlCentre:
         Time for the log [ns].
     monitor : MonitorState or None
         Of satellite positioning; None where nothing judges it.
-    rejected : dict of str to int
+    rejected : Counter of str
         Reports that did not count, by reason.
     """
 
@@ -60,7 +60,7 @@ class ControlCentre:
     times: MonitorLimits = field(default_factory=MonitorLimits)
     lines: list[str] = field(default_factory=list)
     reports: int = 0
-    rejected: dict[str, int] = field(default_factory=dict)
+    rejected: Counter[str] = field(default_factory=Counter)
     stop_s: float | None = None
     _routes: dict[int, int] = field(init=False)
     _verdict: tuple[Verdict, int] | None = None
@@ -73,16 +73,8 @@ class ControlCentre:
     def restored(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
         """Return the centre with what a process before has stored; at the first start as `supervision` has it.
 
-        Trains are unknown until they are heard, and points that were moving are moved again.
-
-        Parameters
-        ----------
-        supervision : Supervision
-        store : Store
-        judged : bool
-            Whether a triangle judges satellite positioning: then the first start is a stop, to be released by hand.
-        rest : Any
-            Further attributes.
+        Trains are unknown until they are heard, and points that were moving are moved again. Where a triangle judges
+        satellite positioning, the first start is a stop, to be released by hand.
         """
         text, monitor = store.document(_INTERLOCKING), MonitorState() if judged else None
         if text is not None:
@@ -113,15 +105,15 @@ class ControlCentre:
         try:
             message = decode(payload)
         except MessageError:
-            self._reject("no position message")
+            self.rejected["no position message"] += 1
             return
         if message.train != number:
-            self._reject("of another train")
+            self.rejected["of another train"] += 1
             return
         before = self.supervision.records.get(number, TrainRecord(train=number))
         reason = self.supervision.report(message, self.clock())
         if reason is not None:
-            self._reject(reason.value)
+            self.rejected[reason.value] += 1
             return
         self.reports += 1
         after = self.supervision.records[number]
@@ -157,7 +149,7 @@ class ControlCentre:
             *self.supervision.records.values(), documents={_INTERLOCKING: to_json(state), _CAUSE: cause or ""}
         )
         for authority in authorities:
-            self._send(authority)
+            self.send(authority.train, authority.encode())
 
     @property
     def limits(self) -> CentreLimits:
@@ -179,12 +171,6 @@ class ControlCentre:
         reason = self.supervision.set_route(train)
         self.log(f"train {train}: route asked for by hand{'' if reason is None else f', refused: {reason}'}")
         return reason
-
-    def _send(self, authority: Authority) -> None:
-        self.send(authority.train, authority.encode())
-
-    def _reject(self, reason: str) -> None:
-        self.rejected[reason] = self.rejected.get(reason, 0) + 1
 
     def _monitor(self, now: float) -> None:
         if self.monitor is None:
@@ -233,8 +219,10 @@ class ControlCentre:
     def _monitor_values(self) -> dict[str, Any]:
         if self.monitor is None:
             return {"verdict": "judged by nothing", "stopped": False, "cause": None}
-        cause = "not yet released" if self.monitor.cause is None else self.monitor.cause.name.lower().replace("_", " ")
-        verdict = "no verdict" if self._judged is None else self._judged.name.lower().replace("_", " ")
+        cause, verdict = (
+            absent if value is None else value.name.lower().replace("_", " ")
+            for value, absent in ((self.monitor.cause, "not yet released"), (self._judged, "no verdict"))
+        )
         return {"verdict": verdict, "stopped": self.monitor.stopped, "cause": cause if self.monitor.stopped else None}
 
 

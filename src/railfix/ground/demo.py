@@ -6,6 +6,7 @@ The centre is that of ``railfix ground centre`` (`railfix.ground.control`), with
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import random
 import tempfile
 from collections.abc import Callable
@@ -129,28 +130,16 @@ async def run_demo(
 ) -> dict[str, Any]:
     """Run the demonstration and return its figures.
 
-    Parameters
-    ----------
-    seed : int
-    speed : float
-        Simulated seconds a second.
-    port : int
-        Of the page, on the loopback address; 0 takes a free one.
-    password : str
-        For the release of a stop on the page.
-    announce : callable
-        Called with the address of the page.
-    keep : callable, optional
-        Awaited with the address at the end, before the page closes.
-    picture : Path, optional
-        Picture of the response rates along the line.
+    `speed` is in simulated seconds a second; the page, on the loopback address, is at the port (0 takes a free one),
+    and its password releases a stop. `announce` is called with its address, `keep` awaited with it at the end, before
+    the page closes; `picture` is that of the response rates along the line.
     """
-    with tempfile.TemporaryDirectory() as name:
-        folder, done = Path(name), False
+    async with contextlib.AsyncExitStack() as held:
+        folder, done = Path(held.enter_context(tempfile.TemporaryDirectory())), False
         write_keys(folder / "keys", [1, 2])
         trains: dict[int, TrainLinks] = {}
         centre = CentreLinks(folder / "keys", HOSTS, received=lambda n, payload: control.report(n, payload))
-        store = Store(f"sqlite:///{folder / 'centre.db'}")
+        store = held.enter_context(Store(f"sqlite:///{folder / 'centre.db'}"))
         traffic = _traffic(seed, store, trains, centre.send)
         control = traffic.control
 
@@ -164,44 +153,45 @@ async def run_demo(
             return {**control.snapshot(), "links": links, "done": done}
 
         page = PageServer(page_app(snapshot, orders_of(control), sessions=Sessions(password=password)), port=port)
+        await page.start()
+        held.push_async_callback(page.stop)
         await centre.start()
-        relays: dict[tuple[int, LinkName], Relay] = {}
+        held.push_async_callback(centre.stop)
+        relays = await _relays(centre, seed)
+        for relay in relays.values():
+            held.callback(relay.close)
         for number in (1, 2):
-            for k, bearer in enumerate(BEARERS):
-                disturbed = RelaySettings(loss=0.1, delay_s=0.02, jitter_s=0.02, seed=seed + 10 * number + k)
-                relays[number, bearer] = Relay(centre.addresses[bearer], disturbed)
-                await relays[number, bearer].open(HOSTS[bearer])
-            local: dict[LinkName, str] = {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"}
-            trains[number] = TrainLinks(
+            links = trains[number] = TrainLinks(
                 number,
                 folder / "keys",
                 {bearer: relays[number, bearer].address for bearer in BEARERS},
-                local,
+                {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"},
                 received=lambda payload: traffic.authority(Authority.decode(payload)),
                 limits=LinkLimits(idle_s=10.0),  # its outages are short in real time
             )
-        try:
-            for links in trains.values():
-                await links.start()
-            await page.start()
-            announce(page.url)
-            await _connected(trains)
-            await _run(traffic, relays, speed)
-            done = True
-            figures = _figures(traffic, trains, centre)
-            if picture is not None:
-                draw_coverage(picture, {b: [links.meters[b] for links in trains.values()] for b in BEARERS})
-            if keep is not None:
-                await keep(page.url)
-        finally:
-            for links in trains.values():
-                await links.stop()
-            await centre.stop()
-            for relay in relays.values():
-                relay.close()
-            await page.stop()
-            store.close()
+            await links.start()
+            held.push_async_callback(links.stop)
+        announce(page.url)
+        await _connected(trains)
+        await _run(traffic, relays, speed)
+        done = True
+        figures = _figures(traffic, trains, centre)
+        if picture is not None:
+            draw_coverage(picture, {b: [links.meters[b] for links in trains.values()] for b in BEARERS})
+        if keep is not None:
+            await keep(page.url)
         return figures
+
+
+async def _relays(centre: CentreLinks, seed: int) -> dict[tuple[int, LinkName], Relay]:
+    """Disturbed ways to the centre, by train and bearer."""
+    relays = {}
+    for number in (1, 2):
+        for k, bearer in enumerate(BEARERS):
+            disturbed = RelaySettings(loss=0.1, delay_s=0.02, jitter_s=0.02, seed=seed + 10 * number + k)
+            relays[number, bearer] = Relay(centre.addresses[bearer], disturbed)
+            await relays[number, bearer].open(HOSTS[bearer])
+    return relays
 
 
 def _number(value: float) -> float | None:

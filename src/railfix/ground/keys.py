@@ -7,21 +7,24 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from railfix.core.errors import OutputError
+from railfix.core.errors import InputFileError, OutputError
 
 #: Validity of the certificates [days].
 VALID_DAYS: Final = 365
+
+
+def check_keys(folder: Path, name: str) -> None:
+    """Raise InputFileError where a file that an end of the links needs is not there."""
+    for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
+        if not (folder / file).is_file():
+            raise InputFileError(folder / file, "is not there; railfix ground keys writes it")
 
 
 def write_keys(folder: Path, trains: list[int], *, valid_days: int = VALID_DAYS) -> list[Path]:
     """Write ``authority.pem``, and certificate and key of ``centre`` and of each ``train-N``; return the files.
 
     The key of the authority is not kept: for another train write a new set. Keys can be read by their owner alone.
-
-    Raises
-    ------
-    OutputError
-        A file is there already, or cannot be written.
+    OutputError: when a file is there already, or cannot be written.
     """
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats
@@ -41,19 +43,10 @@ class NetworkLayout:
 def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> NetworkLayout:
     """Return the layout of a network that is one single line with passing loops.
 
-    A station is a pair of tracks between the same two switches; single line lies between stations and beyond the
-    outer ones. Points reach from the switch to where the two tracks are `CLEAR_M` apart.
-
-    Parameters
-    ----------
-    network : Network
-    drive : {"left", "right"}
-        Side on which trains of rising chainage pass a station: their track is track 1.
-
-    Raises
-    ------
-    MismatchError
-        The network is something else: several lines, branches, stations of three tracks, loops of unequal length.
+    A station is a pair of tracks between the same two switches; single line lies between stations and beyond the outer
+    ones. Points reach from the switch to where the two tracks are `CLEAR_M` apart. Trains of rising chainage pass a
+    station on the side on which they drive: their track is track 1. MismatchError: when the network is something else:
+    several lines, branches, stations of three tracks, loops of unequal length.
     """
     ends = _nodes(network)
     at: dict[int, list[int]] = defaultdict(list)
@@ -77,21 +70,10 @@ def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> 
         far = fars.pop()
         lines = [_points_m(network, track, backward=ends[track][0] != node) for track in ahead]
         if len(ahead) == 2:
-            side = _side(*lines)
             # positive: the second lies on the right of the first
-            pair = (0, 1) if (side > 0.0) == (drive == "left") else (1, 0)
-            ahead, lines = [ahead[k] for k in pair], [lines[k] for k in pair]
-            names = tuple(names[k] for k in pair)
-            lengths = [float(network.length_m[track]) for track in ahead]
-            if abs(lengths[0] - lengths[1]) > LENGTHS_M:
-                raise MismatchError(
-                    f"tracks {names[0]} and {names[1]} are {lengths[0]:.0f} and {lengths[1]:.0f} m long; at most "
-                    f"{LENGTHS_M:g} m of difference were expected"
-                )
-            points = max(_clear_after_m(*lines), _clear_after_m(*(line[::-1] for line in lines)))
-            stations.append(
-                LoopStation(name=names[0], begin_m=here, end_m=here + lengths[0], points_m=round(points + 0.5, 1))
-            )
+            if (_side(*lines) > 0.0) != (drive == "left"):
+                ahead, names, lines = ahead[::-1], names[::-1], lines[::-1]
+            stations.append(_station(names, [float(network.length_m[track]) for track in ahead], lines, here))
         here += float(network.length_m[ahead[0]])
         order.append(names)
         node = far
@@ -102,19 +84,25 @@ def layout_of(network: Network, *, drive: Literal["left", "right"] = "left") -> 
     return NetworkLayout(layout=Layout(stations=tuple(stations)), tracks=tuple(order))
 
 
+def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats], begin_m: float) -> LoopStation:
+    """The station of two tracks, track 1 first, from a chainage on."""
+    if abs(lengths_m[0] - lengths_m[1]) > LENGTHS_M:
+        raise MismatchError(
+            f"tracks {names[0]} and {names[1]} are {lengths_m[0]:.0f} and {lengths_m[1]:.0f} m long; at most "
+            f"{LENGTHS_M:g} m of difference were expected"
+        )
+    points = max(_clear_after_m(*lines), _clear_after_m(*(line[::-1] for line in lines)))
+    return LoopStation(name=names[0], begin_m=begin_m, end_m=begin_m + lengths_m[0], points_m=round(points + 0.5, 1))
+
+
 def _nodes(network: Network) -> list[tuple[int, int]]:
     """Return the point at which each track begins and ends, by numbers: ends that are linked are one point."""
-    parent = list(range(2 * len(network.tracks)))
-
-    def root(end: int) -> int:
-        while parent[end] != end:
-            parent[end] = parent[parent[end]]
-            end = parent[end]
-        return end
-
-    for link in network.links:
-        parent[root(2 * link.first + link.first_end)] = root(2 * link.second + link.second_end)
-    return [(root(2 * track), root(2 * track + 1)) for track in range(len(network.tracks))]
+    count = 2 * len(network.tracks)
+    first = [2 * link.first + link.first_end for link in network.links]
+    second = [2 * link.second + link.second_end for link in network.links]
+    linked = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
+    _, point = connected_components(linked, directed=False)
+    return [(int(begin), int(end)) for begin, end in point.reshape(-1, 2)]
 
 
 def _points_m(network: Network, track: int, *, backward: bool) -> Floats:
@@ -136,13 +124,7 @@ def _side(first: Floats, second: Floats) -> float:
 
 
 def _clear_after_m(first: Floats, second: Floats) -> float:
-    """Return the length from the common end to where the lines are `CLEAR_M` apart [m].
-
-    Raises
-    ------
-    MismatchError
-        They are nowhere.
-    """
+    """Return the length from the common end to where the lines are `CLEAR_M` apart [m]; MismatchError when nowhere."""
     distance, _ = cKDTree(second).query(first)
     clear = np.flatnonzero(np.asarray(distance) >= CLEAR_M)
     if not len(clear):

@@ -27,20 +27,10 @@ def first_sequence() -> int:
 
 
 class TrainLinks:
-    """The train's end: two connections, each from its own local address.
+    """The train's end: two connections, each from its own local address, that of a bearer.
 
-    Parameters
-    ----------
-    train : int
-    keys : Path
-        Folder of `railfix.ground.keys.write_keys`.
-    addresses : dict of {"A", "B"} to (str, int)
-        Centre's address on each bearer.
-    local : dict of {"A", "B"} to str
-        Local address of each bearer.
-    mode : {"spare", "both"}
-    received : callable
-        Called with the payload of each new frame of the centre.
+    With the keys of `railfix.ground.keys.write_keys`; `received` is called with the payload of each new frame of the
+    centre.
     """
 
     def __init__(
@@ -136,15 +126,7 @@ class TrainLinks:
 class CentreLinks:
     """The centre's end: listens at one address a bearer, answers every frame, passes each payload on once.
 
-    Parameters
-    ----------
-    keys : Path
-    hosts : dict of {"A", "B"} to str
-    received : callable
-        Called with the train's number and the payload.
-    ports : dict of {"A", "B"} to int, optional
-        Free ones without it.
-    limits : ReceiverLimits, optional
+    `received` is called with the train's number and the payload; ports are free ones where none are given.
 
     Attributes
     ----------

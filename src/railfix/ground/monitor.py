@@ -80,21 +80,8 @@ def advance(
 ) -> tuple[MonitorState, tuple[Order, ...]]:
     """Return the state after a sample, and the orders to be sent.
 
-    Parameters
-    ----------
-    state : MonitorState
-    now_s : float [s]
-        Clock of the monitor, which never runs backwards (monotonic).
-    verdict : Verdict or None
-        Of the newest fixes; None where nothing has come since.
-    receiver : int
-        Receiver that the verdict names.
-    limits : MonitorLimits
-
-    Raises
-    ------
-    ValueError
-        The clock ran backwards.
+    The clock never runs backwards (ValueError); the verdict on the newest fixes is None where nothing has come since,
+    and may name a receiver.
     """
     if now_s < state.complete_s:
         raise ValueError(f"the clock of the monitor ran back from {state.complete_s} s to {now_s} s")

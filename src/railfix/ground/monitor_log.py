@@ -53,10 +53,7 @@ def monitor_log(
 ) -> MonitoredLog:
     """Run the monitor over fixes in order of time, released at the start.
 
-    Raises
-    ------
-    SettingsError
-        The sides of the triangle are too short for the limits.
+    SettingsError: when the sides of the triangle are too short for the limits.
     """
     limits, times = limits or TriangleLimits(), times or MonitorLimits()
     triangle = _compared(fixes, limits)
@@ -107,27 +104,14 @@ def draw_triangle(path: Path, log: MonitoredLog, *, limits: TriangleLimits) -> N
 
 @dataclass(kw_only=True)
 class LiveMonitor:
-    """Monitor of fixes as they arrive, one epoch at a time.
-
-    Attributes
-    ----------
-    limits : TriangleLimits
-    times : MonitorLimits
-    state : MonitorState
-    """
+    """Monitor of fixes as they arrive, one epoch at a time."""
 
     limits: TriangleLimits
     times: MonitorLimits
     state: MonitorState = field(default_factory=lambda: MonitorState(stopped=False))
 
     def judge(self, fixes: StationFixes, now_s: float) -> tuple[MonitoredLog, tuple[Order, ...]]:
-        """Take one epoch; return it judged, and the orders to be sent.
-
-        Raises
-        ------
-        SettingsError
-            The sides of the triangle are too short for the limits.
-        """
+        """Take one epoch; return it judged, and the orders to be sent; SettingsError as `monitor_log`."""
         triangle = _compared(fixes, self.limits)
         verdict, receiver = Verdict(int(triangle.verdict[0])), int(triangle.receiver[0])
         self.state, orders = advance(self.state, now_s, verdict, receiver=receiver, limits=self.times)

@@ -133,10 +133,7 @@ async def connected(
 ) -> AsyncIterator[LinkProtocol]:
     """Connect from a local address, that of the bearer's interface.
 
-    Raises
-    ------
-    ConnectionError, TimeoutError
-        The other end rejects the certificate, is another one, or does not answer.
+    ConnectionError, TimeoutError: when the other end rejects the certificate, is another one, or does not answer.
     """
     loop = asyncio.get_running_loop()
     transport, protocol = await loop.create_datagram_endpoint(

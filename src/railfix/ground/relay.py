@@ -88,18 +88,7 @@ class Disturbance:
 
 
 class Relay(asyncio.DatagramProtocol):
-    """Relay between one client and a target.
-
-    Parameters
-    ----------
-    target : (str, int)
-    settings : RelaySettings
-
-    Attributes
-    ----------
-    disturbance : Disturbance
-    address : (str, int)
-    """
+    """Relay between one client and a target."""
 
     def __init__(self, target: tuple[str, int], settings: RelaySettings) -> None:
         self.disturbance = Disturbance(settings)

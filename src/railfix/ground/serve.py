@@ -22,6 +22,7 @@ from railfix.core.settings import Settings, load_settings
 from railfix.ground.centre import CentreLimits
 from railfix.ground.control import ControlCentre, orders_of
 from railfix.ground.interlocking import InterlockingLimits, TrainInterval
+from railfix.ground.keys import check_keys
 from railfix.ground.layout import Layout, LoopStation, PointName
 from railfix.ground.layout_network import layout_of
 from railfix.ground.link_quality import LinkName
@@ -41,13 +42,7 @@ STEP_S = 1.0
 
 
 def parse_address(text: object) -> tuple[str, int]:
-    """Return host and port of ``HOST:PORT``.
-
-    Raises
-    ------
-    ValueError
-        The text has another form.
-    """
+    """Return host and port of ``HOST:PORT``; ValueError when the text has another form."""
     host, _, port = str(text).rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_535:
         raise ValueError("HOST:PORT was expected, for example 127.0.0.1:4433")
@@ -180,12 +175,8 @@ class CentreFile(Settings):
     def with_stations(self, folder: Path) -> Self:
         """Return the settings with the stations of the network, whose files are relative to a folder.
 
-        Raises
-        ------
-        InputFileError, MismatchError
-            A map file cannot be read, or the network is no single line with passing loops.
-        SettingsError
-            A train stands where there is no station.
+        InputFileError, MismatchError: when a map file cannot be read, or the network is no single line with passing
+        loops. SettingsError: when a train stands where there is no station.
         """
         if not self.network:
             return self
@@ -266,7 +257,6 @@ async def run_centre(
         centre's certificate.
     password : str
         For orders.
-    for_s : float, optional [s]
     announce : callable
         Called with the address of the page once trains can connect.
 
@@ -279,9 +269,7 @@ async def run_centre(
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
-    for name in ("authority.pem", "centre.pem", "centre.key"):
-        if not (keys / name).is_file():
-            raise InputFileError(keys / name, "is not there; railfix ground keys writes it")
+    check_keys(keys, "centre")
     database = settings.database if "://" in settings.database else f"sqlite:///{path.parent / settings.database}"
     end = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -289,42 +277,12 @@ async def run_centre(
         loop.add_signal_handler(number, end.set)
     with Store(database) as store:
         field_points = SimulatedPoints(move_s=settings.points_s, clock=time.monotonic)
-        supervision = Supervision(
-            layout=settings.layout,
-            state=at_start(settings.layout, settings.intervals()),
-            command=field_points.command,
-            routes=settings.routes,
-            limits=settings.interlocking,
-            centre=settings.centre,
-        )
-        links = CentreLinks(
-            keys,
-            {name: settings.listen[name][0] for name in BEARERS},
-            ports={name: settings.listen[name][1] for name in BEARERS},
-            received=lambda number, payload: control.report(number, payload),
-        )
-        control = ControlCentre.restored(
-            supervision,
-            store,
-            judged=settings.triangle is not None,
-            curves=settings.curves(),
-            send=links.send,
-            clock=time.monotonic,
-            wall_ns=time.time_ns,
-            times=settings.monitor,
-        )
+        control, links = _centre(settings, keys, store, field_points)
         _check_line(control, path)
         done = False
 
         def snapshot() -> dict[str, Any]:
-            now = time.monotonic()
-            heard = [
-                {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,
-                 "silent_s": None if (at := links.heard_s.get((n, bearer))) is None else now - at}
-                for n in supervision.state.trains
-                for bearer in BEARERS
-            ]  # fmt: skip
-            return {**control.snapshot(), "links": heard, "done": done}
+            return {**control.snapshot(), "links": _heard(control, links), "done": done}
 
         app = page_app(snapshot, orders_of(control), sessions=Sessions(password=password))
         loopback = page[0] == "localhost" or _is_loopback(page[0])
@@ -354,10 +312,52 @@ async def run_centre(
             await server.stop()
         return {
             "reports used": control.reports,
-            "routes set": supervision.routes_set,
+            "routes set": control.supervision.routes_set,
             "reports rejected": dict(control.rejected),
             "frames rejected": {threat.value: n for threat, n in sorted(links.threats().items(), key=str) if n},
         }
+
+
+def _centre(
+    settings: CentreFile, keys: Path, store: Store, points: SimulatedPoints
+) -> tuple[ControlCentre, CentreLinks]:
+    """The centre as its store has it, and its links, each of which hands over to the other."""
+    supervision = Supervision(
+        layout=settings.layout,
+        state=at_start(settings.layout, settings.intervals()),
+        command=points.command,
+        routes=settings.routes,
+        limits=settings.interlocking,
+        centre=settings.centre,
+    )
+    links = CentreLinks(
+        keys,
+        {name: settings.listen[name][0] for name in BEARERS},
+        ports={name: settings.listen[name][1] for name in BEARERS},
+        received=lambda number, payload: control.report(number, payload),
+    )
+    control = ControlCentre.restored(
+        supervision,
+        store,
+        judged=settings.triangle is not None,
+        curves=settings.curves(),
+        send=links.send,
+        clock=time.monotonic,
+        wall_ns=time.time_ns,
+        times=settings.monitor,
+    )
+    return control, links
+
+
+def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
+    """When each train was heard last over each bearer, as the page shows it."""
+    now = time.monotonic()
+    return [
+        {"train": n, "bearer": bearer, "rate": None, "misses": None, "round_trip_ms": None,
+         "silent_s": None if (at := links.heard_s.get((n, bearer))) is None else now - at}
+        for n in control.supervision.state.trains
+        for bearer in BEARERS
+    ]  # fmt: skip
 
 
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
@@ -408,10 +408,7 @@ def _is_loopback(host: str) -> bool:
 def read_password(path: Path) -> str:
     """Return the first line of a file that its owner alone can read.
 
-    Raises
-    ------
-    InputFileError
-        The file cannot be read, is empty, or others can read it.
+    InputFileError: when the file cannot be read, is empty, or others can read it.
     """
     try:
         shared = path.stat().st_mode & 0o077

@@ -30,19 +30,10 @@ def simulated_fixes(
     moved_m: Floats | None = None,
     noise_m: float = 0.4,
 ) -> StationFixes:
-    """Return fixes from simulated ranges of satellites that stand still.
+    """Return fixes, one a second, from simulated ranges of satellites that stand still.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    epochs : int
-        T, one a second.
-    common_m : ndarray, shape (T, 9), optional [m]
-        Errors of the satellites, common to the receivers.
-    moved_m : ndarray, shape (T, 3, 2), optional [m]
-        East and north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
-    noise_m : float [m]
-        Noise of a range.
+    `common_m`, shape (T, 9): errors of the satellites, common to the receivers. `moved_m`, shape (T, 3, 2): east and
+    north by which the fix of a receiver moves; NaN: it has none, and its C/N0 has fallen.
     """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)

@@ -57,21 +57,10 @@ class StationFixes:
 def station_fixes(
     logs: list[Observations], points_ecef_m: Floats, navigation: Navigation, *, config: Config | None = None
 ) -> StationFixes:
-    """Compute the fixes of the receivers of a triangle.
+    """Compute the fixes of the receivers of a triangle, at N known points, shape (N, 3), from their N logs.
 
-    Parameters
-    ----------
-    logs : list of Observations, length N
-    points_ecef_m : ndarray, shape (N, 3) [m]
-        Known points of the antennas.
-    navigation : Navigation
-    config : Config, optional
-        Constellations, signals, mask, noise and atmosphere as in a run.
-
-    Raises
-    ------
-    MismatchError
-        The logs have no tag, or no channel, in common.
+    Constellations, signals, mask, noise and atmosphere as in a run. MismatchError: when the logs have no tag, or no
+    channel, in common.
     """
     config = config or Config()
     book = ChannelBook(config)
@@ -122,12 +111,7 @@ def station_fixes(
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
     """Compute fixes from corrected ranges of the same satellites, by the single-point solution of a run.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (T,)
-    ranges : list of Ranges, length N
-    points_ecef_m : ndarray, shape (N, 3) [m]
-    cn0_fallen : ndarray of bool, shape (T, N)
+    At T times, from N ranges at N known points, shape (N, 3); `cn0_fallen` has the shape (T, N).
     """
     plane = _plane(points_ecef_m)
     fixes = [

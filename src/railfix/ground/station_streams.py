@@ -15,12 +15,9 @@ from railfix.core.errors import MismatchError
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.ground.station_fixes import FALLEN_DBHZ, StationFixes, no_fixes, rounded, station_fixes
-from railfix.io.receiver.log import StreamState
-from railfix.io.receiver.recognise import head_of, is_receiver_log
-from railfix.io.rinex import scan_observations
+from railfix.live.arrivals import arrivals, fresh_state, next_arrival
 from railfix.live.settings import LiveSettings
-from railfix.live.sources import Lost, is_file, read_source
-from railfix.live.stream import Received, ReceiverState, receive_bytes, single_epochs
+from railfix.live.stream import Received
 from railfix.pipeline.config import Config
 from railfix.pipeline.received import Received as Known
 from railfix.pipeline.received import known_from_start, receive
@@ -35,17 +32,8 @@ class StationStreams:
     """Fixes of receivers at known points from their epochs as they arrive.
 
     An epoch counts when every receiver has it; older ones that wait are then dropped. A receiver that sends nothing
-    therefore gives no fixes at all, which the monitor finds by their lateness.
-
-    Parameters
-    ----------
-    points_ecef_m : ndarray, shape (N, 3) [m]
-        Known points of the antennas.
-    navigation : Navigation, optional
-        Known from the start; records from the streams are added.
-    config : Config, optional
-    period_s : float [s]
-        Epochs at whole multiples of it are used.
+    therefore gives no fixes at all, which the monitor finds by their lateness. Records from the streams are added to
+    the navigation known from the start; epochs at whole multiples of the period are used.
 
     Attributes
     ----------
@@ -118,43 +106,30 @@ async def stream_fixes(
 ) -> AsyncIterator[StationFixes]:
     """Fixes of one epoch at a time, until every source has ended.
 
-    Parameters
-    ----------
-    sources : sequence of str, length N
-        As of ``railfix live``: ``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files; RINEX files too.
-    points_ecef_m : ndarray, shape (N, 3) [m]
-    navigation : Navigation, optional
-        Known from the start.
-    config : Config, optional
-    settings : LiveSettings, optional
-        Of the connections.
-    period_s : float [s]
-
-    Raises
-    ------
-    InputFileError
-        A source cannot be opened, or breaks and is not opened again.
+    The sources are as of ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receivers' files), and RINEX
+    files too. InputFileError: when a source cannot be opened, or breaks and is not opened again.
     """
     settings = settings or LiveSettings()
     stations = StationStreams(points_ecef_m, navigation=navigation, config=config, period_s=period_s)
     queue: asyncio.Queue[tuple[int, Received | None]] = asyncio.Queue(2 * len(sources))
 
     async def pump(receiver: int, source: str) -> None:
-        async for received in _received(source, settings):
-            await queue.put((receiver, received))
+        async for item in arrivals(source, fresh_state(source), settings):
+            if isinstance(item, Received):
+                await queue.put((receiver, item))
         await queue.put((receiver, None))
 
     pumps = [asyncio.create_task(pump(k, source)) for k, source in enumerate(sources)]
     running = len(pumps)
     try:
         while running:
-            getting = asyncio.ensure_future(queue.get())
-            open_ones = [task for task in pumps if not task.done()]
-            await asyncio.wait([getting, *open_ones], return_when=asyncio.FIRST_COMPLETED)
+            arrived = await next_arrival(queue, pumps)
             for task in pumps:
                 if task.done():
                     task.result()  # an error of a source ends the session
-            receiver, received = await getting
+            if arrived is None:
+                continue
+            receiver, received = arrived
             if received is None:
                 running -= 1
                 continue
@@ -167,23 +142,3 @@ async def stream_fixes(
         for task in pumps:
             task.cancel()
         await asyncio.gather(*pumps, return_exceptions=True)
-
-
-async def _received(source: str, settings: LiveSettings) -> AsyncIterator[Received]:
-    """What a source's data complete, item by item."""
-    path = source.removeprefix("file:")
-    if source != "-" and is_file(source) and not is_receiver_log(head_of(path)):
-        for piece in scan_observations(path, epochs=200):
-            for epoch in single_epochs(piece):
-                yield Received(epochs=(epoch,), after=ReceiverState())
-                await asyncio.sleep(0)
-        return
-    now = np.datetime64("now", "ns")
-    state = ReceiverState() if is_file(source) else ReceiverState(stream=StreamState(time=now))
-    async for part in read_source(source, settings):
-        if isinstance(part, bytes):
-            items, state = receive_bytes(part, state)
-            for item in items:
-                yield item
-        elif isinstance(part, Lost):
-            state = state.after_break()

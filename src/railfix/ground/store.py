@@ -41,17 +41,9 @@ LOG: Final = sql.Table(
 
 
 class Store:
-    """Stored state of a centre.
+    """Stored state of a centre in a database (``sqlite:///centre.db``, ``postgresql+psycopg://...``).
 
-    Parameters
-    ----------
-    url : str
-        SQLAlchemy address: ``sqlite:///centre.db``, ``postgresql+psycopg://...``.
-
-    Raises
-    ------
-    InputFileError
-        The database cannot be opened.
+    InputFileError: when the database cannot be opened.
     """
 
     def __init__(self, url: str) -> None:

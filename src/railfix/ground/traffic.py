@@ -174,7 +174,6 @@ class Traffic:
     conditions: Conditions
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)
-    restarts: int = 0
     moving: dict[PointName, float] = field(default_factory=dict)
     _mail: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     _silent_until: dict[int, float] = field(default_factory=dict)
@@ -219,7 +218,6 @@ class Traffic:
         rng, conditions = self.random, self.conditions
         if self.now_s >= self._centre_back_s and rng.random() < conditions.restart:
             self._centre_back_s = self.now_s + rng.uniform(1.0, 30.0)
-            self.restarts += 1
             self.centre.state = from_json(to_json(self._stored or self.centre.state))
             if Rule.PERSISTENCE not in self.rules:
                 trains = {n: replace(t, end_m=t.front_m) for n, t in self.centre.state.trains.items()}

@@ -10,8 +10,8 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
-from railfix.core.errors import InputFileError
 from railfix.ground.authority import Authority
+from railfix.ground.keys import check_keys
 from railfix.ground.link_quality import LinkName
 from railfix.ground.links import TrainLinks, first_sequence
 from railfix.ground.on_board import OnBoard, OnBoardLimits
@@ -34,29 +34,11 @@ async def run_train(
 ) -> None:
     """Send the newest position every second, and write authorities and braking as lines of JSON.
 
-    Parameters
-    ----------
-    train : int
-    keys : Path
-        Folder with ``authority.pem`` and the train's own two files.
-    addresses : dict of {"A", "B"} to (str, int)
-        Centre's address on each bearer.
-    local : dict of {"A", "B"} to str
-        Local address of each bearer.
-    lines : asynchronous iterator of str, optional
-        Position messages as `railfix.io.train_message.to_json` writes them; standard input without it.
-    write : callable
-    limits : OnBoardLimits, optional
-    for_s : float, optional [s]
-
-    Raises
-    ------
-    InputFileError
-        A key is not there, or a line is no position message.
+    With the train's own two files and ``authority.pem`` of the folder `keys`, to the centre's address on each bearer
+    from its local address. The positions are messages as `railfix.io.train_message.to_json` writes them, from the
+    standard input by default. InputFileError: when a key is not there, or a line is no position message.
     """
-    for name in ("authority.pem", f"train-{train}.pem", f"train-{train}.key"):
-        if not (keys / name).is_file():
-            raise InputFileError(keys / name, "is not there; railfix ground keys writes it")
+    check_keys(keys, f"train-{train}")
     desk = _Desk(train=train, write=write, limits=limits or OnBoardLimits())
     links = TrainLinks(train, keys, addresses, local, received=desk.received)
     await links.start()

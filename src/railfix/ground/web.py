@@ -45,13 +45,7 @@ Order = Callable[[dict[str, Any]], str | None]
 
 @dataclass(kw_only=True)
 class Sessions:
-    """Log-ins of the page.
-
-    Attributes
-    ----------
-    password : str
-    clock : callable
-    """
+    """Log-ins of the page."""
 
     password: str
     clock: Callable[[], float] = time.monotonic
@@ -86,15 +80,10 @@ class Sessions:
 
 
 def page_app(snapshot: Callable[[], dict[str, Any]], orders: dict[str, Order], *, sessions: Sessions) -> Starlette:
-    """Return the web application.
+    """Return the web application: the snapshot's plain values for the page, and orders by the last part of their
+    address.
 
-    Parameters
-    ----------
-    snapshot : callable
-        Plain values for the page; ``done`` ends its events.
-    orders : dict of str to callable
-        Orders by the last part of their address: ``release``, ``route``.
-    sessions : Sessions
+    ``done`` in the snapshot ends its events; the orders are ``release`` and ``route``.
     """
     template = (files("railfix.ground") / "page.html").read_text(encoding="utf-8")
 
@@ -188,21 +177,7 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """Server of the page.
-
-    Parameters
-    ----------
-    app : Starlette
-    host : str
-    port : int
-        0 takes a free one.
-    certificate : (Path, Path), optional
-        Certificate and key: the page is served by TLS.
-
-    Attributes
-    ----------
-    url : str
-    """
+    """Server of the page, at port 0 a free one; by TLS where a certificate and its key are given."""
 
     def __init__(
         self, app: Starlette, *, host: str = "127.0.0.1", port: int = 0, certificate: tuple[Path, Path] | None = None

@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import hashlib
 import multiprocessing
-from collections import Counter, deque
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
@@ -75,86 +74,49 @@ def _second_channel(connection: Connection, processor: EpochProcessor, settings:
             getattr(engine, name)(*arguments, **keywords)
 
 
-class TwoChannels:
-    """A `LiveEngine` with a second one beside it, in a process of its own.
-
-    Parameters
-    ----------
-    processor : EpochProcessor
-    settings : LiveSettings
-    """
+class TwoChannels(LiveEngine):
+    """A `LiveEngine` with a second one beside it, in a process of its own, that gets every call as well."""
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
-        self.engine = LiveEngine(processor, settings)
+        super().__init__(processor, settings)
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_second_channel, args=(other, processor, settings), daemon=True)
         self._process.start()
         other.close()
 
-    @property
-    def counts(self) -> Counter[str]:
-        """Counts of the first channel."""
-        return self.engine.counts
-
-    @property
-    def settings(self) -> LiveSettings:
-        """Settings of both channels."""
-        return self.engine.settings
-
-    @property
-    def told(self) -> deque[str]:
-        """Sentences of the first channel for the log."""
-        return self.engine.told
-
-    @property
-    def uses_sbas(self) -> bool:
-        """As `LiveEngine.uses_sbas`."""
-        return self.engine.uses_sbas
-
     def start(self, *, now_ns: int) -> None:
         """As `LiveEngine.start`."""
-        self.engine.start(now_ns=now_ns)
+        super().start(now_ns=now_ns)
         self._call("start", now_ns=now_ns)
-
-    def saved(self) -> EngineState | None:
-        """As `LiveEngine.saved`."""
-        return self.engine.saved()
 
     def resume(self, saved: EngineState) -> None:
         """As `LiveEngine.resume`."""
-        self.engine.resume(saved)
+        super().resume(saved)
         self._call("resume", saved)
 
     def learn(self, navigation: Navigation) -> None:
         """As `LiveEngine.learn`."""
-        self.engine.learn(navigation)
+        super().learn(navigation)
         self._call("learn", navigation)
 
     def hear(self, messages: SbasMessages) -> None:
         """As `LiveEngine.hear`."""
-        self.engine.hear(messages)
+        super().hear(messages)
         self._call("hear", messages)
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
         """As `LiveEngine.push`."""
-        self.engine.push(antenna, epoch, now_ns=now_ns)
+        super().push(antenna, epoch, now_ns=now_ns)
         self._call("push", antenna, epoch, now_ns=now_ns)
-
-    def wait_s(self, *, now_ns: int) -> float:
-        """As `LiveEngine.wait_s`."""
-        return self.engine.wait_s(now_ns=now_ns)
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """As `LiveEngine.poll`, after both channels have agreed.
 
-        Raises
-        ------
-        ChannelsDisagreeError
-            A message or a stage differs, or the second channel has ended.
+        ChannelsDisagreeError: when a message or a stage differs, or the second channel has ended.
         """
         self._call("poll", now_ns=now_ns, sent_ns=sent_ns)
-        outputs = self.engine.poll(now_ns=now_ns, sent_ns=sent_ns)
+        outputs = super().poll(now_ns=now_ns, sent_ns=sent_ns)
         try:
             theirs = self._connection.recv()
         except (EOFError, OSError):
@@ -177,12 +139,7 @@ class TwoChannels:
 
 
 def compare(ours: list[dict[str, str]], theirs: list[dict[str, str]]) -> None:
-    """Raise at the first difference between the outputs of two channels.
-
-    Raises
-    ------
-    ChannelsDisagreeError
-    """
+    """Raise ChannelsDisagreeError at the first difference between the outputs of two channels."""
     if len(ours) != len(theirs):
         raise ChannelsDisagreeError(f"the channels disagree: {len(ours)} messages in one, {len(theirs)} in the other")
     for one, other in zip(ours, theirs, strict=True):

@@ -71,12 +71,8 @@ class LiveInputs(Settings):
 async def run_live(inputs: LiveInputs) -> list[str]:
     """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each.
 
-    SIGHUP reloads nothing: it is logged and counted.
-
-    Raises
-    ------
-    RailfixError
-        A source, sink, file or setting is not what it should be, or two channels disagree.
+    SIGHUP reloads nothing: it is logged and counted. RailfixError: when a source, sink, file or setting is not what it
+    should be, or two channels disagree.
     """
     for source in inputs.sources.values():
         check_source(source)
@@ -94,7 +90,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
             full = "wait" if replay else "drop"
             sinks.append(await open_sink(text, live, overwrite=inputs.overwrite, full=full))
             held.callback(sinks[-1].close)
-        engine: LiveEngine | TwoChannels = LiveEngine(processor, live)
+        engine = LiveEngine(processor, live)
         if inputs.channels == 2:
             engine = TwoChannels(processor, live)
             held.callback(engine.close)
@@ -132,7 +128,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
 def _hooks(
     inputs: LiveInputs,
     live: LiveSettings,
-    engine: LiveEngine | TwoChannels,
+    engine: LiveEngine,
     log: SessionLog,
     held: contextlib.AsyncExitStack,
     *,

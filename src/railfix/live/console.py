@@ -85,22 +85,8 @@ class _Rotating(logging.handlers.RotatingFileHandler):
 class SessionLog:
     """Log of a session, on the standard error output and in a rotating file, and the status line.
 
-    Parameters
-    ----------
-    path : Path or None
-        Log file; at `LiveSettings.log_bytes` it is put aside as ``path.1``, and so on.
-    settings : LiveSettings
-    status : bool
-        Whether a status line is wanted; shown where the standard error output is a terminal.
-
-    Attributes
-    ----------
-    shows_status : bool
-
-    Raises
-    ------
-    OutputError
-        The file cannot be opened.
+    At `LiveSettings.log_bytes` the file is put aside as ``path.1``, and so on (OutputError when it cannot be opened). A
+    status line that is wanted is shown where the standard error output is a terminal.
     """
 
     def __init__(self, path: Path | None, settings: LiveSettings, *, status: bool = True) -> None:

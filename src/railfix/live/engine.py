@@ -106,11 +106,6 @@ class _Waiting:
 class LiveEngine:
     """Positions of epochs as they arrive; compiled kernels are loaded when it is made.
 
-    Parameters
-    ----------
-    processor : EpochProcessor
-    settings : LiveSettings
-
     Attributes
     ----------
     counts : Counter of str
@@ -185,16 +180,7 @@ class LiveEngine:
         self._saved = saved
 
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
-        """Take one epoch of an antenna.
-
-        Parameters
-        ----------
-        antenna : str
-        epoch : Observations
-            One epoch.
-        now_ns : int [ns]
-            Clock of the computer, on which `poll` is called.
-        """
+        """Take one epoch of an antenna, at the clock of the computer on which `poll` is called."""
         if antenna not in self._waiting:
             raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)
@@ -266,13 +252,9 @@ class LiveEngine:
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
         """Messages that are due: of complete pairs, of epochs that waited long enough, of periods without input.
 
-        Parameters
-        ----------
-        now_ns : int [ns]
-            The clock that `push` was given.
-        sent_ns : int [ns], optional
-            GPS time of sending for the message; then one message goes out a period, that of the newest epoch. Without
-            it (recorded epochs, the clock is that of their tags) every epoch has its message.
+        `now_ns` is of the clock that `push` was given, `sent_ns` the GPS time of sending for the message; then one
+        message goes out a period, that of the newest epoch. Without it (recorded epochs, the clock is that of their
+        tags) every epoch has its message.
         """
         outputs = [self._processed(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:

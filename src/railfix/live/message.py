@@ -43,14 +43,6 @@ def message_of(result: Result, settings: LiveSettings, *, sequence: int, sent_ns
     `antenna_of` names. The bounds are the filter's over- and under-reading amounts where it
     has a level (`tracking.level`); else the protection level of the single epoch, widened by the distance of the
     filter's place from it, so that they hold for both. A doubtful place has none.
-
-    Parameters
-    ----------
-    result : Result
-        Of one epoch.
-    settings : LiveSettings
-    sequence : int
-    sent_ns : int [ns]
     """
     name = antenna_of(result)
     antenna = result.antennas[name]

@@ -111,13 +111,7 @@ def _counter(name: str, label: str, values: Mapping[str, int]) -> list[str]:
 
 
 async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
-    """Serve ``/metrics`` over HTTP.
-
-    Raises
-    ------
-    SettingsError
-        The address is not HOST:PORT, or cannot be listened at.
-    """
+    """Serve ``/metrics`` over HTTP; SettingsError when the address is not HOST:PORT, or cannot be listened at."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdigit():
         raise SettingsError(f"--metrics {address!r}: expected HOST:PORT, for example 127.0.0.1:9100")

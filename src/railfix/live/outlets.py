@@ -17,19 +17,10 @@ _CLOSE_S = 5.0
 
 
 class Outlet(Generic[Item]):
-    """A target behind a queue and a thread of its own.
+    """A target behind a queue and a thread of its own, in which `send` takes one item.
 
-    Parameters
-    ----------
-    name : str
-        For counts and messages.
-    send : callable
-        Takes one item; runs in the outlet's thread.
-    waiting : int
-        Items that may wait.
-    full : {"drop", "wait"}
-        What happens to an item for which there is no room: dropped and counted (live), or waited for (replay of
-        recorded files, which has the time).
+    `full` says what happens to an item for which there is no room: dropped and counted ("drop", live), or waited for
+    ("wait", replay of recorded files, which has the time).
 
     Attributes
     ----------
@@ -49,13 +40,7 @@ class Outlet(Generic[Item]):
         self._thread.start()
 
     def send(self, item: Item) -> None:
-        """Hand over one item.
-
-        Raises
-        ------
-        OutputError
-            The target refuses items, and none may be lost.
-        """
+        """Hand over one item; OutputError when the target refuses items, and none may be lost."""
         if self._defect is not None:
             raise self._defect
         if self._full == "wait":
@@ -84,10 +69,7 @@ class Outlet(Generic[Item]):
     def close(self) -> None:
         """Wait for the items that are left, some seconds at most; what is left then is counted as dropped.
 
-        Raises
-        ------
-        OutputError
-            The target refuses items, and none may be lost.
+        OutputError: as `send`.
         """
         with suppress(queue.Full):  # then the thread is given up below
             self._items.put(None, timeout=_CLOSE_S)

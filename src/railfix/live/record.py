@@ -18,14 +18,7 @@ _BLOCK = 600
 
 
 class ResultTables:
-    """A context manager that writes ``positions.*`` and ``train.*`` of a session into a folder.
-
-    Parameters
-    ----------
-    out : Path
-    overwrite : {"refuse", "replace"}
-    inputs : sequence of Path
-    """
+    """A context manager that writes ``positions.*`` and ``train.*`` of a session into a folder."""
 
     def __init__(self, out: Path, *, overwrite: Overwrite, inputs: Sequence[Path]) -> None:
         self._folder = OutputFolder(out, overwrite=overwrite, inputs=list(inputs))

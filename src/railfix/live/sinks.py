@@ -51,7 +51,7 @@ class Sink(Protocol):
     def failure(self) -> str:
         """Why the last message was refused; blank where it was not."""
 
-    def send(self, output: LiveOutput) -> None:
+    def send(self, item: LiveOutput, /) -> None:
         """Take one output."""
 
     def close(self) -> None:
@@ -134,10 +134,7 @@ class MqttTarget:
     def send(self, output: LiveOutput) -> None:
         """Publish one message, none where the form has nothing to say.
 
-        Raises
-        ------
-        OutputError
-            There is no connection, or the broker does not keep up.
+        OutputError: when there is no connection, or the broker does not keep up.
         """
         data = whole_message(self.form, output)
         if not data:
@@ -160,44 +157,22 @@ class MqttTarget:
         self._client.loop_stop()
 
 
-class OutletSink:
+class OutletSink(Outlet[LiveOutput]):
     """A target behind a queue of its own, closed with it."""
 
     def __init__(self, name: str, target: Any, *, waiting: int, full: str) -> None:
+        super().__init__(name, target.send, waiting=waiting, full=full)
         self._target = target
-        self._outlet: Outlet[LiveOutput] = Outlet(name, target.send, waiting=waiting, full=full)
-        self.name = name
 
-    def send(self, output: LiveOutput) -> None:
+    def send(self, item: LiveOutput) -> None:
         """Hand over one output, if it has what the form takes."""
-        if wants(self._target.form, output):
-            self._outlet.send(output)
-
-    @property
-    def dropped(self) -> int:
-        """As `Outlet.dropped`."""
-        return self._outlet.dropped
-
-    @property
-    def failed(self) -> int:
-        """As `Outlet.failed`."""
-        return self._outlet.failed
-
-    @property
-    def failure(self) -> str:
-        """As `Outlet.failure`."""
-        return self._outlet.failure
+        if wants(self._target.form, item):
+            super().send(item)
 
     def close(self) -> None:
-        """Send what is left, and close the target.
-
-        Raises
-        ------
-        OutputError
-            As `Outlet.close`.
-        """
+        """Send what is left, and close the target; OutputError as `Outlet.close`."""
         try:
-            self._outlet.close()
+            super().close()
         finally:
             self._target.close()
 
@@ -249,23 +224,10 @@ class TcpServerSink:
 async def open_sink(
     text: str, settings: LiveSettings | None = None, *, overwrite: str = "refuse", full: str = "drop"
 ) -> Sink:
-    """Open one sink.
+    """Open the sink of a text ``FORM@TARGET``; `full` as for `Outlet`.
 
-    Parameters
-    ----------
-    text : str
-        FORM@TARGET.
-    settings : LiveSettings, optional
-    overwrite : {"refuse", "replace"}
-    full : {"drop", "wait"}
-        See `Outlet`.
-
-    Raises
-    ------
-    SettingsError
-        The text names no form or target.
-    OutputError
-        The target cannot be opened, or is a file that exists already.
+    SettingsError: when the text names no form or target. OutputError: when the target cannot be opened, or is a file
+    that exists already.
     """
     settings = settings or LiveSettings()
     name, at, target = text.partition("@")

@@ -84,10 +84,7 @@ def hidden(source: str) -> str:
 async def read_source(source: str, settings: LiveSettings) -> AsyncIterator[bytes | Connected | Lost]:
     """Bytes of a source as they arrive; connections that break are opened again, see `LiveSettings.reconnect`.
 
-    Raises
-    ------
-    InputFileError
-        The source cannot be opened, or breaks and is not opened again.
+    InputFileError: when the source cannot be opened, or breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
@@ -234,13 +231,7 @@ class _Chunks:
         self._left = 0
 
     def take(self, data: bytes) -> bytes:
-        """Content of some more bytes.
-
-        Raises
-        ------
-        InputFileError
-            What stands where the length of a chunk should be is none.
-        """
+        """Content of some more bytes; InputFileError when what stands where the length of a chunk should be is none."""
         self._buffer += data
         content = b""
         while self._buffer:

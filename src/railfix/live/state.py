@@ -75,15 +75,7 @@ class Loaded:
 def belongs_to(
     files: Mapping[str, Path], settings: Mapping[str, Settings], antennas: tuple[str, ...]
 ) -> dict[str, Any]:
-    """What a state is made under; a state of anything else is not used.
-
-    Parameters
-    ----------
-    files : mapping of str to Path
-        Track, vehicle, models: by their role.
-    settings : mapping of str to Settings
-    antennas : tuple of str
-    """
+    """What a state is made under (files by their role, settings, antennas); a state of anything else is not used."""
     return {
         "version": f"railfix {railfix.__version__}, numpy {np.__version__}, Python {platform.python_version()}",
         "antennas": list(antennas),
@@ -96,13 +88,7 @@ def belongs_to(
 
 
 def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> None:
-    """Write a state file whole, or leave the one before.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written.
-    """
+    """Write a state file whole, or leave the one before and raise OutputError."""
     content = pickle.dumps(session, protocol=5)
     head = {"form": _FORM, **under, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     part = path.with_name(f".{path.name}.part")
@@ -117,14 +103,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 
 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
-    """Read a state file, if there is one that belongs to this session.
-
-    Parameters
-    ----------
-    path : Path
-    under : mapping
-        Of `belongs_to`.
-    """
+    """Read a state file, if there is one that belongs to this session (`belongs_to`)."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
