@@ -7,23 +7,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Modules whose tests need few of the compiled kernels, or none.
-FEW_KERNELS = (
-    "test_documents",
-    "test_evaluate_c",
-    "test_ground",
-    "test_map",
-    "test_navigation",
-    "test_network",
-    "test_orbits",
-    "test_r",
-    "test_simulate",
-)
+#: Modules whose tests need hardly any of the compiled kernels, the long check of types first.
+FEW_KERNELS = ("test_gate", "test_ground", "test_navigation", "test_rinex", "test_simulate")
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put tests without kernels at the middle, where the second of two workers begins.
+    """Put tests that need few kernels at the middle, where the second of two workers begins.
 
     With ``--dist worksteal`` each worker has a contiguous share of the tests. In a clean checkout the first compiles
     the kernels, for minutes; the second finds them on disk when it needs them.
