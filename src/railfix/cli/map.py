@@ -11,12 +11,11 @@ from rich.table import Table
 
 from railfix.cli.command import Command, Commands
 from railfix.cli.console import console_of_tables, show_notes
-from railfix.cli.map_network import columns_of, match_command, network, route
-from railfix.cli.options import OverwriteOption, Without, check_outputs, from_models
+from railfix.cli.map_network import MapReading, columns_of, match_command, network, route
+from railfix.cli.options import OverwriteOption, check_outputs, from_models
 from railfix.core.errors import MapQualityError, OutputError, SettingsError
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import read_positions
-from railfix.run.options import TrackReading
 from railfix.track import (
     MapLimits,
     Thinned,
@@ -38,6 +37,10 @@ app = typer.Typer(
     help="Check a track map, make one from positions or of a network, and put positions on a network.",
 )
 
+TracksArgument = Annotated[
+    list[Path],
+    typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."),
+]
 #: Findings printed before the rest is only counted.
 _SHOWN = 40
 
@@ -45,17 +48,12 @@ _SHOWN = 40
 @app.command("check", cls=Command)
 @from_models
 def check(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."
-        ),
-    ],
+    tracks: TracksArgument,
     *,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the picture map_check.png; made where absent.")
     ] = None,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
+    reading: MapReading,
     max_gap: Annotated[
         float, typer.Option(metavar="M", help="Widest gap between the ends of two segments that is bridged.")
     ] = 1.0,
@@ -107,17 +105,12 @@ def check(
 @app.command("features", cls=Command)
 @from_models
 def features(
-    tracks: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="TRACK...", help="CSV or GeoJSON track map; several are joined in this order to a route."
-        ),
-    ],
+    tracks: TracksArgument,
     *,
     out: Annotated[
         Path | None, typer.Option(metavar="CSV", help="File for the features; printed alone without it.")
     ] = None,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
+    reading: MapReading,
     overwrite: OverwriteOption = False,
 ) -> None:
     """List the features of a line: the places where its gradient or its curvature changes.

@@ -33,6 +33,9 @@ Columns = Annotated[
     typer.Option(metavar="NAME=COLUMN", help="Column of a CSV log under another name; may be repeated."),
 ]
 
+#: Reading of a map by itself: without what a run alone needs.
+MapReading = Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")]
+
 
 Page = Annotated[
     Path | None, typer.Option(metavar="FILE.html", help="Page to look at: plan to zoom, switches, faults, tables.")
@@ -69,7 +72,7 @@ def _network(maps: list[Path], reading: TrackReading, tolerance: float) -> Netwo
 def network(
     maps: Maps,
     *,
-    reading: Annotated[TrackReading, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
+    reading: MapReading,
     tolerance: Tolerance = TOLERANCE_M,
     out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
     page: Page = None,

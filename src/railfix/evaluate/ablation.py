@@ -170,10 +170,8 @@ def ablate_files(
         See `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
-    config, options = config or Config(), options or RunOptions()
-    config = inputs.with_own_sbas(config)
-    inputs = inputs.with_settings(config)
-    inputs.check()
+    options = options or RunOptions()
+    inputs, config = inputs.checked(config or Config())
     with (
         OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths) as folder,
         ThreadPoolExecutor(max_workers=1) as pool,

@@ -109,11 +109,8 @@ def run_files(
         See `railfix.core.errors`; nothing is left in `out` then.
     """
     began = clock.perf_counter()
-    config, options = config or Config(), options or RunOptions()
-    inputs.check()
-    config = inputs.with_own_sbas(config)
-    inputs = inputs.with_settings(config)
-    inputs.check()
+    options = options or RunOptions()
+    inputs, config = inputs.checked(config or Config())
     with ExitStack() as stack:
         # Forked before any thread is started, and before polars starts its own.
         others = [

@@ -121,12 +121,23 @@ class RunInputs(InputFiles):
         metavar="POSITIONS",
     )
 
+    def checked(self, config: Config) -> tuple[Self, Config]:
+        """Return the inputs with the files that settings name, all checked, and the settings with the logs as files.
+
+        SettingsError, InputFileError: as `_with_own_sbas` and `check`.
+        """
+        self.check()
+        config = self._with_own_sbas(config)
+        inputs = self.with_settings(config)
+        inputs.check()
+        return inputs, config
+
     def with_settings(self, config: Config) -> Self:
-        """Return the same with the files that settings name (`with_own_sbas` comes before)."""
+        """Return the same with the files that settings name."""
         sbas = () if config.sbas == "stream" else config.sbas
         return self.replaced(cn0_curve=config.cn0_curve, error_model=config.error_model, sbas=sbas)
 
-    def with_own_sbas(self, config: Config) -> Config:
+    def _with_own_sbas(self, config: Config) -> Config:
         """Return settings in which ``sbas = "stream"`` is replaced by the receivers' logs, whose messages are meant.
 
         SettingsError: none of the logs is a receiver's.
