@@ -64,21 +64,10 @@ def assembled(
 ) -> Built:
     """The reference of one antenna from everything known of it.
 
-    At a fix the reference is the fix's own place on the track; between fixes it is the smoothed one. Errors
-    that fixes have in common the smoother cannot see, so a bridged instant has them on top of its own; and
-    where a gap does not close within its standard deviation, the larger counts.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    smoothed : Smoothed
-    fixes : Fixes
-    excess : ndarray, shape (G - 1,)
-        From each of the G good fixes to the next: closing error over its standard deviation; 1 where noise
-        explains it.
-    trajectory : Trajectory
-    settings : ReferenceSettings
-    facts : dict
+    At a fix the reference is the fix's own place on the track; between fixes it is the smoothed one. Errors that fixes
+    have in common the smoother cannot see, so a bridged instant has them on top of its own; and where a gap does not
+    close within its standard deviation, the larger counts. `excess`, shape (G - 1,): from each of the G good fixes to
+    the next, closing error over its standard deviation; 1 where noise explains it.
     """
     time, good = evidence.time, fixes.good
     at = np.flatnonzero(np.isfinite(evidence.fix_m))

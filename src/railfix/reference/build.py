@@ -80,21 +80,8 @@ class ReferenceData:
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
     """Reference positions of every antenna that has a log of positions.
 
-    Parameters
-    ----------
-    data : ReferenceData
-    settings : ReferenceSettings, optional
-
-    Returns
-    -------
-    dict of str to Built
-
-    Raises
-    ------
-    NoPositionError
-        Fewer than two good fixes.
-    MismatchError
-        Two logs of positions without the distance between the antennas; pulses or accelerations of another time.
+    NoPositionError: when there are fewer than two good fixes. MismatchError: when there are two logs of positions
+    without the distance between the antennas, or pulses or accelerations of another time.
     """
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}

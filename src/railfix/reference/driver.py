@@ -64,7 +64,7 @@ def reference_files(
     options: ReferenceOptions | None = None,
     asked: Mapping[str, Any] | None = None,
 ) -> ReferenceSummary:
-    """Build the reference of a run and write it.
+    """Build the reference of a run and write it into the folder `out`.
 
     ================== ======================================================================
     reference.csv      `railfix.io.reference_log`, one row an instant and antenna
@@ -72,24 +72,8 @@ def reference_files(
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
 
-    Parameters
-    ----------
-    inputs : ReferenceInputs
-    settings : ReferenceSettings, optional
-    out : Path
-        Folder for the results.
-    options : ReferenceOptions, optional
-    asked : mapping, optional
-        Settings that were given, as opposed to defaults.
-
-    Returns
-    -------
-    ReferenceSummary
-
-    Raises
-    ------
-    RailfixError
-        See `railfix.core.errors`; nothing is left in `out` then.
+    `asked`: settings that were given, as opposed to defaults. RailfixError: see `railfix.core.errors`; nothing is left
+    in `out` then.
     """
     began = clock.perf_counter()
     settings, options = settings or ReferenceSettings(), options or ReferenceOptions()

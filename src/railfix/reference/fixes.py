@@ -218,17 +218,11 @@ def judge_travel(
 ) -> Fixes:
     """The rows by the way between them against the way travelled (P2 3.3).
 
-    Neighbours that agree make a run; a wrong fix, or a stretch of them on wrong ambiguities, is a run of its
-    own, and so is what follows an error of the sensor. Kept is the chain of runs that holds most fixes, where
-    each joint that does not agree counts against it. So a short stretch that agrees with neither side goes, and
-    where long stretches on both sides stay apart, the sensor is held wrong and both stay.
-
-    Parameters
-    ----------
-    fixes : Fixes
-    travelled : callable
-        Way travelled up to instants and its variance since the start, along rising chainage; NaN where unknown.
-    settings : ReferenceSettings
+    Neighbours that agree make a run; a wrong fix, or a stretch of them on wrong ambiguities, is a run of its own, and
+    so is what follows an error of the sensor. Kept is the chain of runs that holds most fixes, where each joint that
+    does not agree counts against it. So a short stretch that agrees with neither side goes, and where long stretches on
+    both sides stay apart, the sensor is held wrong and both stay. `travelled` gives the way up to instants and its
+    variance since the start, along rising chainage; NaN where unknown.
     """
     rows = fixes.good
     if len(rows) < 2:

@@ -73,12 +73,8 @@ class ReferenceInputs(InputFiles):
     def check(self) -> None:
         """Check the input files before anything is read.
 
-        Raises
-        ------
-        SettingsError
-            No positions, observations without navigation or the other way round, two antennas without a vehicle.
-        InputFileError
-            A file is missing, or given as both antennas'.
+        SettingsError: no positions, observations without navigation or the other way round, two antennas without a
+        vehicle. InputFileError: a file is missing, or given as both antennas'.
         """
         if not self.positions:
             raise SettingsError("no positions are given; name a log of them with --rtk or --rtk-rear")

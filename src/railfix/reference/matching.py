@@ -58,24 +58,11 @@ def match(
     height_m: float,
     max_speed_mps: float,
 ) -> Matched:
-    """Put positions on a trajectory.
+    """Put F positions on a trajectory, in order of rising time.
 
     Where the line passes a place more than once (a loop, laps), the chain of passes is taken that a train
-    no faster than `max_speed_mps` can run, and of several such the one with the shortest way.
-
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (F,)
-        Rising.
-    ecef_m : ndarray, shape (F, 3) [m]
-    trajectory : Trajectory
-    lateral_m, height_m : float [m]
-        Passes further off are none.
-    max_speed_mps : float [m/s]
-
-    Returns
-    -------
-    Matched
+    no faster than `max_speed_mps` can run, and of several such the one with the shortest way. Passes further off than
+    `lateral_m` and `height_m` are none.
     """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)

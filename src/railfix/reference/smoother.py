@@ -101,18 +101,9 @@ class _Unknowns:
 
 
 def smooth(evidence: Evidence, settings: ReferenceSettings) -> Smoothed:
-    """Estimate position and speed at every instant from all measurements together.
+    """Estimate position and speed at every instant from all measurements together, at least one fix among them.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        With at least one fix.
-    settings : ReferenceSettings
-        Its `doppler_bias_mps` and `slip_m` are those of the log, where it tells them.
-
-    Returns
-    -------
-    Smoothed
+    `doppler_bias_mps` and `slip_m` of the settings are those of the log, where it tells them.
     """
     t = seconds(evidence.time - evidence.time[0])
     fixed = np.flatnonzero(np.isfinite(evidence.fix_m))
@@ -280,14 +271,7 @@ def closings(
 ) -> Closings:
     """Compare a measured distance with that between fixes, over windows of about a length.
 
-    Parameters
-    ----------
-    time : ndarray of datetime64[ns], shape (F,)
-        Of the fixes.
-    way_m, variance_m2 : ndarray, shape (F,)
-        Way up to each fix, and the variance of its white part since the start; NaN where unknown.
-    fix_m, fix_sigma_m : ndarray, shape (F,) [m]
-    window_s : float [s]
+    `way_m`, `variance_m2`: way up to each fix, and the variance of its white part since the start; NaN where unknown.
     """
     t = seconds(time - time[0])
     end = np.searchsorted(t, t + window_s - 0.5)

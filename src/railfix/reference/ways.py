@@ -66,17 +66,8 @@ def nearest(time: Datetimes, wanted: Datetimes) -> Indices:
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
     """Return the instants of a reference: rows of the position log, receiver epochs, regular steps elsewhere.
 
-    Parameters
-    ----------
-    rows : ndarray of datetime64[ns], shape (n,)
-        Rising strictly, at least two.
-    others : sequence of ndarray of datetime64[ns]
-        Those within `SAME_INSTANT_NS` of a row are that row.
-
-    Returns
-    -------
-    ndarray of datetime64[ns], shape (N,)
-        From the first row to the last; no step is longer than one and a half of the rows' usual one.
+    The rows, at least two, rise strictly; other instants within `SAME_INSTANT_NS` of a row are that row. From the first
+    row to the last no step is longer than one and a half of the rows' usual one.
     """
     merged = rows
     for other in others:
