@@ -141,7 +141,7 @@ def counted_levels(
         Epochs with a position.
     status, verdict : ndarray of str, shape (T,)
         Of the position (`railfix.core.reasons.Status`, `railfix.tracking.TrackStatus`), of the level
-        (`railfix.integrity.protection.Status`); blank where there is none.
+        (`railfix.integrity.protection.LevelStatus`); blank where there is none.
     levels_of : {"usable", "all"}
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)

@@ -45,7 +45,7 @@ class _Orbit:
 
 
 def simulated_navigation(scenario: Scenario) -> Navigation:
-    """Broadcast records for the whole of a run, as `railfix.io.rinex.write.write_navigation` writes them.
+    """Broadcast records for the whole of a run, as `railfix.io.write_navigation` writes them.
 
     All values are already rounded to the digits of the file, so that the file and the arrays are the
     same satellites. Where the scenario names a navigation file, its records (`railfix.simulate.navigation_file`).
