@@ -35,6 +35,7 @@ from railfix.gnss.observations import Observations
 from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
+from railfix.ranges.atmosphere import rtca_troposphere_m, rtca_troposphere_sigma_m
 from railfix.ranges.error_model import (
     ErrorModel,
     ErrorModelFit,
@@ -42,7 +43,7 @@ from railfix.ranges.error_model import (
     fit_bins,
     write_error_model,
 )
-from railfix.ranges.sbas import SbasCorrections, read_sbas, sigma_tropo_m, troposphere_m
+from railfix.ranges.sbas import SbasCorrections, read_sbas
 from railfix.run.driver import RunOptions
 from railfix.run.processor import processor_of
 from railfix.track import read_track
@@ -163,7 +164,10 @@ def parts_of_sbas(log: Log, rounds: int) -> None:
                 "satellites": lambda w=when: engine.satellites(w, satellite, log.navigation),
                 "ionosphere": lambda w=when, a=lat, o=lon, e=elevation, z=azimuth: engine.ionosphere(w, a, o, e, z),
                 "delta_udre": lambda w=when, f=fixes, s=sight, a=lat, o=lon: engine.delta_udre(w, f, s, a, o),
-                "troposphere": lambda w=when, a=lat, h=up, e=elevation: (troposphere_m(w, a, h, e), sigma_tropo_m(e)),
+                "troposphere": lambda w=when, a=lat, h=up, e=elevation: (
+                    rtca_troposphere_m(w, a, h, e),
+                    rtca_troposphere_sigma_m(e),
+                ),
             }
             for name, call in calls.items():
                 begin = time.process_time()
