@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -46,6 +47,17 @@ def result_of(epochs: int, **settings: Any) -> Result:
     return processor_of(Config(**settings), read_navigation(inputs.nav), paths).process(logs)[0]
 
 
+def copied(value: Any) -> Any:
+    """Deep copy of arguments, arrays as writable as they were: others would be compiled for."""
+    if isinstance(value, tuple):
+        parts = [copied(part) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    other = copy.deepcopy(value)
+    if isinstance(value, np.ndarray):
+        other.flags.writeable = value.flags.writeable
+    return other
+
+
 @pytest.fixture(scope="module")
 def calls() -> dict[str, list[tuple[Any, ...]]]:
     """Arguments of the first calls of each kernel in a run."""
@@ -54,7 +66,7 @@ def calls() -> dict[str, list[tuple[Any, ...]]]:
     def recording(name: str) -> Callable[..., Any]:
         def reference(*arguments: Any) -> Any:
             if len(found.setdefault(name, [])) < 4:
-                found[name].append(copy.deepcopy(arguments))
+                found[name].append(copied(arguments))
             return kernels.REGISTERED[name][0](*arguments)
 
         return reference
@@ -74,8 +86,8 @@ def test_each_kernel_gives_what_its_reference_gives(calls: dict[str, list[tuple[
     assert sorted(calls) == sorted(kernels.REGISTERED), "a kernel that no run calls is not compared"
     for name, arguments in calls.items():
         for call in arguments:
-            expected = kernels.REGISTERED[name][0](*copy.deepcopy(call))
-            given = kernels.compiled(name)(*copy.deepcopy(call))
+            expected = kernels.REGISTERED[name][0](*copied(call))
+            given = kernels.compiled(name)(*copied(call))
             if not isinstance(expected, tuple):
                 expected, given = (expected,), (given,)
             assert len(given) == len(expected), name
@@ -158,7 +170,7 @@ def test_levels_of_every_kind_of_hypothesis_are_the_same(
 @pytest.mark.requirement("A8")
 def test_all_kernels_are_loaded_before_a_live_session_needs_them(calls: dict[str, list[tuple[Any, ...]]]) -> None:
     for name, arguments in calls.items():
-        kernels.compiled(name)(*copy.deepcopy(arguments[0]))  # on disk from here on
+        kernels.compiled(name)(*copied(arguments[0]))  # on disk from here on
     program = """
 from railfix import kernels
 from railfix.pipeline.processor import EpochProcessor
@@ -196,6 +208,23 @@ def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None
         after = {name: stamp(copied, name) for name in before}
         assert {name for name in before if after[name] != before[name]} == names
         before = after
+
+
+@pytest.mark.requirement("A7", "A8")
+def test_arrays_of_a_trajectory_and_records_stay_read_only_in_another_process() -> None:
+    """The second channel of a live session gets them pickled; for writable ones each kernel was compiled again."""
+    inputs = demo_inputs()
+    assert inputs.vehicle is not None
+    path = antenna_trajectory(read_track(inputs.track), read_vehicle(inputs.vehicle), "front")
+    assert path.length_m.size
+    assert path.tangent.size  # cached with the instance
+    for sent in (path, read_navigation(inputs.nav).kepler):
+        got = pickle.loads(pickle.dumps(sent))
+        arrays = {name: value for name, value in vars(sent).items() if isinstance(value, np.ndarray)}
+        assert len(arrays) > 5
+        for name, value in arrays.items():
+            assert not vars(got)[name].flags.writeable, name
+            np.testing.assert_array_equal(vars(got)[name], value)
 
 
 @with_numba

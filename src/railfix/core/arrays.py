@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -47,6 +48,16 @@ def freeze_arrays(instance: DataclassInstance) -> None:
         value = getattr(instance, item.name)
         if isinstance(value, np.ndarray):
             object.__setattr__(instance, item.name, read_only(value))
+
+
+class FrozenArrays:
+    """Base of dataclasses that freeze their arrays: they are read-only in copies and in other processes, too.
+
+    A compiled function is compiled anew for arrays that can be written.
+    """
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        vars(self).update({n: read_only(v) if isinstance(v, np.ndarray) else v for n, v in state.items()})
 
 
 def changed(instance: Instance, **values: Any) -> Instance:

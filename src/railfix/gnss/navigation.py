@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Strings, freeze_arrays
+from railfix.core.arrays import Datetimes, Floats, FrozenArrays, Integers, Strings, freeze_arrays
 from railfix.core.display import NotebookTable, plural, time_span_text
 
 
@@ -33,7 +33,7 @@ def _freeze(table: Any, length: int) -> None:
     freeze_arrays(table)
 
 
-class _Records(NotebookTable):
+class _Records(FrozenArrays, NotebookTable):
     """Length, text and freezing of broadcast records."""
 
     satellite: Strings

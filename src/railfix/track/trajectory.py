@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Floats, Indices, freeze_arrays, read_only
+from railfix.core.arrays import Floats, FrozenArrays, Indices, freeze_arrays, read_only
 from railfix.core.display import NotebookTable, plural
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef
 from railfix.kernels import compiled_by
@@ -34,7 +34,7 @@ _END_TOLERANCE_M = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trajectory(NotebookTable):
+class Trajectory(FrozenArrays, NotebookTable):
     """Trajectory of one antenna, V points.
 
     Right is positive across the path, seen in the direction of rising chainage.

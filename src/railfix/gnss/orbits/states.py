@@ -195,14 +195,14 @@ def _fill_kepler(
     states.future_record[:, channels] = (usable & future).T
     kepler_channels(
         time.astype("datetime64[ns]").astype(np.int64),
-        code_m,
+        np.ascontiguousarray(code_m),
         KeplerChannels(channels, rows, usable, plan.signal),
         KeplerRecords(
             table.lookup.toe.astype("datetime64[ns]").astype(np.int64),
             table.orbits.table,
             table.clock,
             table.toe_after_toc_s,
-            table.navigation.kepler.accuracy_m,
+            np.ascontiguousarray(table.navigation.kepler.accuracy_m),
             plan.group_delay_s,
             plan.unhealthy,
         ),
