@@ -227,7 +227,9 @@ def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantEleme
     notes: tuple[str, ...] = ()
     if 0.0 < np.abs(applied).max(initial=0.0) < 1.0:
         unit = scale
-        notes = (f"cant: at most {np.abs(applied).max():g} in the file, which is taken as a length in plan, not as mm",)
+        notes = (
+            f"cant: at most {np.abs(applied).max():g} in the file; taken in its unit of length, not in millimetres",
+        )
     stations, laws = [], []
     for element, value in zip(found, applied * unit, strict=True):
         # clockwise is a curve to the right: the left rail is the outer one
