@@ -53,7 +53,7 @@ class Folder(Protocol):
 
 
 def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
-    """Write an evaluation, commit the folder and return where each file stands.
+    """Write an evaluation and commit the folder.
 
     ==================== ================================================================
     evaluation.json      all figures with their units, options, inputs with their hashes
@@ -66,6 +66,11 @@ def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
     outages.csv          stretches without satellites, where a table of the filter is evaluated
     branches.csv         stated probabilities of the place against its correctness, the same
     ==================== ================================================================
+
+    Returns
+    -------
+    dict of str to Path
+        Where each file stands.
 
     Raises
     ------

@@ -48,7 +48,13 @@ class Authority(Settings):
 
     @classmethod
     def decode(cls, data: bytes) -> Authority:
-        """Return the message of some bytes; MessageError when they are no authority message of this version."""
+        """Return the message of some bytes.
+
+        Raises
+        ------
+        MessageError
+            The bytes are no authority message of this version.
+        """
         if len(data) != _FORM.size:
             raise MessageError(f"has {len(data)} bytes, an authority has {_FORM.size}")
         version, *values = _FORM.unpack(data)

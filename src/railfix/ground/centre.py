@@ -151,9 +151,18 @@ def time_passed(
     authority_m: float | None = None,
     limits: CentreLimits,
 ) -> TrainRecord:
-    """Return the record at a later instant of the centre's clock.
+    """Return the record at a later instant.
 
-    The curves are by direction; the simulated place ends where the train's authority ends.
+    Parameters
+    ----------
+    record : TrainRecord
+    now_s : float [s]
+        Centre's clock.
+    curves : dict of int to ReferenceCurve
+        By direction.
+    authority_m : float, optional [m]
+        End of the train's authority: the simulated place ends there.
+    limits : CentreLimits
     """
     if record.message is None or record.state is TrainState.UNKNOWN or record.message.chainage_cm is None:
         return record

@@ -80,8 +80,21 @@ def advance(
 ) -> tuple[MonitorState, tuple[Order, ...]]:
     """Return the state after a sample, and the orders to be sent.
 
-    The clock never runs backwards (ValueError); the verdict on the newest fixes is None where nothing has come since,
-    and may name a receiver.
+    Parameters
+    ----------
+    state : MonitorState
+    now_s : float [s]
+        Clock of the monitor, which never runs backwards (monotonic).
+    verdict : Verdict or None
+        Of the newest fixes; None where nothing has come since.
+    receiver : int
+        Receiver that the verdict names.
+    limits : MonitorLimits
+
+    Raises
+    ------
+    ValueError
+        The clock ran backwards.
     """
     if now_s < state.complete_s:
         raise ValueError(f"the clock of the monitor ran back from {state.complete_s} s to {now_s} s")

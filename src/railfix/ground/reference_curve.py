@@ -43,9 +43,17 @@ class ReferenceCurve:
     def between_stations(
         cls, stations_m: Floats, *, speed_mps: float, acceleration_mps2: float = 0.5, step_s: float = 1.0
     ) -> Self:
-        """Return the curve of a run that starts and stops at each station, in their order, with an even acceleration.
+        """Return the curve of a run that starts and stops at each station with an even acceleration.
 
-        The highest speed is not reached where the stations are near each other; `step_s` is that of the table.
+        Parameters
+        ----------
+        stations_m : ndarray, shape (K,) [m]
+            In the order of the run.
+        speed_mps : float [m/s]
+            Highest speed; less is reached where the stations are near each other.
+        acceleration_mps2 : float [m/s^2]
+        step_s : float [s]
+            Step of the table.
         """
         direction = 1 if stations_m[-1] > stations_m[0] else -1
         time, place, start = [np.zeros(1)], [stations_m[:1]], 0.0

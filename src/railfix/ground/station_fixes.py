@@ -57,10 +57,21 @@ class StationFixes:
 def station_fixes(
     logs: list[Observations], points_ecef_m: Floats, navigation: Navigation, *, config: Config | None = None
 ) -> StationFixes:
-    """Compute the fixes of the receivers of a triangle, at N known points, shape (N, 3), from their N logs.
+    """Compute the fixes of the receivers of a triangle.
 
-    Constellations, signals, mask, noise and atmosphere as in a run. MismatchError: when the logs have no tag, or no
-    channel, in common.
+    Parameters
+    ----------
+    logs : list of Observations, length N
+    points_ecef_m : ndarray, shape (N, 3) [m]
+        Known points of the antennas.
+    navigation : Navigation
+    config : Config, optional
+        Constellations, signals, mask, noise and atmosphere as in a run.
+
+    Raises
+    ------
+    MismatchError
+        The logs have no tag, or no channel, in common.
     """
     config = config or Config()
     book = ChannelBook(config)

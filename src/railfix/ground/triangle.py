@@ -76,11 +76,24 @@ def limits_for_false_stops(
 ) -> TriangleLimits:
     """Limits that give a rate of false stops a year.
 
-    The length of a horizontal error of standard deviation sigma an axis is Rayleigh distributed: ``P(e > R) = exp(-R^2
-    / (2 sigma^2))``. Half of the false stops are allotted to the three circles, half to the three sides; a year has as
-    many independent samples as `independent_s` fit into it. `sigma_m` is that of a fix, an axis, `own_sigma_m` that of
-    the part which the other receivers do not share; a side has it twice. ValueError: when an argument is not positive,
-    `own_sigma_m` exceeds `sigma_m`, or the rate is higher than the samples allow.
+    The length of a horizontal error of standard deviation sigma an axis is Rayleigh distributed:
+    ``P(e > R) = exp(-R^2 / (2 sigma^2))``. Half of the false stops are allotted to the three circles, half to the
+    three sides; a year has as many independent samples as `independent_s` fit into it.
+
+    Parameters
+    ----------
+    sigma_m : float [m]
+        Standard deviation of a fix, an axis.
+    own_sigma_m : float [m]
+        That of the part which the other receivers do not share; a side has it twice.
+    stops_per_year : float
+    independent_s : float [s]
+        Time after which the errors of a fix are independent of those before.
+
+    Raises
+    ------
+    ValueError
+        An argument is not positive, `own_sigma_m` exceeds `sigma_m`, or the rate is higher than the samples allow.
     """
     if not (0.0 < own_sigma_m <= sigma_m and stops_per_year > 0.0 and independent_s > 0.0):
         raise ValueError("0 < own_sigma_m <= sigma_m, stops_per_year > 0 and independent_s > 0 were expected")

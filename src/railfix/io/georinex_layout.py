@@ -63,8 +63,15 @@ _UNKNOWN: Final = 0.99e9
 def observations_to_xarray(observations: Observations) -> xr.Dataset:
     """Observations as a dataset in the layout of georinex.
 
-    One variable over ``time`` and ``sv`` for each observation type; absent is NaN. Beyond georinex's own:
-    ``break_before`` over ``time``, ``glonass_channel`` over ``sv``. Attributes as georinex's.
+    Parameters
+    ----------
+    observations : Observations
+
+    Returns
+    -------
+    xarray.Dataset
+        One variable over ``time`` and ``sv`` for each observation type; absent is NaN. Beyond georinex's
+        own: ``break_before`` over ``time``, ``glonass_channel`` over ``sv``. Attributes as georinex's.
     """
     import xarray as xr
 
@@ -204,10 +211,18 @@ def _observation_header(data: xr.Dataset, keys: list[tuple[str, str]], version: 
 
 
 def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
-    """Navigation records as a dataset in the layout of georinex; `precise` is left out.
+    """Navigation records as a dataset in the layout of georinex.
 
-    Variables over ``time`` and ``sv`` by the names of georinex; NaN where a satellite has no record at a time.
-    Klobuchar coefficients are attributes.
+    Parameters
+    ----------
+    navigation : Navigation
+        `precise` is left out.
+
+    Returns
+    -------
+    xarray.Dataset
+        Variables over ``time`` and ``sv`` by the names of georinex; NaN where a satellite has no record
+        at a time. Klobuchar coefficients are attributes.
     """
     import xarray as xr
 
@@ -243,9 +258,18 @@ def navigation_to_xarray(navigation: Navigation) -> xr.Dataset:
 
 
 def navigation_from_xarray(data: xr.Dataset) -> Navigation:
-    """Navigation records of a dataset as ``georinex.load`` gives it for a RINEX 3 navigation file.
+    """Navigation records of a dataset in the layout of georinex.
 
-    In order of satellite, then time. Records of constellations that railfix does not use are counted in `skipped`.
+    Parameters
+    ----------
+    data : xarray.Dataset
+        As ``georinex.load`` gives it for a RINEX 3 navigation file.
+
+    Returns
+    -------
+    Navigation
+        Records in order of satellite, then time. Records of constellations that railfix does not use are
+        counted in `skipped`.
 
     Raises
     ------

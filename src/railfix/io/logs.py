@@ -145,7 +145,13 @@ def _of_systems(run: Observations, letters: list[str]) -> Observations:
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
     """Navigation records from RINEX navigation files and receiver logs, mixed at will.
 
-    `broken_lines` is as for `railfix.io.rinex.read_navigation`; `date` is some time within half a week of RTCM 3 logs.
+    Parameters
+    ----------
+    paths : path or sequence of path
+    broken_lines : {"stop", "count"}
+        As `railfix.io.rinex.read_navigation`.
+    date : datetime64 or str, optional
+        Some time within half a week of RTCM 3 logs.
 
     Raises
     ------

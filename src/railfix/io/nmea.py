@@ -55,7 +55,7 @@ def read_nmea(
     broken_lines: BrokenLines = "stop",
     date: np.datetime64 | None = None,
 ) -> PositionLog:
-    """Read the GGA sentences of an NMEA log; times in GPS time, qualities as RTKLIB numbers them (`QUALITY`).
+    """Read the GGA sentences of an NMEA log.
 
     Parameters
     ----------
@@ -65,6 +65,11 @@ def read_nmea(
         A sentence with a wrong checksum or invalid fields is an error, or is skipped and noted.
     date : datetime64, optional
         UTC date of the first GGA, for logs without RMC and ZDA.
+
+    Returns
+    -------
+    PositionLog
+        Times in GPS time; qualities as RTKLIB numbers them (`QUALITY`), 1 a fix.
 
     Raises
     ------
@@ -202,8 +207,14 @@ def read_any_positions(
     """Read a log of positions of any kind, by its ending.
 
     NMEA (``.nmea``, ``.nma``, ``.gga``), GPX (``.gpx``), NovAtel ASCII (``.asc``, ``.ascii``, ``.gps``), receiver logs
-    by their content (`railfix.io.receiver.positions`), else `read_positions`. `date` is for NMEA (see `read_nmea`), and
-    UBX logs whose positions have no date.
+    by their content (`railfix.io.receiver.positions`), else `read_positions`.
+
+    Parameters
+    ----------
+    path : path
+    broken_lines : {"stop", "count"}
+    date : datetime64, optional
+        For NMEA (see `read_nmea`), and UBX logs whose positions have no date.
     """
     if ending(path) in (".nmea", ".nma", ".gga"):
         return read_nmea(path, broken_lines=broken_lines, date=date)

@@ -174,7 +174,13 @@ def _of_antenna(
 
 
 def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaReference]) -> None:
-    """Write references by antenna as CSV (`COLUMNS`), sorted by time; a failed write leaves no file.
+    """Write references as CSV (`COLUMNS`), sorted by time; a failed write leaves no file.
+
+    Parameters
+    ----------
+    path : path
+    references : mapping of str to AntennaReference
+        By antenna.
 
     Raises
     ------

@@ -32,9 +32,17 @@ class _States:
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:
-    """Read positions and clocks of one or several SP3 files (plain, gzip, compress), joined in order of time.
+    """Read positions and clocks of one or several SP3 files, joined in order of time.
 
-    Where files overlap, the file given first takes precedence.
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        Plain, gzip, compress.
+
+    Returns
+    -------
+    PreciseEphemeris
+        Where files overlap, the file given first takes precedence.
 
     Raises
     ------

@@ -90,7 +90,7 @@ def run_files(
     asked: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Position the logs of one run along its line and write the results into the folder `out`.
+    """Position the logs of one run along its line and write the results.
 
     Parameters
     ----------
@@ -98,10 +98,15 @@ def run_files(
     config : Config, optional
         Settings used; the defaults unless given.
     out : Path
+        Folder for the results.
     options : RunOptions, optional
     asked : mapping, optional
         Settings that were given, as opposed to defaults; goes into ``run.json``.
     progress : Progress, optional
+
+    Returns
+    -------
+    RunSummary
 
     Raises
     ------

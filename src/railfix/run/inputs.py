@@ -81,10 +81,29 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run; the options of `railfix run` say what each is.
+    """Input files of a run.
 
-    `truth` is for `ablate` alone; `config`, `cn0_curve`, `error_model` and `sbas` are named by the settings
-    (`with_settings`).
+    Attributes
+    ----------
+    front, rear : tuple of Path
+        RINEX observation files of each antenna, in order of time; `rear` may be empty.
+    nav, sp3 : tuple of Path
+        Navigation files; precise orbits, which may be empty.
+    track : tuple of Path
+        Track map, joined to a route in this order.
+    heights : Path or None
+        Heights of a track map without.
+    vehicle : Path or None
+    tachometer, inertial, radar, ranging : Path or None
+        Tables of the sensors on board.
+    ranging_units : Path or None
+        Surveyed positions of the ground units that `ranging` names.
+    truth : Path or None
+        Reference positions, for `ablate` alone.
+    config : Path or None
+    cn0_curve, error_model : Path or None
+    sbas : tuple of Path
+        Named by the settings (`with_settings`).
     """
 
     front: tuple[Path, ...] = input_option(
@@ -155,7 +174,13 @@ class RunInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Raise InputFileError where a file is missing, a folder, cannot be opened, or the same log is given twice."""
+        """Check every file before the work begins.
+
+        Raises
+        ------
+        InputFileError
+            A file is missing, a folder, or cannot be opened; or the same log is given twice.
+        """
         self.check_files()
         check_given_once((f"--{name}", path) for name, paths in self.logs.items() for path in paths)
 

@@ -38,7 +38,10 @@ def demo_folder() -> Path:
 def demo_files() -> dict[str, Path]:
     """Files of the demonstration run: ``front``, ``rear``, ``nav``, ``track``, ``vehicle``, ``truth``, ``readme``.
 
-    InputFileError: as `demo_folder`.
+    Raises
+    ------
+    InputFileError
+        As `demo_folder`.
     """
     folder = demo_folder()
     return {name: folder / file for name, file in DEMO_FILES.items()}

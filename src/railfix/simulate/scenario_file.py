@@ -170,10 +170,19 @@ def _run_table(
 
 
 def load_scenario(name: str | PathLike[str]) -> Scenario:
-    """The scenario of a file (a path, or the name of a shipped scenario) that holds one run.
+    """The scenario of a file that holds one run.
 
-    InputFileError: when the file is missing, unreadable, or no TOML. SettingsError: when a setting is misspelt, of the
-    wrong kind, or out of range; or the file lists many runs.
+    Parameters
+    ----------
+    name : path-like
+        A path, or the name of a shipped scenario.
+
+    Raises
+    ------
+    InputFileError
+        The file is missing, unreadable, or no TOML.
+    SettingsError
+        A setting is misspelt, of the wrong kind, or out of range; or the file lists many runs.
     """
     recipe = load_recipe(name)
     if recipe.names[0]:

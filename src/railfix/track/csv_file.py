@@ -168,10 +168,15 @@ def _in_frame(crs: str | None, latitude: Floats, longitude: Floats, *, path: str
 
 
 def write_track_csv(track: Track, path: str | PathLike[str]) -> None:
-    """Write a track as CSV with ellipsoidal heights; a failed write leaves no file, and raises OutputError.
+    """Write a track as CSV with ellipsoidal heights; a failed write leaves no file.
 
     Attributes without any value are omitted. The file reads back equal to the track within
     1e-10 degrees and 0.1 mm.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
     """
     columns = {
         "latitude_deg": [f"{v:.10f}" for v in track.latitude_deg],

@@ -109,11 +109,20 @@ def thin(
     usable: Masks | None = None,
     limits: ThinningLimits | None = None,
 ) -> Thinned:
-    """Choose the positions that become points of a map, out of the usable rows (NaN is not).
+    """Choose the positions that become points of a map.
 
     Noise and drift of a stationary antenna make no loops: stationary rows are dropped first, and a point
     is kept only at full spacing from the last. The last usable position is kept where it is at least a
     fifth of the spacing further on.
+
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (n,)
+    ecef_m : ndarray, shape (n, 3) [m]
+        Rows with NaN are dropped.
+    usable : ndarray of bool, shape (n,), optional
+        False drops a row for its quality.
+    limits : ThinningLimits, optional
     """
     limits = limits or ThinningLimits()
     finite = np.isfinite(ecef_m).all(axis=1)
@@ -258,9 +267,26 @@ def from_positions(
 ) -> Track:
     """Create a track from positions, thinned and without stationary positions.
 
-    Its notes record that it is the path of the antenna, and its gaps and reversals. Times are in the order of travel,
-    NaT where unknown; `usable` drops rows; the spacing is ignored where limits are given. ValueError: when fewer than
-    two points are left.
+    Parameters
+    ----------
+    time : ndarray of datetime64[ns], shape (n,)
+        In the order of travel; NaT where unknown.
+    ecef_m : ndarray, shape (n, 3) [m]
+    spacing_m : float [m]
+        Ignored where `limits` is given.
+    usable : ndarray of bool, shape (n,), optional
+        False drops a row.
+    limits : ThinningLimits, optional
+
+    Returns
+    -------
+    Track
+        Its notes record that it is the path of the antenna, and its gaps and reversals.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two points are left.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
     return track_of(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
@@ -361,7 +387,10 @@ def from_position_log(
 ) -> tuple[Track, Thinned]:
     """Create a track from the accurate positions of a log, and report the selection of rows.
 
-    InputFileError: when fewer than two points are left, or the log has no column for a filter.
+    Raises
+    ------
+    InputFileError
+        Fewer than two points are left, or the log has no column for a filter.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)

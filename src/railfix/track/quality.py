@@ -126,7 +126,15 @@ class TrackQuality:
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
     """Check the quality of a track map.
 
-    Read it with ``duplicates="keep"`` so that duplicates are findings instead of an error.
+    Parameters
+    ----------
+    track : Track
+        Read with ``duplicates="keep"`` so that duplicates are findings instead of an error.
+    limits : MapLimits, optional
+
+    Returns
+    -------
+    TrackQuality
     """
     limits = limits or MapLimits()
     geometry = geometry_of(track)

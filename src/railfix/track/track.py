@@ -133,7 +133,17 @@ class Track(NotebookTable):
         sigma_height_m: float = SIGMA_HEIGHT_M,
         provenance: Provenance | None = None,
     ) -> Track:
-        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height); attributes not given are NaN."""
+        """Create a track from geodetic coordinates; attributes not given are NaN.
+
+        Parameters
+        ----------
+        latitude_deg, longitude_deg, height_m : array_like, shape (V,)
+            WGS 84, ellipsoidal height.
+
+        Returns
+        -------
+        Track
+        """
         latitude = np.array(latitude_deg, dtype=np.float64)
 
         def floats(values: ArrayLike | None) -> Floats:
@@ -220,10 +230,21 @@ def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
-    """Interpolate the kilometrage, known at V rising chainages, at others; NaN where the nearer point has none.
+    """Interpolate the kilometrage at chainages.
 
     Linear between two points. Inside a segment with a jump, the kilometrage of the nearer point is
     extrapolated in its own direction, never interpolated across the jump.
+
+    Parameters
+    ----------
+    chainage_m : array_like, any shape [m]
+    known_chainage_m, known_kilometrage_m : ndarray, shape (V,) [m]
+        Rising chainage, and the kilometrage there.
+
+    Returns
+    -------
+    ndarray, same shape as `chainage_m` [m]
+        NaN where the nearer point has no kilometrage, and for NaN.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     index = np.clip(np.searchsorted(known_chainage_m, at, side="right") - 1, 0, len(known_chainage_m) - 2)

@@ -184,10 +184,19 @@ class Trajectory(FrozenArrays, NotebookTable):
         return NearestOnPolyline(self.ecef_m)
 
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
-        """Find the segment of each arc length, and the distance along it from its first point.
+        """Find the segment of each arc length, and the distance along it.
 
-        A point shared by two segments belongs to the later one. Before the start it is segment 0 and the distance
-        negative, beyond the end the last segment; for NaN the last segment and NaN.
+        Parameters
+        ----------
+        arc_m : array_like, any shape [m]
+
+        Returns
+        -------
+        index : ndarray of int
+            A point shared by two segments belongs to the later one; 0 before the start; the last segment
+            beyond the end and for NaN.
+        along_m : ndarray [m]
+            From the segment's first point; negative before the start; NaN for NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(np.searchsorted(self.arc_m, arc, side="right") - 1, 0), len(self) - 2)
@@ -235,10 +244,19 @@ class Trajectory(FrozenArrays, NotebookTable):
         return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
 
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Find the nearest point of the trajectory to each position, shape (n, 3): its arc length and its distance.
+        """Find the nearest point of the trajectory to each position.
 
-        Exact over all segments: a k-d tree gives the candidates, and a bound excludes all others. NaN where the
-        position is NaN; of two equally near points the one of smaller arc length.
+        Exact over all segments: a k-d tree gives the candidates, and a bound excludes all others.
+
+        Parameters
+        ----------
+        ecef_m : array_like, shape (n, 3) [m]
+
+        Returns
+        -------
+        arc_m, offset_m : ndarray, shape (n,) [m]
+            Arc length of the nearest point and its distance; NaN where the position is NaN. Of two
+            equally near points the one of smaller arc length.
         """
         index, along, offset = self._nearest(ecef_m)
         known = index >= 0

@@ -75,8 +75,12 @@ class Vehicle(Settings):
 def read_vehicle(path: str | PathLike[str]) -> Vehicle:
     """Read a vehicle file (TOML).
 
-    InputFileError: when there is no such file, or it is not TOML. SettingsError: when a key is unknown, missing or out
-    of range.
+    Raises
+    ------
+    InputFileError
+        No such file, or not TOML.
+    SettingsError
+        A key is unknown, missing or out of range.
     """
     return load_settings(Vehicle, path, what="a vehicle file")
 
@@ -311,15 +315,23 @@ def antenna_trajectory(
     rolls by ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean
     of the two (P1 3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the
     vertical rotated by the roll. The path begins and ends where a bogie reaches the end of the track; on a closed
-    track where the body's middle does, so that it is closed too. It has one point where the body's middle passes each
-    point of the track, and more where the path deviates from a chord by more than `PATH_TOLERANCE_M`.
+    track where the body's middle does, so that it is closed too.
 
     Parameters
     ----------
+    track : Track
+    vehicle : Vehicle
+    antenna : {"front", "rear"}
     reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
         Point of the vehicle to which the chainage refers: the centreline point abeam the antenna
         (beyond the outer bogies the centreline is extended straight), the middle between the bogies,
         or a bogie centre; front and rear are those of the vehicle.
+
+    Returns
+    -------
+    Trajectory
+        One point where the body's middle passes each point of the track, and more where the path
+        deviates from a chord by more than `PATH_TOLERANCE_M`.
 
     Raises
     ------
