@@ -1,7 +1,8 @@
 """Tables of what noise scale, clock offsets, sigmas, maps and priors do to positions and levels.
 
 ``python tests/integrity_tables.py PART`` with the recordings beside the checkout prints a part of
-``docs/bounds.md``: faults, maps, sigmas, starts, priors, together, sides, late.
+``docs/bounds.md``: faults, maps, sigmas, starts, priors, together, sides, late, ionosphere,
+coefficients.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ import recordings_truth
 from conftest import ROOT
 from integrity_recordings import ranges_of
 from railfix.core.arrays import Floats, Masks
-from railfix.core.geodesy import elevation_azimuth, range_with_rotation
+from railfix.core.constants import FREQUENCY_L1
+from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef, range_with_rotation
 from railfix.core.reasons import Status
 from railfix.core.timescale import seconds
 from railfix.evaluate import along_track_error, interpolate_reference
@@ -36,6 +38,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.results import AntennaResult
 from railfix.positioning.normal_equations import Ranges, inverse_3x3, normal_equations
 from railfix.positioning.robust_fit import map_information
+from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m
 from railfix.simulate.demo_data import demo_files
 from railfix.track import read_track
 from railfix.track.trajectory import Trajectory
@@ -50,6 +53,14 @@ SIZES_M: Final = (20.0, 50.0, 100.0)
 OFFSETS_M: Final = ((0, 0), (5, 0), (10, 0), (20, 0), (50, 0), (200, 0), (2000, 0), (0, 10), (0, 20), (0, 37))
 #: Priors of local faults that cities ask for (docs/bounds.md).
 LOCAL_PRIORS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4)
+#: Navigation files with Klobuchar coefficients of other days, beside `DATA`.
+COEFFICIENT_FILES: Final = (
+    "static/rtklib_geonet2005/07590920.05n",
+    "static/ESBC_2020177/ESBC00DNK_R_20201770000_01D_MN.rnx.gz",
+    "kinematic/gsdc_pixel5_a/hour1180.21n",
+    "kinematic/japan_mosaic_2021265_with_GEONET3034/SEPT2650.21P",
+    "dual/mosaic_x2_99cm/base.nav",
+)
 _NORMAL_MEDIAN: Final = 0.6745
 
 
@@ -383,6 +394,58 @@ def side_rows() -> Iterator[str]:
             )
 
 
+def ionosphere_rows() -> Iterator[str]:
+    """Positions and levels with and without Klobuchar's coefficients, and without them under delays twice as large."""
+    yield "log    coefficients, delays   vertical [m]   straight p50     p95    max   ratio p95   level median   over"
+    for name, case in cases().items():
+        bare = replace(case, navigation=replace(case.navigation, klobuchar={}))
+        known, place = case.solved(), geodetic_from_ecef(case.trajectory.at_arc(np.zeros(1)))
+        latitude, longitude = (np.repeat(value, len(known)) for value in place[:2])
+        delay = partial(klobuchar_delay_m, known.time, latitude, longitude)
+        coefficients = case.navigation.klobuchar.get("G", TYPICAL_KLOBUCHAR)
+        carrier = np.array([FREQUENCY_L1])
+        twice = np.nan_to_num(delay(known.elevation_deg, known.azimuth_deg, coefficients, carrier))
+        overhead = np.full((len(known), 1), 90.0)
+        vertical = float(np.median(delay(overhead, np.zeros_like(overhead), coefficients, carrier)))
+        for label, result in (
+            ("received, as they were", known),
+            ("none, as they were", bare.solved()),
+            ("none, twice", bare.solved(bias_m=twice)),
+        ):
+            straight, along = case.errors(result)
+            level, calm = bounds(result)
+            sizes = np.percentile(straight[np.isfinite(straight)], (50.0, 95.0, 100.0))
+            ratio = along / result.along_sigma_m
+            yield (
+                f"{name:6s} {label:24s} {vertical:10.1f} {sizes[0]:14.2f} {sizes[1]:7.2f} {sizes[2]:6.1f}"
+                f" {np.percentile(ratio[np.isfinite(ratio)], 95.0):11.2f} {np.median(level[np.isfinite(level)]):14.1f}"
+                f" {int((calm & (along > level)).sum()):6d}"
+            )
+
+
+def coefficient_rows() -> Iterator[str]:
+    """Vertical delay of the typical coefficients, and of others less that, over latitudes, longitudes and hours."""
+    grid = np.meshgrid(np.arange(-60.0, 61.0, 10.0), np.arange(-180.0, 180.0, 30.0), np.arange(24.0))
+    latitude, longitude, hour = (axis.ravel() for axis in grid)
+    tags = np.datetime64("2020-01-05", "ns") + (hour * 3.6e12).astype("timedelta64[ns]")
+    overhead = np.full((len(tags), 1), 90.0)
+
+    def vertical(coefficients: Floats) -> Floats:
+        model = partial(klobuchar_delay_m, tags, latitude, longitude, overhead, np.zeros_like(overhead))
+        return model(coefficients, np.array([FREQUENCY_L1]))[:, 0]
+
+    typical = vertical(TYPICAL_KLOBUCHAR)
+    yield "day          RMS of the delay [m]   RMS less the typical   largest"
+    yield f"2004-01-01 {np.sqrt(np.mean(typical**2)):22.2f}"
+    for file in COEFFICIENT_FILES:
+        navigation = read_navigation([DATA.parent / file])
+        delay = vertical(navigation.klobuchar["G"])
+        yield (
+            f"{navigation.kepler.toe.min().astype('datetime64[D]')} {np.sqrt(np.mean(delay**2)):22.2f}"
+            f" {np.sqrt(np.mean((delay - typical) ** 2)):22.2f} {np.abs(delay - typical).max():9.1f}"
+        )
+
+
 def reweighted(
     ranges: Ranges, line: Trajectory, arc: Floats, section: Floats, scale: Floats, how: Reweighting
 ) -> Floats:
@@ -441,6 +504,8 @@ PARTS: Final[dict[str, Callable[[], Iterator[str]]]] = {
     "together": class_rows,
     "sides": side_rows,
     "late": late_rows,
+    "ionosphere": ionosphere_rows,
+    "coefficients": coefficient_rows,
 }
 
 

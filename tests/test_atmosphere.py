@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from orbit_cases import TOE
 from railfix.core.arrays import read_only
 from railfix.core.constants import CARRIER_FREQUENCY, FREQUENCY_L1, SPEED_OF_LIGHT
-from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
+from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, klobuchar_delay_m, saastamoinen_delay_m
 
 REFERENCES = json.loads((Path(__file__).parent / "references" / "orbits.json").read_text())
 COEFFICIENTS = np.array(REFERENCES["klobuchar"])
@@ -49,6 +49,17 @@ def test_troposphere_is_that_of_an_independent_program() -> None:
     for row in rows:
         found = troposphere(row["latitude_deg"], row["height_m"], row["elevation_deg"], row["relative_humidity"])
         assert found == pytest.approx(row["delay_m"], abs=1e-6), row
+
+
+@pytest.mark.parametrize("hour", [2, 9, 14, 19])
+def test_typical_coefficients_are_those_of_another_program(hour: int) -> None:
+    """RTKLIB's, where its coefficients are all zero."""
+    from pyrtklib_orbits import ionosphere_m
+
+    time = np.array([np.datetime64("2021-05-17", "ns") + np.timedelta64(hour, "h")])
+    place, angles = (np.array([22.3]), np.array([114.2])), (np.array([[40.0]]), np.array([[130.0]]))
+    found = klobuchar_delay_m(time, *place, *angles, TYPICAL_KLOBUCHAR, L1)[0, 0]
+    assert found == pytest.approx(ionosphere_m(time[0], (22.3, 114.2), 40.0, 130.0, [0.0] * 8), abs=1e-3)
 
 
 def by_hand(seconds_of_day: float, latitude: float, longitude: float, elevation: float, azimuth: float) -> float:

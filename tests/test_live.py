@@ -6,6 +6,7 @@ import asyncio
 import gzip
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -194,9 +195,23 @@ def test_duplicates_order_and_restart(logs: dict[str, tuple[Observations, ...]])
     assert sum(o.result is not None for o in later) == 18  # the third epoch in a row begins anew
 
 
-def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> None:
-    from dataclasses import replace
+def test_what_is_used_in_place_of_what_was_asked_for_is_told(logs: dict[str, tuple[Observations, ...]]) -> None:
+    """Ephemerides without coefficients of the ionosphere at the start, the coefficients ten epochs later."""
+    known = processor("front")
+    navigation = known.received.navigation
+    bare = railfix.EpochProcessor(known.config, known.trajectories, navigation=replace(navigation, klobuchar={}))
+    engine = LiveEngine(bare, LiveSettings())
+    assert "no coefficients received" in engine.told[0]
+    engine.told.clear()
+    at = tag_ns(logs["front"][0])
+    played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][:10])])
+    assert not engine.told
+    engine.learn(navigation)
+    played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][10:20], 10)])
+    assert [text.startswith("no longer so: ionosphere") for text in engine.told] == [True]
 
+
+def test_a_clock_step_is_counted(logs: dict[str, tuple[Observations, ...]]) -> None:
     engine = LiveEngine(processor("front"), LiveSettings())
     epochs = [
         replace(epoch, time=epoch.time + np.timedelta64(1 if k >= 10 else 0, "ms"))

@@ -205,6 +205,19 @@ def test_models_that_are_off_give_no_delay() -> None:
     assert on.ionosphere_m[0, 0] > zenith.ionosphere_m[0, 0] > 1.0
 
 
+def test_coefficients_that_were_not_received_widen_sigma() -> None:
+    """2 m at the zenith, times the obliquity of `test_nominal_sigma_by_hand` at 30 degrees, and the carrier."""
+    coefficients = np.array([1e-8, 0.0, 0.0, 0.0, 9e4, 0.0, 0.0, 0.0])
+    carriers, models = np.array([FREQUENCY_L1, 1_207.14e6]), {"klobuchar": coefficients, "troposphere": "off"}
+    found = [
+        modelled_delays(TIME, one_satellite(angle, 2), carriers, ionosphere_sigma_m=2.0, **models).sigma_m[0]
+        for angle in (90.0, 30.0)
+    ]
+    np.testing.assert_allclose(found[0], [2.0, 2.0 * 1.70328], rtol=1e-4)
+    np.testing.assert_allclose(found[1], 1.75143 * found[0], rtol=1e-4)
+    assert not modelled_delays(TIME, one_satellite(30.0, 2), carriers, **models).sigma_m.any()
+
+
 def test_channels_of_one_clock_stand_together_and_the_best_signal_first() -> None:
     satellite = np.array(["E01", "G02", "J01", "G01", "G01", "C05"])
     signal = np.array(["1C", "1C", "1C", "1X", "1C", "2I"])

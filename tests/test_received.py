@@ -30,6 +30,8 @@ from railfix.io.rinex import read_navigation, read_observations
 from railfix.pipeline.config import parse_config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import known_from_start, receive
+from railfix.pipeline.results import AntennaResult
+from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR, thin_shell_obliquity
 from railfix.ranges.sbas import read_sbas
 from recordings_score import straight_line
 
@@ -206,3 +208,39 @@ def test_expired_records_are_dropped_but_for_the_newest(recordings: Path) -> Non
 def glonass_rows(navigation: Navigation, chosen: np.ndarray) -> GlonassRecords:
     names = navigation.glonass.__dataclass_fields__
     return GlonassRecords(**{name: getattr(navigation.glonass, name)[chosen] for name in names})
+
+
+@pytest.mark.requirement("B4")
+@pytest.mark.requirement("C2")
+def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
+    """Typical coefficients, a note, and wider positions and levels, until coefficients arrive or the model is off."""
+    navigation, parts = clean_navigation(), {name: log[:40] for name, log in clean_observations().items()}
+    bare = replace(navigation, klobuchar={})
+    sigma = {"screens": ["elevation"], "nominal": {"typical_ionosphere_sigma_m": 3.0}}
+    without = known_from_start(parse_config(sigma), navigation=bare)
+    np.testing.assert_array_equal(without.klobuchar, TYPICAL_KLOBUCHAR)
+    assert without.ionosphere_sigma_m == 3.0
+    assert "no coefficients received" in without.notes[0]
+    assert "3 m added" in without.notes[0]
+    off = known_from_start(parse_config({"ionosphere": "off"} | sigma), navigation=bare)
+    assert (off.klobuchar, off.ionosphere_sigma_m, off.notes) == (None, 0.0, ())
+    later = receive(without, parse_config(sigma), parts["front"].time[0], navigation=navigation)
+    np.testing.assert_array_equal(later.klobuchar, navigation.klobuchar["G"])
+    assert (later.ionosphere_sigma_m, later.notes) == (0.0, ())
+
+    def solved(known: Navigation) -> AntennaResult:
+        return (
+            EpochProcessor(parse_config(sigma), clean_trajectories(), navigation=known)
+            .process(parts)[0]
+            .antennas["front"]
+        )
+
+    typical = {"G": np.asarray(TYPICAL_KLOBUCHAR)}
+    stated, assumed = solved(replace(navigation, klobuchar=typical)), solved(bare)
+    used = (stated.reason == 0) & (assumed.reason == 0)
+    added = thin_shell_obliquity(stated.elevation_deg[used]) * 3.0  # all signals of the log are near L1
+    np.testing.assert_allclose(assumed.sigma_m[used] ** 2, stated.sigma_m[used] ** 2 + added**2, rtol=1e-3)
+    assert (assumed.along_sigma_m > 1.3 * stated.along_sigma_m).all()
+    assert stated.protection is not None
+    assert assumed.protection is not None
+    assert (assumed.protection.level.level_m > 1.3 * stated.protection.level.level_m).all()

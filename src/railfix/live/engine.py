@@ -113,7 +113,8 @@ class LiveEngine:
         "tag step", "restart", "no input", "superseded" (processed, but a newer one had the message of the period),
         "dropped, too many waiting".
     told : deque of str
-        Sentences for the log on what happened: restarts, what became of a saved state.
+        Sentences for the log on what happened: what is used in place of what was asked for, and when that ends,
+        restarts, what became of a saved state.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings) -> None:
@@ -121,7 +122,8 @@ class LiveEngine:
         self.processor = processor
         self.settings = settings
         self.counts: Counter[str] = Counter()
-        self.told: deque[str] = deque(maxlen=100)
+        self.told: deque[str] = deque(processor.notes, maxlen=100)
+        self._notes = processor.received.notes
         self._order, self._ordered_at_m = processor.antenna_order(), float("-inf")
         self._antennas = tuple(processor.trajectories)
         self._waiting: dict[str, deque[_Waiting]] = {name: deque() for name in self._antennas}
@@ -350,8 +352,16 @@ class LiveEngine:
             epochs, self._state, navigation=news.navigation, messages=news.messages
         )
         self._done_ns = max(head.tag_ns for head in heads.values())
+        self._tell_changes((self._state.received or self.processor.received).notes)
         self._check_order(result)
         return LiveOutput(message=message_of(result, self.settings, sequence=0, sent_ns=0), result=result)
+
+    def _tell_changes(self, notes: tuple[str, ...]) -> None:
+        """Tell what is used in place of what was asked for since the received data changed, and what no longer is."""
+        if notes is not self._notes:
+            self.told.extend(note for note in notes if note not in self._notes)
+            self.told.extend(f"no longer so: {note}" for note in self._notes if note not in notes)
+            self._notes = notes
 
     def _check_order(self, result: Result) -> None:
         """Tell once where the positions have the antennas in the wrong order."""

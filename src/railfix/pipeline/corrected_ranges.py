@@ -208,13 +208,20 @@ def correct_ranges(
     seen, frequency = SeenFrom.of(anchor, states.position_ecef_m), channels.frequency_hz
     if sbas is None or fixes is None:
         delays = modelled_delays(
-            obs.time, seen, frequency, klobuchar=received.klobuchar, troposphere=config.troposphere
+            obs.time,
+            seen,
+            frequency,
+            klobuchar=received.klobuchar,
+            ionosphere_sigma_m=received.ionosphere_sigma_m,
+            troposphere=config.troposphere,
         )
     else:
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
         reason = np.where(observed, reason | delays.reason, reason)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
-    nominal = config.nominal.sigma_m(seen.elevation_deg) if sbas is None else delays.sigma_m
+    nominal = (
+        delays.sigma_m if sbas is not None else np.hypot(config.nominal.sigma_m(seen.elevation_deg), delays.sigma_m)
+    )
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
     bound, bias = np.zeros(code.shape), np.zeros(code.shape)
     if error_model is not None:

@@ -95,7 +95,12 @@ def antenna_ranges(obs: Observations, received: Received, config: Config, book: 
     place = single_point(raw, _below(raw), limits=config.single_point).ecef_m
     seen = SeenFrom.of(np.where(np.isnan(place), _below(raw), place), states.position_ecef_m)
     delays = modelled_delays(
-        obs.time, seen, channels.frequency_hz, klobuchar=received.klobuchar, troposphere=config.troposphere
+        obs.time,
+        seen,
+        channels.frequency_hz,
+        klobuchar=received.klobuchar,
+        ionosphere_sigma_m=received.ionosphere_sigma_m,
+        troposphere=config.troposphere,
     )
     clean = clean - delays.ionosphere_m - delays.troposphere_m
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)

@@ -13,6 +13,7 @@ from railfix.core.timescale import timedelta
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.gnss.orbits.record_selection import VALIDITY_S, validity_s
 from railfix.pipeline.config import Config
+from railfix.ranges.atmosphere import TYPICAL_KLOBUCHAR
 from railfix.ranges.sbas import SbasCorrections, SbasMessages, SbasState
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
@@ -56,6 +57,8 @@ class Received:
         Corrections by these messages.
     klobuchar : ndarray, shape (8,), or None
         Ionospheric coefficients in use; None leaves the ionosphere uncorrected, or to SBAS.
+    ionosphere_sigma_m : float
+        Standard deviation of the vertical delay by coefficients that were not received; else 0.
     notes : tuple of str
         Data that were asked for, and the data used in their place, one sentence each.
     """
@@ -64,6 +67,7 @@ class Received:
     messages: SbasState | None = None
     sbas: SbasCorrections | None = None
     klobuchar: Floats | None = None
+    ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()
 
 
@@ -160,10 +164,8 @@ def _with_notes(received: Received, config: Config) -> Received:
     """Return the data with the ionospheric coefficients in use and notes on what replaces what was asked for."""
     if received.sbas is not None and received.navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; give --sbas or --sp3")
-    klobuchar, notes = _ionosphere(received, config)
-    return replace(
-        received, klobuchar=klobuchar, notes=(*notes, *(() if received.sbas is None else received.sbas.notes))
-    )
+    received = _with_ionosphere(received, config)
+    return received if received.sbas is None else replace(received, notes=(*received.notes, *received.sbas.notes))
 
 
 def _current(navigation: Navigation, time: np.datetime64) -> Navigation:
@@ -217,15 +219,23 @@ def _united(old: Records, new: Records, key: tuple[str, ...]) -> Records:
     )
 
 
-def _ionosphere(received: Received, config: Config) -> tuple[Floats | None, tuple[str, ...]]:
-    """Return the Klobuchar coefficients in use, and notes where they are not those asked for."""
+def _with_ionosphere(received: Received, config: Config) -> Received:
+    """Return the data with the Klobuchar coefficients in use, and notes where they are not those asked for."""
     if received.sbas is not None:
         asked = f"ionosphere: {config.ionosphere}, troposphere: {config.troposphere}"
-        return None, (f"{asked} asked for, those of SBAS used in their place",)
+        note = f"{asked} asked for, those of SBAS used in their place"
+        return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=(note,))
     if config.ionosphere == "off":
-        return None, ()
+        return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=())
     for letter, name in (("G", "GPS"), ("J", "QZSS"), ("C", "BeiDou")):
-        if letter in received.navigation.klobuchar:
+        if letter in (known := received.navigation.klobuchar):
             note = f"ionosphere: klobuchar asked for, coefficients broadcast by {name} used"
-            return received.navigation.klobuchar[letter], (() if letter == "G" else (note,))
-    return None, ("ionosphere: klobuchar asked for, no coefficients received, delay left uncorrected",)
+            return replace(
+                received, klobuchar=known[letter], ionosphere_sigma_m=0.0, notes=() if letter == "G" else (note,)
+            )
+    sigma = config.nominal.typical_ionosphere_sigma_m
+    note = (
+        "ionosphere: klobuchar asked for, no coefficients received: typical ones used (GPS, 2004-01-01), "
+        f"{sigma:g} m added to the sigma of the vertical delay"
+    )
+    return replace(received, klobuchar=TYPICAL_KLOBUCHAR, ionosphere_sigma_m=sigma, notes=(note,))

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from railfix.core.arrays import Bits, Datetimes, Floats
+from railfix.core.constants import FREQUENCY_L1
 from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
-from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m
+from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m, thin_shell_obliquity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,8 @@ class Delays:
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
         On the channel's own carrier; 0 where a model is off, NaN where SBAS has none.
     sigma_m : ndarray, shape (T, K) [m]
-        To be added to that of local errors; 0 without SBAS, NaN where a part of it is unknown.
+        To be added to that of local errors; 0 by models with received coefficients, NaN where a part of it is
+        unknown.
     reason : ndarray of int64, shape (T, K)
         Flags of unknown delays (`railfix.core.reasons.Reason`).
     """
@@ -74,6 +76,7 @@ def modelled_delays(
     frequency_hz: Floats,
     *,
     klobuchar: Floats | None,
+    ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
     """Delays by the models of Klobuchar and Saastamoinen, 0 by a model that is off.
@@ -85,19 +88,23 @@ def modelled_delays(
     frequency_hz : ndarray, shape (K,) [Hz]
     klobuchar : ndarray, shape (8,), or None
         None: off.
+    ionosphere_sigma_m : float
+        Standard deviation of the vertical delay at L1 for coefficients that were not received.
     troposphere : {"saastamoinen", "off"}
     """
     shape = seen.elevation_deg.shape
-    ionosphere, troposphere_m = np.zeros((2, *shape))
+    ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:
         ionosphere = klobuchar_delay_m(
             time, seen.latitude_deg, seen.longitude_deg, seen.elevation_deg, seen.azimuth_deg, klobuchar, frequency_hz
         )
+    if ionosphere_sigma_m > 0.0:
+        sigma = ionosphere_sigma_m * thin_shell_obliquity(seen.elevation_deg) * (FREQUENCY_L1 / frequency_hz) ** 2
     if troposphere == "saastamoinen":
         troposphere_m = saastamoinen_delay_m(seen.latitude_deg, seen.height_m, seen.elevation_deg)
     return Delays(
         ionosphere_m=ionosphere,
         troposphere_m=troposphere_m,
-        sigma_m=np.zeros(shape),
+        sigma_m=sigma,
         reason=np.zeros(shape, dtype=np.int64),
     )

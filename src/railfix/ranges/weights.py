@@ -15,11 +15,10 @@ from pydantic import Field
 from railfix.core.arrays import Floats, Indices, Masks, Strings
 from railfix.core.constants import CLOCK_GROUP
 from railfix.core.settings import Settings
+from railfix.ranges.atmosphere import thin_shell_obliquity
 
 #: A pseudorange lies between these [m]: nearest satellite less a receiver clock 33 ms off, GEO plus the same.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
-#: Radius of the Earth over that of the ionosphere's thin shell, 350 km above it (DO-229D A.4.4.10.4).
-_SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 class CodeNoise(Settings):
@@ -74,20 +73,23 @@ class NominalErrors(Settings):
         promise 2 m and 95 % of the time less.
     ionosphere_sigma_m : float
         Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
+    typical_ionosphere_sigma_m : float
+        Added to it, and to the sigma of the ranges, as long as no coefficients of Klobuchar's model have been received
+        and typical ones stand in for them: what the two models differ by.
     troposphere_sigma_m : float
         Vertical delay that the standard atmosphere leaves (DO-229D A.4.2.4: 0.12 m).
     """
 
     satellite_sigma_m: float = Field(default=0.8, ge=0)
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
+    typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats) -> Floats:
         """Standard deviation at elevations, any shape [m]; NaN below the horizon."""
         sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
-        thin_shell = 1.0 / np.sqrt(1.0 - (_SHELL * np.sqrt(1.0 - sine**2)) ** 2)
         wet = 1.001 / np.sqrt(0.002001 + sine**2)
-        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell) ** 2)
+        parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
 

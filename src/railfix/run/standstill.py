@@ -20,6 +20,7 @@ from railfix.pipeline.locate import AntennaRanges, antenna_ranges, locate
 from railfix.pipeline.received import known_from_start
 from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.which_track import StandstillErrors, StandstillFix, standstill_fix
+from railfix.ranges.atmosphere import thin_shell_obliquity
 
 #: Satellites in fewer than this share of the epochs are left out, so that the mean is over the same ones.
 _SHARE: Final = 0.9
@@ -115,7 +116,8 @@ def standstill_codes(
     origin = np.median(places, axis=0) if origin_ecef_m is None else origin_ecef_m
     time, residual, names = obs.time, _residual(seen, origin), seen.channels.satellite
     columns, phases = np.arange(len(names)), None
-    nominal = config.nominal.sigma_m(np.nanmedian(seen.elevation_deg, axis=0))
+    elevation = np.nanmedian(seen.elevation_deg, axis=0)
+    nominal = np.hypot(config.nominal.sigma_m(elevation), received.ionosphere_sigma_m * thin_shell_obliquity(elevation))
     if base is not None:
         other = antenna_ranges(base.observations, received, config, book)
         mine, its = _common_epochs(obs, base.observations)
