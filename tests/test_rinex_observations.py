@@ -55,6 +55,16 @@ def test_version_2(tmp_path: Path, version: str) -> None:
     np.testing.assert_array_equal(observations.loss_of_lock[0], [0, 4, 0])
 
 
+def test_a_number_of_satellites_may_be_left_aligned(tmp_path: Path) -> None:
+    """As some converters write it, blanks up to the end of its columns."""
+    epochs = [epoch_3("02 33 13.0", {"G05": four(2e7), "G12": four(3e7)}), epoch_3("02 33 14.0", {"G05": four(2e7)})]
+    for lines, count in zip(epochs, ("2  ", " 1 "), strict=True):
+        lines[0] = lines[0][:32] + count
+    observations = read_observations(write(tmp_path / "log", header_3() + epochs[0] + epochs[1]))
+    np.testing.assert_array_equal(observations.code_m, [[2e7, 3e7], [2e7, np.nan]])
+    assert not observations.problems
+
+
 def test_arrays_handed_out_are_read_only(tmp_path: Path) -> None:
     observations = read_observations(write(tmp_path / "a", header_3() + epoch_3("02 33 13.0", {"G05": four(2e7)})))
     for array in (observations.time, observations.code_m, observations.loss_of_lock, observations.satellite):

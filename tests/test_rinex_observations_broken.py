@@ -88,6 +88,7 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "time one column off": (edit(good_3, 9, "14.0000000  0", " 14.0000000 0"), "not in their columns", 9, 5, 5),
     "flag 7": (edit(good_3, 9, "14.0000000  0", "14.0000000  7"), "the epoch flag '7' is none of 0 to 6", 9, 5, 5),
     "count no number": (edit(good_3, 9, "0  2", "0  x"), "number of satellites '  x' is no number", 9, 5, 5),
+    "count of two parts": (edit(good_3, 9, "0  2", "02 2"), "number of satellites '2 2' is no number", 9, 5, 5),
     "epoch line short": (edit(good_3, 9, "  0  2", ""), "shorter than 35 characters", 9, 5, 5),
     "time goes back": (edit(good_3, 12, "15.0000000", "13.5000000"), "not later than 2021-05-17T02:33:14", 12, 5, 5),
     "time stands still": (edit(good_3, 12, "15.0000000", "14.0000000"), "is not later than", 12, 5, 5),

@@ -131,7 +131,7 @@ def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochL
     text = np.ascontiguousarray(lines.columns(which, width).T)  # a row for each column of the file
     at = width - 35
     flag, flag_ok = _number(text[31 + at : 32 + at])
-    count, count_ok = _number(text[32 + at : 35 + at])
+    count, count_ok = _number(_right_aligned(text[32 + at : 35 + at]))
     year_from = 2 if version >= 3.0 else 1
     year, year_ok = _number(text[year_from : 6 + at])
     if version < 3.0:
@@ -175,6 +175,13 @@ def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
     text = f"{lines.text(line):<{width}}"
     message = FLAWS[flaw].format(width=width, flag=text[width - 4], count=text[width - 3 : width])
     return f"{message} ('{text[:width].rstrip()}')"
+
+
+def _right_aligned(text: Bytes) -> Bytes:
+    """Return fields of three characters without blanks at their end, which some programs write after a count."""
+    for _ in range(2):
+        text = np.where(text[-1] == _BLANK, np.roll(text, 1, axis=0), text)
+    return text
 
 
 def _number(text: Bytes) -> tuple[Integers, Masks]:
