@@ -60,7 +60,7 @@ def test_a_number_of_satellites_may_be_left_aligned(tmp_path: Path) -> None:
     epochs = [epoch_3("02 33 13.0", {"G05": four(2e7), "G12": four(3e7)}), epoch_3("02 33 14.0", {"G05": four(2e7)})]
     for lines, count in zip(epochs, ("2  ", " 1 "), strict=True):
         lines[0] = lines[0][:32] + count
-    observations = read_observations(write(tmp_path / "log", header_3() + epochs[0] + epochs[1]))
+    observations = read_observations(write(tmp_path / "log", header_3() + epochs[0] + epochs[1], strip=False))
     np.testing.assert_array_equal(observations.code_m, [[2e7, 3e7], [2e7, np.nan]])
     assert not observations.problems
 
