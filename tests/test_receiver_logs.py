@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import railfix
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.errors import InputFileError, MismatchError
 from railfix.gnss.observations import Observations, concatenate
 from railfix.io import rinex
@@ -370,6 +371,11 @@ def msm4(number: int, time_field: int) -> bytes:
     """A multiple signal message (RTCM 10403.3, 3.5.16) of satellite 5 alone, its first signal at 70.5 ms."""
     fields = [(number, 12), (0, 12), (time_field, 30), (0, 19), (1 << 59, 64), (1 << 30, 32), (1, 1)]
     fields += [(70, 8), (512, 10), (0, 15), (0, 22), (5, 4), (0, 1), (40, 6)]
+    return rtcm_message(fields)
+
+
+def rtcm_message(fields: list[tuple[int, int]]) -> bytes:
+    """A message of values of so many bits each."""
     bits = "".join(f"{value:0{length}b}" for value, length in fields)
     body = int(bits.ljust(-len(bits) // 8 * -8, "0"), 2).to_bytes(-(-len(bits) // 8), "big")
     framed = b"\xd3" + len(body).to_bytes(2, "big") + body
@@ -392,6 +398,24 @@ def test_day_of_glonass_messages(day: int) -> None:
         datetime.datetime(2019, 1, 22, 8, 43, 56, 600_000), datetime.datetime(2019, 1, 22, 8, 43, 56, 800_000)
     ]  # fmt: skip
     assert np.isfinite(observations.code_m).all()
+
+
+@pytest.mark.requirement("A8")
+def test_channel_of_glonass_phases_by_hand() -> None:
+    """MSM4 has phases in metres: no cycles before message 1020 gave the channel, and its latest one after it."""
+    tow_ms = 204_236_600
+    epochs = [msm4(1084, 2 << 27 | (tow_ms + k - 18_000 + 3 * 3_600_000) % 86_400_000) for k in range(0, 800, 200)]
+    channel = {k: rtcm_message([(1020, 12), (5, 6), (k + 7, 5), (0, 337)]) for k in (-3, 6)}
+    other = rtcm_message([(1020, 12), (4, 6), (1, 5), (0, 337)])
+    stream = [epochs[0], channel[-3] + other + epochs[1], epochs[2], channel[6] + epochs[3]]
+    metres = 70.5e-3 * SPEED_OF_LIGHT
+    expected = [np.nan, *(metres * (1602e6 + k * 562_500.0) / SPEED_OF_LIGHT for k in (-3, -3, 6))]
+    for pieces in ([b"".join(stream)], stream):
+        state, phases = StreamState(time=np.datetime64("2019-01-20", "ns")), []
+        for k, data in enumerate(pieces):
+            piece, state = decode(data, state, at_end=k == len(pieces) - 1)
+            phases += piece.measurements.phase_cycles.tolist()
+        np.testing.assert_allclose(phases, expected, rtol=1e-13)
 
 
 def test_time_of_week_beyond_the_week_is_broken() -> None:

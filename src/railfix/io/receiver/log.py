@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -38,12 +38,16 @@ class Piece:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time."""
+    """What the bytes so far left: the start of a frame, unfinished ephemerides, the last known time.
+
+    `glonass_channels` are the frequency channels by satellite number that 1020 messages gave.
+    """
 
     rest: bytes = b""
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
+    glonass_channels: Mapping[int, int] = field(default_factory=dict)
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Piece, StreamState]:
@@ -60,7 +64,8 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
             frames = replace(find_frames(buffer[:unfinished]), data=buffer)
     raw = _raw_measurements(frames)
     time = raw.time[0] if np.isnat(state.time) and len(raw.time) else state.time
-    msm = rtcm.msm_measurements(frames, time)
+    channels = rtcm.glonass_channels(frames, state.glonass_channels)
+    msm = rtcm.msm_measurements(frames, time, channels)
     parts = [part for part in (raw, msm) if len(part.time) or part.skipped]
     measurements = joined(parts) if parts else raw
     measurements = replace(measurements, skipped={**measurements.skipped, **_of_old_kinds(frames)})
@@ -75,7 +80,10 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Pi
         bytes=frames.consumed,
     )
     rest = buffer[frames.consumed :].tobytes()
-    return piece, StreamState(rest=rest, subframes=subframes, messages=messages, time=last)
+    after = StreamState(
+        rest=rest, subframes=subframes, messages=messages, time=last, glonass_channels=channels.latest()
+    )
+    return piece, after
 
 
 def _of_old_kinds(frames: Frames) -> dict[str, int]:

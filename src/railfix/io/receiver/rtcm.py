@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -58,16 +58,51 @@ def _lock_table(bits: int) -> Floats:
     return np.concatenate([values, np.full(1024 - 705, values[-1])]) * 1e-3
 
 
-def msm_measurements(frames: Frames, near: np.datetime64) -> Measurements:
+class ChannelNews(NamedTuple):
+    """Frequency channels of GLONASS as they became known: place in the stream, satellite number, channel, (N,) each."""
+
+    place: Indices
+    number: Integers
+    channel: Integers
+
+    def latest(self) -> dict[int, int]:
+        """Last known channel by satellite number."""
+        return dict(zip(self.number.tolist(), self.channel.tolist(), strict=True))
+
+    def at(self, place: Indices, numbers: Integers) -> Integers:
+        """Channels of satellites known at places of the stream, shape (places, satellites); -99 where there is none."""
+        found = np.full((len(place), len(numbers)), -99)
+        for k, number in enumerate(numbers.tolist()):
+            mine = self.number == number
+            latest = np.searchsorted(self.place[mine], place) - 1
+            found[:, k] = np.where(latest < 0, -99, np.append(self.channel[mine], -99)[latest])
+        return found
+
+
+def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
+    """Channels of 1020 messages after those known before; MSM4 and MSM6 carry none themselves."""
+    chosen = frames.of("rtcm3", 1020)
+    bits = bits_of(frames, chosen, 23)
+    known = (
+        np.full(len(before), -1),
+        np.array([*before], dtype=np.int64),
+        np.array([*before.values()], dtype=np.int64),
+    )
+    new = (frames.frame_start[chosen], unsigned(bits, 12, 6), unsigned(bits, 18, 5) - 7)
+    return ChannelNews(*(np.concatenate(parts) for parts in zip(known, new, strict=True)))
+
+
+def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> Measurements:
     """Measurements of all MSM4 to MSM7 messages; messages of one instant make one epoch.
 
     The messages carry the time of week only: `near` is a time within half a week of the log, GPS time; NaT gives none.
+    Phases of GLONASS are in metres: without a channel in the message, or before it, they have no cycles.
     """
     messages = len(frames.of("rtcm3", *MSM_NUMBERS))
     parts = [
         (order, rows, np.full(len(order), SYSTEMS[number // 10] == "R"))
         for number in (() if np.isnat(near) else MSM_NUMBERS)
-        for order, rows in _of_number(frames, number, near)
+        for order, rows in _of_number(frames, number, near, channels)
     ]
     if not parts:
         what = UNDATED if np.isnat(near) else "broken MSM"
@@ -160,7 +195,9 @@ def unfinished_epoch(frames: Frames) -> int | None:
     return first
 
 
-def _of_number(frames: Frames, number: int, near: np.datetime64) -> Iterator[tuple[Integers, Measurements]]:
+def _of_number(
+    frames: Frames, number: int, near: np.datetime64, channels: ChannelNews
+) -> Iterator[tuple[Integers, Measurements]]:
     """Measurements of one kind of message, those with equal masks together; and each message's place in the stream."""
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
@@ -185,7 +222,9 @@ def _of_number(frames: Frames, number: int, near: np.datetime64) -> Iterator[tup
         satellites = np.flatnonzero(head[members[0], 73:137]) + 1
         signals = np.flatnonzero(head[members[0], 137:169]) + 1
         mask = used[members[0], : len(satellites) * len(signals)].reshape(len(satellites), len(signals)) == 1
-        yield frames.frame_start[chosen[members]], _decoded(number, bits, satellites, signals, mask, near)
+        place = frames.frame_start[chosen[members]]
+        known = channels.at(place, satellites)
+        yield place, _decoded(number, bits, satellites, signals, mask, near, known)
 
 
 def _bits_needed(kind: int, n_satellites: Integers, n_cells: Integers) -> Integers:
@@ -200,8 +239,12 @@ def _decoded(
     signals: Integers,
     mask: np.ndarray,
     near: np.datetime64,
+    known: Integers,
 ) -> Measurements:
-    """Measurements of N messages with equal masks: every field is an array (N, satellites) or (N, cells)."""
+    """Measurements of N messages with equal masks: every field is an array (N, satellites) or (N, cells).
+
+    `known` are frequency channels of GLONASS, for messages that carry none.
+    """
     system = SYSTEMS[number // 10]
     code_bits, code_step, phase_bits, phase_step, lock_bits, cn0_bits, cn0_step, with_rate = _LAYOUT[number % 10]
     n_satellites, n_cells = len(satellites), int(mask.sum())
@@ -215,7 +258,7 @@ def _decoded(
         return read(part, 0, length).reshape(len(bits), count)
 
     whole_ms = block(n_satellites, 8)
-    extended = block(n_satellites, 4) if with_rate else np.full((len(bits), n_satellites), 15)
+    channel = block(n_satellites, 4) - 7 if with_rate else known
     rough_ms = np.where(whole_ms == 255, np.nan, whole_ms + block(n_satellites, 10) / 1024.0)
     rough_rate = block(n_satellites, 14, two_complement=True) if with_rate else np.full(rough_ms.shape, -8192)
     fine_code = block(n_cells, code_bits, two_complement=True)
@@ -232,7 +275,7 @@ def _decoded(
     rate = np.where((rough_rate[:, of_satellite] == -8192) | (fine_rate == -16384), np.nan, rate)
     names = np.array([f"{system}{k + 19 if system == 'S' else k:02d}" for k in satellites.tolist()])[of_satellite]
     codes = np.array([SIGNALS[system].get(k, "") for k in signals.tolist()])[of_signal]
-    channel = extended[:, of_satellite] - 7
+    channel = channel[:, of_satellite]
     frequency = _frequency(system, codes, channel)
     shape = (len(bits), n_cells)
     return Measurements(
