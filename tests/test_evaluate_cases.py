@@ -225,6 +225,23 @@ def test_the_conventional_position_of_another_run_on_the_same_log(tmp_path: Path
         evaluate_runs([item])
 
 
+def test_accepted_qualities_of_the_reference(tmp_path: Path):
+    """Of six rows every second one is a float solution: used when asked for."""
+    time, place = np.arange(6.0), np.arange(100.0, 160.0, 10.0)
+    run, truth = write_run(tmp_path / "run", time, place), reference(time, place)["front"]
+    rows = pl.DataFrame({"time_gpst": truth.time, "chainage_m": place, "quality": [1, 2] * 3}).with_columns(
+        pl.Series(name, column) for name, column in zip(("x_m", "y_m", "z_m"), truth.ecef_m.T, strict=True)
+    )
+    rows.write_csv(tmp_path / "rtk.csv")
+    words = ["evaluate", str(run), "--reference", str(tmp_path / "rtk.csv"), "--reference-gap", "0.5"]
+    words += ["--method", "chainage", "--out", str(tmp_path / "out"), "--overwrite"]
+    for more, positions in (([], 3), (["--reference-quality", "1,2"], 6)):
+        result = CliRunner().invoke(app, [*words, *more])
+        assert result.exit_code == 0, result.output
+        errors = pl.read_parquet(tmp_path / "out" / "errors.parquet")
+        assert errors["error_m"].is_not_null().sum() == positions
+
+
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 @pytest.mark.parametrize("method", ["chainage", "trajectory"])
 def test_the_sign_does_not_turn_with_the_train(tmp_path: Path, direction: float, method: str):

@@ -88,6 +88,9 @@ def test_of_a_plain_log_the_fixes_count(tmp_path: Path) -> None:
     # two seconds of latitude arc of 0.0002 degrees
     assert np.linalg.norm(np.diff(found.ecef_m, axis=0)) == pytest.approx(22.19, abs=0.01)
     assert np.isnan(np.column_stack([found.chainage_m, found.speed_mps, found.sigma_m])).all()
+    assert len(read_reference(path, ["front"], quality=(1, 2))["front"]) == 3
+    with pytest.raises(InputFileError, match="fewer than two positions with a time and quality 2, 5"):
+        read_reference(path, ["front"], quality=(2, 5))
     with pytest.raises(InputFileError, match=r"a column antenna \(front, rear\) is needed"):
         read_reference(path, ["front", "rear"])
 

@@ -54,6 +54,13 @@ class EvaluationOptions(Settings):
     reference_sigma_m: Positive = option(
         "Largest standard deviation of a reference position that is used.", 0.5, name="--reference-sigma", metavar="M"
     )
+    reference_quality: tuple[int, ...] = option(
+        "Quality numbers of the reference positions that are used, where the log has them (RTKLIB: 1 fix, 2 float, 5 "
+        "single).",
+        (1,),
+        name="--reference-quality",
+        metavar="Q,...",
+    )
     reference_gap_s: Positive = option(
         "Longest gap of the reference that is interpolated over.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
     )

@@ -19,7 +19,7 @@ is such a file without a source, and so are position logs (RTKLIB, CSV, NMEA).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from os import PathLike
 from pathlib import Path
@@ -95,16 +95,20 @@ class AntennaReference:
         return len(self.time)
 
 
-def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[str, AntennaReference]:
+def read_reference(
+    path: str | PathLike[str], antennas: Sequence[str], *, quality: Collection[int] = (_FIX,)
+) -> dict[str, AntennaReference]:
     """Read the reference of one antenna, or of several by the column ``antenna``.
 
     Parameters
     ----------
     path : path
         A reference file or ground truth of the simulator (``.csv``, ``.csv.gz``), or a position log for
-        `railfix.io.nmea.read_any_positions`. Where the log has a quality, only 1 (fix) is used.
+        `railfix.io.nmea.read_any_positions`.
     antennas : sequence of str
         Antennas to read. A file without the column ``antenna`` holds one antenna.
+    quality : collection of int
+        Accepted qualities, where the log has them.
 
     Returns
     -------
@@ -121,7 +125,7 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
     log = read_any_positions(path) if table is None else positions_of_table(table)
     usable = np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time)
     if log.has_quality:
-        usable &= log.quality == _FIX
+        usable &= np.isin(log.quality, [*quality])
     owner = np.full(len(log), antennas[0])
     if table is not None and "antenna" in table:
         owner = np.array(table.cells["antenna"].to_list(), dtype=np.str_)
@@ -132,7 +136,8 @@ def read_reference(path: str | PathLike[str], antennas: Sequence[str]) -> dict[s
             "with one (railfix reference makes it of a log of one antenna)",
         )
     columns = _columns(log, table)
-    return {name: _of_antenna(path, name, owner, usable, columns) for name in antennas}
+    what = f" and quality {', '.join(map(str, quality))}" if log.has_quality else ""
+    return {name: _of_antenna(path, name, owner, usable, columns, what) for name in antennas}
 
 
 def _table(path: Path) -> NamedColumns | None:
@@ -165,11 +170,12 @@ def _of_antenna(
     owner: Strings,
     usable: Masks,
     columns: Mapping[str, NDArray[np.generic]],
+    what: str,
 ) -> AntennaReference:
     rows = np.flatnonzero(usable & (owner == name))
     _, first = np.unique(columns["time"][rows], return_index=True)
     if len(first) < 2:
-        raise InputFileError(path, f"fewer than two positions with a time for the antenna {name}")
+        raise InputFileError(path, f"fewer than two positions with a time{what} for the antenna {name}")
     return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
 
 
