@@ -248,6 +248,11 @@ def test_health_is_that_of_the_signal(satellite: str, health: int, signal: str, 
 def test_galileo_without_predicted_accuracy_and_sick_glonass_are_unhealthy() -> None:
     assert unhealthy(kepler({"satellite": "E11", "accuracy_m": -1.0}), "1C").all()
     assert not unhealthy(kepler({"satellite": "E11", "accuracy_m": np.nan}), "1C").any()
+    for satellite in ("G11", "J02", "C11"):
+        stated = [
+            unhealthy(kepler({"satellite": satellite, "accuracy_m": a}), "1C").any() for a in (48.0, 64.0, 8192.0)
+        ]
+        assert stated == [False, True, True]
     nav = navigation({"satellite": "R07", "health": 1}, {"satellite": "R08"})
     assert look(nav, 0.1, "R07").unhealthy.all()
     assert not look(nav, 0.1, "R08").unhealthy.any()

@@ -184,6 +184,7 @@ def test_nominal_sigma_by_hand() -> None:
         1.99404, rel=1e-4
     )
     assert np.isnan(nominal.sigma_m(np.array([0.0]))[0])
+    np.testing.assert_array_equal(nominal.stated_m(np.array([2.0, 5.0, 6.85, np.nan])), [0.0, 0.0, 6.85, 0.0])
 
 
 @pytest.mark.parametrize("settings", [{"zenith_sigma_m": 0.0}, {"floor_sigma_m": -0.1}, {"model": "cn0"}])

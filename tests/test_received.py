@@ -244,3 +244,30 @@ def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
     assert stated.protection is not None
     assert assumed.protection is not None
     assert (assumed.protection.level.level_m > 1.3 * stated.protection.level.level_m).all()
+
+
+@pytest.mark.requirement("B4")
+@pytest.mark.requirement("C2")
+def test_an_accuracy_worse_than_usual_is_believed() -> None:
+    """Of one satellite's records the stated accuracy becomes 4.85 m, 6.85 m, 64 m: usual, added to sigma, unusable."""
+    navigation, parts = clean_navigation(), {name: log[:40] for name, log in clean_observations().items()}
+    of_g = np.char.startswith(navigation.kepler.satellite, "G")
+    name = str(navigation.kepler.satellite[of_g][0])
+
+    def solved(accuracy_m: float) -> AntennaResult:
+        kepler = navigation.kepler
+        accuracy = np.where(kepler.satellite == name, accuracy_m, kepler.accuracy_m)
+        config = parse_config({"screens": ["elevation"]})
+        known = replace(navigation, kepler=replace(kepler, accuracy_m=accuracy))
+        return EpochProcessor(config, clean_trajectories(), navigation=known).process(parts)[0].antennas["front"]
+
+    usual, worse, none = (solved(accuracy) for accuracy in (4.85, 6.85, 64.0))
+    here = usual.satellite == name
+    used = (usual.reason == 0) & here
+    assert used.any(axis=1).all()
+    np.testing.assert_allclose(worse.sigma_m[used], np.hypot(usual.sigma_m[used], 6.85), rtol=1e-6)
+    np.testing.assert_allclose(worse.sigma_m[:, ~here], usual.sigma_m[:, ~here], rtol=1e-6)
+    assert (none.reason[used] == Reason.UNHEALTHY).all()
+    assert usual.protection is not None
+    assert worse.protection is not None
+    assert (worse.protection.level.level_m > usual.protection.level.level_m).all()

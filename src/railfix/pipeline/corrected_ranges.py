@@ -215,14 +215,14 @@ def correct_ranges(
             ionosphere_sigma_m=received.ionosphere_sigma_m,
             troposphere=config.troposphere,
         )
+        beyond = np.hypot(delays.sigma_m, config.nominal.stated_m(states.accuracy_m))
+        nominal = np.hypot(config.nominal.sigma_m(seen.elevation_deg), beyond)
     else:
         delays = sbas_delays(sbas, fixes, obs.time, seen, frequency)
+        beyond = nominal = delays.sigma_m
         reason = np.where(observed, reason | delays.reason, reason)
     clean = clean - delays.ionosphere_m - delays.troposphere_m
-    nominal = (
-        delays.sigma_m if sbas is not None else np.hypot(config.nominal.sigma_m(seen.elevation_deg), delays.sigma_m)
-    )
-    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
+    sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), beyond)
     bound, bias = np.zeros(code.shape), np.zeros(code.shape)
     if error_model is not None:
         bound, bias = _by_error_model(error_model, seen, cn0, index)

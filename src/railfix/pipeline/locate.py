@@ -105,6 +105,7 @@ def antenna_ranges(obs: Observations, received: Received, config: Config, book: 
     clean = clean - delays.ionosphere_m - delays.troposphere_m
     sigma = np.hypot(code_sigma_m(cn0, seen.elevation_deg, noise=config.noise), delays.sigma_m)
     sigma = np.hypot(sigma, config.nominal.sigma_m(seen.elevation_deg))
+    sigma = np.hypot(sigma, config.nominal.stated_m(states.accuracy_m))
     usable &= seen.elevation_deg >= config.elevation.mask_deg
     ranges = usable_ranges(states, clean, 1.0 / sigma**2, np.where(usable, 0, 1), channels.groups)
     return AntennaRanges(

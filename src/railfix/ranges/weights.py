@@ -71,6 +71,9 @@ class NominalErrors(Settings):
     satellite_sigma_m : float
         Orbit and clock in the range; GPS and Galileo stay near half a metre, their service definitions
         promise 2 m and 95 % of the time less.
+    usual_accuracy_m : float
+        Accuracies that records state (URA, SISA) up to this are usual, 2 to 4.85 m, and stand for `satellite_sigma_m`.
+        A worse one is believed: it is added to the sigma of the satellite's ranges.
     ionosphere_sigma_m : float
         Vertical delay that Klobuchar's model leaves. Mostly common to all satellites, taken as independent.
     typical_ionosphere_sigma_m : float
@@ -81,6 +84,7 @@ class NominalErrors(Settings):
     """
 
     satellite_sigma_m: float = Field(default=0.8, ge=0)
+    usual_accuracy_m: float = Field(default=5.0, gt=0)
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
@@ -91,6 +95,10 @@ class NominalErrors(Settings):
         wet = 1.001 / np.sqrt(0.002001 + sine**2)
         parts = (self.satellite_sigma_m**2, (self.ionosphere_sigma_m * thin_shell_obliquity(elevation_deg)) ** 2)
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
+
+    def stated_m(self, accuracy_m: Floats) -> Floats:
+        """Accuracies of records, any shape, where they are worse than usual; 0 for the others and for unknown ones."""
+        return np.where(accuracy_m > self.usual_accuracy_m, accuracy_m, 0.0)
 
 
 def channel_order(

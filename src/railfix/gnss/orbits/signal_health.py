@@ -19,6 +19,9 @@ QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
 }  # fmt: skip
+#: A record that states an accuracy beyond this (GPS and QZSS: URA index 8 and more, 15 is no prediction at all;
+#: IS-GPS-200, 20.3.3.3.1.3) is of no use [m]; the performance standard of GPS calls such a signal marginal.
+LARGEST_ACCURACY_M: Final = 48.0
 #: All bits.
 _ANY: Final = -1
 
@@ -28,13 +31,13 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
 
     GPS: any of the six bits. QZSS and Galileo: the bits of the signal; Galileo also where no
     accuracy is predicted (SISA "NAPA", written as -1; OS SDD 1.3, 2.3.1.4 calls that marginal).
-    BeiDou: SatH1.
+    BeiDou: SatH1. All: an accuracy beyond `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
     bits = np.full(len(records), _ANY, dtype=np.int64)
     bits[system == "J"] = QZSS_HEALTH.get(signal, _ANY)
     bits[system == "E"] = GALILEO_HEALTH.get(signal[:1], _ANY)
-    no_accuracy = (system == "E") & (records.accuracy_m < 0.0)
+    no_accuracy = ((system == "E") & (records.accuracy_m < 0.0)) | (records.accuracy_m > LARGEST_ACCURACY_M)
     return np.asarray(((records.health & bits) != 0) | no_accuracy)
 
 
