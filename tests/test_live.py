@@ -201,7 +201,7 @@ def test_what_is_used_in_place_of_what_was_asked_for_is_told(logs: dict[str, tup
     navigation = known.received.navigation
     bare = railfix.EpochProcessor(known.config, known.trajectories, navigation=replace(navigation, klobuchar={}))
     engine = LiveEngine(bare, LiveSettings())
-    assert "no coefficients received" in engine.told[0]
+    assert "no coefficients of GPS or QZSS received" in engine.told[0]
     engine.told.clear()
     at = tag_ns(logs["front"][0])
     played(engine, [(at + 100 * MS * k, "front", epoch) for k, epoch in enumerate(logs["front"][:10])])

@@ -220,10 +220,15 @@ def test_coefficients_that_were_not_received_are_named_and_bounded() -> None:
     without = known_from_start(parse_config(sigma), navigation=bare)
     np.testing.assert_array_equal(without.klobuchar, TYPICAL_KLOBUCHAR)
     assert without.ionosphere_sigma_m == 3.0
-    assert "no coefficients received" in without.notes[0]
+    assert "no coefficients of GPS or QZSS received" in without.notes[0]
     assert "3 m added" in without.notes[0]
     off = known_from_start(parse_config({"ionosphere": "off"} | sigma), navigation=bare)
     assert (off.klobuchar, off.ionosphere_sigma_m, off.notes) == (None, 0.0, ())
+    own = known_from_start(parse_config(sigma), navigation=replace(bare, klobuchar={"C": navigation.klobuchar["G"]}))
+    assert own.ionosphere_sigma_m == 3.0  # BeiDou's are for a model of its own
+    japan = known_from_start(parse_config(sigma), navigation=replace(bare, klobuchar={"J": navigation.klobuchar["G"]}))
+    assert japan.ionosphere_sigma_m == 0.0
+    assert japan.notes == ("ionosphere: klobuchar asked for, coefficients broadcast by QZSS used",)
     later = receive(without, parse_config(sigma), parts["front"].time[0], navigation=navigation)
     np.testing.assert_array_equal(later.klobuchar, navigation.klobuchar["G"])
     assert (later.ionosphere_sigma_m, later.notes) == (0.0, ())

@@ -227,15 +227,13 @@ def _with_ionosphere(received: Received, config: Config) -> Received:
         return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=(note,))
     if config.ionosphere == "off":
         return replace(received, klobuchar=None, ionosphere_sigma_m=0.0, notes=())
-    for letter, name in (("G", "GPS"), ("J", "QZSS"), ("C", "BeiDou")):
-        if letter in (known := received.navigation.klobuchar):
-            note = f"ionosphere: klobuchar asked for, coefficients broadcast by {name} used"
-            return replace(
-                received, klobuchar=known[letter], ionosphere_sigma_m=0.0, notes=() if letter == "G" else (note,)
-            )
+    known = received.navigation.klobuchar
+    if "G" in known or "J" in known:  # those of BeiDou are made for a model of its own
+        notes = () if "G" in known else ("ionosphere: klobuchar asked for, coefficients broadcast by QZSS used",)
+        return replace(received, klobuchar=known.get("G", known.get("J")), ionosphere_sigma_m=0.0, notes=notes)
     sigma = config.nominal.typical_ionosphere_sigma_m
     note = (
-        "ionosphere: klobuchar asked for, no coefficients received: typical ones used (GPS, 2004-01-01), "
-        f"{sigma:g} m added to the sigma of the vertical delay"
+        "ionosphere: klobuchar asked for, no coefficients of GPS or QZSS received: typical ones used (GPS, "
+        f"2004-01-01), {sigma:g} m added to the sigma of the vertical delay"
     )
     return replace(received, klobuchar=TYPICAL_KLOBUCHAR, ionosphere_sigma_m=sigma, notes=(note,))

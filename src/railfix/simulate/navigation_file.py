@@ -38,7 +38,7 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
         raise MismatchError(
             f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; take another file, "
-            "or set sky.ionosphere_scale to 0"
+            "or set sky.ionosphere_scale to 0 and position with `--set ionosphere=off`"
         )
     records = _believed(navigation.kepler, scenario.sky.systems)
     first = scenario.start
