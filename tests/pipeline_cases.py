@@ -141,12 +141,12 @@ def flat(value: Any, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def same(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray], *, atol: float) -> None:
-    """Equal bit for bit, or numbers that differ by no more than `atol` (metres) or one in 1e12."""
+    """Equal bit for bit, or numbers that differ by no more than `atol` (metres) or one in 1e10."""
     assert one.keys() == other.keys()
     for name in one:
         a, b = one[name], other[name]
         assert a.shape == b.shape, name
         if a.dtype.kind == "f":
-            np.testing.assert_allclose(a, b, rtol=1e-12, atol=atol, equal_nan=True, err_msg=name)
+            np.testing.assert_allclose(a, b, rtol=1e-10, atol=atol, equal_nan=True, err_msg=name)
         else:
             np.testing.assert_array_equal(a, b, err_msg=name)

@@ -129,6 +129,7 @@ def test_the_run_says_unasked_that_its_logs_are_exchanged(tmp_path: Path, exchan
 def test_the_live_engine_tells_it_once(exchanged: bool) -> None:
     front, rear = paths()
     engine = LiveEngine(EpochProcessor(Config(), {"front": front, "rear": rear}), LiveSettings())
+    engine.told.clear()
     ends = {"front": SPACING_M / 2.0, "rear": -SPACING_M / 2.0}
     for k, middle in enumerate(RISING):
         time = np.array(["2024-03-05T03:10:00"], dtype="datetime64[ns]") + np.timedelta64(k, "s")

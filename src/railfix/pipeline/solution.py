@@ -227,7 +227,8 @@ def _nominal_variance_m2(model: LinearModel, corrected: CorrectedRanges, config:
     """Return the variance along the line by satellites and atmosphere, where the ranges' sigmas leave them out."""
     if config.sbas:
         return np.zeros(len(model))
-    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(corrected.nominal_m, 0.0), 0.0)
+    nominal = config.nominal.sigma_m(corrected.elevation_deg)  # what is beyond it is in the ranges' sigmas
+    share = model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal, 0.0), 0.0)
     return np.asarray((share**2).sum(axis=1))
 
 
