@@ -156,11 +156,11 @@ def hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Fl
     offset, sigma, weight = np.empty((epochs, width)), np.empty((epochs, width)), np.zeros((epochs, width))
     ratio = np.zeros(width)
     # Projector of the channels, and below it their gains, residuals, responses to the map across and up; the same
-    # without the map; without a shared fault; without one more satellite, without two more.
+    # without the map; without a shared fault; without one more satellite and without two more.
     rows, free_rows, work = np.empty((n + 4, n)), np.zeros((n + 4, n)), np.empty((n + 4, n))
-    second, third = np.empty((n + 4, n)), np.empty((n + 4, n))
+    reduced, taken, blinds = np.empty((2, n + 4, n)), np.zeros((3, 4)), np.zeros(3, dtype=np.bool_)
+    start, place, product = np.zeros(3, dtype=np.intp), np.zeros(3, dtype=np.intp), np.zeros(3)
     member, single, gone = np.empty(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), np.zeros(4)
-    gone_two, gone_three = np.zeros(4), np.zeros(4)
     own, likely, others, spread = np.empty(n), np.empty(n), np.empty(n), np.empty((n, 3))
     range_bias, beyond, common, free = np.zeros(n), np.zeros(n), np.zeros(10), np.zeros(10)
     requested, pull, step, shift = np.empty(clocks), np.empty(3), np.empty(3), np.empty(3)
@@ -294,47 +294,33 @@ def hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Fl
                     offset[t, at], sigma[t, at], ratio[at] = 0.0, np.inf, 0.0
                 weight[t, at] = of_base * others[i]
                 at += 1
-            two, three, four = first[2], first[3], first[4]
-            for i in range(n if order > 1 else 0):
-                end = two + n - 1 - i
-                _with_each_later(
-                    system, i, gone, blind, nil, known, by_range, gain, left, own, range_bias, beyond,
-                    offset[t, two:end], sigma[t, two:end], ratio[two:end],
-                )  # fmt: skip
-                for j in range(i + 1, n):
-                    weight[t, two] = of_base * others[i] * others[j]
-                    two += 1
-                if order < 3:
+            # Sets of two and more: all but the last channel left out of the system one after the other, `depth` so far.
+            depth = 0 if order > 1 else -1
+            start[0], product[0], blinds[0], taken[0], place[:] = 0, of_base, blind, gone, first[2:]
+            while depth >= 0:
+                i = start[depth]
+                if i == n:
+                    depth -= 1
                     continue
-                single[i] = True
-                blind_two = _leave_out(system, single, True, nil, second, gone_two) or blind
-                single[i] = False
-                gone_two += gone
+                start[depth] += 1
+                rest = system if depth == 0 else reduced[depth - 1]
+                begin, end = place[depth], place[depth] + n - 1 - i
+                _with_each_later(
+                    rest, i, taken[depth], blinds[depth], nil, known, by_range, gain, rest[n], own, range_bias, beyond,
+                    offset[t, begin:end], sigma[t, begin:end], ratio[begin:end],
+                )  # fmt: skip
+                with_first = product[depth] * others[i]
                 for j in range(i + 1, n):
-                    end = three + n - 1 - j
-                    _with_each_later(
-                        second, j, gone_two, blind_two, nil, known, by_range, gain, second[n], own, range_bias, beyond,
-                        offset[t, three:end], sigma[t, three:end], ratio[three:end],
-                    )  # fmt: skip
-                    of_two = of_base * others[i] * others[j]
-                    for k in range(j + 1, n):
-                        weight[t, three] = of_two * others[k]
-                        three += 1
-                    if order < 4:
-                        continue
-                    single[j] = True
-                    blind_three = _leave_out(second, single, True, nil, third, gone_three) or blind_two
-                    single[j] = False
-                    gone_three += gone_two
-                    for k in range(j + 1, n):
-                        end = four + n - 1 - k
-                        _with_each_later(
-                            third, k, gone_three, blind_three, nil, known, by_range, gain, third[n], own, range_bias,
-                            beyond, offset[t, four:end], sigma[t, four:end], ratio[four:end],
-                        )  # fmt: skip
-                        for m in range(k + 1, n):
-                            weight[t, four] = of_two * others[k] * others[m]
-                            four += 1
+                    weight[t, begin + j - i - 1] = with_first * others[j]
+                place[depth] = end
+                if order > depth + 2:
+                    single[i] = True
+                    lost_now = _leave_out(rest, single, True, nil, reduced[depth], taken[depth + 1])
+                    single[i] = False
+                    taken[depth + 1] += taken[depth]
+                    start[depth + 1], product[depth + 1] = i + 1, with_first
+                    blinds[depth + 1] = lost_now or blinds[depth]
+                    depth += 1
         for m in range(width):
             if not weight[t, m] > 0.0:
                 offset[t, m], sigma[t, m] = 0.0, 1.0
