@@ -8,9 +8,10 @@ from __future__ import annotations
 import tempfile
 import time
 
+from disturbed_traffic import traffic
 from railfix.ground.control import ControlCentre
 from railfix.ground.store import Store
-from railfix.ground.traffic import line_with_loops, traffic
+from railfix.ground.traffic import line_with_loops
 from railfix.io.train_message import encode
 
 

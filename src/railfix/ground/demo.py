@@ -29,7 +29,7 @@ from railfix.ground.relay import Relay, RelaySettings
 from railfix.ground.simulated_triangle import PLAN_M, simulated_fixes
 from railfix.ground.store import Store
 from railfix.ground.supervision import Supervision, at_start
-from railfix.ground.traffic import Conditions, SimulatedTrain, Traffic, line_with_loops
+from railfix.ground.traffic import SimulatedTrain, Traffic, line_with_loops
 from railfix.ground.triangle import TriangleLimits, Verdict, compare_triangle
 from railfix.ground.web import PageServer, Sessions, page_app
 from railfix.io.train_message import TrainMessage, encode
@@ -69,11 +69,13 @@ class LinkedTraffic(Traffic):
         if stopped and self.rest_s is None:
             self.rest_s = self.now_s
 
-    def _send_report(self, message: TrainMessage) -> None:
+    def send_report(self, message: TrainMessage) -> None:
+        """Send the report of a train over its links."""
         train = self.trains[message.train]
         self.links[message.train].send(encode(message), chainage_m=train.front_m, direction=train.direction)
 
-    def _advance_centre(self) -> None:
+    def exchange(self) -> None:
+        """Let the centre judge satellite positioning and work."""
         if self.now_s == FAULT_S:
             self.control.log("simulated fault: the clock of a satellite drifts away")
         self.control.judge(*self.verdicts[min(int(self.now_s), len(self.verdicts) - 1)])
@@ -113,7 +115,7 @@ def _traffic(
     )  # fmt: skip
     run = LinkedTraffic(
         trains=trains, centre=supervision, random=random.Random(seed), verdicts=_verdicts(seed), links=links,
-        conditions=Conditions(outage=0.0, restart=0.0, blind=0.0, suspension=0.0), control=control,
+        control=control,
     )  # fmt: skip
     return run
 

@@ -10,31 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Final
 
 from pydantic import Field
 
 from railfix.core.settings import Settings
 from railfix.ground.layout import Layout, PointName, overlap
 from railfix.io.train_message import MessageStatus, TrainMessage
-
-
-class Rule(Enum):
-    """Rules of the interlocking, of its store and on board; tests take each out in turn."""
-
-    TRAIN_AHEAD = "an authority ends before the interval of another train"
-    SAFE_REAR = "the interval begins at the rear end, with length and over-reading amount"
-    SEQUENCE = "older reports are rejected, and a safe rear end never moves back"
-    DIRECTION = "a section is given to one direction at a time"
-    POINTS_LOCKED = "points under an interval or a route do not move"
-    POINTS_DETECTED = "an authority ends before points that are not detected in their position"
-    PERSISTENCE = "granted authorities survive a restart of the centre"
-    SUPERVISION = "a train is braked before the end of its authority"
-    FRESHNESS = "a train without a fresh authority is braked"
-
-
-ALL_RULES: Final = frozenset(Rule)
 
 
 class InterlockingLimits(Settings):
@@ -128,9 +109,7 @@ def interval_of(train: TrainInterval) -> tuple[float, float]:
     return train.rear_m, max(train.end_m * train.direction, train.front_m * train.direction) * train.direction
 
 
-def report_received(
-    state: Interlocking, message: TrainMessage, layout: Layout, *, rules: frozenset[Rule] = ALL_RULES
-) -> Interlocking:
+def report_received(state: Interlocking, message: TrainMessage, layout: Layout) -> Interlocking:
     """Return the state after a position report.
 
     A train that looks the other way than before has changed ends; that counts only at a standstill with its interval
@@ -143,14 +122,13 @@ def report_received(
     chainage_cm, over_cm, under_cm = message.chainage_cm, message.over_cm, message.under_cm
     if chainage_cm is None or over_cm is None or under_cm is None:  # a bound that is absent is unknown, not 0
         return state
-    if Rule.SEQUENCE in rules and message.sequence <= known.sequence:
+    if message.sequence <= known.sequence:
         return state
     front, facing = chainage_cm / 100.0, message.facing
-    behind = (over_cm + message.length_cm) / 100.0 if Rule.SAFE_REAR in rules else 0.0
+    behind = (over_cm + message.length_cm) / 100.0
     rear, ahead = front - facing * behind, front + facing * under_cm / 100.0
     if facing == known.direction:
-        if Rule.SEQUENCE in rules:  # a wider bound moves no rear end back either
-            rear = facing * max(facing * rear, facing * known.rear_m)
+        rear = facing * max(facing * rear, facing * known.rear_m)  # a wider bound moves no rear end back either
         train = replace(known, rear_m=rear, front_m=ahead, sequence=message.sequence, standstill=message.standstill)
     else:
         if not message.standstill or layout.station_at(*sorted((rear, ahead))) != known.station:
@@ -174,7 +152,7 @@ def points_reported(state: Interlocking, point: PointName, detected: int | None)
 
 
 def route_requested(
-    state: Interlocking, train: int, layout: Layout, *, rules: frozenset[Rule] = ALL_RULES
+    state: Interlocking, train: int, layout: Layout
 ) -> tuple[Interlocking, tuple[PointName, ...], str | None]:
     """Return the state with a route to the next station, the points to be moved, and the reason of a refusal."""
     here = state.trains[train]
@@ -192,14 +170,14 @@ def route_requested(
         stays = other.station == target or other.direction != direction
         if other.tracks.get(target) == track and stays and _in_station(other, target, layout):
             return state, (), f"track {track} of {layout.stations[target].name} is taken by train {other.train}"
-        if Rule.DIRECTION in rules and other.direction != direction and _uses_section(other, section, layout):
+        if other.direction != direction and _uses_section(other, section, layout):
             return state, (), f"train {other.train} comes the other way"
     needs: dict[PointName, int] = {(begin, direction): here.tracks[begin], (target, -direction): track}
     points, moved = dict(state.points), []
     for name, wanted in needs.items():
         point = points[name]
         if point.wanted != wanted:
-            if Rule.POINTS_LOCKED in rules and (point.locked or _under_interval(state, name, layout)):
+            if point.locked or _under_interval(state, name, layout):
                 return state, (), f"points {layout.stations[name[0]].name} are locked"
             moved.append(name)
             point = replace(point, wanted=wanted, detected=None)
@@ -249,23 +227,19 @@ def released(state: Interlocking, now_s: float, layout: Layout, *, limits: Inter
     return replace(state, points=points)
 
 
-def extended(
-    state: Interlocking, layout: Layout, *, limits: InterlockingLimits, rules: frozenset[Rule] = ALL_RULES
-) -> Interlocking:
+def extended(state: Interlocking, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
     """Return the state with every authority extended as far as it may be."""
     if state.stopped:
         return state
     for number in state.trains:
         train = state.trains[number]
-        end = _limit_m(state, train, layout, limits=limits, rules=rules)
+        end = _limit_m(state, train, layout, limits=limits)
         if train.direction * (end - train.end_m) > 0.0:
             state = replace(state, trains={**state.trains, number: replace(train, end_m=end)})
     return state
 
 
-def _limit_m(
-    state: Interlocking, train: TrainInterval, layout: Layout, *, limits: InterlockingLimits, rules: frozenset[Rule]
-) -> float:
+def _limit_m(state: Interlocking, train: TrainInterval, layout: Layout, *, limits: InterlockingLimits) -> float:
     """Return the furthest end of a train's authority [m]."""
     direction = train.direction
     inner = layout.stations[train.station].inner_m
@@ -276,18 +250,15 @@ def _limit_m(
         if far <= direction * train.rear_m or near >= end:
             continue
         wanted = train.tracks.get(name[0])
-        ready = train.train in point.locked and point.wanted == wanted
-        ready &= point.detected == wanted or Rule.POINTS_DETECTED not in rules
         # points that the train stands on, locked by its passage, do not limit it
-        if not ready:
+        if not (train.train in point.locked and point.wanted == wanted == point.detected):
             end = min(end, near)
-    if Rule.TRAIN_AHEAD in rules:
-        path = layout.pieces(train.rear_m, direction * end, train.tracks)
-        for other in state.trains.values():
-            if other.train == train.train:
-                continue
-            for lane, low, high in layout.pieces(*interval_of(other), other.tracks):
-                for mine, first, last in path:
-                    if mine == lane and low < last and first < high:
-                        end = min(end, direction * (low if direction > 0 else high))
+    path = layout.pieces(train.rear_m, direction * end, train.tracks)
+    for other in state.trains.values():
+        if other.train == train.train:
+            continue
+        for lane, low, high in layout.pieces(*interval_of(other), other.tracks):
+            for mine, first, last in path:
+                if mine == lane and low < last and first < high:
+                    end = min(end, direction * (low if direction > 0 else high))
     return direction * (end - limits.margin_m)

@@ -1,7 +1,7 @@
 """Supervision of the trains of a line by the centre: reports in, authorities out, without input or output.
 
-The one path for `railfix.ground.control` (the centre with its store and page) and for the simulated traffic of the
-tests (`railfix.ground.traffic`).
+The one path for `railfix.ground.control` (the centre with its store and page) and for simulated traffic
+(`railfix.ground.traffic`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ from railfix.ground.authority import Authority
 from railfix.ground.centre import CentreLimits, Rejection, TrainRecord
 from railfix.ground.centre import report_received as record_received
 from railfix.ground.interlocking import (
-    ALL_RULES,
     Interlocking,
     InterlockingLimits,
     PointState,
-    Rule,
     TrainInterval,
     extended,
     points_reported,
@@ -55,7 +53,6 @@ class Supervision:
     state: Interlocking
     command: Callable[[PointName], None] = lambda _: None
     routes: Literal["automatic", "by hand"] = "automatic"
-    rules: frozenset[Rule] = ALL_RULES
     limits: InterlockingLimits = field(default_factory=InterlockingLimits)
     centre: CentreLimits = field(default_factory=CentreLimits)
     records: dict[int, TrainRecord] = field(default_factory=dict)
@@ -68,8 +65,8 @@ class Supervision:
             return Rejection.UNKNOWN_TRAIN
         record = self.records.get(message.train, TrainRecord(train=message.train))
         self.records[message.train], reason = record_received(record, message, now_s, limits=self.centre)
-        if reason is None or Rule.SEQUENCE not in self.rules:
-            self.state = report_received(self.state, message, self.layout, rules=self.rules)
+        if reason is None:
+            self.state = report_received(self.state, message, self.layout)
         return reason
 
     def detected(self, point: PointName) -> None:
@@ -80,7 +77,7 @@ class Supervision:
         """Set a route to the next station; return the reason of a refusal."""
         if train not in self.state.trains:
             return f"there is no train {train}"
-        self.state, moved, reason = route_requested(self.state, train, self.layout, rules=self.rules)
+        self.state, moved, reason = route_requested(self.state, train, self.layout)
         if reason is not None:
             self.refusals[reason] += 1
             return reason
@@ -96,7 +93,7 @@ class Supervision:
             for number, train in self.state.trains.items():
                 if self._wants_route(train):
                     self.set_route(number)
-        self.state = extended(self.state, self.layout, limits=self.limits, rules=self.rules)
+        self.state = extended(self.state, self.layout, limits=self.limits)
         self.state = replace(self.state, granted=self.state.granted + 1)
         return [
             Authority(

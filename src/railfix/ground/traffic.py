@@ -1,20 +1,17 @@
-"""Simulated traffic of a line: trains, points and lossy links, every invariant checked at each step of time."""
+"""Simulated traffic of a line: trains and points, every invariant checked at each step of time."""
 
 from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from railfix.ground.authority import Authority
-from railfix.ground.interlocking import ALL_RULES, Interlocking, Rule, TrainInterval, interval_of
-from railfix.ground.interlocking_text import from_json, to_json
+from railfix.ground.interlocking import TrainInterval, interval_of
 from railfix.ground.layout import Layout, LoopStation, PointName, overlap
 from railfix.ground.on_board import OnBoard
-from railfix.ground.supervision import Supervision, at_start, standing_train
+from railfix.ground.supervision import Supervision, standing_train
 from railfix.io.train_message import MessageStatus, TrainMessage
 
 BRAKING_MPS2: Final = 0.7
@@ -111,17 +108,13 @@ class SimulatedTrain:
             complete=True,
         )
 
-    def step(self, now_s: float, rules: frozenset[Rule]) -> None:
+    def step(self, now_s: float) -> None:
         """Run for a step of time below the braking curve to the end of the authority."""
         room = self.direction * (self.on_board.end_m - self.front_m - self.error_m) - self.bound_m - STOP_SHORT_M
         wanted = min(self.top_mps, self.speed_mps + ACCELERATION_MPS2 * STEP_S)
-        if Rule.SUPERVISION in rules:
-            lag = 1.5 * BRAKING_MPS2 * STEP_S
-            wanted = min(wanted, (lag**2 + 2.0 * BRAKING_MPS2 * max(room, 0.0)) ** 0.5 - lag)
-        elif room <= 0.0:
-            wanted = 0.0
-        braked = self.on_board.stopped if Rule.FRESHNESS not in rules else self.on_board.brake_reason(now_s) is not None
-        if braked or now_s < self.blind_until_s:
+        lag = 1.5 * BRAKING_MPS2 * STEP_S
+        wanted = min(wanted, (lag**2 + 2.0 * BRAKING_MPS2 * max(room, 0.0)) ** 0.5 - lag)
+        if self.on_board.brake_reason(now_s) is not None or now_s < self.blind_until_s:
             wanted = 0.0
         after = max(wanted, self.speed_mps - BRAKING_MPS2 * STEP_S, 0.0)
         after = 0.0 if after < 0.05 else after
@@ -130,40 +123,16 @@ class SimulatedTrain:
 
 
 @dataclass(kw_only=True)
-class Conditions:
-    """Disturbances of a run of traffic.
-
-    Attributes
-    ----------
-    loss : float
-        Probability that a message is lost.
-    delay_s : float [s]
-        Largest delay; messages overtake each other.
-    outage : float
-        Probability a second that a train's links fail for up to 60 s.
-    restart : float
-        Probability a second that the centre stops for up to 30 s and is restarted from its store.
-    blind : float
-        Probability a second that a train's sensors fail for up to 40 s.
-    suspension : float
-        Probability a second that satellite positioning is suspended for up to 120 s: trains stop.
-    """
-
-    loss: float = 0.3
-    delay_s: float = 8.0
-    outage: float = 0.002
-    restart: float = 0.004
-    blind: float = 0.001
-    suspension: float = 0.001
-
-
-@dataclass(kw_only=True)
 class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
+
+    Its messages are those of a subclass: `send_report` and `exchange`.
 
     Attributes
     ----------
     centre : Supervision
+    centre_works : bool
+        False while the centre is stopped: it hears nothing, and no points are detected.
     violations : Counter of str
         Invariants that were broken, by kind and in seconds.
     """
@@ -171,16 +140,11 @@ class Traffic:
     trains: dict[int, SimulatedTrain]
     centre: Supervision
     random: random.Random
-    conditions: Conditions
+    centre_works: bool = True
     now_s: float = 0.0
     violations: Counter[str] = field(default_factory=Counter)
     moving: dict[PointName, float] = field(default_factory=dict)
-    _mail: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
-    _silent_until: dict[int, float] = field(default_factory=dict)
-    _centre_back_s: float = -1.0
-    _suspended_until_s: float = -1.0
     _stopped_s: float | None = None
-    _stored: Interlocking | None = None
 
     def __post_init__(self) -> None:
         self.centre.command = self.command
@@ -190,69 +154,33 @@ class Traffic:
         """Line."""
         return self.centre.layout
 
-    @property
-    def rules(self) -> frozenset[Rule]:
-        """Rules that are kept."""
-        return self.centre.rules
-
     def step(self) -> None:
         """Run everything for a step of time and check the invariants."""
         self.now_s += STEP_S
-        self._disturb()
+        self.disturb()
         self._field()
         for train in self.trains.values():
             before = train.front_m
-            train.step(self.now_s, self.rules)
+            train.step(self.now_s)
             self._lead(train, before)
             self._change_ends(train)
-            self._send_report(train.message(self.now_s))
-        due = [item for item in self._mail if item[0] <= self.now_s]
-        self._mail = [item for item in self._mail if item[0] > self.now_s]
-        for _, _, deliver in sorted(due, key=lambda item: item[:2]):
-            deliver()
-        if self.now_s >= self._centre_back_s:
-            self._advance_centre()
+            self.send_report(train.message(self.now_s))
+        self.exchange()
         self._check()
 
-    def _disturb(self) -> None:
-        rng, conditions = self.random, self.conditions
-        if self.now_s >= self._centre_back_s and rng.random() < conditions.restart:
-            self._centre_back_s = self.now_s + rng.uniform(1.0, 30.0)
-            self.centre.state = from_json(to_json(self._stored or self.centre.state))
-            if Rule.PERSISTENCE not in self.rules:
-                trains = {n: replace(t, end_m=t.front_m) for n, t in self.centre.state.trains.items()}
-                self.centre.state = replace(self.centre.state, trains=trains)
-        if rng.random() < conditions.suspension:
-            self._suspended_until_s = self.now_s + rng.uniform(30.0, 120.0)
+    def disturb(self) -> None:
+        """Change the position errors of some trains."""
         for train in self.trains.values():
-            if rng.random() < conditions.outage:
-                self._silent_until[train.number] = self.now_s + rng.uniform(5.0, 60.0)
-            if rng.random() < conditions.blind:
-                train.blind_until_s = self.now_s + rng.uniform(5.0, 40.0)
-            if rng.random() < 0.05:
-                train.error_m = rng.uniform(-train.bound_m, train.bound_m)
+            if self.random.random() < 0.05:
+                train.error_m = self.random.uniform(-train.bound_m, train.bound_m)
 
-    def _send(self, train: int, deliver: Callable[[], None]) -> None:
-        rng = self.random
-        if rng.random() < self.conditions.loss or self.now_s < self._silent_until.get(train, -1.0):
-            return
-        delay = rng.uniform(0.0, self.conditions.delay_s) if rng.random() < 0.5 else 0.0
-        self._mail.append((self.now_s + delay, len(self._mail), deliver))
+    def send_report(self, message: TrainMessage) -> None:
+        """Send the report of a train."""
+        raise NotImplementedError
 
-    def _report(self, message: TrainMessage) -> None:
-        if self.now_s >= self._centre_back_s:
-            self.centre.report(message, self.now_s)
-
-    def _advance_centre(self) -> None:
-        """Let the centre work for a step: store, then send."""
-        self.centre.state = replace(self.centre.state, stopped=self.now_s < self._suspended_until_s)
-        authorities = self.centre.advance(self.now_s)
-        self._stored = self.centre.state
-        for authority in authorities:
-            self._send(authority.train, partial(self.authority, authority))
-
-    def _send_report(self, message: TrainMessage) -> None:
-        self._send(message.train, partial(self._report, message))
+    def exchange(self) -> None:
+        """Deliver the messages that are due, and let the centre work for a step."""
+        raise NotImplementedError
 
     def authority(self, authority: Authority) -> None:
         """Take an authority on board."""
@@ -268,7 +196,7 @@ class Traffic:
 
     def _field(self) -> None:
         for name, until in list(self.moving.items()):
-            if self.now_s >= until and self.now_s >= self._centre_back_s:
+            if self.now_s >= until and self.centre_works:
                 del self.moving[name]
                 self.centre.detected(name)
 
@@ -331,7 +259,7 @@ class Traffic:
 
     def _check_stops(self) -> None:
         """Trains brake once their authority is too old, and so at the latest after an order to stop."""
-        stopped = self.centre.state.stopped and self.now_s >= self._centre_back_s
+        stopped = self.centre.state.stopped and self.centre_works
         self._stopped_s = (self.now_s if self._stopped_s is None else self._stopped_s) if stopped else None
         for train in self.trains.values():
             limit_s = train.on_board.limits.fresh_s
@@ -341,38 +269,3 @@ class Traffic:
             rest_s = limit_s + train.top_mps / BRAKING_MPS2 + 3.0 * STEP_S
             if self._stopped_s is not None and self.now_s - self._stopped_s > rest_s and train.speed_mps > 0.0:
                 self.violations["runs after a stop was ordered"] += 1
-
-
-def traffic(
-    seed: int,
-    *,
-    trains: int = 8,
-    layout: Layout | None = None,
-    rules: frozenset[Rule] = ALL_RULES,
-    conditions: Conditions | None = None,
-) -> Traffic:
-    """Return traffic at its start: trains at rest in stations, at places that the seed chooses."""
-    layout, rng = layout or line_with_loops(), random.Random(seed)
-    last = len(layout.stations) - 1
-    slots = [(k, track) for k in range(last + 1) for track in (1, 2)]
-    simulated, supervised = {}, []
-    for number, (station, track) in enumerate(rng.sample(slots, trains), start=1):
-        direction = 1 if station == 0 else -1 if station == last else 1 if track == 1 else -1
-        inner = layout.stations[station].inner_m
-        front = (inner[1] if direction > 0 else inner[0]) - direction * rng.uniform(60.0, 120.0)
-        train = SimulatedTrain(
-            number=number,
-            front_m=front,
-            tracks={station: track},
-            on_board=OnBoard(direction=direction, end_m=front),
-            top_mps=rng.uniform(12.0, 25.0),
-            length_m=rng.uniform(40.0, 150.0),
-        )
-        simulated[number] = train
-        supervised.append(train.at_rest())
-    return Traffic(
-        trains=simulated,
-        centre=Supervision(layout=layout, state=at_start(layout, supervised), rules=rules),
-        random=rng,
-        conditions=conditions or Conditions(),
-    )
