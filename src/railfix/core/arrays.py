@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -44,10 +43,7 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 def freeze_arrays(instance: DataclassInstance) -> None:
     """Replace the array fields of a dataclass by read-only views; to be called in its `__post_init__`."""
-    for item in fields(instance):
-        value = getattr(instance, item.name)
-        if isinstance(value, np.ndarray):
-            object.__setattr__(instance, item.name, read_only(value))
+    vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})
 
 
 class FrozenArrays:

@@ -80,12 +80,12 @@ def enu_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Floats:
     """
     lat = np.radians(np.asarray(latitude_deg, dtype=np.float64))
     lon = np.radians(np.asarray(longitude_deg, dtype=np.float64))
-    lat, lon = np.broadcast_arrays(lat, lon)
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    east = np.stack([-sin_lon, cos_lon, np.zeros_like(lon)], axis=-1)
-    north = np.stack([-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat], axis=-1)
-    up = np.stack([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat], axis=-1)
-    return np.stack([east, north, up], axis=-2)
+    axes = np.empty((*np.broadcast_shapes(lat.shape, lon.shape), 3, 3))
+    axes[..., 0, 0], axes[..., 0, 1], axes[..., 0, 2] = -sin_lon, cos_lon, 0.0
+    axes[..., 1, 0], axes[..., 1, 1], axes[..., 1, 2] = -sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat
+    axes[..., 2, 0], axes[..., 2, 1], axes[..., 2, 2] = cos_lat * cos_lon, cos_lat * sin_lon, sin_lat
+    return axes
 
 
 def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
@@ -104,7 +104,15 @@ def elevation_azimuth(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tupl
     sat = np.asarray(sat_ecef_m, dtype=np.float64)
     receiver = np.asarray(receiver_ecef_m, dtype=np.float64)
     lat, lon, _ = geodetic_from_ecef(receiver)
-    enu = np.matmul(enu_axes(lat, lon), (sat - receiver[:, None, :]).swapaxes(1, 2))
+    return angles_of(sat - receiver[:, None, :], enu_axes(lat, lon))
+
+
+def angles_of(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
+    """Compute elevation and azimuth of lines from receivers to satellites, shape (T, N, 3) [m].
+
+    With the `enu_axes` of the receivers, shape (T, 3, 3); otherwise as `elevation_azimuth`.
+    """
+    enu = np.matmul(axes, line_ecef_m.swapaxes(1, 2))
     east, north, up = enu[:, 0], enu[:, 1], enu[:, 2]
     azimuth = np.degrees(np.arctan2(east, north))
     azimuth[azimuth < 0.0] += 360.0

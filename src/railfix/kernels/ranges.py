@@ -13,7 +13,7 @@ from railfix.kernels.sight import sight
 
 
 @inner
-def _reduce(
+def reduce_epoch(
     sat_ecef_m: Floats,
     code_m: Floats,
     weight: Floats,
@@ -122,7 +122,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     rows, totals = np.empty((epochs, 4, channels)), np.empty((epochs, groups))
     for t in range(epochs):
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
-        _reduce(
+        reduce_epoch(
             sat_ecef_m[t], code_m[t], weight[t], place_ecef_m[t], starts, offset, spread,
             system[t], means[t], rows[t], totals[t],
         )  # fmt: skip
@@ -217,7 +217,7 @@ def iterated_points(
         current[:] = start_ecef_m[t]
         offset, spread = (offset_m[t], sigma_m[t]) if tied else (no, no)
         for _ in range(most):
-            _reduce(
+            reduce_epoch(
                 sat_ecef_m[t], code_m[t], weight[t], current, starts, offset, spread, system, means, rows, totals
             )  # fmt: skip
             _invert(system, inverse)
@@ -301,7 +301,9 @@ def iterated_along(
         for _ in range(most):
             for i in range(3):
                 place[i] = start_ecef_m[section, i] + along * tangent[section, i]
-            _reduce(sat_ecef_m[t], code_m[t], weight[t], place, starts, offset, spread, system, means, rows, totals)
+            reduce_epoch(
+                sat_ecef_m[t], code_m[t], weight[t], place, starts, offset, spread, system, means, rows, totals
+            )
             step, sigma, exact, least = _along(system, tangent[section], across[section], up[section], plan_m, height_m)
             target, length = along + step, length_m[section]
             below, above = target < 0.0, target > length
@@ -321,7 +323,9 @@ def iterated_along(
                     chosen[t] = section
                     for m in range(channels):
                         unit[m] = 1.0 if weight[t, m] > 0.0 else 0.0
-                    _reduce(sat_ecef_m[t], code_m[t], unit, place, starts, offset, spread, system, means, rows, totals)
+                    reduce_epoch(
+                        sat_ecef_m[t], code_m[t], unit, place, starts, offset, spread, system, means, rows, totals
+                    )
                     information = 0.0
                     for i in range(3):
                         for j in range(3):

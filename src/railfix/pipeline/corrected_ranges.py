@@ -126,7 +126,9 @@ class CorrectedRanges:
 
     def rejected(self, mask: Masks, reason: Reason) -> CorrectedRanges:
         """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
-        hit = mask & ((self.reason & Reason.NOT_OBSERVED) == 0)
+        if not mask.any():
+            return self
+        hit = mask & ((self.reason & int(Reason.NOT_OBSERVED)) == 0)
         return changed(self, reason=np.where(hit, self.reason | int(reason), self.reason))
 
     def judged(self, verdicts: Iterable[Verdict]) -> CorrectedRanges:
@@ -179,7 +181,7 @@ def correct_ranges(
     columns, satellite, signal, groups = channels.columns, channels.satellite, channels.signal, channels.groups
     code, cn0 = obs.code_m[:, columns], obs.cn0_dbhz[:, columns]
     reason, sbas = _reasons_of_codes(satellite, code), received.sbas
-    observed = (reason & Reason.NOT_OBSERVED) == 0
+    observed = (reason & int(Reason.NOT_OBSERVED)) == 0
     fixes = None if sbas is None else sbas.satellites(obs.time, satellite, received.navigation)
     states = satellite_states(
         obs.time,
@@ -268,7 +270,7 @@ def _anchor(index: SearchIndex, config: Config, ranges: Ranges) -> Floats:
     itself where it is far from the line; the best-fitting point of the line where there is no 3-D position.
     """
     trajectory = index.trajectory
-    middle = np.broadcast_to(trajectory.ecef_m.mean(axis=0), (len(ranges), 3))
+    middle = np.broadcast_to(index.middle_ecef_m, (len(ranges), 3))
     point = single_point(ranges, middle, limits=_rough(config.single_point))
     anchor = point.ecef_m.copy()
     found = np.flatnonzero(np.isfinite(anchor[:, 0]))

@@ -220,8 +220,8 @@ class EpochProcessor:
             name,
             observations,
             state.received or self.received,
-            state.antennas.get(name, AntennaState()),
-            state.fusion.get(name, FilterState()),
+            state.antennas.get(name) or AntennaState(),
+            state.fusion.get(name) or FilterState(),
             sensors,
         )
 

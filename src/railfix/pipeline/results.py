@@ -61,7 +61,7 @@ class RaimResult:
     @property
     def faulty(self) -> Masks:
         """Epochs with a fault left in the position, shape (T,)."""
-        return np.asarray((self.outcome == Outcome.INSEPARABLE) | (self.outcome == Outcome.UNRESOLVED))
+        return np.asarray((self.outcome == int(Outcome.INSEPARABLE)) | (self.outcome == int(Outcome.UNRESOLVED)))
 
 
 @dataclass(frozen=True, kw_only=True)

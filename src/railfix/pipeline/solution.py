@@ -157,7 +157,7 @@ def solve(
         place=place,
         ties=ties,
         raim=raim,
-        status=np.full(len(ranges), Status.OK, dtype=np.int8),
+        status=np.zeros(len(ranges), dtype=np.int8),
         noise_scale=scale,
         own_sigma_m=own_sigma,
         arc_m=arc,
@@ -299,4 +299,7 @@ def _status(
             Status.AMBIGUOUS,
         ),
     ]
-    return np.select([c for c, _ in conditions], [s.value for _, s in conditions], Status.OK).astype(np.int8)
+    status = np.full(len(ranges), Status.OK, dtype=np.int8)
+    for condition, value in reversed(conditions):
+        status[condition] = value
+    return status

@@ -18,8 +18,9 @@ from scipy.special import chdtri, chndtrinc
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.settings import Settings
+from railfix.kernels import compiled_by
 from railfix.positioning.forgetting import ages, decayed_sums, steps_s
-from railfix.positioning.normal_equations import Ranges, normal_equations
+from railfix.positioning.normal_equations import RangeArrays, Ranges, reduced_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
 
@@ -124,15 +125,17 @@ class MapOffset:
     @property
     def seen(self) -> tuple[Floats, Floats]:
         """Offset (T, 2) [m] and its inverse covariance (T, 2, 2) [1/m^2]; 0 without a window."""
-        offset = np.stack([self.across_m, self.up_m], axis=1)
-        return np.nan_to_num(offset), np.nan_to_num(_inverse_2x2(self.covariance_m2))
+        known = np.isfinite(self.across_m)[:, None]
+        offset = np.where(known, np.stack([self.across_m, self.up_m], axis=1), 0.0)
+        return offset, np.where(known[..., None], _inverse_2x2(self.covariance_m2), 0.0)
 
     @property
     def beyond_m(self) -> tuple[Floats, Floats]:
         """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 without a verdict."""
         across = np.sign(self.across_m) * np.maximum(np.abs(self.across_m) - self.across_sigma_m, 0.0)
         up = np.sign(self.up_m) * np.maximum(np.abs(self.up_m) - self.up_sigma_m, 0.0)
-        return np.nan_to_num(across), np.nan_to_num(up)
+        known = np.isfinite(self.across_m)
+        return np.where(known, across, 0.0), np.where(known, up, 0.0)
 
 
 def map_offset(
@@ -182,25 +185,11 @@ def map_offset(
     axes = np.stack([trajectory.across[section], trajectory.up[section]], axis=1)
     place = trajectory.at_arc(arc)
     at = np.where(usable[:, None], point.ecef_m, place)
-    offset = np.einsum("tij,tj->ti", axes, at - place)
     covariance = np.where(usable[:, None, None], point.covariance_m2, np.eye(3))
-    equations = normal_equations(ranges, at)
-    gain = (axes @ covariance) @ (equations.design * ranges.weight[:, None])
-    nominal = gain * np.where(ranges.weight > 0, np.fmax(nominal_m, 0.0), 0.0)[:, None]
-    bias = nominal @ nominal.swapaxes(1, 2)
-    noise = (axes @ covariance @ axes.swapaxes(1, 2)) * variance[:, None, None]
-    information = _inverse_2x2(noise)
+    terms = terms_of_epochs(ranges.arrays, at, covariance, place, axes, np.ascontiguousarray(nominal_m), variance)
     step = steps_s(time, state.time)
     fresh = np.where(usable, np.minimum(step / limits.correlation_s, 1.0), 0.0)
-    values = fresh[:, None] * np.concatenate(
-        [
-            information[:, [0, 0, 1], [0, 1, 1]],
-            np.einsum("tij,tj->ti", information, offset),
-            bias[:, [0, 0, 1], [0, 1, 1]],
-            np.ones((len(time), 1)),
-        ],
-        axis=1,
-    )
+    values = fresh[:, None] * terms
     samples = limits.window_s / limits.correlation_s
     age = ages(time, state.time, state.age, window_s=limits.window_s, least_epochs=samples)
     values = np.concatenate([np.where(off_map[:, None] == off, values, 0.0) for off in (False, True)], axis=1)
@@ -209,13 +198,9 @@ def map_offset(
     sums = np.where(off_map[:, None], both[:, _SUMS:], both[:, :_SUMS])
     enough = sums[:, 8] >= limits.least_samples
     sums = np.where(enough[:, None], sums, [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
-    mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])
-    known = of_noise + sums[:, [5, 6, 6, 7]].reshape(-1, 2, 2) / sums[:, 8, None, None]
-    known = known + np.diag([trajectory.sigma_plan_m**2, trajectory.sigma_height_m**2])
-    inverse = _inverse_2x2(known)
-    statistic = np.einsum("ti,tij,tj->t", mean, inverse, mean)
-    detectable = limits.detectable_sigmas / np.sqrt(inverse[:, [0, 1], [0, 1]])
+    mean, known, statistic, detectable = means_of_windows(
+        sums, trajectory.sigma_plan_m, trajectory.sigma_height_m, limits.detectable_sigmas
+    )
 
     def judged(values: Floats) -> Floats:
         return np.where(enough, values, np.nan)
@@ -228,6 +213,62 @@ def map_offset(
         detectable_m=np.where(enough[:, None], detectable, np.nan),
     )
     return result, MapOffsetState(time=time[-1], age=float(age[-1]), sums=after) if len(time) else state
+
+
+@compiled_by("map_offset")
+def terms_of_epochs(
+    ranges: RangeArrays,
+    ecef_m: Floats,
+    covariance_m2: Floats,
+    place_ecef_m: Floats,
+    axes: Floats,
+    nominal_m: Floats,
+    variance: Floats,
+) -> Floats:
+    """Return what each epoch adds to the sums of its window, shape (T, 9): `MapOffsetState.sums`, of one sample.
+
+    Parameters
+    ----------
+    ranges, nominal_m, variance
+        As for `map_offset`; `nominal_m` in C order.
+    ecef_m, covariance_m2 : ndarray, shapes (T, 3) [m], (T, 3, 3) [m^2]
+        3-D positions.
+    place_ecef_m : ndarray, shape (T, 3) [m]
+        Positions on the line.
+    axes : ndarray, shape (T, 2, 3)
+        Unit vectors across and up there.
+    """
+    offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
+    gain = (axes @ covariance_m2) @ (reduced_equations(ranges, ecef_m)[2][:, :3] * ranges.weight[:, None])
+    nominal = gain * np.where(ranges.weight > 0, np.fmax(nominal_m, 0.0), 0.0)[:, None]
+    bias = nominal @ nominal.swapaxes(1, 2)
+    information = _inverse_2x2((axes @ covariance_m2 @ axes.swapaxes(1, 2)) * variance[:, None, None])
+    return np.concatenate(
+        [
+            information[:, [0, 0, 1], [0, 1, 1]],
+            np.einsum("tij,tj->ti", information, offset),
+            bias[:, [0, 0, 1], [0, 1, 1]],
+            np.ones((len(ecef_m), 1)),
+        ],
+        axis=1,
+    )
+
+
+@compiled_by("map_offset")
+def means_of_windows(
+    sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and smallest offsets found (T, 2) by sums (T, 9).
+
+    See `MapOffset`; the sigmas are those of the map, and of `MapOffsetLimits`.
+    """
+    of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+    mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])
+    known = of_noise + sums[:, [5, 6, 6, 7]].reshape(-1, 2, 2) / sums[:, 8, None, None]
+    known = known + np.diag([sigma_plan_m**2, sigma_height_m**2])
+    inverse = _inverse_2x2(known)
+    statistic = np.einsum("ti,tij,tj->t", mean, inverse, mean)
+    return mean, known, statistic, detectable_sigmas / np.sqrt(inverse[:, [0, 1], [0, 1]])
 
 
 def _inverse_2x2(matrix: Floats) -> Floats:

@@ -109,6 +109,8 @@ class SearchIndex:
     Attributes
     ----------
     trajectory : Trajectory
+    middle_ecef_m : ndarray, shape (3,) [m]
+        Mean of its points.
     tree : cKDTree
         Of its points.
     off_tangent_m : ndarray, shape (V - 1,) [m]
@@ -118,6 +120,7 @@ class SearchIndex:
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
+        self.middle_ecef_m = trajectory.ecef_m.mean(axis=0)
         self.off_tangent_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
         self.tree = cKDTree(points)

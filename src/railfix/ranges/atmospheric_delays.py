@@ -8,7 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Bits, Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1
-from railfix.core.geodesy import elevation_azimuth, geodetic_from_ecef
+from railfix.core.geodesy import angles_of, enu_axes, geodetic_from_ecef
 from railfix.ranges.atmosphere import klobuchar_delay_m, saastamoinen_delay_m, thin_shell_obliquity
 
 
@@ -37,7 +37,7 @@ class SeenFrom:
     def of(cls, receiver_ecef_m: Floats, satellite_ecef_m: Floats) -> SeenFrom:
         """Directions and geodetic coordinates from Earth-fixed positions."""
         latitude, longitude, height = geodetic_from_ecef(receiver_ecef_m)
-        elevation, azimuth = elevation_azimuth(satellite_ecef_m, receiver_ecef_m)
+        elevation, azimuth = angles_of(satellite_ecef_m - receiver_ecef_m[:, None], enu_axes(latitude, longitude))
         return cls(
             receiver_ecef_m=receiver_ecef_m,
             latitude_deg=latitude,

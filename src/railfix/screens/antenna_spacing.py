@@ -61,7 +61,7 @@ def antenna_spacing_screen(
     limits = limits or AntennaSpacingLimits()
     apart = np.asarray(chainage_front_m, dtype=np.float64) - np.asarray(chainage_rear_m, dtype=np.float64)
     spacing, sign = np.asarray(spacing_m, dtype=np.float64), np.asarray(facing)
-    if not np.isin(sign, (-1, 0, 1)).all():
+    if not (sign * sign == np.abs(sign)).all():
         raise ValueError("facing must be 1 (rising chainage), -1 (falling) or 0 (unknown)")
     if (spacing < 0.0).any():
         raise ValueError("spacing_m must not be negative; facing gives the order of the two")

@@ -132,6 +132,8 @@ def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats
     sigma_m : ndarray, shape (T, M) [m]
         Without the suspicion.
     """
+    if not reject.any():
+        return sigma_m
     at, result = np.nonzero(reject), sigma_m.copy()
     sigma = sigma_m[at]
     result[at] = np.hypot(sigma, np.maximum(np.abs(np.nan_to_num(error_m[at])), LEAST_SUSPICION * sigma))

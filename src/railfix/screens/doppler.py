@@ -14,13 +14,13 @@ step that the codes themselves show, before the Doppler is applied.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, read_only
+from railfix.core.arrays import Datetimes, Floats, Integers, Masks, Strings, freeze_arrays
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.reasons import Reason
 from railfix.core.timescale import seconds
@@ -94,10 +94,7 @@ class DopplerState:
     scale_epochs: float = 0.0
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, np.ndarray):
-                object.__setattr__(self, item.name, read_only(value))
+        freeze_arrays(self)
 
 
 def doppler_screen(

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from railfix.core.arrays import Floats, Indices, Masks
+from railfix.kernels import compiled_by
 
 #: Samples examined in the first round; four times as many for positions not yet proven.
 _FIRST_CANDIDATES = 6
@@ -71,13 +72,40 @@ class NearestOnPolyline:
         """Find the best among the segments of the nearest samples, and whether no other can be better."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
-        segment = self._segment[sample]
-        share, offset = project_on_segments(points[:, None], self._start[segment], self._step[segment])
-        best = offset.min(axis=1)
-        # of equally near points the one earlier on the line, independent of the order of the tree
-        place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
-        column = np.argmin(place, axis=1)[:, None]
-        chosen = np.take_along_axis(segment, column, axis=1)[:, 0]
-        along = np.take_along_axis(share, column, axis=1)[:, 0] * self._length[chosen]
+        chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
         proven = (distance[:, -1] > best + self.reach_m) | (candidates == len(self._segment))
-        return chosen, along, best, proven
+        return chosen, share * self._length[chosen], best, proven
+
+
+@compiled_by("trajectory")
+def nearest_segments(
+    points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
+) -> tuple[Indices, Floats, Floats]:
+    """Find the nearest of some segments to each point; of equally near ones the one earlier on the line.
+
+    Parameters
+    ----------
+    points_m : ndarray, shape (n, 3) [m]
+    segment : ndarray of int, shape (n, C)
+        Segments to look at, for each point.
+    start_m, step_m : ndarray, shape (V - 1, 3) [m]
+        First point of each segment, and from there to its last.
+
+    Returns
+    -------
+    segment : ndarray of int, shape (n,)
+    share : ndarray, shape (n,)
+        Place on it, 0 to 1.
+    offset_m : ndarray, shape (n,) [m]
+        Distance from it.
+    """
+    share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
+    best = offset.min(axis=1)
+    # independent of the order of the tree that has named the segments
+    place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
+    column = np.argmin(place, axis=1)[:, None]
+    return (
+        np.take_along_axis(segment, column, axis=1)[:, 0],
+        np.take_along_axis(share, column, axis=1)[:, 0],
+        best,
+    )

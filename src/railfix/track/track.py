@@ -223,10 +223,12 @@ def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
     There its change, in either direction, differs from the length of the segment by more than `KILOMETRAGE_BREAK_M` and
     a twentieth; False where it is NaN.
     """
-    length = np.diff(chainage_m)
-    change = np.abs(np.diff(kilometrage_m))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.abs(change - length) > KILOMETRAGE_BREAK_M + 0.05 * length)
+    return _jumping(np.diff(chainage_m), np.diff(kilometrage_m))
+
+
+def _jumping(length_m: Floats, change_m: Floats) -> Masks:
+    """Flag segments whose change of the kilometrage is not their length, any shape."""
+    return np.asarray(np.abs(np.abs(change_m) - length_m) > KILOMETRAGE_BREAK_M + 0.05 * length_m)
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
@@ -252,16 +254,16 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
     before, after = known_kilometrage_m[index], known_kilometrage_m[index + 1]
     length = np.where(end > start, end - start, 1.0)
     linear = before + (at - start) / length * (after - before)
-    broken = kilometrage_breaks(known_chainage_m, known_kilometrage_m)
+    broken = _jumping(end - start, after - before)
     if not broken.any():
         return linear
-    left, right = _running_direction(known_kilometrage_m, broken)
+    left, right = _running_direction(known_kilometrage_m, kilometrage_breaks(known_chainage_m, known_kilometrage_m))
     extrapolated = np.where(
         at - start < end - at,
         before + left[index] * (at - start),
         after - right[index + 1] * (end - at),
     )
-    return np.where(broken[index], extrapolated, linear)
+    return np.where(broken, extrapolated, linear)
 
 
 def _running_direction(kilometrage_m: Floats, broken: Masks) -> tuple[Floats, Floats]:

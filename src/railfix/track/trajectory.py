@@ -133,7 +133,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         """Arc lengths at which a closed line goes on before its start and after its end [m]; NaN at an open end."""
         return joins_m(self.arc_m, self.ecef_m)
 
-    @property
+    @cached_property
     def turn_m(self) -> float:
         """Once round a closed line [m]; infinite for others."""
         before, after = self.joins_m
