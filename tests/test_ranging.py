@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from railfix.core.constants import SPEED_OF_LIGHT
-from railfix.motion.ranging import (
-    along_m,
-    along_sigma_m,
-    radar_speed_mps,
-    reject_echoes,
-    two_way_range_m,
-)
+from railfix.motion.ranging import radar_speed_mps, two_way_range_m
+from railfix.pipeline.along_track import FilterState, Fixed, _gated_ranges
+from railfix.pipeline.config import Config
+from railfix.track.track import Track
+from railfix.track.trajectory import Trajectory
+from railfix.tracking import Line, RangeEpochs
 
 
 @pytest.mark.requirement("E4")
@@ -35,47 +34,43 @@ def test_radar_gives_111_hz_a_km_per_hour_ahead_and_79_at_45_degrees() -> None:
 def test_way_by_the_radar_is_free_of_a_periodic_pitch() -> None:
     t = np.arange(0.0, 20.0, 0.01)
     pitch = 0.02 * np.sin(2.0 * np.pi * t)
-    measured = 20.0 * np.cos(np.pi / 4 + pitch) / np.cos(np.pi / 4)
+    shift = 2.0 * 60e9 * 20.0 * np.cos(np.pi / 4 + pitch) / SPEED_OF_LIGHT
+    measured = radar_speed_mps(shift, 60e9, np.pi / 4)
     assert np.trapezoid(measured, t)[()] == pytest.approx(np.trapezoid(np.full(len(t), 20.0), t), rel=3e-4)
     assert np.abs(measured / 20.0 - 1.0).max() > 0.015
 
 
-@pytest.mark.requirement("E4")
-def test_distance_along_the_track_and_its_sigma() -> None:
-    ranges = np.array([50.0, 5.0, 3.0])
-    along = along_m(ranges, 3.0, 4.0)
-    np.testing.assert_allclose(along[:2], [np.sqrt(2500.0 - 25.0), 0.0])
-    assert np.isnan(along[2])
-    assert along_sigma_m(ranges[:1], along[:1], 0.2)[0] == pytest.approx(0.2 * 50.0 / along[0])
-    assert np.isinf(along_sigma_m(ranges[1:2], along[1:2], 0.2)[0])
+def gated(measured_m: np.ndarray, unit_arc_m: np.ndarray, *, place_m: float, sigma_m: float) -> np.ndarray:
+    """Which ranges to units 3 m beside a straight line the filter keeps, whose place is `place_m` to 1 cm."""
+    ecef = np.array([6.378e6, 0.0, 0.0]) + np.array([[0.0, 0.0, 0.0], [0.0, 400.0, 0.0]])
+    line = Line.of(Trajectory.from_track(Track.from_ecef(ecef)))
+    point, axes = line.at(unit_arc_m)
+    time = np.array(["2024-03-05T00:00:00"], dtype="datetime64[ns]")
+    ranges = RangeEpochs(
+        range_m=measured_m[None], sigma_m=np.full((1, len(measured_m)), sigma_m), age_s=np.zeros((1, len(measured_m))),
+        unit_ecef_m=(point + 3.0 * axes[:, 1])[None], lever_m=np.zeros(3),
+    )  # fmt: skip
+    state = FilterState(anchor=Fixed(time=time[0], arc_m=place_m, sigma_m=0.01, speed_mps=11.0))
+    return np.isfinite(_gated_ranges(ranges, time, line, state, Config()).range_m[0])
 
 
 @pytest.mark.requirement("E4")
 @pytest.mark.parametrize("sigma", [0.19, 0.24])
 def test_15_000_ranges_with_echoes(sigma: float) -> None:
     random = np.random.default_rng(7)
-    right = wrong = rejected_direct = direct = 0
-    for _ in range(100):
-        t = np.arange(150) * 0.2
-        predicted = np.abs(100.0 - 11.0 * t) + 0.02 * t
-        noise = sigma * random.normal(size=len(t))
-        echo = random.uniform(size=len(t)) < 0.03
-        measured = predicted + 3.2 + noise + np.where(echo, random.uniform(1.5, 15.0, len(t)), 0.0)
-        found = reject_echoes(measured, predicted, np.full(len(t), 11.0))
-        judged = np.isfinite(found.residual_m)
-        error = measured - predicted - 3.2
-        good = np.abs(error) <= 0.3 + 3.0 * sigma
-        right += int((found.accepted & good).sum())
-        wrong += int((found.accepted & ~good).sum())
-        direct += int((judged & ~echo).sum())
-        rejected_direct += int((judged & ~echo & ~found.accepted).sum())
-    assert right + wrong > 14_000 * 0.9
-    assert right / (right + wrong) >= 0.999
-    assert rejected_direct / direct < 0.01
+    unit = random.uniform(100.0, 300.0, 15_000)
+    noise = sigma * random.normal(size=len(unit))
+    echo = random.uniform(size=len(unit)) < 0.03
+    error = noise + np.where(echo, random.uniform(1.5, 15.0, len(unit)), 0.0)
+    accepted = gated(np.hypot(unit - 200.0, 3.0) + error, unit, place_m=200.0, sigma_m=sigma)
+    good = np.abs(error) <= 0.3 + 3.0 * sigma
+    assert (accepted & good).sum() / accepted.sum() >= 0.999
+    assert (~accepted & ~echo).sum() / (~echo).sum() < 0.01
 
 
 @pytest.mark.requirement("E4")
-def test_standing_beside_a_wall_nothing_is_acquired() -> None:
-    measured = np.full(50, 60.0 + 4.0)
-    found = reject_echoes(measured, np.full(50, 60.0), np.zeros(50))
-    assert not found.accepted.any()
+def test_beside_a_wall_no_echo_is_taken() -> None:
+    unit = np.full(50, 260.0)
+    direct = np.hypot(unit - 200.0, 3.0)
+    assert gated(direct, unit, place_m=200.0, sigma_m=0.24).all()
+    assert not gated(direct + 4.0, unit, place_m=200.0, sigma_m=0.24).any()

@@ -1,15 +1,7 @@
 # The names of `railfix.motion`, imported at their first use (lazy-loader).
 
 from .features import Feature, FeatureLimits, LineSeries, Located, line_series, locate, map_features
-from .ranging import (
-    EchoLimits,
-    EchoResult,
-    along_m,
-    along_sigma_m,
-    radar_speed_mps,
-    reject_echoes,
-    two_way_range_m,
-)
+from .ranging import EchoLimits, radar_speed_mps, two_way_range_m
 from .samples import InertialSamples, RadarSpeeds, SensorSamples, StationRanges, TachometerPulses
 from .slip import MotionState, SlipLimits, SlipResult, find_slips
 from .tachometer import (
@@ -26,7 +18,6 @@ from .tachometer import (
 
 __all__ = [
     "EchoLimits",
-    "EchoResult",
     "Feature",
     "FeatureLimits",
     "InertialSamples",
@@ -42,8 +33,6 @@ __all__ = [
     "StationRanges",
     "TachometerLimits",
     "TachometerPulses",
-    "along_m",
-    "along_sigma_m",
     "check_speeds",
     "find_slips",
     "line_series",
@@ -52,7 +41,6 @@ __all__ = [
     "pulse_acceleration",
     "pulse_speeds",
     "radar_speed_mps",
-    "reject_echoes",
     "tooth_faults",
     "two_way_range_m",
     "way_m",
