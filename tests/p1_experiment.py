@@ -77,9 +77,7 @@ WAYS: Final = (
     Way("constrained", COMMON),
     Way("p1", {"preset": "p1"}),
     Way("default, drop", DEFAULT, "checked"),
-    Way("default, ok", DEFAULT, "ok"),
     Way("strict", DEFAULT, "checked", largest_sigma_m=10.0),
-    Way("strict, ok", DEFAULT, "ok", largest_sigma_m=10.0),
 )
 #: The filter along the track beside the conventional position.
 FILTERED: Final = {"preset": "default", "filter": "track"}
@@ -91,10 +89,7 @@ FILTER_WAYS: Final = (
 FILTER_SYSTEMS: Final = ("GJ", "GJE")
 #: Uncorrected and corrected, side by side; the messages are of GPS, as those of P1.
 CORRECTED_WAYS: Final = tuple(
-    replace(way, name=f"{way.name}{word}", sbas=sbas)
-    for way in WAYS
-    if way.name != "default, ok" and way.name != "strict, ok"
-    for word, sbas in (("", False), (", SBAS", True))
+    replace(way, name=f"{way.name}{word}", sbas=sbas) for way in WAYS for word, sbas in (("", False), (", SBAS", True))
 )
 #: The service's own errors, as in the scenario commercial-full.
 SERVICE: Final = SbasSettings(clock_sigma_m=0.1)
@@ -103,12 +98,8 @@ _NONE: Final = (Status.TOO_FEW_SATELLITES, Status.UNOBSERVABLE, Status.NO_CONVER
 BURST_EPOCHS: Final = 50
 #: Length of the short part [s].
 SHORT_S: Final = 120.0
-#: The check against the distance run: median of so many positions before, limit, and the wheel's own error.
-BEFORE: Final = 50
-RUN_LIMIT_M: Final = 5.0
-WHEEL_ERROR: Final = 0.001
-#: Positions of antennas that disagree are taken back this near to what the distance run says.
-BACK_M: Final = 3.0
+#: Lines of the list of large errors of a way and choice of systems.
+MOST_BURSTS: Final = 3
 
 
 HEAD: Final = (
@@ -177,41 +168,6 @@ def thresholds_table(campaign: Campaign) -> Iterator[str]:
         yield f"{'+'.join(letters):7s} " + "   ".join(cells)
 
 
-def against_distance_run(passage: Passage, found: Found, *, back_m: float) -> Found:
-    """Positions that lie near what the ones before say, moved on by the wheel's distance; the others dropped.
-
-    The distance is the true one, too long by `WHEEL_ERROR`. Of the positions before, one a metre counts: multipath
-    of a standing train stays as it is. They count whether they were dropped here or not, so that
-    nothing is locked out. Positions that were dropped because the two antennas disagree come back where they
-    are within `back_m` of it.
-    """
-    moved = (passage.chainage_m - passage.chainage_m[0]) * (1.0 + WHEEL_ERROR)
-    # where the train would have been at its first epoch by each position and the distance run since
-    begin = passage.chainage_m + found.before_checks_m - moved
-    has = np.flatnonzero(np.isfinite(found.error_m))
-    metre = np.floor(np.cumsum(np.abs(np.diff(moved, prepend=0.0))))
-    has = has[np.diff(metre[has], prepend=-1.0) > 0.0]
-    if len(has) <= BEFORE:
-        return found
-    medians = np.median(np.lib.stride_tricks.sliding_window_view(begin[has], BEFORE), axis=1)
-    number = np.searchsorted(has, np.arange(len(begin))) - BEFORE
-    away = np.where(number >= 0, np.abs(begin - medians[np.maximum(number, 0)]), np.nan)
-    error = np.where(away > RUN_LIMIT_M, np.nan, found.error_m)
-    back = (found.status == Status.ANTENNAS_DISAGREE) & (found.own_sigma_m <= 10.0) & (away <= back_m)
-    return replace(found, error_m=np.where(back, found.before_checks_m, error))
-
-
-def distance_table(campaign: Campaign) -> Iterator[str]:
-    """The stricter ways with a check against the distance run, which railfix does not have."""
-    yield from HEAD.splitlines()
-    for letters in SYSTEMS:
-        for way, back_m, word in (("p1", 0.0, ""), ("strict", 0.0, ""), ("strict", BACK_M, ", back")):
-            pairs = zip(campaign.passages, campaign.found[letters, way], strict=True)
-            found = [against_distance_run(p, f, back_m=back_m) for p, f in pairs]
-            yardstick = campaign.found[letters, WAYS[0].name]
-            yield row(f"{'+'.join(letters):7s} {way}{word}", campaign.passages, found, yardstick, everywhere)
-
-
 def lost_table(campaign: Campaign) -> Iterator[str]:
     """Why positions are lost that the conventional way has, and where, in points of the positioning rate."""
     yield "points lost against the conventional"
@@ -243,28 +199,14 @@ def lost_table(campaign: Campaign) -> Iterator[str]:
             )
 
 
-def only_ok(found: Found) -> Found:
-    """The positions of status ok alone."""
-    return replace(found, error_m=np.where(found.status == Status.OK, found.error_m, np.nan))
-
-
-def goal_ways(campaign: Campaign, letters: str) -> Iterator[tuple[str, list[Found]]]:
-    """The ways that are held to the goal, by name."""
-    for way in ("p1", "default, drop", "strict"):
-        yield way, campaign.found[letters, way]
-    yield "p1, ok", [only_ok(f) for f in campaign.found[letters, "p1"]]
-    for way, name in (("p1", "p1"), ("default, drop", "default"), ("strict", "strict")):
-        pairs = zip(campaign.passages, campaign.found[letters, way], strict=True)
-        yield f"{name}, distance run", [against_distance_run(p, f, back_m=BACK_M) for p, f in pairs]
-
-
 def goal_table(campaign: Campaign) -> Iterator[str]:
     """Points of the rate lost and largest error, run by run, and whether that is the goal."""
     runs = list(dict.fromkeys(p.run for p in campaign.passages))
     yield f"{'points lost / largest [m]':27s}" + "".join(f"{run:>18s}" for run in [*runs, "all"])
     for letters in SYSTEMS:
         yardstick = campaign.found[letters, WAYS[0].name]
-        for name, founds in goal_ways(campaign, letters):
+        for name in ("p1", "default, drop", "strict"):
+            founds = campaign.found[letters, name]
             cells = []
             for run in [*runs, ""]:
                 triples = zip(campaign.passages, yardstick, founds, strict=True)
@@ -348,8 +290,6 @@ def commercial_report(campaign: Campaign) -> Iterator[str]:
     yield from goal_table(campaign)
     yield ""
     yield from thresholds_table(campaign)
-    yield "\nwith a check against the distance run"
-    yield from distance_table(campaign)
     yield ""
     yield from lost_table(campaign)
     yield ""
@@ -375,8 +315,6 @@ def corrected_report(folder: Path) -> Iterator[str]:
         yield from main_table(campaign, everywhere)
         yield f"ways without tunnels (P1: rate {P1_RATE[0]} % to {P1_RATE[1]} %)"
         yield from main_table(campaign, without_tunnels)
-        yield ""
-        yield from ranges_table(campaign)
         yield ""
 
 
@@ -412,7 +350,7 @@ def unobserved_lines(campaign: Campaign) -> Iterator[str]:
 
 
 def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
-    """Every epoch of 10 m and more of a way, and what it is made of; of many together in time the largest."""
+    """The largest errors of a way, each with what it is made of; of many epochs together in time the largest."""
     for letters in dict.fromkeys(letters for letters, _ in campaign.found):
         items = campaign.breaking.get((letters, way), [])
         yield f"{'+'.join(letters)} {way}: {len(items)} epochs of {LARGE_M:g} m and more"
@@ -422,8 +360,8 @@ def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
             if last is None or item.passage != last.passage or item.epoch - last.epoch > BURST_EPOCHS:
                 bursts.append([])
             bursts[-1].append(item)
-        for burst in bursts:
-            item = max(burst, key=lambda one: abs(one.error_m))
+        largest = [(max(burst, key=lambda one: abs(one.error_m)), len(burst)) for burst in bursts]
+        for item, together_in_time in sorted(largest, key=lambda one: -abs(one[0].error_m))[:MOST_BURSTS]:
             passage, found = campaign.passages[item.passage], campaign.found[letters, way][item.passage]
             t = item.epoch
             yield (
@@ -431,7 +369,7 @@ def breaking_lines(campaign: Campaign, way: str) -> Iterator[str]:
                 f"{passage.environment[t]:9s} {passage.speed_mps[t]:4.1f} m/s {item.error_m:+7.1f} m "
                 f"{Status(int(found.status[t])).text} own {found.own_sigma_m[t]:.1f} m dilution {item.dilution:.1f} "
                 f"late {item.late} of {found.n_used[t]}: {item.signals}"
-                + (f" (largest of {len(burst)})" if len(burst) > 1 else "")
+                + (f" (largest of {together_in_time})" if together_in_time > 1 else "")
             )
 
 

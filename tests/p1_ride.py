@@ -45,9 +45,9 @@ class Way:
     name : str
     settings : mapping
         Of the run.
-    positions : {"conventional", "constrained", "checked", "ok", "filtered"}
+    positions : {"conventional", "constrained", "checked", "filtered"}
         Which of its positions: 3-D at the nearest point of the line; on the line; of these the ones that no check
-        failed (``failed_checks = "drop"``); those of status ok alone; those of the filter along the track.
+        failed (``failed_checks = "drop"``); those of the filter along the track.
     largest_sigma_m : float
         As `Config.largest_sigma_m` with failed checks dropped, put upon the results of a run with a wider limit.
     sensors : bool
@@ -58,7 +58,7 @@ class Way:
 
     name: str
     settings: Mapping[str, Any]
-    positions: Literal["conventional", "constrained", "checked", "ok", "filtered"] = "constrained"
+    positions: Literal["conventional", "constrained", "checked", "filtered"] = "constrained"
     largest_sigma_m: float = np.inf
     sensors: bool = False
     sbas: bool = False
@@ -107,10 +107,9 @@ class Passage:
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What one way gave on one passage; `before_checks_m` also where the way leaves the position out."""
+    """What one way gave on one passage."""
 
     error_m: Floats
-    before_checks_m: Floats
     status: Codes
     n_used: Integers
     own_sigma_m: Floats
@@ -272,8 +271,6 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     kept = np.ones(len(chainage), dtype=np.bool_)
     if way.positions == "checked":
         kept = ~np.isin(got.status, CHECK_FAILED)
-    elif way.positions == "ok":
-        kept = got.status == Status.OK
     if way.positions not in ("conventional", "filtered"):
         kept &= (got.own_sigma_m <= way.largest_sigma_m) | (got.status == Status.OFF_MAP)
     error = chainage - truth.chainage_m
@@ -282,7 +279,6 @@ def of_result(way: Way, got: AntennaResult, truth: Passage, track: AlongTrack | 
     flat = away - np.einsum("ti,ti->t", away, up)[:, None] * up
     return Found(
         error_m=np.where(kept, error, np.nan),
-        before_checks_m=error,
         status=got.status,
         n_used=got.n_used,
         own_sigma_m=got.own_sigma_m,
