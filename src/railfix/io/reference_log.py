@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from railfix.core.arrays import Datetimes, Floats, Masks, Strings, freeze_arrays
@@ -193,29 +194,28 @@ def write_reference(path: str | PathLike[str], references: Mapping[str, AntennaR
     OutputError
         The file cannot be written.
     """
-    write_whole(path, "\n".join(reference_lines(references)) + "\n")
+    table = reference_table(references)
+    write_whole(path, table.write_csv(float_precision=4, datetime_format="%Y-%m-%dT%H:%M:%S%.9f"))
 
 
-def reference_lines(references: Mapping[str, AntennaReference]) -> list[str]:
-    """Format the lines of the CSV, header first."""
-    if not references:
-        return [",".join(COLUMNS)]
-    parts = list(references.values())
-    owner = np.repeat(np.array(list(references)), [len(part) for part in parts])
-    time = np.concatenate([part.time for part in parts])
-    order = np.argsort(time, kind="stable")
-    columns = [np.datetime_as_string(time, unit="ns"), owner, _decimals(parts, "chainage_m")]
-    columns += [_text(np.concatenate([part.ecef_m[:, i] for part in parts])) for i in range(3)]
-    columns += [_decimals(parts, "speed_mps"), _decimals(parts, "sigma_m")]
-    columns += [np.concatenate([getattr(part, name) for part in parts]) for name in ("source", "environment")]
-    rows = zip(*(column[order].tolist() for column in columns), strict=True)
-    return [",".join(COLUMNS), *(",".join(row) for row in rows)]
-
-
-def _decimals(parts: Sequence[AntennaReference], name: str) -> Strings:
-    return _text(np.concatenate([getattr(part, name) for part in parts]))
-
-
-def _text(values: Floats) -> Strings:
-    """Format numbers with four decimals, NaN blank."""
-    return np.array([f"{value:.4f}" if value == value else "" for value in values.tolist()], dtype=np.str_)
+def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
+    """Return the rows of such a file, by time and then antenna; null where blank."""
+    tables = [
+        pl.DataFrame(
+            {
+                "time_gpst": part.time,
+                "antenna": np.full(len(part), name),
+                "chainage_m": part.chainage_m,
+                **{axis: part.ecef_m[:, i] for i, axis in enumerate(("x_m", "y_m", "z_m"))},
+                "speed_mps": part.speed_mps,
+                "sigma_m": part.sigma_m,
+                "source": part.source,
+                "environment": part.environment,
+            }
+        )
+        for name, part in references.items()
+    ]
+    table = pl.concat(tables).sort("time_gpst", maintain_order=True).select(COLUMNS)
+    return table.with_columns(
+        pl.col(pl.Float64).round(4).fill_nan(None), pl.col("source", "environment").replace("", None)
+    )

@@ -13,7 +13,6 @@ from .tachometer import (
     pulse_speeds,
     tooth_faults,
     way_m,
-    wheel_scale,
 )
 
 __all__ = [
@@ -44,5 +43,4 @@ __all__ = [
     "tooth_faults",
     "two_way_range_m",
     "way_m",
-    "wheel_scale",
 ]

@@ -187,11 +187,6 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
     return np.asarray(total[np.maximum(np.searchsorted(pulses.time, time, side="right") - 2, 0)], dtype=np.int64)
 
 
-def wheel_scale(way_gnss_m: float, way_wheel_m: float, gnss_sigma_m: float) -> tuple[float, float]:
-    """Return the ratio of the true way to the wheel's, and its standard deviation ``sqrt(2) sigma / way``."""
-    return way_gnss_m / way_wheel_m, float(np.sqrt(2.0)) * gnss_sigma_m / abs(way_wheel_m)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SpeedCheck:
     """A log of speeds against speeds known to be right.

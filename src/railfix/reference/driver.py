@@ -19,13 +19,14 @@ from railfix.gnss.observations import concatenate
 from railfix.io.logs import read_navigation
 from railfix.io.nmea import read_any_positions
 from railfix.io.position_log import PositionLog
+from railfix.io.reference_log import reference_table
 from railfix.io.sensor_log import read_acceleration, read_pulses
 from railfix.pipeline.config import DEFAULT_SIGNALS
 from railfix.positioning.doppler_speed import Dopplers, dopplers_of_log
 from railfix.reference.assemble import Built
 from railfix.reference.build import ReferenceData, build_references
 from railfix.reference.inputs import ReferenceInputs, ReferenceOptions
-from railfix.reference.record import antenna_record, fixes_table, reference_table
+from railfix.reference.record import antenna_record, fixes_table
 from railfix.reference.settings import ReferenceSettings
 from railfix.run.inputs import Antenna
 from railfix.run.output import OutputFolder

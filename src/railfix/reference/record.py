@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from railfix.io.reference_log import COLUMNS, AntennaReference
 from railfix.reference.assemble import Built
 from railfix.reference.fixes import Rejection
 from railfix.track.trajectory import Trajectory
-
-
-def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
-    """Rows of reference.csv, by time and then antenna."""
-    tables = [
-        pl.DataFrame(
-            {
-                "time_gpst": part.time,
-                "antenna": np.full(len(part), name),
-                "chainage_m": part.chainage_m,
-                **{axis: part.ecef_m[:, i] for i, axis in enumerate(("x_m", "y_m", "z_m"))},
-                "speed_mps": part.speed_mps,
-                "sigma_m": part.sigma_m,
-                "source": part.source,
-                "environment": part.environment,
-            }
-        )
-        for name, part in references.items()
-    ]
-    environment = pl.when(pl.col("environment") != "").then(pl.col("environment")).alias("environment")
-    return _rounded(pl.concat(tables).sort("time_gpst", maintain_order=True).select(COLUMNS).with_columns(environment))
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:

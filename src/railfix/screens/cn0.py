@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,10 +30,6 @@ from railfix.screens.base import (
     ScreenSetup,
     Verdict,
 )
-
-#: Values of `Cn0Screened.judged_by`.
-BY_BOTH, BY_CURVE, BY_FLOOR, BY_NOTHING = "curve and floor", "curve", "floor", "nothing"
-_WORDS: Final = np.array([BY_NOTHING, BY_FLOOR, BY_CURVE, BY_BOTH])
 
 
 class Cn0Limits(Settings):
@@ -66,24 +62,10 @@ class Cn0Screened:
         The metric is the deficit, mean at the elevation less C/N0 [dB]; NaN where the curve does not
         reach: no curve given, none for the constellation and signal, elevation unknown or below
         the lowest of the curve.
-    judged_by : ndarray of str, shape (M,)
-        Of each channel "curve and floor", "curve", "floor" or "nothing".
     """
 
     floor: Screened
     curve: Screened
-    judged_by: Strings
-
-    @property
-    def note(self) -> str:
-        """One sentence on what was used, for the output."""
-        if not len(self.judged_by):
-            return "C/N0: no channels"
-        words, counts = np.unique(self.judged_by, return_counts=True)
-        parts = [
-            f"{word} on {count} of {len(self.judged_by)} channels" for word, count in zip(words, counts, strict=True)
-        ]
-        return "C/N0 judged by " + ", ".join(parts)
 
 
 def cn0_screen(
@@ -105,7 +87,7 @@ def cn0_screen(
     satellite, signal : ndarray of str, shape (M,)
     limits : Cn0Limits, optional
     curve : Cn0Curve, optional
-        Without one only the floor is applied (`judged_by`).
+        Without one only the floor is applied.
 
     Returns
     -------
@@ -116,15 +98,12 @@ def cn0_screen(
     cn0 = np.asarray(cn0_dbhz, dtype=np.float64)
     elevation = np.asarray(elevation_deg, dtype=np.float64)
     deficit = np.full(cn0.shape, np.nan)
-    by_curve = np.zeros(len(satellite), dtype=np.int64)
     if curve is not None and limits.deficit_dbhz is not None:
         deficit = curve.mean_dbhz(elevation, satellite=satellite, signal=signal) - cn0
-        by_curve += curve.covers(satellite, signal)
     none = np.zeros(cn0.shape, dtype=bool)
     return Cn0Screened(
         floor=Screened(metric=cn0, reject=none if limits.floor_dbhz is None else cn0 < limits.floor_dbhz),
         curve=Screened(metric=deficit, reject=none if limits.deficit_dbhz is None else deficit > limits.deficit_dbhz),
-        judged_by=_WORDS[2 * by_curve + (limits.floor_dbhz is not None)],
     )
 
 

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri, chndtr, ndtri
+from scipy.special import chdtri, chndtrinc, ndtri
 
 from railfix.core.arrays import Floats, Indices, Masks
 from railfix.integrity.raim.detection import RaimLimits
@@ -155,17 +155,7 @@ def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Fl
 @lru_cache(maxsize=1024)
 def _noncentrality(freedom: int, false_alarm: float, missed_detection: float) -> float:
     """The lambda with ``P(noncentral chi-square < T_CS) = missed_detection``."""
-    from scipy.optimize import brentq
-
-    limit = float(chdtri(freedom, false_alarm))
-
-    def excess(value: float) -> float:
-        return math.log(max(float(chndtr(limit, freedom, value)), 1e-300)) - math.log(missed_detection)
-
-    upper = limit + 10.0
-    while excess(upper) > 0:
-        upper *= 2.0
-    return float(brentq(excess, 1e-12, upper, xtol=1e-9, rtol=1e-12))
+    return float(chndtrinc(chdtri(freedom, false_alarm), freedom, missed_detection))
 
 
 def _noise_factor(risk: float, components: int) -> float:

@@ -72,10 +72,6 @@ class Frames:
         wanted = self.protocol == protocol
         return np.flatnonzero(wanted & np.isin(self.kind, kinds) if kinds else wanted)
 
-    def payload(self, index: int) -> Bytes:
-        """Payload of one frame."""
-        return self.data[self.start[index] : self.end[index]]
-
 
 @dataclass(frozen=True)
 class _Candidates:
