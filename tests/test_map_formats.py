@@ -19,6 +19,7 @@ from railfix.track import read_track
 from railfix.track.elements import LAWS, PlanElement, ProfileElement, alignment_at
 from railfix.track.ifc_file import _plan, _profile, _Step, read_ifc_segments
 from railfix.track.read import read_segments
+from railfix.track.segment import MapReading
 from railfix.track.xml_files import read_xml_segments
 
 pyogrio = pytest.importorskip("pyogrio")
@@ -67,7 +68,7 @@ def test_gpx_and_openstreetmap_have_no_heights_to_use(tmp_path: Path) -> None:
         '<?xml version="1.0"?><gpx version="1.1" creator="test" xmlns="http://www.topografix.com/GPX/1/1">'
         f"<trk><name>main</name><trkseg>{points}</trkseg></trk></gpx>"
     )
-    assert [s.metadata["name"] for s in read_segments(gpx)] == ["main"]
+    assert [s.metadata["name"] for s in read_segments(gpx, MapReading())] == ["main"]
     nodes = "".join(f'<node id="{k}" version="1" lat="{y:.8f}" lon="{x:.8f}"/>' for k, (x, y, _) in enumerate(LINE, 1))
     way = "".join(f'<nd ref="{k}"/>' for k in range(1, len(LINE) + 1))
     osm = tmp_path / "area.osm"
@@ -75,7 +76,7 @@ def test_gpx_and_openstreetmap_have_no_heights_to_use(tmp_path: Path) -> None:
         f'<?xml version="1.0"?><osm version="0.6">{nodes}<way id="7" version="1">{way}<tag k="railway" v="rail"/></way>'
         f'<way id="8" version="1">{way}<tag k="highway" v="path"/></way></osm>'
     )
-    assert [s.metadata["name"] for s in read_segments(osm)] == ["7"]
+    assert [s.metadata["name"] for s in read_segments(osm, MapReading())] == ["7"]
     with pytest.raises(InputFileError, match="no height"):
         read_track(osm)
 
@@ -280,7 +281,7 @@ def test_a_viennese_bend_of_ifc_is_the_polynomial_of_its_standard(tmp_path: Path
     """The terms of order 2 to 7 of the curvature that buildingSMART's alignment test set has for this very element."""
     path = tmp_path / "bend.ifc"
     path.write_text(VIENNESE)
-    (segment,) = read_ifc_segments(path, crs="EPSG:32632", height_datum="ellipsoidal")
+    (segment,) = read_ifc_segments(path, MapReading(crs="EPSG:32632", height_datum="ellipsoidal"))
     terms = {2: -125.657906854859, 3: 83.922298125931, 4: 64.2314061308743}
     terms |= {5: -57.7378785242934, 6: 63.7638813456506, 7: -78.8880838459446}
     east, north = Transformer.from_crs(4326, 32632, always_xy=True).transform(
@@ -354,7 +355,7 @@ def test_plan_and_profile_of_shared_ifc_files_are_those_of_ifcopenshell(recordin
 def test_swiss_alignment_has_the_cant_and_the_curves_of_its_design(recordings: Path) -> None:
     """The file writes northing before easting; its README has 126 mm of cant in the first curve, 467 m to the left."""
     path = recordings / "rail" / "ifc_alignment" / "UT_AWC_1_UT_AWC_1_no_geometry.ifc"
-    (segment,) = read_ifc_segments(path, crs="EPSG:2056", height_datum="ellipsoidal")
+    (segment,) = read_ifc_segments(path, MapReading(crs="EPSG:2056", height_datum="ellipsoidal"))
     curve = np.isclose(segment.radius_m, -467.0)
     assert curve.sum() > 5
     assert segment.cant_m[curve] == pytest.approx(0.126)
@@ -413,7 +414,7 @@ def test_landxml_of_inframodel_is_read(tmp_path: Path) -> None:
 <CantStation station="100" appliedCant="0" curvature="cw" transitionType="biquadraticParabola"/>
 <CantStation station="260" appliedCant="0.150" curvature="cw"/></Cant></Alignment></Alignments></LandXML>"""
     )
-    (segment,) = read_xml_segments(path, height_datum="ellipsoidal")
+    (segment,) = read_xml_segments(path, MapReading(height_datum="ellipsoidal"))
     assert any("at most 0.15 in the file; taken in its unit of length" in note for note in segment.notes)
     assert not any("do not meet" in note for note in segment.notes)
     assert segment.cant_m[-1] == pytest.approx(0.150)
@@ -438,7 +439,7 @@ def test_a_landxml_parabola_is_laid_out_from_the_straight(tmp_path: Path) -> Non
         f"<PI>{5320000 + y - 90.0 * np.sin(direction):.9f} {650000 + x - 90.0 * np.cos(direction):.9f}</PI>"
         f"<End>{5320000 + y:.9f} {650000 + x:.9f}</End></Spiral></CoordGeom></Alignment></Alignments></LandXML>"
     )
-    (segment,) = read_xml_segments(path, crs="EPSG:25832")
+    (segment,) = read_xml_segments(path, MapReading(crs="EPSG:25832"))
     end = Transformer.from_crs(4326, 25832, always_xy=True).transform(
         segment.longitude_deg[-1], segment.latitude_deg[-1]
     )

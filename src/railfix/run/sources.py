@@ -21,7 +21,7 @@ from railfix.run.prepared import PreparedLines, key_of, track_key
 from railfix.track import Track
 from railfix.track.frames import FrameShift, track_at
 from railfix.track.read import read_segments, track_of_segments
-from railfix.track.segment import Segment
+from railfix.track.segment import MapReading, Segment
 from railfix.track.trajectory import Trajectory
 from railfix.track.vehicle import Vehicle, antenna_trajectory, read_vehicle
 
@@ -168,11 +168,8 @@ def _read_line(
 def _segments(track: tuple[Path, ...], reading: TrackReading) -> list[Segment]:
     if not track:
         raise SettingsError("no track map was given")
-    return [
-        segment
-        for path in track
-        for segment in read_segments(path, crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
-    ]
+    of_map = MapReading(crs=reading.crs, height_datum=reading.height_datum, geoid=reading.geoid)
+    return [segment for path in track for segment in read_segments(path, of_map)]
 
 
 def _paths(

@@ -15,7 +15,7 @@ from railfix.core.spelling import misspelt
 from railfix.io.named_columns import NamedColumns, read_named_columns
 from railfix.track.frames import frame_degrees, known_crs, older_datum_note
 from railfix.track.heights import check_height_datum, ellipsoidal_heights
-from railfix.track.segment import Segment
+from railfix.track.segment import MapReading, Segment
 from railfix.track.track import UNNAMED, Track
 
 #: Attribute of the track, factor, and value of an empty cell, by column of the file.
@@ -42,35 +42,28 @@ def attributes(count: int, read: Callable[[str, float], Floats | None]) -> dict[
     return found | {"radius_m": np.where(found["radius_m"] == 0.0, np.inf, found["radius_m"])}
 
 
-def read_csv_segment(
-    path: str | PathLike[str],
-    *,
-    crs: str | None = None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
-    duplicates: str = "reject",
-) -> Segment:
+def read_csv_segment(path: str | PathLike[str], reading: MapReading) -> Segment:
     """Read a CSV track map as one segment of a route.
 
-    `crs` is geographic, where it is not WGS 84 (``EPSG:6668``); `height_datum` only confirms that of the column name;
-    `geoid` as for `railfix.track.heights.geoid_heights`. Equal consecutive points are an error ("reject"), or kept for
-    the quality checks ("keep").
+    The CRS is geographic, where it is not WGS 84 (``EPSG:6668``); the height datum only confirms that of the column
+    name.
     """
-    check_height_datum(height_datum)
+    check_height_datum(reading.height_datum)
     table = read_named_columns(path)
     notes = _check_columns(table)
     if "note" in table.metadata:
         notes += tuple(table.metadata["note"].split("; "))
     latitude, longitude = table.numbers("latitude_deg"), table.numbers("longitude_deg")
     check_degrees(table, latitude, longitude)
-    datum = _datum(table, height_datum)
+    datum = _datum(table, reading.height_datum)
     heights = table.numbers("height_m" if datum == "ellipsoidal" else "elevation_m")
     if len(table) < 2:
         raise InputFileError(path, f"{len(table)} point(s); a track needs at least two")
-    if duplicates == "reject":
+    if reading.duplicates == "reject":
         _reject_duplicates(table, latitude, longitude, heights)
-    crs = crs if crs is not None else table.metadata.get("crs")
+    crs = reading.crs if reading.crs is not None else table.metadata.get("crs")
     latitude, longitude, frame = _in_frame(crs, latitude, longitude, path=table.path)
+    geoid = reading.geoid
     if geoid is None and datum == "orthometric" and "geoid_m" not in table:
         geoid = table.metadata.get("geoid")
     height, model = ellipsoidal_heights(

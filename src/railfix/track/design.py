@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError
 from railfix.track.elements import CantElement, PlanElement, ProfileElement, alignment_points
 from railfix.track.frames import frame_degrees, older_datum_note
 from railfix.track.heights import stated_heights
-from railfix.track.segment import NO_HEIGHTS, Segment
+from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 
 #: Margin about the area of use of a CRS [deg].
 _MARGIN_DEG: Final = 0.5
@@ -26,9 +26,7 @@ def segment_of_design(
     plan: Sequence[PlanElement],
     profile: Sequence[ProfileElement],
     cant: Sequence[CantElement],
-    crs: str | None,
-    height_datum: str | None,
-    geoid: str | None,
+    reading: MapReading,
     grid: tuple[float, float, float, float, float, float] | None = None,
     notes: tuple[str, ...] = (),
 ) -> Segment:
@@ -41,6 +39,7 @@ def segment_of_design(
     """
     if not plan:
         raise InputFileError(path, f"alignment {name!r} has no element in plan")
+    crs = reading.crs
     if crs is None:
         raise InputFileError(path, f"alignment {name!r} is in a grid that the file does not name; give --crs")
     points, joints = alignment_points(plan, profile, cant)
@@ -58,9 +57,7 @@ def segment_of_design(
         raise InputFileError(path, f"alignment {name!r}: coordinates lie outside the CRS {crs}; give the right --crs")
     height, model, datum = np.full(len(latitude), np.nan), "", NO_HEIGHTS
     if profile:
-        height, model, datum = stated_heights(
-            points.height_m + up, latitude, longitude, height_datum=height_datum, geoid=geoid, path=path
-        )
+        height, model, datum = stated_heights(points.height_m + up, latitude, longitude, reading, path=path)
     radius = np.full(len(latitude), np.inf)
     bent = np.abs(curvature) > 1e-9
     radius[bent] = -1.0 / curvature[bent] * scale

@@ -16,7 +16,7 @@ from railfix.core.spelling import misspelt
 from railfix.track.csv_file import OPTIONAL_COLUMNS, attributes
 from railfix.track.frames import frame_degrees, known_crs, older_datum_note, used_crs
 from railfix.track.heights import HEIGHT_DATUMS, ellipsoidal_heights
-from railfix.track.segment import Segment
+from railfix.track.segment import MapReading, Segment
 
 #: RFC 7946, section 4: longitude and latitude on WGS 84 where the file names no CRS.
 RFC_CRS: Final = "OGC:CRS84"
@@ -154,18 +154,11 @@ def _in_frame(path: str, crs: str, values: Floats) -> tuple[Floats, Floats, str]
     return lat, lon, frame
 
 
-def read_geojson_segments(
-    path: str | PathLike[str],
-    *,
-    crs: str | None = None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
-    duplicates: str = "reject",
-) -> list[Segment]:
+def read_geojson_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
     """Read the lines of a GeoJSON file, in their order, as segments of a route.
 
     The CRS is that of a file without one (an error where the file names another one); height datum and geoid are used
-    where the file has no such member or property; duplicates as for `railfix.track.read_track`.
+    where the file has no such member or property.
     """
     text = read_text(path)
     try:
@@ -176,11 +169,12 @@ def read_geojson_segments(
         raise InputFileError(path, "this JSON is nested too deeply for a GeoJSON object") from None
     if not isinstance(document, dict):
         raise InputFileError(path, "this is JSON, but not a GeoJSON object")
-    used = used_crs(path, crs, _crs_member(str(path), document)) or RFC_CRS
-    return [_segment(line, used, height_datum, geoid, duplicates) for line in _lines(str(path), document, "", {})]
+    used = used_crs(path, reading.crs, _crs_member(str(path), document)) or RFC_CRS
+    return [_segment(line, used, reading) for line in _lines(str(path), document, "", {})]
 
 
-def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None, duplicates: str) -> Segment:
+def _segment(line: _Line, crs: str, reading: MapReading) -> Segment:
+    height_datum, geoid = reading.height_datum, reading.geoid
     stated = line.text("height_datum")
     if stated is not None and stated not in HEIGHT_DATUMS:
         raise line.error(f"height_datum is {stated!r}; expected 'ellipsoidal' or 'orthometric'")
@@ -193,7 +187,7 @@ def _segment(line: _Line, crs: str, height_datum: str | None, geoid: str | None,
         if right not in line.properties:
             raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
     same = (np.diff(line.coordinates, axis=0) == 0).all(axis=1)
-    if duplicates == "reject" and same.any():
+    if reading.duplicates == "reject" and same.any():
         raise line.error(
             f"point {int(np.argmax(same)) + 2} repeats the one before ({int(same.sum())} such); remove it, "
             "'railfix map check' lists them all"

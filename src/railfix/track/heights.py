@@ -16,6 +16,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from railfix.core.arrays import Floats
 from railfix.core.errors import InputFileError, SettingsError
+from railfix.track.segment import MapReading
 
 #: Geoid models of the Geospatial Information Authority of Japan that japan-geoid ships. Heights levelled
 #: before April 2025 belong to GSIGEO2011, those of the later national height system to JPGEO2024.
@@ -97,19 +98,19 @@ def stated_heights(
     heights_m: Floats,
     latitude_deg: Floats,
     longitude_deg: Floats,
+    reading: MapReading,
     *,
-    height_datum: str | None,
-    geoid: str | None,
     path: str,
 ) -> tuple[Floats, str, str]:
     """Ellipsoidal heights of a file without a datum of its own, the geoid used, and the datum, which must be given."""
-    check_height_datum(height_datum)
-    if height_datum is None:
+    datum = reading.height_datum
+    check_height_datum(datum)
+    if datum is None:
         raise SettingsError(f"{path}: the height datum is missing; give --height-datum ellipsoidal or orthometric")
     height, model = ellipsoidal_heights(
-        heights_m, latitude_deg, longitude_deg, datum=height_datum, geoid=geoid, geoid_m=None, path=path
+        heights_m, latitude_deg, longitude_deg, datum=datum, geoid=reading.geoid, geoid_m=None, path=path
     )
-    return height, model, height_datum
+    return height, model, datum
 
 
 def ellipsoidal_heights(

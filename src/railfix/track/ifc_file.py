@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import read_text
 from railfix.track.design import segment_of_design
 from railfix.track.elements import CantElement, PlanElement, ProfileElement
-from railfix.track.segment import Segment
+from railfix.track.segment import MapReading, Segment
 
 _LAWS: Final = {
     "LINE": "linear",
@@ -78,9 +78,7 @@ def _values(text: str) -> list[Any]:
     return list(stack[0][0])
 
 
-def read_ifc_segments(
-    path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
-) -> list[Segment]:
+def read_ifc_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
     """Read the alignments of an IFC file, one segment each; the CRS is that of the grid where it has no
     IfcProjectedCRS.
 
@@ -125,9 +123,7 @@ def read_ifc_segments(
                 plan=[p for p in plan if p.length_m > 0.0],
                 profile=[p for p in profile if p.length_m > 0.0],
                 cant=[c for c in cant if c.length_m > 0.0],
-                crs=crs or system,
-                height_datum=height_datum,
-                geoid=geoid,
+                reading=replace(reading, crs=reading.crs or system),
                 grid=xy,
                 notes=notes,
             )

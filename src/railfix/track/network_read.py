@@ -18,7 +18,7 @@ from railfix.track.geojson_file import RELATION
 from railfix.track.network import Link, Network, end_points
 from railfix.track.read import read_segments
 from railfix.track.route import first_gap, orient
-from railfix.track.segment import Segment
+from railfix.track.segment import MapReading, Segment
 from railfix.track.vector_file import read_layers
 from railfix.track.xml_files import Relation, read_railml_relations
 
@@ -41,9 +41,8 @@ def read_network(
     Where the files state no connections, ends nearer than the tolerance are one point, and a track on which the end of
     another lies is divided there. InputFileError, SettingsError.
     """
-    tracks: list[Segment] = []
-    for path in paths:
-        tracks += read_segments(path, crs=crs, height_datum=height_datum, geoid=geoid, duplicates="keep")
+    reading = MapReading(crs=crs, height_datum=height_datum, geoid=geoid, duplicates="keep")
+    tracks = [track for path in paths for track in read_segments(path, reading)]
     return network_of(tracks, paths, tolerance_m=tolerance_m)
 
 

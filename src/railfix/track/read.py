@@ -14,7 +14,7 @@ from railfix.track.csv_file import read_csv_segment
 from railfix.track.geojson_file import read_geojson_segments
 from railfix.track.heights import check_height_datum
 from railfix.track.route import MAX_GAP_M, join
-from railfix.track.segment import NO_HEIGHTS, Segment
+from railfix.track.segment import NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import Track
 from railfix.track.vector_file import ENDINGS as VECTOR_ENDINGS
 from railfix.track.vector_file import geojson_has_heights, read_vector_segments
@@ -78,14 +78,11 @@ def read_track(
         if value is not None and not value > 0.0:
             raise SettingsError(f"{key} is {value:g}; a positive number of metres was expected")
     files = [paths] if isinstance(paths, str | PathLike) else list(paths)
+    reading = MapReading(crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
     if not files:
         raise SettingsError("no track map was given")
     return track_of_segments(
-        [
-            segment
-            for file in files
-            for segment in read_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
-        ],
+        [segment for file in files for segment in read_segments(file, reading)],
         heights=heights,
         geoid=geoid,
         name=name,
@@ -132,35 +129,28 @@ def track_of_segments(
     return with_heights(track, heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
 
 
-def read_segments(
-    file: str | PathLike[str],
-    *,
-    crs: str | None = None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
-    duplicates: str = "reject",
-) -> list[Segment]:
+def read_segments(file: str | PathLike[str], reading: MapReading) -> list[Segment]:
     """Read the lines of one map file in their order; a file without heights gives segments without.
 
-    Options as for `read_track`. InputFileError: when the file is not a map.
+    InputFileError: when the file is not a map.
     """
     kind = ending(file)
     if kind == ".csv":
-        return [read_csv_segment(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)]
+        return [read_csv_segment(file, reading)]
     if kind in (".geojson", ".json"):
         if geojson_has_heights(read_text(file)):
-            return read_geojson_segments(file, crs=crs, height_datum=height_datum, geoid=geoid, duplicates=duplicates)
-        return read_vector_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+            return read_geojson_segments(file, reading)
+        return read_vector_segments(file, reading)
     if kind in VECTOR_ENDINGS:
-        return read_vector_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+        return read_vector_segments(file, reading)
     if kind == ".ifc":
         from railfix.track.ifc_file import read_ifc_segments
 
-        return read_ifc_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+        return read_ifc_segments(file, reading)
     if kind in (".xml", ".landxml", ".railml"):
         from railfix.track.xml_files import read_xml_segments
 
-        return read_xml_segments(file, crs=crs, height_datum=height_datum, geoid=geoid)
+        return read_xml_segments(file, reading)
     raise InputFileError(
         file,
         "a track map ends in .csv, .geojson or .json, .ifc, .xml, .landxml, .railml, " + ", ".join(VECTOR_ENDINGS),

@@ -13,6 +13,16 @@ ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
 
 @dataclass(frozen=True, kw_only=True)
+class MapReading:
+    """Options for reading a map file: those of `railfix.track.read_track` of the same names."""
+
+    crs: str | None = None
+    height_datum: str | None = None
+    geoid: str | None = None
+    duplicates: str = "reject"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Segment:
     """Points of one file or feature, with ellipsoidal heights, or NaN where the file has none (`NO_HEIGHTS`).
 

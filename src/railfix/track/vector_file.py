@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +19,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import ending
 from railfix.track.frames import frame_degrees, older_datum_note, used_crs
 from railfix.track.heights import check_height_datum, stated_heights
-from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, Segment
+from railfix.track.segment import ATTRIBUTES, NO_HEIGHTS, MapReading, Segment
 from railfix.track.track import UNNAMED
 
 #: Endings of files that are read here.
@@ -59,48 +59,29 @@ def read_layers(path: str | PathLike[str], *, geometry: str) -> list[tuple[str |
     return layers
 
 
-def read_vector_segments(
-    path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
-) -> list[Segment]:
+def read_vector_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
     """Read the lines of a map file as segments, in the order of the file.
 
     The CRS is that of a file without one (an error where the file names another one); height datum and geoid are those
     of coordinates with heights: a segment whose heights are all 0 counts as one without. InputFileError, SettingsError.
     """
-    check_height_datum(height_datum)
+    check_height_datum(reading.height_datum)
     segments: list[Segment] = []
     for named, rows, shapes in read_layers(path, geometry="LineString"):
-        used = used_crs(path, crs, named)
+        of_layer = replace(reading, crs=used_crs(path, reading.crs, named))
         for row, shape in zip(rows, shapes, strict=True):
             if not _is_track(row):
                 continue
             for k, part in enumerate(shape.geoms if shape.geom_type.startswith("Multi") else [shape]):
                 name = _name(row, fallback=f"line {len(segments) + 1}") + (f", part {k + 1}" if k else "")
-                segments.append(
-                    plan_segment(
-                        np.array(part.coords, dtype=np.float64),
-                        path=str(path),
-                        name=name,
-                        crs=used,
-                        height_datum=height_datum,
-                        geoid=geoid,
-                    )
-                )
+                points = np.array(part.coords, dtype=np.float64)
+                segments.append(plan_segment(points, of_layer, path=str(path), name=name))
     if not segments:
         raise InputFileError(path, "there is no line in this file; a track map needs LineStrings")
     return segments
 
 
-def plan_segment(
-    coordinates: Floats,
-    *,
-    path: str,
-    name: str,
-    crs: str | None,
-    height_datum: str | None = None,
-    geoid: str | None = None,
-    metadata: Mapping[str, str] = MappingProxyType({}),
-) -> Segment:
+def plan_segment(coordinates: Floats, reading: MapReading, *, path: str, name: str) -> Segment:
     """A segment of coordinates in map order, shape (n, 2 or 3); points repeated in plan are left out."""
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():
@@ -109,15 +90,14 @@ def plan_segment(
     values = coordinates[kept]
     if len(values) < 2:
         raise InputFileError(source, "a track needs at least two different points")
+    crs = reading.crs
     used = crs or "EPSG:4326"
     latitude, longitude, frame = frame_degrees(used, values[:, 0], values[:, 1])
     if not (np.isfinite(latitude).all() and np.isfinite(longitude).all() and (np.abs(latitude) <= 90.0).all()):
         raise InputFileError(source, f"some coordinates lie outside the CRS {used}; is it the right one?")
     height, model, datum = np.full(len(values), np.nan), "", NO_HEIGHTS
     if values.shape[1] == 3 and np.isfinite(values[:, 2]).all() and values[:, 2].any():
-        height, model, datum = stated_heights(
-            values[:, 2], latitude, longitude, height_datum=height_datum, geoid=geoid, path=source
-        )
+        height, model, datum = stated_heights(values[:, 2], latitude, longitude, reading, path=source)
     return Segment(
         source=source,
         file=path,
@@ -128,7 +108,7 @@ def plan_segment(
         frame=frame if crs else "EPSG:4979",
         height_datum=datum,
         geoid=model,
-        metadata={"name": name, **metadata},
+        metadata={"name": name},
         notes=older_datum_note(crs),
         **{key: np.full(len(values), np.nan) for key in ATTRIBUTES},
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from os import PathLike
 from typing import Any, Final
@@ -13,7 +13,7 @@ from railfix.core.errors import InputFileError
 from railfix.core.files import read_bytes
 from railfix.track.design import segment_of_design
 from railfix.track.elements import CantElement, PlanElement, ProfileElement
-from railfix.track.segment import Segment
+from railfix.track.segment import MapReading, Segment
 from railfix.track.vector_file import INSTALL, plan_segment
 
 _UNITS: Final = {"meter": 1.0, "millimeter": 1e-3, "foot": 0.3048, "USSurveyFoot": 1200.0 / 3937.0}
@@ -62,23 +62,21 @@ def _root(path: str | PathLike[str]) -> Any:
         raise InputFileError(path, f"this is not XML ({error.msg})", line=error.lineno) from None
 
 
-def read_xml_segments(
-    path: str | PathLike[str], *, crs: str | None = None, height_datum: str | None = None, geoid: str | None = None
-) -> list[Segment]:
+def read_xml_segments(path: str | PathLike[str], reading: MapReading) -> list[Segment]:
     """Read the lines of a LandXML or railML 3 file as segments; InputFileError when it is neither, or has no line."""
     root = _root(path)
     kind = str(root.tag).rsplit("}", 1)[-1]
     if kind == "LandXML":
-        return _landxml(str(path), root, crs, height_datum, geoid)
+        return _landxml(str(path), root, reading)
     if kind == "railML":
-        return _railml(str(path), root, crs, height_datum, geoid)
+        return _railml(str(path), root, reading)
     raise InputFileError(path, f"the root element is {kind!r}; LandXML or railML (3) was expected")
 
 
 # --- LandXML -----------------------------------------------------------------
 
 
-def _landxml(path: str, root: Any, crs: str | None, height_datum: str | None, geoid: str | None) -> list[Segment]:
+def _landxml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     unit = root.find(".//{*}Metric")
     unit = root.find(".//{*}Imperial") if unit is None else unit
     scale = _UNITS.get(unit.get("linearUnit", "meter"), 1.0) if unit is not None else 1.0
@@ -108,9 +106,7 @@ def _landxml(path: str, root: Any, crs: str | None, height_datum: str | None, ge
                 plan=plan,
                 profile=profile,
                 cant=cant,
-                crs=crs or named,
-                height_datum=height_datum,
-                geoid=geoid,
+                reading=replace(reading, crs=reading.crs or named),
                 notes=notes,
             )
         )
@@ -248,10 +244,11 @@ def _landxml_cant(cant: Any, scale: float, start: float) -> tuple[list[CantEleme
 # --- railML ------------------------------------------------------------------
 
 
-def _railml(path: str, root: Any, crs: str | None, height_datum: str | None, geoid: str | None) -> list[Segment]:
+def _railml(path: str, root: Any, reading: MapReading) -> list[Segment]:
     system = root.find(".//{*}geometricPositioningSystem")
     definition = system.get("crsDefinition") if system is not None else None
     named = definition.replace("urn:ogc:def:crs:", "").replace("::", ":") if definition else None
+    reading = replace(reading, crs=reading.crs or named)
     segments = []
     for element in root.iterfind(".//{*}netElement"):
         points: list[tuple[float, list[float]]] = []
@@ -264,16 +261,7 @@ def _railml(path: str, root: Any, crs: str | None, height_datum: str | None, geo
             continue
         size = min(len(xyz) for _, xyz in points)
         ordered = np.array([xyz[:size] for _, xyz in sorted(points, key=lambda p: p[0])])
-        segments.append(
-            plan_segment(
-                ordered,
-                path=path,
-                name=str(element.get("id")),
-                crs=crs or named,
-                height_datum=height_datum,
-                geoid=geoid,
-            )
-        )
+        segments.append(plan_segment(ordered, reading, path=path, name=str(element.get("id"))))
     if not segments:
         raise InputFileError(path, "no netElement of this railML file has geometric coordinates; railML 3 was expected")
     return segments
