@@ -182,7 +182,7 @@ def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: 
 
 
 @inner
-def _invert(matrix: Floats, inverse: Floats) -> None:
+def invert(matrix: Floats, inverse: Floats) -> None:
     """Invert a symmetric matrix by its cofactors (`inverse_3x3`)."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
     d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
@@ -220,7 +220,7 @@ def iterated_points(
             reduce_epoch(
                 sat_ecef_m[t], code_m[t], weight[t], current, starts, offset, spread, system, means, rows, totals
             )  # fmt: skip
-            _invert(system, inverse)
+            invert(system, inverse)
             gain = 0.0
             for i in range(3):
                 step[i] = 0.0
@@ -267,7 +267,7 @@ def _along(
     step = sigma = math.nan
     if information > 1e-12 * own:
         step, sigma = gradient / information, 1.0 / math.sqrt(information)
-    _invert(matrix, inverse)
+    invert(matrix, inverse)
     least = system[3, 3]
     for i in range(3):
         for j in range(3):

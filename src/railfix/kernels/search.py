@@ -13,6 +13,41 @@ from railfix.kernels.compiling import inner, kernel
 _CURVATURE, _TURNING, _FAN_OUT, _SLACK_M = 1.0 / (2.0 * 1.9e7), 1.1e-5, 8, 1e-6
 
 
+@inner
+def _bend_m(distance_m: float) -> float:
+    """Return the largest error of the linear model of a range at a distance from its expansion point [m]."""
+    return distance_m * distance_m * _CURVATURE + _TURNING * distance_m
+
+
+@kernel
+def radii_of_balls(
+    distance_m: Floats,
+    away_m: Floats,
+    matrix: Floats,
+    covariance_m2: Floats,
+    wsse: Floats,
+    weight_norm: Floats,
+    freedom: Integers,
+    limit: float,
+) -> Floats:
+    """Return the radius of the ball that holds every point worth looking at, epoch by epoch."""
+    result = np.empty(len(distance_m))
+    for t in range(len(distance_m)):
+        form, norm, q0 = 0.0, weight_norm[t], max(wsse[t], 0.0)
+        for i in range(3):
+            for j in range(3):
+                form += away_m[t, i] * matrix[t, i, j] * away_m[t, j]
+        best = (math.sqrt(q0 + form) + norm * _bend_m(distance_m[t])) ** 2
+        reach = math.sqrt(best + limit * max(1.0, best / freedom[t]))
+        growth = 1.0 / (covariance_m2[t, 0, 0] + covariance_m2[t, 1, 1] + covariance_m2[t, 2, 2])
+        size = max(distance_m[t], math.sqrt(max(reach**2 - q0, 0.0) / growth))
+        for _ in range(3):
+            size = max(size, math.sqrt(max((reach + norm * _bend_m(size)) ** 2 - q0, 0.0) / growth))
+        holds = norm * _bend_m(2.0 * size) < 0.5 * math.sqrt(growth) * size
+        result[t] = 1.001 * size + 1e-3 if holds else math.nan
+    return result
+
+
 @kernel
 def points_in_balls(
     points_m: Floats,
@@ -64,7 +99,7 @@ def points_in_balls(
                 values[at, 1 + k] = matrix[t, k, 0] * dx + matrix[t, k, 1] * dy + matrix[t, k, 2] * dz
             q = max(least[t], 0.0) + dx * values[at, 1] + dy * values[at, 2] + dz * values[at, 3]
             square = dx * dx + dy * dy + dz * dz
-            bend = weight_norm[t] * (square * _CURVATURE + _TURNING * math.sqrt(square))
+            bend = weight_norm[t] * _bend_m(math.sqrt(square))
             root = math.sqrt(q)
             vertex[at], values[at, 0], values[at, 4], values[at, 5] = p, q, root - bend, root + bend
             best = min(best, root + bend)

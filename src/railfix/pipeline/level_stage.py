@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -232,9 +232,9 @@ def judged(
     config : Config
     """
     values = {}
-    for item in fields(ProtectionLevel):
-        value = getattr(protection.level, item.name)
-        values[item.name] = np.where(has, value, np.nan) if value.dtype == np.float64 else value
+    kept = has.all()
+    for name, value in vars(protection.level).items():
+        values[name] = value if kept or value.dtype != np.float64 else np.where(has, value, np.nan)
     for start, end in config.no_level_m:
         near = (chainage_m + values["level_m"] > start) & (chainage_m - values["level_m"] < end)
         values["level_m"] = np.where(near, np.inf, values["level_m"])

@@ -109,7 +109,8 @@ def solve(
         tied = _tied(ranges, ties, point, corrected.anchor_ecef_m, config)
     place = place_on_line(ranges, index, tied, config)
     corrected = corrected.rejected(alone_on_their_clocks(corrected, ties), Reason.ALONE_ON_ITS_CLOCK)
-    robust, robust_sums, on_line = _robust_scale(corrected, ranges, trajectory, place, config, state)
+    age = noise_age(time, state.noise, limits=config.noise_scale)
+    robust, robust_sums, on_line = _robust_scale(corrected, ranges, trajectory, place, age, config, state)
     ranges, place, raim = fault_free(ranges, index, place, robust, on_line.kept, config)
     constrained, redundancy = place.constrained, redundancy_of(ranges)
     off_map = _off_map(ranges, trajectory, place, constrained.arc_m, config)
@@ -117,7 +118,7 @@ def solve(
     if "raim" not in config.screens:
         teaching[:] = False
     scale, stated_sums = stated_scale(
-        time, constrained.wsse, redundancy, teaching, robust, state.noise, limits=config.noise_scale
+        age, constrained.wsse, redundancy, teaching, robust, state.noise, limits=config.noise_scale
     )
     scale = np.maximum(scale, _least_scale(config))
     away, off_map_state = off_map_epochs(
@@ -170,7 +171,6 @@ def solve(
     solution = changed(solution, status=_status(corrected, ranges, solution, judged, off_map, open_elsewhere, config))
     noise = state.noise
     if len(time):
-        age = noise_age(time, noise, limits=config.noise_scale)
         noise = NoiseState(time=time[-1], age=float(age[-1]), robust=robust_sums, remaining=stated_sums)
     after = replace(state, offsets=offsets, noise=noise, map_offset=map_state, off_map=off_map_state, carrier=carrier)
     return corrected, solution, after
@@ -205,6 +205,7 @@ def _robust_scale(
     ranges: Ranges,
     trajectory: Trajectory,
     place: Place,
+    age: Floats,
     config: Config,
     state: AntennaState,
 ) -> tuple[Floats, Floats, RobustFit]:
@@ -214,7 +215,7 @@ def _robust_scale(
     at = np.where(known[:, None], trajectory.at_arc(np.where(known, arc, 0.0)), corrected.anchor_ecef_m)
     fit = robust_fit(ranges, at, information=map_information(trajectory, section), limits=config.robust_fit)
     teaching = known & ~_off_map(ranges, trajectory, place, arc, config)
-    scale, sums = robust_scale(corrected.time, fit, teaching, state.noise, limits=config.noise_scale)
+    scale, sums = robust_scale(age, fit, teaching, state.noise, limits=config.noise_scale)
     return np.maximum(scale, _least_scale(config)), sums, fit
 
 

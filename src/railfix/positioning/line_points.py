@@ -25,6 +25,48 @@ def bend_m(distance_m: Floats) -> Floats:
 
 
 @compiled_by("search")
+def radii_of_balls(
+    distance_m: Floats,
+    away_m: Floats,
+    matrix: Floats,
+    covariance_m2: Floats,
+    wsse: Floats,
+    weight_norm: Floats,
+    freedom: Integers,
+    limit: float,
+) -> Floats:
+    """Return the radius of the ball around each 3-D position that holds every point worth looking at, shape (n,) [m].
+
+    NaN where errors of the linear model leave it open.
+
+    Parameters
+    ----------
+    distance_m, away_m : ndarray, shapes (n,), (n, 3) [m]
+        To the nearest point of the line.
+    matrix, covariance_m2, wsse : ndarray, shapes (n, 3, 3), (n, 3, 3), (n,)
+        Of the 3-D positions.
+    weight_norm : ndarray, shape (n,)
+        Root of the summed weights.
+    freedom : ndarray of int, shape (n,)
+        Redundancy on the line, 1 at least.
+    limit : float
+        `SectionLimits.reach`.
+    """
+    form = np.einsum("ti,tij,tj->t", away_m, matrix, away_m)
+    q0 = np.maximum(wsse, 0.0)
+    best = (np.sqrt(q0 + form) + weight_norm * bend_m(distance_m)) ** 2
+    reach = np.sqrt(best + limit * np.maximum(1.0, best / freedom))
+    # 1/trace(N^-1) is below the least eigenvalue of N: q grows at least that fast in every direction.
+    growth = 1.0 / np.trace(covariance_m2, axis1=1, axis2=2)
+    size = np.maximum(distance_m, np.sqrt(np.maximum(reach**2 - q0, 0.0) / growth))
+    for _ in range(3):
+        size = np.maximum(size, np.sqrt(np.maximum((reach + weight_norm * bend_m(size)) ** 2 - q0, 0.0) / growth))
+    # The bound holds where curvature stays small against growth; otherwise the search goes coarse to fine.
+    holds = weight_norm * bend_m(2.0 * size) < 0.5 * np.sqrt(growth) * size
+    return np.where(holds, 1.001 * size + 1e-3, np.nan)
+
+
+@compiled_by("search")
 def points_in_balls(
     points_m: Floats,
     middle: Indices,

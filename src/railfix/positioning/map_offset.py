@@ -54,12 +54,12 @@ class MapOffsetLimits(Settings):
     risk: float = Field(default=1e-3, gt=0, lt=1)
     missed: float = Field(default=1e-2, gt=0, lt=1)
 
-    @property
+    @cached_property
     def note_threshold(self) -> float:
         """Statistic from which on a run has a note."""
         return float(chdtri(2, self.note_risk))
 
-    @property
+    @cached_property
     def threshold(self) -> float:
         """Statistic from which on epochs have the status."""
         return float(chdtri(2, self.risk))

@@ -81,13 +81,14 @@ def noise_age(time: Datetimes, state: NoiseState, *, limits: NoiseScaleLimits) -
 
 
 def robust_scale(
-    time: Datetimes, fit: RobustFit, teaching: Masks, state: NoiseState, *, limits: NoiseScaleLimits
+    age: Floats, fit: RobustFit, teaching: Masks, state: NoiseState, *, limits: NoiseScaleLimits
 ) -> tuple[Floats, Floats]:
     """Standard deviation of the ranges against their weights, from what agreed in the epochs before each.
 
     Parameters
     ----------
-    time : ndarray of datetime64[ns], shape (T,)
+    age : ndarray, shape (T,) [windows]
+        `noise_age`.
     fit : RobustFit
         On the line.
     teaching : ndarray of bool, shape (T,)
@@ -102,12 +103,12 @@ def robust_scale(
         New `NoiseState.robust`.
     """
     use = teaching & (fit.freedom > 0) & np.isfinite(fit.variance)
-    return _learnt(time, np.where(use, fit.variance * fit.freedom, 0.0), np.where(use, fit.freedom, 0), state.robust,
-                   np.ones(len(time)), state, limits)  # fmt: skip
+    return _learnt(age, np.where(use, fit.variance * fit.freedom, 0.0), np.where(use, fit.freedom, 0), state.robust,
+                   np.ones(len(age)), state, limits)  # fmt: skip
 
 
 def stated_scale(
-    time: Datetimes,
+    age: Floats,
     wsse: Floats,
     redundancy: Integers,
     teaching: Masks,
@@ -120,7 +121,8 @@ def stated_scale(
 
     Parameters
     ----------
-    time : ndarray of datetime64[ns], shape (T,)
+    age : ndarray, shape (T,) [windows]
+        `noise_age`.
     wsse : ndarray, shape (T,)
         Weighted sum of squared residuals after exclusions.
     redundancy : ndarray of int, shape (T,)
@@ -138,11 +140,11 @@ def stated_scale(
         New `NoiseState.remaining`.
     """
     use = teaching & (redundancy > 0) & np.isfinite(wsse)
-    return _learnt(time, np.where(use, wsse, 0.0), np.where(use, redundancy, 0), state.remaining, robust, state, limits)
+    return _learnt(age, np.where(use, wsse, 0.0), np.where(use, redundancy, 0), state.remaining, robust, state, limits)
 
 
 def _learnt(
-    time: Datetimes,
+    age: Floats,
     wsse: Floats,
     freedom: Integers,
     start: Floats,
@@ -152,7 +154,7 @@ def _learnt(
 ) -> tuple[Floats, Floats]:
     """Root mean square with forgetting around a prior scale, and the sums to go on with."""
     values = np.stack([wsse, freedom.astype(np.float64)], axis=1)
-    before, after = decayed_sums(noise_age(time, state, limits=limits), values, start, state.age)
+    before, after = decayed_sums(age, values, start, state.age)
     if np.isinf(limits.prior):
         return prior, after
     return np.sqrt((before[:, 0] + limits.prior * prior**2) / (before[:, 1] + limits.prior)), after

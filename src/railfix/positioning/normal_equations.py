@@ -65,6 +65,11 @@ class RangeArrays(NamedTuple):
         """Whether anything is known of the offsets between the clocks."""
         return len(self.offset_m) == len(self.code_m)
 
+    @property
+    def clock(self) -> Indices:
+        """Group of each channel."""
+        return np.repeat(np.arange(len(self.starts)), np.diff(np.append(self.starts, self.code_m.shape[1])))
+
     def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
         """The arrays of some epochs."""
         ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
@@ -122,7 +127,7 @@ class Ranges:
     @cached_property
     def n_used(self) -> Integers:
         """Channels with weight, shape (T,)."""
-        return np.asarray(np.count_nonzero(self.weight, axis=1), dtype=np.int64)
+        return np.asarray((self.weight > 0).sum(axis=1), dtype=np.int64)
 
     @cached_property
     def starts(self) -> Indices:
@@ -134,9 +139,9 @@ class Ranges:
         """Clocks to be found from at least one channel, those tied to each other counted as one, shape (T,)."""
         seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
         if self.ties is None:
-            return np.asarray(np.count_nonzero(seen, axis=1), dtype=np.int64)
+            return np.asarray(seen.sum(axis=1), dtype=np.int64)
         tied = self.ties.sigma_m < UNTIED_M
-        return np.asarray(np.count_nonzero(seen & ~tied, axis=1) + np.any(seen & tied, axis=1), dtype=np.int64)
+        return np.asarray((seen & ~tied).sum(axis=1) + (seen & tied).any(axis=1), dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,7 +27,7 @@ from scipy.special import chdtri
 
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.settings import Settings
-from railfix.positioning.line_points import FAN_OUT, ROTATION_GRADIENT, bend_m, best_points, points_in_balls
+from railfix.positioning.line_points import FAN_OUT, ROTATION_GRADIENT, best_points, points_in_balls, radii_of_balls
 from railfix.positioning.normal_equations import Ranges, fit, normal_equations
 from railfix.positioning.single_point import SinglePoint
 from railfix.track.trajectory import Trajectory
@@ -225,20 +225,16 @@ def _ball(
         return radius
     nearest_m, vertex = index.tree.query(point.ecef_m[at])
     distance = np.asarray(nearest_m, dtype=np.float64)
-    delta = index.trajectory.ecef_m[vertex] - point.ecef_m[at]
-    form = np.einsum("ti,tij,tj->t", delta, point.matrix[at], delta)
-    bend = weight_norm[at] * bend_m(distance)
-    q0 = np.maximum(point.wsse[at], 0.0)
-    best = (np.sqrt(q0 + form) + bend) ** 2
-    reach = np.sqrt(best + limits.reach * np.maximum(1.0, best / freedom[at]))
-    # 1/trace(N^-1) is below the least eigenvalue of N: q grows at least that fast in every direction.
-    growth = 1.0 / np.trace(point.covariance_m2[at], axis1=1, axis2=2)
-    size = np.maximum(distance, np.sqrt(np.maximum(reach**2 - q0, 0.0) / growth))
-    for _ in range(3):
-        size = np.maximum(size, np.sqrt(np.maximum((reach + weight_norm[at] * bend_m(size)) ** 2 - q0, 0.0) / growth))
-    # The bound holds where curvature stays small against growth; otherwise the search goes coarse to fine.
-    holds = weight_norm[at] * bend_m(2.0 * size) < 0.5 * np.sqrt(growth) * size
-    radius[at] = np.where(holds, 1.001 * size + 1e-3, np.nan)
+    radius[at] = radii_of_balls(
+        distance,
+        index.trajectory.ecef_m[vertex] - point.ecef_m[at],
+        point.matrix[at],
+        point.covariance_m2[at],
+        point.wsse[at],
+        weight_norm[at],
+        freedom[at],
+        limits.reach,
+    )
     return radius
 
 

@@ -145,10 +145,10 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
     -------
     ndarray of bool, shape (T, K)
     """
-    starts = np.flatnonzero(np.r_[True, satellite[1:] != satellite[:-1]]) if len(satellite) else np.empty(0, int)
+    starts = np.flatnonzero(np.append(True, satellite[1:] != satellite[:-1])) if len(satellite) else np.empty(0, int)
     if len(starts) == len(satellite):
         return available.copy()
     count = np.cumsum(available, axis=1)
     before = np.where(starts > 0, count[:, starts - 1], 0)
-    offset = np.repeat(before, np.diff(np.r_[starts, len(satellite)]), axis=1)
+    offset = np.repeat(before, np.diff(np.append(starts, len(satellite))), axis=1)
     return np.asarray(available & (count - offset == 1))

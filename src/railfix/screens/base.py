@@ -136,7 +136,7 @@ def suspicion_sigma_m(reject: Masks, error_m: Floats, sigma_m: Floats) -> Floats
         return sigma_m
     at, result = np.nonzero(reject), sigma_m.copy()
     sigma = sigma_m[at]
-    result[at] = np.hypot(sigma, np.maximum(np.abs(np.nan_to_num(error_m[at])), LEAST_SUSPICION * sigma))
+    result[at] = np.hypot(sigma, np.fmax(np.abs(error_m[at]), LEAST_SUSPICION * sigma))
     return result
 
 

@@ -294,8 +294,7 @@ def _level_of_block(
     # After the channels: constellations, then the sides, a wrong map, and none.
     letters = np.array([*plan.groups, *[""] * (len(plan.shared) + 1)])
     result.worst_constellation[rows] = letters[np.where(one >= n, one - n, -1)]
-    pairs = np.stack(np.triu_indices(n if asked.first[0, 2] >= 0 else 0, 1), axis=1)
-    pairs = np.concatenate([pairs, [[-1, -1]]])
+    pairs = np.concatenate([_sets(n, 2).T if asked.first[0, 2] >= 0 else np.empty((0, 2), dtype=np.intp), [[-1, -1]]])
     result.worst_two[rows] = _channels(channel, pairs[np.where(two < len(pairs), two, -1)])
     infinite = np.full(len(rows), Cause.BUDGET)
     if (unchecked := np.isinf(level) & (plan.fault_free[rows] > 0)).any():

@@ -40,5 +40,7 @@ def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayL
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")
     level = np.asarray(level_m, dtype=np.float64)
-    status = np.where(level <= alarm_limit_m, LevelStatus.AVAILABLE, LevelStatus.UNAVAILABLE)
-    return np.where(~np.isnan(level) & ~np.asarray(consistent), LevelStatus.ALARM, status).astype(np.int8)
+    status = np.full(level.shape, LevelStatus.UNAVAILABLE, dtype=np.int8)
+    status[level <= alarm_limit_m] = LevelStatus.AVAILABLE
+    status[~np.isnan(level) & ~np.asarray(consistent)] = LevelStatus.ALARM
+    return status

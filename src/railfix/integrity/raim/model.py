@@ -25,7 +25,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.geodesy import enu_axes, geodetic_from_ecef, range_with_rotation
 from railfix.kernels import compiled_by
-from railfix.positioning.normal_equations import Ranges, inverse_3x3
+from railfix.positioning.normal_equations import RangeArrays, Ranges, inverse_3x3
 from railfix.track.trajectory import Trajectory
 
 
@@ -282,33 +282,57 @@ def point_model(ranges: Ranges, ecef_m: Floats) -> LinearModel:
 
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
     """Whiten, take the clocks out, invert."""
-    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
-    root = np.sqrt(ranges.weight)
-    clock = np.zeros(root.shape[1], dtype=np.intp)
-    for g, group in enumerate(ranges.groups):
-        clock[group] = g
-    totals = ranges.weight @ _one_hot(clock, len(ranges.groups))
-    misfit = ranges.code_m - distance
-    if ranges.ties is not None:
-        misfit = misfit - ranges.ties.offset_m[:, clock]
-    # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
-    total = totals.sum(axis=1, keepdims=True)
-    misfit = misfit - (ranges.weight * misfit).sum(axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
-    rows = root[..., None] * -(los @ axes.swapaxes(1, 2))
-    covariance = _clock_covariance(totals, None if ranges.ties is None else ranges.ties.sigma_m)
-    design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
-    normal = rows.swapaxes(1, 2) @ design
+    root, clock_covariance, design, covariance, misfit = linearised(
+        ranges.arrays, np.ascontiguousarray(place_ecef_m), axes, prior
+    )
     return LinearModel(
         root_weight=root,
-        clock=clock,
-        clock_covariance_m2=covariance,
+        clock=ranges.arrays.clock,
+        clock_covariance_m2=clock_covariance,
         design=design,
-        covariance_m2=regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior),
+        covariance_m2=covariance,
         prior=prior,
-        misfit=root * misfit,
+        misfit=misfit,
         freedom=ranges.n_used - ranges.n_clocks - unknowns,
         interest=1 if unknowns == 1 else 2,
     )
+
+
+@compiled_by("raim")
+def linearised(
+    ranges: RangeArrays, place_ecef_m: Floats, axes: Floats, prior: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Compute fields of `LinearModel`.
+
+    Parameters
+    ----------
+    ranges : RangeArrays
+    place_ecef_m : ndarray, shape (T, 3) [m]
+        Positions; NaN where there is none.
+    axes : ndarray, shape (T, 3, 3)
+        Unit vectors of the three unknowns there.
+    prior : ndarray, shape (3, 3) [1/m^2]
+
+    Returns
+    -------
+    root_weight, clock_covariance_m2, design, covariance_m2, misfit
+    """
+    weight, groups = ranges.weight, len(ranges.starts)
+    distance, los = range_with_rotation(ranges.sat_ecef_m, place_ecef_m[:, None, :])
+    root, clock = np.sqrt(weight), ranges.clock
+    totals = weight @ _one_hot(clock, groups)
+    misfit = ranges.code_m - distance
+    if ranges.tied:
+        misfit = misfit - ranges.offset_m[:, clock]
+    # A constant common to all ranges is no residual; subtracting it keeps the digits of the sums.
+    total = totals.sum(axis=1, keepdims=True)
+    misfit = misfit - (weight * misfit).sum(axis=1, keepdims=True) / np.where(total > 0, total, 1.0)
+    rows = root[..., None] * -(los @ axes.swapaxes(1, 2))
+    covariance = _clock_covariance(totals, ranges.sigma_m if ranges.tied else None)
+    design = rows - root[..., None] * _clocks(root, clock, covariance, rows)
+    normal = rows.swapaxes(1, 2) @ design
+    inverse = regular_inverse((normal + normal.swapaxes(1, 2)) / 2.0 + prior)
+    return root, covariance, design, inverse, root * misfit
 
 
 def _clock_covariance(totals: Floats, tie_sigma_m: Floats | None) -> Floats:
