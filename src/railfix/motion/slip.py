@@ -237,14 +237,8 @@ def find_slips(
     """
     limits = limits or SlipLimits()
     size = len(time_s)
-    if not size:
-        empty = np.empty(0)
-        return SlipResult(
-            state=np.empty(0, dtype=np.int8), speed_mps=empty, way_m=empty, metric=empty, smooth=empty, pitch=empty,
-            gyro_bias_radps=empty, offset_mps2=empty,
-        ), state  # fmt: skip
     automaton = _Automaton(limits) if state is None else state.automaton.copied(limits)
-    steps = np.diff(time_s, prepend=time_s[0] if state is None else state.time_s).tolist()
+    steps = np.diff(time_s, prepend=time_s[:1] if state is None else state.time_s).tolist()
     turning = np.full((size, 3), np.nan) if body is None else body
     since = np.full(size, np.nan) if since_pulse_s is None else since_pulse_s
     columns = (wheel_mps, wheel_mps2, force_mps2, line_sine, turning, since)
@@ -263,7 +257,7 @@ def find_slips(
         gyro_bias_radps=bias,
         offset_mps2=offset,
     )
-    return result, SlipState(time_s=float(time_s[-1]), automaton=automaton)
+    return result, SlipState(time_s=float(time_s[-1]), automaton=automaton) if size else state
 
 
 class _Automaton:

@@ -20,24 +20,7 @@ LAST_YEAR: Final = 2261
 
 
 class TrackReading(Settings):
-    """How to read the track, and which point of the vehicle the chainage is that of.
-
-    Attributes
-    ----------
-    crs, height_datum, geoid : str or None
-        Where the track's own file does not say; see `railfix.track.read_track`.
-    height_sigma : float or None [m]
-    map_epoch : float or None [year]
-        Epoch of the track's coordinates, where its frame is an ITRF or held at an epoch (JGD2011).
-    plate : str or None
-        Plate that moves such coordinates to the time of the log; see `railfix.track.frames.track_at`.
-    jgd_parameters : Path or None
-        Semi-dynamic correction of a track in JGD2011.
-    reference : {"antenna", "centre", "front_bogie", "rear_bogie"}
-        See `railfix.track.vehicle.antenna_trajectory`.
-    cache : {"use", "skip"}
-        See `railfix.run.prepared`.
-    """
+    """How to read the track, and which point of the vehicle the chainage is that of."""
 
     crs: str | None = option("CRS of the track where its file does not name one.", None, metavar="EPSG")
     height_datum: str | None = option("Heights of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
@@ -88,26 +71,7 @@ class LogReading(Settings):
 
 
 class RunOptions(Settings):
-    """Options of a run that do not change the positions.
-
-    Attributes
-    ----------
-    observations : {"skip", "write"}
-        Whether ``observations.parquet`` is written.
-    broken_lines : {"stop", "count"}
-        What to do with lines of the logs that cannot be read.
-    overwrite : {"refuse", "replace"}
-    chunk_epochs : int
-        Epochs in memory at a time.
-    start, end : datetime or None
-        First epoch, and the time before which the last one lies, GPS time.
-    smooth : {"off", "on"}
-        Whether `train.*` gets the columns of the smoother.
-    workers : int
-        See `railfix.run.antennas.processes`.
-    track : TrackReading
-    logs : LogReading
-    """
+    """Options of a run that do not change the positions."""
 
     start: datetime | None = option("First epoch, GPS time.", None, metavar="TIME")
     end: datetime | None = option("Epochs before this time only, GPS time.", None, metavar="TIME")

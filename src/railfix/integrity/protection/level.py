@@ -209,21 +209,9 @@ def _by_epoch(values: ArrayLike | None, epochs: int, width: int) -> Floats:
 
 def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
     """A result without positions."""
-
-    def nan() -> Floats:
-        return np.full(epochs, np.nan)
-
+    floats = "level_m fault_free_m one_fault_m two_fault_m sigma_m k_fault_free k_one_fault k_two_faults k_false_alarm"
     return ProtectionLevel(
-        level_m=nan(),
-        fault_free_m=nan(),
-        one_fault_m=nan(),
-        two_fault_m=nan(),
-        sigma_m=nan(),
-        k_fault_free=nan(),
-        k_one_fault=nan(),
-        k_two_faults=nan(),
-        k_false_alarm=nan(),
-        separation=nan(),
+        **{name: np.full(epochs, np.nan) for name in (*floats.split(), "separation")},
         consistent=np.zeros(epochs, dtype=bool),
         worst_one=np.full(epochs, -1, dtype=np.intp),
         worst_two=np.full((epochs, 2), -1, dtype=np.intp),
@@ -281,11 +269,8 @@ def _level_of_block(
     share = np.stack([each[rows] for each in (plan.fault_free, plan.one, plan.two, plan.more)], axis=1)
     level, spender, part, k, worst = lowered(offset, sigma, weight, asked.bounds, share, plan.reserved[rows])
 
-    result.level_m[rows], result.sigma_m[rows], result.k_false_alarm[rows] = (
-        level,
-        sigma[:, 0],
-        plan.k_false_alarm[rows],
-    )
+    result.level_m[rows], result.sigma_m[rows] = level, sigma[:, 0]
+    result.k_false_alarm[rows] = plan.k_false_alarm[rows]
     result.fault_free_m[rows], result.one_fault_m[rows], result.two_fault_m[rows] = part.T[:3]
     result.k_fault_free[rows], result.k_one_fault[rows], result.k_two_faults[rows] = k.T[:3]
     result.separation[rows], result.consistent[rows] = separation, separation <= 1.0

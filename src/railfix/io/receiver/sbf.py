@@ -144,12 +144,11 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
         "MeasEpoch without time": int(np.count_nonzero(~dated & ~scrambled)),
         "scrambled MeasEpoch": int(np.count_nonzero(scrambled)),
     }
-    place = np.concatenate(places) if places else np.zeros(0, dtype=np.intp)
-    kind = np.concatenate(kinds) if kinds else np.zeros(0, dtype=np.intp)
-    master = np.concatenate(masters) if masters else np.zeros(0, dtype=np.intp)
-    epoch = np.repeat(np.arange(len(epochs)), [len(p) for p in places]) if places else np.zeros(0, dtype=np.intp)
+    none = np.zeros(0, dtype=np.intp)
+    place, kind, master = (np.concatenate([none, *parts]) for parts in (places, kinds, masters))
+    epoch = np.repeat(np.arange(len(epochs)), np.array([len(p) for p in places], dtype=np.intp))
     rows = head[np.array(epochs, dtype=np.intp)]
-    main = frames.data[place + np.where(kind == 0, 1, 0)] >> 5 == 0 if len(place) else np.zeros(0, dtype=bool)
+    main = frames.data[place + np.where(kind == 0, 1, 0)] >> 5 == 0
     skipped["measurements of further antennas of a MeasEpoch"] = int(np.count_nonzero(~main))
     values = {name: array[main] for name, array in _decoded(frames, place, kind, master).items()}
     return Measurements(
