@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import polars as pl
 
@@ -20,6 +19,7 @@ from railfix.evaluate.integrity import BEYOND_COLUMNS, STANFORD_COLUMNS
 from railfix.evaluate.intervals import INTERVAL_COLUMNS
 from railfix.evaluate.levels import LEVEL_COLUMNS
 from railfix.evaluate.outages import OUTAGE_COLUMNS
+from railfix.run.output import OutputFolder
 
 #: What P1 found (3.3, table 4; 5, figures 10 to 12), for comparison where it is asked for.
 P1_TABLE_4: Final = (
@@ -36,23 +36,7 @@ _FILTER_COLUMNS: Final = {"outages": OUTAGE_COLUMNS, "branches": BRANCH_COLUMNS}
 MOST_BEYOND: Final = 200
 
 
-class Folder(Protocol):
-    """Where results go, whole or not at all; `railfix.run.output.OutputFolder` is one."""
-
-    def append_parquet(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a Parquet file."""
-
-    def append_csv(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a CSV file."""
-
-    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a JSON file."""
-
-    def commit(self, metadata: Mapping[str, str]) -> dict[str, Path]:
-        """Move every file in place."""
-
-
-def write_evaluation(evaluation: Evaluation, folder: Folder) -> dict[str, Path]:
+def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, Path]:
     """Write an evaluation and commit the folder.
 
     ==================== ================================================================
