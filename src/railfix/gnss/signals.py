@@ -36,3 +36,18 @@ def carrier_frequency_hz(
             frequency += channels.get(name, np.nan) * GLONASS_STEP[band]
         result[i] = frequency
     return result
+
+
+def named_frequency_hz(name: Strings, glonass_channel: Floats) -> Floats:
+    """Carrier frequency by constellation and signal ("G1C") of channels, shape (..., M) [Hz].
+
+    NaN where the signal, or the frequency channel of a GLONASS satellite (..., M), is not known.
+    """
+    frequency = np.full(glonass_channel.shape, np.nan)
+    for text in np.unique(name).tolist():
+        letter, band = text[:1], text[1:2]
+        chosen = name == text
+        frequency[..., chosen] = CARRIER_FREQUENCY.get(letter, {}).get(band, np.nan)
+        if letter == "R" and band in GLONASS_STEP:
+            frequency[..., chosen] += glonass_channel[..., chosen] * GLONASS_STEP[band]
+    return frequency

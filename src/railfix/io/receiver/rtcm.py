@@ -11,9 +11,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks, Strings
-from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP, SPEED_OF_LIGHT
+from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Masks
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.timescale import bdt_to_gpst, gpst_minus_utc, nearest_week
+from railfix.gnss.signals import named_frequency_hz
 from railfix.io.receiver.bits import Field, fields, signed, unsigned
 from railfix.io.receiver.framing import Frames
 from railfix.io.receiver.measurements import Measurements, joined
@@ -276,7 +277,8 @@ def _decoded(
     names = np.array([f"{system}{k + 19 if system == 'S' else k:02d}" for k in satellites.tolist()])[of_satellite]
     codes = np.array([SIGNALS[system].get(k, "") for k in signals.tolist()])[of_signal]
     channel = channel[:, of_satellite]
-    frequency = _frequency(system, codes, channel)
+    known_channel = np.isin(channel, list(_GLONASS_RANGE))
+    frequency = named_frequency_hz(np.char.add(system, codes), np.where(known_channel, channel, np.nan))
     shape = (len(bits), n_cells)
     return Measurements(
         time=_times(system, bits, near),
@@ -290,21 +292,8 @@ def _decoded(
         lock_s=lock.reshape(-1),
         half_cycle=half.reshape(-1),
         polarity=np.zeros(shape[0] * shape[1], dtype=np.int64),
-        glonass_channel=np.where(np.isin(channel, list(_GLONASS_RANGE)), channel, 99).reshape(-1),
+        glonass_channel=np.where(known_channel, channel, 99).reshape(-1),
     )
-
-
-def _frequency(system: str, codes: Strings, channel: Integers) -> Floats:
-    """Carrier of each cell [Hz], NaN where it is not known (GLONASS without channel)."""
-    frequency = np.full(channel.shape, np.nan)
-    for k, code in enumerate(codes.tolist()):
-        if not code:
-            continue
-        frequency[:, k] = CARRIER_FREQUENCY[system].get(code[0], np.nan)
-        if system == "R":
-            known = np.isin(channel[:, k], list(_GLONASS_RANGE))
-            frequency[:, k] += np.where(known, channel[:, k] * GLONASS_STEP[code[0]], np.nan)
-    return frequency
 
 
 def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:

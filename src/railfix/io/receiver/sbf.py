@@ -10,10 +10,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from railfix.core.arrays import Bytes, Floats, Indices, Integers, Strings
-from railfix.core.constants import CARRIER_FREQUENCY, GLONASS_STEP, SPEED_OF_LIGHT
+from railfix.core.arrays import Bytes, Indices, Integers, Strings
+from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic
 from railfix.core.timescale import from_week
+from railfix.gnss.signals import named_frequency_hz
 from railfix.io.receiver.framing import Frames
 from railfix.io.receiver.measurements import Measurements
 from railfix.io.receiver.subframes import Subframes
@@ -196,9 +197,9 @@ def _decoded(frames: Frames, place: Indices, kind: Indices, master: Indices) -> 
     name = _SIGNAL_NAMES[number]
     satellite = _NAMES[first["sv"]]
     known = (np.char.str_len(satellite) > 0) & (name.astype("<U1") == satellite.astype("<U1"))
-    channel = (_info_high(first["info"]) - 8).astype(np.int64)
+    channel = (first["info"] >> 3).astype(np.int64) - 8  # bits 3 to 7 of ObsInfo
     main = _SIGNAL_NAMES[_signal_number(first["type"], first["info"])]
-    frequency, main_frequency = _frequency(name, channel), _frequency(main, channel)
+    frequency, main_frequency = (named_frequency_hz(names, channel.astype(np.float64)) for names in (name, main))
     code_main = ((first["misc"] & 15).astype(np.int64) << 32 | first["code"].astype(np.int64)) * 1e-3
     code_main = np.where(code_main == 0, np.nan, code_main)
     doppler_main = np.where(first["doppler"] == -(1 << 31), np.nan, first["doppler"] * 1e-4)
@@ -233,11 +234,6 @@ def _decoded(frames: Frames, place: Indices, kind: Indices, master: Indices) -> 
     }
 
 
-def _info_high(info: Integers) -> Integers:
-    """Bits 3 to 7 of ObsInfo: GLONASS channel plus 8, or the extended signal number."""
-    return np.asarray(info >> 3)
-
-
 def _signal_number(kind: Integers, info: Integers) -> Integers:
     """Signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where these are 31."""
     low = np.asarray(kind, dtype=np.int64) & 31
@@ -247,18 +243,6 @@ def _signal_number(kind: Integers, info: Integers) -> Integers:
 def _signed(value: Integers, bits: int) -> Integers:
     value = np.asarray(value, dtype=np.int64)
     return np.where(value >= 1 << bits - 1, value - (1 << bits), value)
-
-
-def _frequency(name: Strings, channel: Integers) -> Floats:
-    """Carrier of each measurement [Hz]; NaN where the signal is unknown."""
-    frequency = np.full(len(name), np.nan)
-    for text in np.unique(name).tolist():
-        if text:
-            chosen = name == text
-            frequency[chosen] = CARRIER_FREQUENCY.get(text[0], {}).get(text[1], np.nan)
-            if text[0] == "R" and text[1] in GLONASS_STEP:
-                frequency[chosen] += channel[chosen] * GLONASS_STEP[text[1]]
-    return frequency
 
 
 def navigation_subframes(frames: Frames) -> Subframes:

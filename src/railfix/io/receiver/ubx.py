@@ -126,8 +126,8 @@ def rawx_measurements(frames: Frames) -> Measurements:
     chosen, length = chosen[length >= 16], length[length >= 16]
     whole = length == 16 + 32 * header["count"].astype(np.int64)
     plausible = whole & (header["week"] > 0) & (header["tow"] >= 0) & (header["tow"] < 604_800)
-    skipped = {"broken RXM-RAWX": int(np.count_nonzero(~whole)), "RXM-RAWX without time": 0}
-    skipped["RXM-RAWX without time"] = int(np.count_nonzero(whole & ~plausible))
+    undated = whole & ~plausible
+    skipped = {"broken RXM-RAWX": int((~whole).sum()), "RXM-RAWX without time": int(undated.sum())}
     chosen, header = chosen[plausible], header[plausible]
     count = header["count"].astype(np.int64)
     epoch = np.repeat(np.arange(len(chosen)), count)
