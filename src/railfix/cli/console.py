@@ -99,12 +99,7 @@ def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     def show(*, epochs: int, fraction: float) -> None:
         bar.start()  # its thread starts with the first epochs: a run forks before it has threads
         elapsed = bar.tasks[task].elapsed or 0.0
-        bar.update(
-            task,
-            completed=fraction,
-            epochs=epochs,
-            rate=epochs / elapsed if elapsed > 0 else 0.0,
-        )
+        bar.update(task, completed=fraction, epochs=epochs, rate=epochs / elapsed if elapsed > 0 else 0.0)
 
     try:
         yield show
@@ -132,10 +127,7 @@ def show_summary(summary: RunSummary) -> None:
 
 def _positions(summary: RunSummary, names: list[str]) -> Table:
     tally, sigma = summary.tally.antennas, summary.sigma
-    table = Table()
-    table.add_column("")
-    for name in names:
-        table.add_column(name, justify="right")
+    table = _by_antenna(names)
     table.add_row("epochs", *(f"{tally[n].epochs:,}" for n in names))
     table.add_row("with observations", *(f"{tally[n].observed:,}" for n in names))
     for head, of_antenna in (
@@ -151,15 +143,10 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
                     _rows_of_few(table, [tally[n] for n in names])
     table.add_row("positioning rate", *(_percent(tally[n].positioned, tally[n].observed) for n in names))
     table.add_row("rate of ok", *(_percent(tally[n].status[Status.OK.text], tally[n].observed) for n in names))
-    for label, field in (("p50", "p50_m"), ("p95", "p95_m"), ("largest", "max_m")):
-        cells = [f"{getattr(sigma[n], field):.2f} m" if n in sigma else "-" for n in names]
-        table.add_row(f"sigma along the line, {label}", *cells)
+    _add_metres(table, "sigma along the line", [sigma.get(n) for n in names], _OF_SIGMA)
     levels = summary.levels
     if levels:
-        for label, field in (("p50", "p50_m"), ("p95", "p95_m")):
-            values = {n: getattr(levels[n], field) for n in names if n in levels}
-            cells = [f"{values[n]:.2f} m" if values.get(n) is not None else "-" for n in names]
-            table.add_row(f"{summary.level_basis} level, {label}", *cells)
+        _add_metres(table, f"{summary.level_basis} level", [levels.get(n) for n in names], _OF_LEVEL)
         for word in ("available", "alarm"):
             shown = [_percent(getattr(levels[n], word), tally[n].observed) if n in levels else "-" for n in names]
             table.add_row(f"  {word}", *shown)
@@ -167,26 +154,37 @@ def _positions(summary: RunSummary, names: list[str]) -> Table:
 
 
 def _filtered(tracks: Mapping[str, Filtered]) -> Table:
-    table = Table()
-    table.add_column("")
-    for name in tracks:
-        table.add_column(name, justify="right")
+    table = _by_antenna(tracks)
     for status in dict.fromkeys(word for found in tracks.values() for word in found.status):
         if any(found.status[status] for found in tracks.values()):
             table.add_row(status, *(f"{found.status[status]:,}" for found in tracks.values()))
-    for label, field in (("p50", "p50_m"), ("p95", "p95_m"), ("largest", "max_m")):
-        sigmas = [found.along_sigma_m for found in tracks.values()]
-        cells = ["-" if sigma is None else f"{getattr(sigma, field):.2f} m" for sigma in sigmas]
-        table.add_row(f"sigma along the line, {label}", *cells)
+    _add_metres(table, "sigma along the line", [found.along_sigma_m for found in tracks.values()], _OF_SIGMA)
     levels = [found.level for found in tracks.values()]
     if any(levels):
-        for label, field in (("p50", "p50_m"), ("p95", "p95_m")):
-            values = [None if level is None else getattr(level, field) for level in levels]
-            table.add_row(
-                f"indicative protection level, {label}", *("-" if v is None else f"{v:.2f} m" for v in values)
-            )
+        _add_metres(table, "indicative protection level", levels, _OF_LEVEL)
         table.add_row("  with a level", *("-" if level is None else f"{level.finite:,}" for level in levels))
     return table
+
+
+#: Fields of `AlongSigma`, and of `Levels` and `FilterLevel`, by their names in the tables.
+_OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
+_OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
+
+
+def _by_antenna(names: Iterable[str]) -> Table:
+    """A table with a column for each antenna, without rows."""
+    table = Table()
+    table.add_column("")
+    for name in names:
+        table.add_column(name, justify="right")
+    return table
+
+
+def _add_metres(table: Table, what: str, found: Sequence[Any], fields: Mapping[str, str]) -> None:
+    """A row for each field of what was found of the antennas, None where nothing was."""
+    for label, field in fields.items():
+        values = [None if of_antenna is None else getattr(of_antenna, field) for of_antenna in found]
+        table.add_row(f"{what}, {label}", *("-" if value is None else f"{value:.2f} m" for value in values))
 
 
 def _without(antenna: AntennaTally) -> Counter[str]:

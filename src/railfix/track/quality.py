@@ -235,18 +235,10 @@ def _shape(report: _Report, geometry: Geometry, limits: MapLimits) -> Iterator[F
         turn = np.abs(geometry.turn_deg)
         sharp = np.radians(turn) > geometry.reach_m / limits.least_radius_m
         kink = sharp & (turn > limits.kink_deg)
-    for severity, mask, limit in (
-        ("error", kink & (turn > limits.sharp_kink_deg), limits.sharp_kink_deg),
-        ("warning", kink & ~(turn > limits.sharp_kink_deg), limits.kink_deg),
-    ):
-        yield from report.runs(
-            mask,
-            "error" if severity == "error" else "warning",
-            "kink",
-            "the direction turns by {value:.1f} degrees at one point (limit {limit:g})",
-            values=turn,
-            limit=limit,
-        )
+        too_sharp = turn > limits.sharp_kink_deg
+    text = "the direction turns by {value:.1f} degrees at one point (limit {limit:g})"
+    yield from report.runs(kink & too_sharp, "error", "kink", text, values=turn, limit=limits.sharp_kink_deg)
+    yield from report.runs(kink & ~too_sharp, "warning", "kink", text, values=turn, limit=limits.kink_deg)
 
 
 def _kilometrage(report: _Report, track: Track) -> Iterator[Finding]:
