@@ -3,44 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Masks, Strings
+from railfix.core.arrays import Floats
 from railfix.screens import AntennaRanges, Screened, Verdict
-
-
-class PlacedRanges(AntennaRanges, Protocol):
-    """Corrected ranges with the approximate places of the antenna."""
-
-    @property
-    def anchor_ecef_m(self) -> Floats:
-        """Approximate place, shape (T, 3) [m]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SentRanges:
-    """`PlacedRanges` without anything else, to be sent to another process."""
-
-    time: Datetimes
-    break_before: Masks
-    satellite: Strings
-    signal: Strings
-    frequency_hz: Floats
-    code_m: Floats
-    doppler_hz: Floats
-    cn0_dbhz: Floats
-    elevation_deg: Floats
-    azimuth_deg: Floats
-    corrected_code_m: Floats
-    sigma_m: Floats
-    reason: Bits
-    anchor_ecef_m: Floats
-
-    @classmethod
-    def of(cls, ranges: PlacedRanges) -> SentRanges:
-        """Return what `ranges` shows."""
-        return cls(**{item.name: getattr(ranges, item.name) for item in fields(cls)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +34,7 @@ class PositionVerdict(NamedTuple):
 class ChunkSteps(Protocol):
     """A chunk of one antenna, in this process or another one; the steps are called in this order."""
 
-    def screened(self) -> PlacedRanges:
+    def screened(self) -> AntennaRanges:
         """Return the corrected ranges after the screens of this antenna alone."""
 
     def judge(self, verdicts: Iterable[Verdict]) -> None:

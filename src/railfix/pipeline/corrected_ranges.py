@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from railfix.core.arrays import Bits, Datetimes, Floats, Indices, Masks, Strings, changed
+from railfix.core.arrays import Bits, Floats, Indices, Masks, Strings, changed
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import Observations
 from railfix.gnss.orbits import SatelliteStates, satellite_states
@@ -24,7 +24,7 @@ from railfix.ranges.atmospheric_delays import SeenFrom, modelled_delays
 from railfix.ranges.error_model import ErrorModel
 from railfix.ranges.sbas_delays import SBAS_SIGNAL, corrected_satellites, sbas_delays
 from railfix.ranges.weights import PLAUSIBLE_CODE_M, code_sigma_m, first_available
-from railfix.screens import Screened, Verdict, suspicion_sigma_m
+from railfix.screens import AntennaRanges, Screened, Verdict, suspicion_sigma_m
 
 #: Standard deviation given to raw ranges for the approximate place of the antenna [m].
 ANCHOR_SIGMA_M: Final = 10.0
@@ -37,27 +37,20 @@ SOMEWHERE_ABOVE_M: Final = (2.6e7, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectedRanges:
+class CorrectedRanges(AntennaRanges):
     """Corrected pseudoranges of one antenna before positioning: T epochs by the K channels that the settings allow.
 
     Attributes
     ----------
     observations : Observations
     channels : Channels
-    code_m, doppler_hz, cn0_dbhz : ndarray, shape (T, K)
     satellites : SatelliteStates
-    anchor_ecef_m : ndarray, shape (T, 3) [m]
-        Approximate place of the antenna, from which the directions to the satellites are computed.
-    elevation_deg, azimuth_deg : ndarray, shape (T, K)
     ionosphere_m, troposphere_m : ndarray, shape (T, K) [m]
         Delays subtracted from the codes; 0 where the model is off, NaN where SBAS has none.
-    corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
     nominal_m : ndarray, shape (T, K) [m]
         Standard deviation of satellites and atmosphere: by SBAS, otherwise by `Config.nominal`.
     bound_sigma_m, bias_m : ndarray, shape (T, K) [m]
         Overbounding sigma and largest nominal bias of each range by the error model; 0 without one.
-    reason : ndarray of int64, shape (T, K)
-        `reasons.Reason` bits so far, 0 = usable.
     screens : mapping of str to Screened
         Metric and verdict of each screen so far.
     slips : Slips or None
@@ -66,48 +59,19 @@ class CorrectedRanges:
 
     observations: Observations
     channels: Channels
-    code_m: Floats
-    doppler_hz: Floats
-    cn0_dbhz: Floats
     satellites: SatelliteStates
-    anchor_ecef_m: Floats
-    elevation_deg: Floats
-    azimuth_deg: Floats
     ionosphere_m: Floats
     troposphere_m: Floats
-    corrected_code_m: Floats
-    sigma_m: Floats
     nominal_m: Floats
     bound_sigma_m: Floats
     bias_m: Floats
-    reason: Bits
     screens: Mapping[str, Screened] = field(default_factory=dict)
     slips: Slips | None = None
-
-    @property
-    def time(self) -> Datetimes:
-        """Time tags of the epochs, shape (T,)."""
-        return self.observations.time
-
-    @property
-    def break_before(self) -> Masks:
-        """Epochs that must not be differenced with the one before, shape (T,)."""
-        return self.observations.break_before
 
     @property
     def columns(self) -> Indices:
         """Columns of the channels in the observations, shape (K,)."""
         return self.channels.columns
-
-    @property
-    def satellite(self) -> Strings:
-        """Satellite of each channel, shape (K,)."""
-        return self.channels.satellite
-
-    @property
-    def signal(self) -> Strings:
-        """Signal of each channel, shape (K,)."""
-        return self.channels.signal
 
     @property
     def groups(self) -> tuple[slice, ...]:
@@ -118,11 +82,6 @@ class CorrectedRanges:
     def clocks(self) -> tuple[str, ...]:
         """Letter of each receiver clock."""
         return self.channels.clocks
-
-    @property
-    def frequency_hz(self) -> Floats:
-        """Carrier of each channel, shape (K,) [Hz]."""
-        return self.channels.frequency_hz
 
     def rejected(self, mask: Masks, reason: Reason) -> CorrectedRanges:
         """Return the ranges with a reason added to the observed channels of a mask, shape (T, K)."""
@@ -233,6 +192,11 @@ def correct_ranges(
     return CorrectedRanges(
         observations=obs,
         channels=channels,
+        time=obs.time,
+        break_before=obs.break_before,
+        satellite=satellite,
+        signal=signal,
+        frequency_hz=frequency,
         code_m=code,
         doppler_hz=obs.doppler_hz[:, columns],
         cn0_dbhz=cn0,

@@ -22,7 +22,7 @@ from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.compared import ChunkSteps, PlacedRanges, PositionVerdict, Published
+from railfix.pipeline.compared import ChunkSteps, PositionVerdict, Published
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
@@ -37,6 +37,7 @@ from railfix.ranges.error_model import Conditions, ErrorModel, condition_differe
 from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
+    AntennaRanges,
     ObservationScreen,
     PairedEpochs,
     PairScreen,
@@ -294,7 +295,7 @@ class EpochProcessor:
             state = replace(state, carrier=carrier)
         return ranges, state
 
-    def _pair(self, ranges: Mapping[str, PlacedRanges]) -> PairedEpochs | None:
+    def _pair(self, ranges: Mapping[str, AntennaRanges]) -> PairedEpochs | None:
         """Return the common epochs of two antennas of one vehicle; None where there are no such antennas."""
         if len(ranges) < 2 or not self._setup.spacing_known:
             return None
@@ -309,7 +310,7 @@ class EpochProcessor:
         )
 
     def _pair_verdicts(
-        self, pair: PairedEpochs | None, ranges: Mapping[str, PlacedRanges]
+        self, pair: PairedEpochs | None, ranges: Mapping[str, AntennaRanges]
     ) -> dict[str, tuple[Verdict, ...]]:
         """Return the verdicts of the screens of common observations, by antenna."""
         verdicts: dict[str, tuple[Verdict, ...]] = {}

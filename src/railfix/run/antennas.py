@@ -13,7 +13,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
@@ -24,7 +24,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes
 from railfix.core.errors import RailfixError, SettingsError
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.compared import PlacedRanges, PositionVerdict, Published, SentRanges
+from railfix.pipeline.compared import PositionVerdict, Published
 from railfix.pipeline.processor import AntennaChunk, EpochProcessor
 from railfix.pipeline.results import State
 from railfix.pipeline.smoothing import Replay, smooth
@@ -37,7 +37,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
-from railfix.screens import Verdict
+from railfix.screens import AntennaRanges, Verdict
 from railfix.tracking import Line
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class AntennaRun:
         assert self._chunk is not None, "begin() comes first"
         return self._chunk
 
-    def screened(self) -> PlacedRanges:
+    def screened(self) -> AntennaRanges:
         """See `ChunkSteps`."""
         return self.chunk.screened()
 
@@ -243,9 +243,9 @@ class OtherProcess:
         self._ask("begin", epochs, after, end)
         self._ask("screened")
 
-    def screened(self) -> PlacedRanges:
+    def screened(self) -> AntennaRanges:
         """See `ChunkSteps`."""
-        ranges: SentRanges = self._answer()
+        ranges: AntennaRanges = self._answer()
         return ranges
 
     def judge(self, verdicts: Iterable[Verdict]) -> None:
@@ -318,7 +318,8 @@ def _serve(pipe: Connection, other_end: Connection, make: Callable[[], AntennaRu
             if step == "more":
                 pipe.send(("more", (answer, run.log.share, run.log.problems, run.log.skipped)))
             elif step == "screened":
-                pipe.send((step, SentRanges.of(answer)))
+                shown = {item.name: getattr(answer, item.name) for item in fields(AntennaRanges)}
+                pipe.send((step, AntennaRanges(**shown)))
             elif step in ("solved", "finished", "smoothed"):
                 pipe.send((step, answer))
                 if step == "finished":

@@ -24,60 +24,42 @@ Limits = TypeVar("Limits", bound=Settings)
 LEAST_SUSPICION: Final = 2.0
 
 
-class AntennaRanges(Protocol):
-    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels (`pipeline.CorrectedRanges`)."""
+@dataclass(frozen=True, kw_only=True)
+class AntennaRanges:
+    """Corrected ranges of one antenna as a screen sees them: T epochs by K channels.
 
-    @property
-    def time(self) -> Datetimes:
-        """Time tags, shape (T,)."""
+    Attributes
+    ----------
+    time : ndarray of datetime64[ns], shape (T,)
+    break_before : ndarray of bool, shape (T,)
+        Epochs that must not be differenced with the one before.
+    satellite, signal, frequency_hz : ndarray, shape (K,)
+        Of each channel.
+    code_m, doppler_hz, cn0_dbhz : ndarray, shape (T, K)
+        As observed.
+    anchor_ecef_m : ndarray, shape (T, 3) [m]
+        Approximate place of the antenna, from which the directions to the satellites are computed.
+    elevation_deg, azimuth_deg : ndarray, shape (T, K)
+    corrected_code_m, sigma_m : ndarray, shape (T, K) [m]
+        Pseudoranges with satellite clock, group delay and atmosphere applied, and their standard deviations.
+    reason : ndarray of int64, shape (T, K)
+        `reasons.Reason` bits so far, 0 = usable.
+    """
 
-    @property
-    def break_before(self) -> Masks:
-        """Epochs that must not be differenced with the one before, shape (T,)."""
-
-    @property
-    def satellite(self) -> Strings:
-        """Satellite of each channel, shape (K,)."""
-
-    @property
-    def signal(self) -> Strings:
-        """Signal of each channel, shape (K,)."""
-
-    @property
-    def frequency_hz(self) -> Floats:
-        """Carrier of each channel, shape (K,) [Hz]."""
-
-    @property
-    def code_m(self) -> Floats:
-        """Raw pseudoranges, shape (T, K) [m]."""
-
-    @property
-    def doppler_hz(self) -> Floats:
-        """Doppler, shape (T, K) [Hz]."""
-
-    @property
-    def cn0_dbhz(self) -> Floats:
-        """C/N0, shape (T, K) [dB-Hz]."""
-
-    @property
-    def elevation_deg(self) -> Floats:
-        """Elevation of the satellites, shape (T, K) [deg]."""
-
-    @property
-    def azimuth_deg(self) -> Floats:
-        """Azimuth of the satellites, shape (T, K) [deg]."""
-
-    @property
-    def corrected_code_m(self) -> Floats:
-        """Pseudoranges with satellite clock, group delay and atmosphere applied, shape (T, K) [m]."""
-
-    @property
-    def sigma_m(self) -> Floats:
-        """Standard deviation assumed for them, shape (T, K) [m]."""
-
-    @property
-    def reason(self) -> Bits:
-        """`Reason` bits so far, shape (T, K)."""
+    time: Datetimes
+    break_before: Masks
+    satellite: Strings
+    signal: Strings
+    frequency_hz: Floats
+    code_m: Floats
+    doppler_hz: Floats
+    cn0_dbhz: Floats
+    anchor_ecef_m: Floats
+    elevation_deg: Floats
+    azimuth_deg: Floats
+    corrected_code_m: Floats
+    sigma_m: Floats
+    reason: Bits
 
 
 @dataclass(frozen=True, kw_only=True)
