@@ -106,32 +106,31 @@ def tie_clocks(
     age = ages(time, state.last, state.age, window_s=limits.window_s, least_epochs=samples)
     freedom = np.maximum(ranges.n_used - ranges.n_clocks - 3, 1)
     misfit = np.maximum(1.0, free.wsse / freedom)
-    base = clocks.index(reference) if reference in clocks else -1
-    if base >= 0:
+    others = [g for g, letter in enumerate(clocks) if letter != reference]
+    letters = [clocks[g] for g in others]
+    weight, difference = np.zeros((2, epochs, len(others)))
+    if reference in clocks:
+        base = [clocks.index(reference)]
         sigma[:, base] = 0.0
-    for g, letter in enumerate(clocks):
-        if letter == reference:
-            continue
-        weight = np.zeros(epochs)
-        difference = np.zeros(epochs)
-        if base >= 0:
-            weights, base_weights = ranges.weight[:, ranges.groups[g]], ranges.weight[:, ranges.groups[base]]
-            usable = (np.count_nonzero(weights, axis=1) >= 2) & (np.count_nonzero(base_weights, axis=1) >= 2)
-            usable &= np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
-            variance = misfit * (
-                1.0 / np.maximum(weights.sum(axis=1), 1e-12) + 1.0 / np.maximum(base_weights.sum(axis=1), 1e-12)
-            )
-            weight = np.where(usable, fresh / np.where(usable, variance, 1.0), 0.0)
-            difference = np.where(usable, free.clock_m[:, g] - free.clock_m[:, base], 0.0)
-        start = np.array([information.get(letter, 0.0), moment.get(letter, 0.0)])
-        values = np.stack([weight, weight * difference], axis=1)
-        before, after = decayed_sums(age, values, start, state.age)
-        has = before[:, 0] > 0.0
-        safe = np.where(has, before[:, 0], 1.0)
-        offset[:, g] = np.where(has, before[:, 1] / safe, 0.0)
-        spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
-        sigma[:, g] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
-        information[letter], moment[letter] = float(after[0]), float(after[1])
+        of_clocks = [ranges.weight[:, group] for group in ranges.groups]
+        total = np.maximum(np.stack([weights.sum(axis=1) for weights in of_clocks], axis=1), 1e-12)
+        two = np.stack([(weights > 0).sum(axis=1) >= 2 for weights in of_clocks], axis=1)
+        known = np.isfinite(free.wsse) & (ranges.n_used - ranges.n_clocks > 3)
+        usable = two[:, others] & two[:, base] & known[:, None]
+        variance = misfit[:, None] * (1.0 / total[:, others] + 1.0 / total[:, base])
+        weight = np.where(usable, fresh[:, None] / variance, 0.0)
+        difference = np.where(usable, free.clock_m[:, others] - free.clock_m[:, base], 0.0)
+    start = np.array([*(information.get(name, 0.0) for name in letters), *(moment.get(name, 0.0) for name in letters)])
+    before, after = decayed_sums(age, np.concatenate([weight, weight * difference], axis=1), start, state.age)
+    of_information, of_moment = before[:, : len(others)], before[:, len(others) :]
+    has = of_information > 0.0
+    safe = np.where(has, of_information, 1.0)
+    offset[:, others] = np.where(has, of_moment / safe, 0.0)
+    spread = np.sqrt(limits.stability_m**2 + 1.0 / safe)
+    sigma[:, others] = np.where(has & (spread < UNTIED_M), spread, UNTIED_M)
+    sums = after.tolist()
+    information |= zip(letters, sums[: len(others)], strict=True)
+    moment |= zip(letters, sums[len(others) :], strict=True)
     last = time[-1] if epochs else state.last
     return ClockTies(offset_m=offset, sigma_m=sigma), OffsetState(
         information=information, moment=moment, last=last, age=float(age[-1]) if epochs else state.age

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
+from railfix.kernels import compiled_by
 
 #: Latitudes of its tables [deg].
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])
@@ -78,14 +79,36 @@ def klobuchar_delay_m(
     ndarray, shape (T, M) [m]
         NaN where an angle, a coordinate or a frequency is NaN, and at or below the horizon.
     """
-    alpha, beta = np.asarray(coefficients, dtype=np.float64).reshape(2, 4)
+    _, seconds_of_week = to_week(time)
+    return klobuchar(
+        seconds_of_week,
+        latitude_deg,
+        longitude_deg,
+        np.ascontiguousarray(elevation_deg),
+        np.ascontiguousarray(azimuth_deg),
+        np.array(coefficients, dtype=np.float64).reshape(2, 4),
+        frequency_hz,
+    )
+
+
+@compiled_by("atmosphere")
+def klobuchar(
+    seconds_of_week: Floats,
+    latitude_deg: Floats,
+    longitude_deg: Floats,
+    elevation_deg: Floats,
+    azimuth_deg: Floats,
+    coefficients: Floats,
+    frequency_hz: Floats,
+) -> Floats:
+    """Compute `klobuchar_delay_m`; `coefficients` are of shape (2, 4), alpha and beta."""
+    alpha, beta = coefficients
     elevation = np.where(elevation_deg > 0.0, elevation_deg, np.nan) / 180.0
     azimuth = np.radians(azimuth_deg)
     earth_angle = 0.0137 / (elevation + 0.11) - 0.022
     latitude = np.clip(latitude_deg[:, None] / 180.0 + earth_angle * np.cos(azimuth), -0.416, 0.416)
     longitude = longitude_deg[:, None] / 180.0 + earth_angle * np.sin(azimuth) / np.cos(latitude * np.pi)
     magnetic = latitude + 0.064 * np.cos((longitude - 1.617) * np.pi)
-    _, seconds_of_week = to_week(time)
     local = (43_200.0 * longitude + seconds_of_week[:, None]) % SECONDS_PER_DAY
     low = 0.53 - elevation
     slant = 1.0 + 16.0 * low * low * low
