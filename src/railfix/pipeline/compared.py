@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from railfix.core.arrays import Floats
 from railfix.screens import AntennaRanges, Screened, Verdict
-
-
-@dataclass(frozen=True, kw_only=True)
-class Published:
-    """Positions of T epochs that are compared with those of the other antenna.
-
-    Attributes
-    ----------
-    chainage_m : ndarray, shape (T,) [m]
-        NaN where there is none.
-    """
-
-    chainage_m: Floats
 
 
 class PositionVerdict(NamedTuple):
@@ -40,8 +26,8 @@ class ChunkSteps(Protocol):
     def judge(self, verdicts: Iterable[Verdict]) -> None:
         """Take the verdicts of the screens of common observations."""
 
-    def solved(self) -> Published:
-        """Solve and return what is published of the positions."""
+    def solved(self) -> Floats:
+        """Solve and return the chainages that are published, NaN where there is none, shape (T,) [m]."""
 
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """Take the verdicts of the screens of the published positions."""

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from railfix.core.arrays import changed
+from railfix.core.arrays import Floats, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
@@ -22,7 +22,7 @@ from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.compared import ChunkSteps, PositionVerdict, Published
+from railfix.pipeline.compared import ChunkSteps, PositionVerdict
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
@@ -321,17 +321,17 @@ class EpochProcessor:
         return verdicts
 
     def _position_verdicts(
-        self, pair: PairedEpochs | None, published: Mapping[str, Published]
+        self, pair: PairedEpochs | None, chainage_m: Mapping[str, Floats]
     ) -> dict[str, tuple[PositionVerdict, ...]]:
         """Return the verdicts of the screens of the published positions, by antenna; both antennas get the status."""
         checks: dict[str, tuple[PositionVerdict, ...]] = {}
         for screen, limits in self._screens:
             if pair is None or not isinstance(screen, PositionScreen):
                 continue
-            front, rear = published["front"].chainage_m, published["rear"].chainage_m
-            verdict = screen.judge(front[pair.front_epoch], rear[pair.rear_epoch], pair, limits)
+            front, rear = chainage_m["front"][pair.front_epoch], chainage_m["rear"][pair.rear_epoch]
+            verdict = screen.judge(front, rear, pair, limits)
             for name, epochs in (("front", pair.front_epoch), ("rear", pair.rear_epoch)):
-                screened = on_pairs(verdict, published[name].chainage_m.shape, epochs, epochs)
+                screened = on_pairs(verdict, chainage_m[name].shape, epochs, epochs)
                 checks[name] = (*checks.get(name, ()), PositionVerdict(screen.name, screened, int(screen.status)))
         return checks
 
@@ -377,13 +377,13 @@ class AntennaChunk:
         """Take the verdicts of the screens of common observations."""
         self._ranges = self._ranges.judged(verdicts)
 
-    def solved(self) -> Published:
-        """Solve and return what is published of the positions."""
+    def solved(self) -> Floats:
+        """Solve and return the chainages that are published, NaN where there is none, shape (T,) [m]."""
         processor = self._processor
         self._ranges, self._solution, self.state = solve(
             self._ranges, processor._index[self._name], processor.config, self.state
         )
-        return Published(chainage_m=processor.trajectories[self._name].chainage_at(self._solution.arc_m))
+        return processor.trajectories[self._name].chainage_at(self._solution.arc_m)
 
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """Take the verdicts of the screens of the published positions."""

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from railfix.core.arrays import Datetimes
+from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import RailfixError, SettingsError
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.compared import PositionVerdict, Published
+from railfix.pipeline.compared import PositionVerdict
 from railfix.pipeline.processor import AntennaChunk, EpochProcessor
 from railfix.pipeline.results import State
 from railfix.pipeline.smoothing import Replay, smooth
@@ -124,7 +124,7 @@ class AntennaRun:
         """See `ChunkSteps`."""
         self.chunk.judge(verdicts)
 
-    def solved(self) -> Published:
+    def solved(self) -> Floats:
         """See `ChunkSteps`."""
         return self.chunk.solved()
 
@@ -253,10 +253,10 @@ class OtherProcess:
         self._ask("judge", tuple(verdicts))
         self._ask("solved")
 
-    def solved(self) -> Published:
+    def solved(self) -> Floats:
         """See `ChunkSteps`."""
-        published: Published = self._answer()
-        return published
+        chainage_m: Floats = self._answer()
+        return chainage_m
 
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """See `ChunkSteps`."""
