@@ -14,6 +14,8 @@ import railfix
 from railfix.cli import app
 from railfix.core.errors import SettingsError
 from railfix.core.geodesy import geodetic_from_ecef
+from railfix.pipeline.config import parse_config
+from railfix.pipeline.level_stage import risk_of
 from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.ranges.sbas.messages import with_parity
 from ubx_made import log_of
@@ -125,3 +127,9 @@ def test_without_a_message_every_satellite_is_rejected(log: dict[str, Path]) -> 
     assert np.isnan(result.antennas["front"].chainage_m).all()
     with pytest.raises(SettingsError, match="give its PRN"):
         railfix.EpochProcessor(railfix.Config(sbas="stream"), line)
+
+
+def test_the_budget_beside_sbas_is_one_object_so_that_a_live_epoch_finds_its_allocation_kept() -> None:
+    config = parse_config({"sbas": "stream"})
+    assert risk_of(config) is risk_of(config)
+    assert set(risk_of(config).satellite_prior.values()) == {0.0}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
-from railfix.core.arrays import Floats, Masks
+from railfix.core.arrays import Floats, Masks, read_only
 from railfix.core.geodesy import geodetic_from_ecef
 from railfix.core.reasons import CHECK_FAILED, POSITIONED, Status
 from railfix.pipeline.config import Config
@@ -18,10 +19,11 @@ from railfix.pipeline.solution import Solution
 from railfix.track.trajectory import Trajectory
 
 
-def with_coordinates(config: Config) -> Masks:
-    """Return which statuses come with coordinates, by the number of the status."""
-    dropped = CHECK_FAILED if config.failed_checks == "drop" else ()
-    return np.array([status in POSITIONED and status not in dropped for status in sorted(Status)])
+@lru_cache
+def with_coordinates(failed_checks: str) -> Masks:
+    """Return which statuses come with coordinates, by the number of the status; of `Config.failed_checks`."""
+    dropped = CHECK_FAILED if failed_checks == "drop" else ()
+    return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))
 
 
 def antenna_result(
@@ -29,7 +31,7 @@ def antenna_result(
 ) -> AntennaResult:
     """Return the result of one antenna."""
     obs, point, constrained = corrected.observations, solution.point, solution.place.constrained
-    has = with_coordinates(config)[solution.status]
+    has = with_coordinates(config.failed_checks)[solution.status]
     arc = np.where(has, solution.arc_m, np.nan)
     ecef = trajectory.at_arc(arc)
     latitude, longitude, height = geodetic_from_ecef(ecef)

@@ -19,6 +19,7 @@ A preset names a set of settings; single settings override it.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -276,6 +277,12 @@ class Config(ScreenSettings):
         if "code" not in value or len(set(value)) != len(value):
             raise ValueError("name each measurement once, code among them: places are sought by codes")
         return tuple(name for name in FILTER_SOURCES if name in value)
+
+    @cached_property
+    def local_risk(self) -> RiskBudget:
+        """Risk budget of local faults alone, where SBAS covers those of the satellites."""
+        none = dict.fromkeys(self.risk.satellite_prior, 0.0)
+        return self.risk.replaced(satellite_prior=none, constellation_prior={})
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

@@ -103,9 +103,7 @@ def level_facts(config: Config) -> dict[str, Any]:
 
 def risk_of(config: Config) -> RiskBudget:
     """Return the risk budget in use: with SBAS, satellite faults are covered by it and only local ones are left."""
-    if kind_of(config) == "separation":
-        return config.risk
-    return config.risk.replaced(satellite_prior=dict.fromkeys(config.risk.satellite_prior, 0.0), constellation_prior={})
+    return config.risk if kind_of(config) == "separation" else config.local_risk
 
 
 def level_scale(scale: Floats, config: Config) -> Floats:

@@ -123,7 +123,8 @@ class EpochProcessor:
         )
         self._track, self._units = track, units
         self._features: dict[str, LineFeatures] = {}
-        self._has_coordinates = with_coordinates(config)
+        self._has_coordinates = with_coordinates(config.failed_checks)
+        self._before_filter = FilterState()
         self._lacking = self._unable()
 
     @property
@@ -222,7 +223,7 @@ class EpochProcessor:
             observations,
             state.received or self.received,
             state.antennas.get(name) or AntennaState(),
-            state.fusion.get(name) or FilterState(),
+            state.fusion.get(name) or self._before_filter,
             sensors,
         )
 
