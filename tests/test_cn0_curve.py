@@ -132,7 +132,7 @@ def test_kinds(satellite: str, kind: str) -> None:
 # -- the file -----------------------------------------------------------------------------------------------
 
 SOURCE = Cn0CurveSource(
-    antenna='NOV703GGG.R2    NONE "x" \\', receiver="TRE_G3T\tDELTA", marker="駅", files=(("day.crx.gz", "ab" * 32),),
+    antenna='NOV703GGG.R2    NONE "x" \\', receiver="TRE_G3T\tDELTA", marker="駅", file=({"name": "day.crx.gz", "sha256": "ab" * 32},),
     start="2021-01-01T00:00:00", end="2021-01-01T23:59:30", epochs=2880, position_ecef_m=(1.5, -2.25, 3.0),
     railfix_version="0.1.0",
 )  # fmt: skip
@@ -230,7 +230,8 @@ def test_command_on_the_demonstration(tmp_path: Path) -> None:
     assert "0.1 h long" in printed
     curve = read_cn0_curve(out)
     assert curve.source.receiver == "SIMULATED"
-    assert dict(curve.source.files)["nav.rnx.gz"] == hashlib.sha256((DEMO / "nav.rnx.gz").read_bytes()).hexdigest()
+    digests = {file.name: file.sha256 for file in curve.source.file}
+    assert digests["nav.rnx.gz"] == hashlib.sha256((DEMO / "nav.rnx.gz").read_bytes()).hexdigest()
     assert curve.source.epochs == 2000
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["curve.png", "curve.toml"]

@@ -7,6 +7,7 @@ from .curve import (
     Cn0Mean,
     Cn0Samples,
     CurveFit,
+    SourceFile,
     fit_cn0_curve,
     satellite_kind,
 )
@@ -21,6 +22,7 @@ __all__ = [
     "Cn0Mean",
     "Cn0Samples",
     "CurveFit",
+    "SourceFile",
     "cn0_curve_from_log",
     "fit_cn0_curve",
     "read_cn0_curve",

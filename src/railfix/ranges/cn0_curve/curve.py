@@ -129,6 +129,13 @@ class Cn0Mean:
         return np.asarray(self._interpolated(inside), dtype=np.float64)
 
 
+class SourceFile(Settings):
+    """A file that a curve was made from, and its SHA-256."""
+
+    name: str
+    sha256: str
+
+
 class Cn0CurveSource(Settings):
     """Log that a curve was made from.
 
@@ -136,24 +143,24 @@ class Cn0CurveSource(Settings):
     ----------
     antenna, receiver, marker : str
         From the header of the log, as written.
-    files : tuple of (name, SHA-256)
     start, end : str
         First and last epoch used, ISO 8601, GPS time.
     epochs : int
     position_ecef_m : tuple of float
         Position of the antenna.
     railfix_version : str
+    file : tuple of SourceFile
     """
 
     antenna: str = ""
     receiver: str = ""
     marker: str = ""
-    files: tuple[tuple[str, str], ...] = ()
     start: str = ""
     end: str = ""
-    epochs: int = 0
+    epochs: int = Field(default=0, ge=0, strict=True)
     position_ecef_m: tuple[float, ...] = ()
     railfix_version: str = ""
+    file: tuple[SourceFile, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,25 +36,6 @@ FORMAT: Final = "railfix C/N0 curve 1"
 _DIGITS: Final = {"elevation_deg": 3, "mean_dbhz": 2, "spread_db": 2, "count": 0}
 
 
-class _SourceFile(Settings):
-    name: str
-    sha256: str
-
-
-class _Source(Settings):
-    """`Cn0CurveSource`, its files one table each."""
-
-    antenna: str = ""
-    receiver: str = ""
-    marker: str = ""
-    start: str = ""
-    end: str = ""
-    railfix_version: str = ""
-    epochs: int = Field(default=0, ge=0, strict=True)
-    position_ecef_m: tuple[float, ...] = ()
-    file: tuple[_SourceFile, ...] = ()
-
-
 def _number(low: float, high: float) -> object:
     return Field(ge=low, le=high, strict=True, allow_inf_nan=False)
 
@@ -81,7 +62,7 @@ class _File(Settings):
     """Content of the file."""
 
     format: Literal["railfix C/N0 curve 1"]
-    source: _Source
+    source: Cn0CurveSource
     curve: tuple[_Curve, ...] = Field(min_length=1)
 
 
@@ -93,8 +74,6 @@ def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
     OutputError
         The file cannot be written.
     """
-    source = curve.source.model_dump(exclude={"files"})
-    files = [{"name": name, "sha256": digest} for name, digest in curve.source.files]
     curves = [
         {
             "kind": mean.kind,
@@ -104,8 +83,8 @@ def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
         for mean in curve.means
     ]
     comment = "Mean C/N0 over elevation, measured under open sky; belongs to this antenna and receiver only."
-    position = np.round(curve.source.position_ecef_m, 3).tolist()
-    values = {"format": FORMAT, "source": {**source, "position_ecef_m": position, "file": files}, "curve": curves}
+    source = {**curve.source.model_dump(), "position_ecef_m": np.round(curve.source.position_ecef_m, 3).tolist()}
+    values = {"format": FORMAT, "source": source, "curve": curves}
     write_toml(path, values, what="curve", comment=comment)
 
 
@@ -118,15 +97,11 @@ def read_cn0_curve(path: FilePath) -> Cn0Curve:
         The file is missing, unreadable, no curve, or an entry of it is unknown, missing or out of range.
     """
     file = read_model_file(_File, path, what="a C/N0 curve", format_name=FORMAT, command="railfix cn0-curve")
-    source = Cn0CurveSource(
-        **file.source.model_dump(exclude={"file"}),
-        files=tuple((entry.name, entry.sha256) for entry in file.source.file),
-    )
     means = tuple(
         _mean(path, curve, f"curve {i + 1} ({curve.kind} {curve.signal})") for i, curve in enumerate(file.curve)
     )
     try:
-        return Cn0Curve(means=means, source=source)
+        return Cn0Curve(means=means, source=file.source)
     except ValueError as error:
         raise InputFileError(path, f"{error}; each kind and signal stands once") from None
 

@@ -19,7 +19,15 @@ from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.gnss.orbits import satellite_states
 from railfix.io.logs import read_navigation, scan_observations
-from railfix.ranges.cn0_curve.curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Samples, CurveFit, fit_cn0_curve
+from railfix.ranges.cn0_curve.curve import (
+    KINDS,
+    Cn0Curve,
+    Cn0CurveSource,
+    Cn0Samples,
+    CurveFit,
+    SourceFile,
+    fit_cn0_curve,
+)
 
 #: P1 2.3(1) asks for about a day; below this a note is made [s].
 _SHORT_S: Final = 12 * 3600.0
@@ -127,12 +135,12 @@ def cn0_curve_from_log(
         antenna=header.antenna,
         receiver=header.receiver,
         marker=header.marker,
-        files=tuple((path.name, file_sha256(path)) for path in (*observations, *navigation)),
         start=str(start),
         end=str(end),
         epochs=epochs,
         position_ecef_m=tuple(place.tolist()),
         railfix_version=__version__,
+        file=tuple(SourceFile(name=p.name, sha256=file_sha256(p)) for p in (*observations, *navigation)),
     )
     try:
         curve = fit_cn0_curve(samples, fit=fit, source=source)
