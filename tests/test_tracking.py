@@ -14,7 +14,7 @@ from railfix.tracking.robust import applied, log_evidence, prior_of, robust_upda
 from railfix.tracking.rows import Rows
 from railfix.tracking.state import TrackState
 from railfix.tracking.student_t import Tails
-from tracking_cases import Ride, bent_line, part, ride, wheel, without_epochs
+from tracking_cases import Ride, bent_line, part, reflected, ride, wheel, without_epochs
 
 
 def _in_parts(ride: Ride, cuts: list[int]) -> tuple[list[Tracked], TrackState | None]:
@@ -111,6 +111,38 @@ def test_a_clock_step_of_a_millisecond_moves_nothing() -> None:
     moved = replace(case.epochs, code_m=case.epochs.code_m + step, phase_m=case.epochs.phase_m + step)
     result, _ = track(moved, case.line)
     assert np.abs(result.arc_m - case.arc_m)[20:].max() < 0.1
+
+
+@pytest.mark.requirement("E5")
+def test_a_few_satellites_of_one_wall_do_not_stop_the_train() -> None:
+    """They agree with each other on rest; at 15 m/s a second before no train is."""
+    case = ride(noise=1.0, seed=3)
+    epochs = reflected(case, 80)
+    result, _ = track(epochs, case.line)
+    error = np.abs(result.arc_m - case.arc_m)
+    assert result.status[80] == TrackStatus.COASTING
+    assert result.speed_mps[80] == pytest.approx(15.0, abs=2.0)
+    assert error[80:].max() < 4.0
+    believed, _ = track(epochs, case.line, limits=TrackingLimits(trusted_satellites=0))
+    assert np.abs(believed.arc_m - case.arc_m)[80:85].min() > 8.0
+
+
+@pytest.mark.requirement("E5")
+def test_emergency_braking_is_followed() -> None:
+    """3 m/s2 down to rest, by all satellites and by a wheel with three of them."""
+    case = ride(
+        noise=1.0,
+        speed_mps=lambda t: np.where(t < 60.0, np.minimum(0.5 * t, 15.0), np.maximum(15.0 - 3.0 * (t - 60.0), 0.0)),
+    )
+    few = replace(
+        case.epochs,
+        **{n: np.where(np.arange(10) < 3, getattr(case.epochs, n), np.nan) for n in ("code_m", "phase_m", "rate_mps")},
+    )
+    found, _ = track(case.epochs, case.line)
+    by_wheel, _ = track(few, case.line, sensors=wheel(case))
+    for result in (found, by_wheel):
+        assert (result.status[60:70] == TrackStatus.TRACKING).all()
+        assert np.abs(result.speed_mps - case.speed_mps)[58:70].max() < 0.5
 
 
 @pytest.mark.requirement("E5")

@@ -12,7 +12,7 @@ import pytest
 
 from railfix import kernels
 from railfix.tracking import GnssEpochs, Line, SensorEpochs, Tracked, TrackState, track
-from tracking_cases import bent_line, part, ride, without_epochs
+from tracking_cases import bent_line, part, reflected, ride, without_epochs
 
 pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed (railfix[fast])")
 
@@ -70,6 +70,8 @@ def _case(name: str) -> tuple[GnssEpochs, Line, SensorEpochs | None]:
         joined[random.random(code.shape) < 0.1] = False
         step = 299_792.458 * (np.arange(len(code)) >= 50)[:, None]
         epochs = replace(epochs, code_m=code + step, phase_m=epochs.phase_m + step, phase_joined=joined, rate_mps=rate)
+    if name == "one wall":
+        epochs = reflected(case, 80)
     if name == "off map":
         away = np.zeros(len(case.arc_m), dtype=bool)
         away[40:60] = away[:3] = True
@@ -82,7 +84,7 @@ def _case(name: str) -> tuple[GnssEpochs, Line, SensorEpochs | None]:
 
 
 @pytest.mark.requirement("E5")
-@pytest.mark.parametrize("name", ["plain", "10 Hz", "branches", "sensors", "faults", "gap", "off map"])
+@pytest.mark.parametrize("name", ["plain", "10 Hz", "branches", "sensors", "faults", "gap", "one wall", "off map"])
 def test_the_compiled_filter_gives_what_numpy_gives(name: str) -> None:
     epochs, line, sensors = _case(name)
     expected, one = _with("numpy", epochs, line, sensors=sensors)

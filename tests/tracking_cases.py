@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,12 +57,13 @@ def ride(
     noise: float = 0.0,
     code_sigma_m: float = 2.0,
     seed: int = 0,
+    speed_mps: Callable[[np.ndarray], np.ndarray] = lambda t: np.clip(0.5 * (t - 10.0), 0.0, 15.0),
 ) -> Ride:
-    """Start from rest, 0.5 m/s2 up to 15 m/s; `noise` scales white errors of the sizes that the filter assumes."""
+    """From rest with 0.5 m/s2 up to 15 m/s; `noise` scales white errors of the sizes that the filter assumes."""
     trajectory = trajectory or bent_line()
     random = np.random.default_rng(seed)
     t = np.arange(int(seconds * rate_hz)) / rate_hz
-    speed = np.clip(0.5 * (t - 10.0), 0.0, 15.0)
+    speed = speed_mps(t)
     whole = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) / rate_hz)])
     arc = start_m + whole
     line = Line.of(trajectory)
@@ -102,6 +104,23 @@ def without_epochs(epochs: GnssEpochs, mask: np.ndarray) -> GnssEpochs:
     """The same with nothing measured at some epochs."""
     blank = {name: np.where(mask[:, None], np.nan, getattr(epochs, name)) for name in ("code_m", "phase_m", "rate_mps")}
     return replace(epochs, **blank)
+
+
+def reflected(ride: Ride, epoch: int, *, satellites: int = 3) -> GnssEpochs:
+    """Two epochs with one satellite, and one with a few that agree on rest 20 m back: reflected by one wall."""
+    line, epochs = ride.line, ride.epochs
+    code, phase, rate = (np.array(values) for values in (epochs.code_m, epochs.phase_m, epochs.rate_mps))
+    joined = np.array(epochs.phase_joined)
+    for values in (code, phase, rate):
+        values[epoch - 2 : epoch, 1:] = np.nan
+        values[epoch, satellites:] = np.nan
+    place, _ = line.at(ride.arc_m[[epoch]] - 20.0)
+    direct, _ = line.at(ride.arc_m[[epoch]])
+    away, near = (range_with_rotation(epochs.sat_ecef_m[[epoch]], p[:, None, :])[0][0] for p in (place, direct))
+    code[epoch] += away - near
+    rate[epoch] = np.where(np.isfinite(rate[epoch]), 30.0, np.nan)
+    joined[epoch : epoch + 2] = False
+    return replace(epochs, code_m=code, phase_m=phase, rate_mps=rate, phase_joined=joined)
 
 
 def part(epochs: GnssEpochs, which: slice) -> GnssEpochs:

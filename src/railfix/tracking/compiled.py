@@ -15,7 +15,7 @@ import numpy as np
 
 from railfix.core.arrays import Floats, Indices
 from railfix.core.timescale import seconds, timedelta
-from railfix.tracking import bank, branches, clocks, misfit, predict, rows
+from railfix.tracking import bank, branches, clocks, misfit, possible_speed, predict, rows
 from railfix.tracking.chunk import Chunk
 from railfix.tracking.epochs import SensorEpochs
 from railfix.tracking.limits import TrackingLimits
@@ -125,7 +125,7 @@ class Compiled:
         origin = self.chunk.time[0]
         scalars = np.array([
             count, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m, state.direction,
-            seconds(state.measured - origin), *state.code_shift, state.map_log_scale,
+            seconds(state.measured - origin), *state.code_shift, state.map_log_scale, *state.speed_range_mps,
         ])  # fmt: skip
         memory = self.layout.Memory(
             mean=_own(state.mean[:, full]),
@@ -240,10 +240,11 @@ class Compiled:
         state.log_probability = memory.log_probability[:count].copy()
         state.origin_m = memory.origin_m[:count].copy()
         state.time = self.chunk.time[done - 1]
-        _, motion, code, doppler, phase, unaided, direction, measured, *shift, map_scale = memory.scalars.tolist()
+        _, motion, code, doppler, phase, unaided, direction, measured, *learnt = memory.scalars.tolist()
         state.weak_motion_s, state.weak_code_s, state.log_scale = motion, code, (doppler, phase)
         state.unaided_m, state.direction = unaided, direction
-        state.code_shift, state.map_log_scale = (shift[0], shift[1]), map_scale
+        state.code_shift, state.map_log_scale = (learnt[0], learnt[1]), learnt[2]
+        state.speed_range_mps = (learnt[3], learnt[4])
         state.measured = self.chunk.time[0] + timedelta(measured)
 
 
@@ -335,6 +336,7 @@ def _numbers(layout: ModuleType, limits: TrackingLimits) -> Any:
         "moved_m": MOVED_M,
         "relinearised": RELINEARISED,
         "sensor_floor": SENSOR_FLOOR,
+        "speed_sigmas": possible_speed.SPEED_SIGMAS,
         "direction_mps": rows.DIRECTION_MPS,
         "chord_m": rows.CHORD_M,
         "gravity_mps2": rows.GRAVITY_MPS2,

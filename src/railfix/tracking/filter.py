@@ -19,6 +19,7 @@ from railfix.tracking.epochs import GnssEpochs, SensorEpochs
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.misfit import code_shift, learn_map
+from railfix.tracking.possible_speed import possible, widen
 from railfix.tracking.predict import predicted
 from railfix.tracking.result import Tracked, TrackStatus, write_place, write_rows
 from railfix.tracking.robust import (
@@ -134,15 +135,16 @@ def _step(
     mean = state.mean
     sensed = sensor_rows(sensors, epoch, line, mean, dt, state.direction)
     rows = rows_of(chunk, epoch, line, mean, mean[:, _PLACES], state.log_scale, sensed)
-    if len(rows.variance):
-        _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost, levels, step)
-    elif state.bank is not None:
+    widen(state, dt, limits)
+    measured = len(rows.variance) > 0
+    measured = measured and _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost, levels, step)
+    if not measured and state.bank is not None:
         means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
     speed = float(state.mean[most_probable(state.log_probability), Unknown.SPEED])
     if abs(speed) > DIRECTION_MPS:
         state.direction = float(np.sign(speed))
-    state.unaided_m = 0.0 if rows.bounds[0] else state.unaided_m + abs(speed) * dt
+    state.unaided_m = 0.0 if measured and rows.bounds[0] else state.unaided_m + abs(speed) * dt
     if state.hypotheses > 1:
         chosen, probability = surviving(state.mean, state.covariance, state.log_probability, state.origin_m, limits)
         state.mean, state.covariance = state.mean[chosen], state.covariance[chosen]
@@ -152,7 +154,7 @@ def _step(
     if trace is not None:
         step.mean, step.covariance, step.parent = state.mean, state.covariance, state.parent
         trace.append(step)
-    write_place(result, epoch, state, measured=len(rows.variance) > 0, lost=lost, limits=limits)
+    write_place(result, epoch, state, measured=measured, lost=lost, limits=limits)
 
 
 def _measure(
@@ -167,11 +169,11 @@ def _measure(
     lost: bool,
     levels: bool,
     step: Step,
-) -> None:
-    """Update the state by the rows of an epoch."""
+) -> bool:
+    """Update the state by the rows of an epoch; return False where no train can do what they say."""
     dt = float(chunk.interval_s[epoch])
     before, predicted_covariance = state.mean, state.covariance
-    mean, covariance, state.offset_known = clocks_of_epoch(
+    mean, covariance, offset_known = clocks_of_epoch(
         rows, chunk.offset, before, predicted_covariance, state.offset_known
     )
     value = rows.value - (rows.design @ (rows.combine @ (mean - before)[..., None]))[..., 0]
@@ -196,6 +198,13 @@ def _measure(
         prior = prior_of(settled, covariance)
         update = robust_update(settled, prior, update.weight, tails=tails, passes=passes)
         after = applied(mean, covariance, prior, update)
+    satellites = max(part.stop - part.start for part in rows.common[1:])
+    trusted = not 0 < satellites < limits.trusted_satellites or len(rows.variance) > rows.bounds[2]
+    if state.hypotheses == 1 and not possible(state, after[0][0], after[1][0], trusted=trusted):
+        state.weak_motion_s += dt
+        write_rows(result, epoch, rows, rows.value[0], np.zeros_like(update.weight[0]))
+        return False
+    state.offset_known = offset_known
     if state.hypotheses > 1:
         evidence = log_evidence(settled, prior, update, tails)
         log_probability = judged(state.log_probability, evidence, line.at(after[0][:, Unknown.PLACE])[0], limits)
@@ -218,6 +227,7 @@ def _measure(
     learn(state, rows, update, best, dt, limits)
     learn_map(state, 0.0 if best else shift, dt, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
+    return True
 
 
 def _least(weight: Floats) -> float:

@@ -10,7 +10,7 @@ from railfix.tracking.chunk import Chunk
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.predict import predicted
-from railfix.tracking.state import Narrowed, TrackState, Unknown
+from railfix.tracking.state import ANY_SPEED, Narrowed, TrackState, Unknown
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> bool:
@@ -65,7 +65,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
         state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
         state.narrowed = narrowed
     state.weak_motion_s = state.weak_code_s = 0.0
-    state.code_shift = (0.0, 0.0)
+    state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
     return lost
 
 

@@ -56,6 +56,8 @@ class Unknown(IntEnum):
 OFFSETS: Final = len(Unknown)
 #: First error of a satellite.
 SATELLITES: Final = OFFSETS + len(CLOCKS)
+#: Bounds of the speed where nothing is known of it [m/s].
+ANY_SPEED: Final = (-np.inf, np.inf)
 #: Unknowns that begin anew at every epoch: clock of the codes, displacements of the map.
 FRESH: Final = slice(Unknown.CODE_CLOCK, Unknown.STEP_ALONG + 1)
 
@@ -146,6 +148,9 @@ class TrackState:
         Way since codes were used.
     direction : float
         Sign of the last speed with a direction.
+    speed_range_mps : tuple of float
+        Speeds that are possible after those measured so far (`railfix.tracking.possible_speed`); no bounds while there
+        are several hypotheses.
     """
 
     time: np.datetime64
@@ -168,6 +173,7 @@ class TrackState:
     narrowed: list[Narrowed | None] | None = None
     unaided_m: float = 0.0
     direction: float = 0.0
+    speed_range_mps: tuple[float, float] = ANY_SPEED
 
     @property
     def map_scale(self) -> float:
@@ -216,6 +222,7 @@ class TrackState:
         self.weak_motion_s = self.weak_code_s = self.unaided_m = self.direction = 0.0
         self.code_shift = self.log_scale = (0.0, 0.0)
         self.map_log_scale = 0.0
+        self.speed_range_mps = ANY_SPEED
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:

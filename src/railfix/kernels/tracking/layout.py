@@ -98,6 +98,9 @@ class Numbers(NamedTuple):
     least_probability: float
     most_hypotheses: int
     start_sigma_m: float
+    service_acceleration_mps2: float
+    trusted_satellites: int
+    speed_sigmas: float
     gap_s: float
     lost_motion_weight: float
     lost_motion_s: float
@@ -255,7 +258,7 @@ class Work(NamedTuple):
 
 
 HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
-SHIFT, SHIFT_VARIANCE, MAP_SCALE = 8, 9, 10
+SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED = 8, 9, 10, 11, 12
 
 
 class Answers(NamedTuple):

@@ -19,8 +19,10 @@ from railfix.kernels.tracking.layout import (
     DIRECTION,
     DRIFT,
     HYPOTHESES,
+    LEAST_SPEED,
     MAP_SCALE,
     MEASURED,
+    MOST_SPEED,
     OF_EPOCH,
     OLD_PLACE,
     PHASE_CLOCK,
@@ -248,7 +250,7 @@ def _update(
     rows: Rows,
     work: Work,
 ) -> float:
-    """Update all hypotheses by the measurements of an epoch; return the shift that codes ask of the one in the lead."""
+    """Write all hypotheses after an epoch's measurements; return the shift that codes ask of the one in the lead."""
     mean, new_mean = work.mean, work.new_mean
     n, room = mean.shape[1] - OF_EPOCH, mean.shape[0] - 1
     count, nc = int(memory.scalars[HYPOTHESES]), rows.counts[0]
@@ -286,8 +288,28 @@ def _update(
         reweigh(course, numbers, rows, memory, work, count)
     for h in range(count):
         onto_line(course, numbers.start_sigma_m, work, h)
-        _take(memory.mean, memory.covariance, h, new_mean, work.new_covariance, h)
     return shift
+
+
+@borrowing
+def _possible(numbers: Numbers, memory: Memory, rows: Rows, work: Work, dt: float, measured: bool) -> bool:
+    """Return whether the speed after an epoch is possible, and narrow its range: `railfix.tracking.possible_speed`."""
+    scalars, counts = memory.scalars, rows.counts
+    low, high = -math.inf, math.inf
+    if int(scalars[HYPOTHESES]) == 1:
+        change = numbers.service_acceleration_mps2 * dt
+        low, high = scalars[LEAST_SPEED] - change, scalars[MOST_SPEED] + change
+        if measured:
+            satellites = max(counts[1], counts[2])
+            if not 0 < satellites < numbers.trusted_satellites or counts[3] > 0:
+                low, high = -math.inf, math.inf
+            speed = work.new_mean[0, SPEED]
+            reach = numbers.speed_sigmas * math.sqrt(work.new_covariance[0, SPEED, SPEED])
+            if speed + reach < low or speed - reach > high:
+                return False
+            low, high = max(low, speed - reach), min(high, speed + reach)
+    scalars[LEAST_SPEED], scalars[MOST_SPEED] = low, high
+    return True
 
 
 @borrowing
@@ -427,6 +449,11 @@ def advance(
         if measured:
             _write_variances(epochs, t, memory, rows, work.variance)
             shift = _update(epochs, t, course, numbers, active, memory, rows, work)
+        if not _possible(numbers, memory, rows, work, dt, measured):
+            return t
+        if measured:
+            for h in range(count):
+                _take(memory.mean, memory.covariance, h, work.new_mean, work.new_covariance, h)
             scalars[MEASURED] = epochs.time_s[t]
         else:
             _coast(epochs, t, course, numbers, active, memory, bank, work, room)
