@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from pipeline_cases import clean_files, clean_observations
+from pipeline_cases import clean_files, clean_observations, processor
 from railfix.core.constants import SPEED_OF_LIGHT
 from railfix.core.geodesy import ecef_from_geodetic, elevation_azimuth, enu_axes
 from railfix.core.timescale import timedelta
@@ -32,7 +32,10 @@ from railfix.screens import (
     pair_epochs,
     spacing_direction,
 )
+from railfix.screens.antenna_spacing import SCREEN
+from railfix.screens.base import PairedEpochs
 from railfix.screens.pairs import on_pairs
+from railfix.tracking import TrackStatus
 
 START = np.datetime64("2021-01-01T00:00:00", "ns")
 NAN = np.nan
@@ -423,3 +426,38 @@ def test_positions_are_checked() -> None:
         antenna_spacing_screen([1.0], [2.0], 3.0, facing=2)
     with pytest.raises(ValueError, match="spacing_m"):
         antenna_spacing_screen([1.0], [2.0], -3.0)
+
+
+def test_places_by_the_filter_differ_by_more_than_the_limit_and_noise() -> None:
+    pair = PairedEpochs(
+        front_epoch=np.arange(4),
+        rear_epoch=np.arange(4),
+        front_ecef_m=np.zeros((4, 3)),
+        rear_ecef_m=np.zeros((4, 3)),
+        along_m=np.full(4, -18.0),
+    )
+    front, rear = np.array([100.0, 100.0, 100.0, np.nan]), np.array([118.0, 130.0, 130.0, 118.0])
+    found = SCREEN.judge_filtered(front, rear, np.array([1.0, 1.0, 5.0, 1.0]), pair, AntennaSpacingLimits())
+    np.testing.assert_allclose(found.metric, [0.0, 12.0, 12.0, np.nan])
+    np.testing.assert_array_equal(found.reject, [False, True, False, False])
+
+
+@pytest.mark.requirement("B5")
+@pytest.mark.parametrize("screens", [["elevation", "antenna_spacing"], ["elevation"]])
+def test_filtered_places_that_are_not_apart_as_the_antennas_are_doubtful(screens: list[str]) -> None:
+    """The log of the front antenna is given for both; with the rear one's own there is no doubt."""
+    parts = {name: log[:60] for name, log in clean_observations().items()}
+    one = processor({"screens": screens, "filter": "track", "tracking": {"level": "on"}})
+    good, _ = one.process(parts)
+    wrong, _ = one.process({"front": parts["front"], "rear": parts["front"]})
+    judged = "antenna_spacing" in screens
+    for name in ("front", "rear"):
+        clear, doubtful = good.fusion[name], wrong.fusion[name]
+        assert (clear.tracked.status[5:] == TrackStatus.TRACKING).all()
+        assert np.isfinite(clear.tracked.level_m[5:]).all()
+        expected = TrackStatus.ANTENNAS_DISAGREE if judged else TrackStatus.TRACKING
+        assert (doubtful.tracked.status[5:] == expected).all()
+        assert (np.isinf(doubtful.tracked.level_m[5:]) == judged).all()
+        if judged:
+            assert np.abs(clear.spacing_error_m[5:]).max() < 3.0
+            np.testing.assert_allclose(doubtful.spacing_error_m[5:], -18.0, atol=1.0)

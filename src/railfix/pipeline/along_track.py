@@ -22,6 +22,7 @@ from railfix.pipeline.return_gate import ReturnState, refused_codes
 from railfix.pipeline.sensor_epochs import SensorState, Surroundings, sensor_epochs
 from railfix.pipeline.smoothing import Replay, SmoothedTrack
 from railfix.positioning.carrier import SlipState, corrected_phase_m, find_slips
+from railfix.screens import Screened
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import GnssEpochs, Kind, Line, RangeEpochs, SensorEpochs, Tracked, TrackState, TrackStatus, track
 from railfix.tracking.levels import LevelState, with_levels
@@ -136,6 +137,8 @@ class AlongTrack:
     standstill : ndarray of bool, shape (T,)
     motion : ndarray of int8, shape (T,)
         `railfix.motion.slip.MotionState` since the epoch before, by wheel and inertial unit.
+    spacing_error_m : ndarray, shape (T,) [m]
+        Distance from the place of the other antenna less that of the antennas; NaN where it was not looked at.
     replay : tuple of Replay
         What the filter was given, to smooth it (`railfix.pipeline.smoothing`).
     """
@@ -150,6 +153,7 @@ class AlongTrack:
     direction: Codes
     standstill: Masks
     motion: Codes
+    spacing_error_m: Floats
     replay: tuple[Replay, ...] = ()
 
     @property
@@ -196,10 +200,7 @@ def along_track(
         (single.arc_m, single.sigma_m),
     )  # fmt: skip
     beside = (tracked.status == TrackStatus.TRACKING) & single.map_offset
-    status = np.where(beside, np.int8(TrackStatus.MAP_OFFSET), tracked.status)
-    unbounded = np.isfinite(tracked.level_m) & ~np.isin(status, BOUNDED)
-    level, amount = (np.where(unbounded, np.inf, values) for values in (tracked.level_m, tracked.amount_m))
-    tracked = replace(tracked, status=status, level_m=level, amount_m=amount)
+    tracked = _doubted(tracked, beside, TrackStatus.MAP_OFFSET)
     inside = on_line_m(tracked, trajectory)
     ecef = trajectory.at_arc(inside)
     latitude, longitude, height = geodetic_from_ecef(ecef)
@@ -216,9 +217,26 @@ def along_track(
         direction=direction.astype(np.int8),
         standstill=np.abs(speed) + 2.0 * sigma < STANDSTILL_MPS,
         motion=motion,
+        spacing_error_m=np.full(len(tracked), np.nan),
         replay=replays,
     )
     return result, replace(after, line=line)
+
+
+def checked(result: AlongTrack, spacing: Screened) -> AlongTrack:
+    """Return the positions with the verdict on their distance from those of the other antenna, shape (T,)."""
+    status = result.tracked.status
+    doubtful = spacing.reject & np.isin(status, BOUNDED)
+    tracked = _doubted(result.tracked, doubtful, TrackStatus.ANTENNAS_DISAGREE)
+    return replace(result, tracked=tracked, spacing_error_m=spacing.metric)
+
+
+def _doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:
+    """Places with a status of doubt at some epochs; nothing bounds their error there."""
+    told = np.where(doubtful, np.int8(status), tracked.status)
+    unbounded = np.isfinite(tracked.level_m) & ~np.isin(told, BOUNDED)
+    level, amount = (np.where(unbounded, np.inf, values) for values in (tracked.level_m, tracked.amount_m))
+    return replace(tracked, status=told, level_m=level, amount_m=amount)
 
 
 def _tracked(

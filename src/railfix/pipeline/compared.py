@@ -9,6 +9,13 @@ from railfix.core.arrays import Floats
 from railfix.screens import AntennaRanges, Screened, Verdict
 
 
+class Followed(NamedTuple):
+    """Places of one antenna by the filter and their standard deviations, shape (T,) [m]; NaN without one."""
+
+    chainage_m: Floats
+    sigma_m: Floats
+
+
 class PositionVerdict(NamedTuple):
     """Verdict of a screen on the positions of one antenna: doubtful ones get the status."""
 
@@ -31,3 +38,9 @@ class ChunkSteps(Protocol):
 
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """Take the verdicts of the screens of the published positions."""
+
+    def followed(self) -> Followed:
+        """Filter along the track and return its places; NaN where the filter is off."""
+
+    def check_filter(self, spacing: Screened | None) -> None:
+        """Take the verdict on the distance of those places; None where it was not looked at."""

@@ -17,12 +17,12 @@ from railfix.core.arrays import Floats, changed
 from railfix.gnss.navigation import Navigation
 from railfix.gnss.observations import Observations
 from railfix.motion.samples import GroundUnits, SensorSamples
-from railfix.pipeline.along_track import AlongTrack, FilterState, SingleEpochs, along_track
+from railfix.pipeline.along_track import AlongTrack, FilterState, SingleEpochs, along_track, checked
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.compared import ChunkSteps, PositionVerdict
+from railfix.pipeline.compared import ChunkSteps, Followed, PositionVerdict
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
@@ -42,6 +42,7 @@ from railfix.screens import (
     PairedEpochs,
     PairScreen,
     PositionScreen,
+    Screened,
     ScreenSetup,
     Verdict,
 )
@@ -273,6 +274,9 @@ class EpochProcessor:
         checks = self._position_verdicts(pair, published)
         for name, chunk in chunks.items():
             chunk.check(checks.get(name, ()))
+        spacing = self._filter_verdicts(pair, {name: chunk.followed() for name, chunk in chunks.items()})
+        for name, chunk in chunks.items():
+            chunk.check_filter(spacing.get(name))
 
     def _screened(
         self, name: str, obs: Observations, received: Received, state: AntennaState
@@ -336,6 +340,20 @@ class EpochProcessor:
                 checks[name] = (*checks.get(name, ()), PositionVerdict(screen.name, screened, int(screen.status)))
         return checks
 
+    def _filter_verdicts(self, pair: PairedEpochs | None, followed: Mapping[str, Followed]) -> dict[str, Screened]:
+        """Return the verdicts of the screens of positions on the places by the filter, by antenna."""
+        checks: dict[str, Screened] = {}
+        for screen, limits in self._screens:
+            if pair is None or self.config.filter == "off" or not isinstance(screen, PositionScreen):
+                continue
+            epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
+            front, rear = (followed[name].chainage_m[rows] for name, rows in epochs.items())
+            sigma = np.hypot(*(followed[name].sigma_m[rows] for name, rows in epochs.items()))
+            verdict = screen.judge_filtered(front, rear, sigma, pair, limits)
+            for name, rows in epochs.items():
+                checks[name] = on_pairs(verdict, followed[name].chainage_m.shape, rows, rows)
+        return checks
+
 
 class AntennaChunk:
     """A chunk of one antenna: the steps between which antennas are compared (`ChunkSteps`).
@@ -369,6 +387,7 @@ class AntennaChunk:
         self._processor, self._name, self._received, self._sensors = processor, name, received, sensors
         self._ranges, self.state = processor._screened(name, observations, received, state)
         self._solution: Solution | None = None
+        self._result: AntennaResult | None = None
 
     def screened(self) -> CorrectedRanges:
         """Return the corrected ranges after the screens of this antenna alone."""
@@ -397,23 +416,35 @@ class AntennaChunk:
             self._ranges = changed(self._ranges, screens=screens)
             self._solution = changed(self._solution, status=status)
 
-    def finished(self) -> AntennaResult:
-        """Return the result of the chunk."""
+    def followed(self) -> Followed:
+        """Filter along the track and return its places; NaN where the filter is off."""
         assert self._solution is not None, "solved() comes first"
         processor, trajectory = self._processor, self._processor.trajectories[self._name]
-        result = antenna_result(self._ranges, trajectory, self._solution, processor.config)
-        if processor.config.filter == "track":
-            self.tracked, self.filter_state = along_track(
-                self._ranges,
-                self._single_epochs(result),
-                trajectory,
-                self._received.navigation,
-                processor.config,
-                self.filter_state,
-                samples=self._sensors,
-                surroundings=processor.surroundings(self._name, self._sensors),
-            )
-        return result
+        result = self._result = antenna_result(self._ranges, trajectory, self._solution, processor.config)
+        if processor.config.filter == "off":
+            nowhere = np.full(len(result), np.nan)
+            return Followed(chainage_m=nowhere, sigma_m=nowhere)
+        self.tracked, self.filter_state = along_track(
+            self._ranges,
+            self._single_epochs(result),
+            trajectory,
+            self._received.navigation,
+            processor.config,
+            self.filter_state,
+            samples=self._sensors,
+            surroundings=processor.surroundings(self._name, self._sensors),
+        )
+        return Followed(chainage_m=self.tracked.chainage_m, sigma_m=self.tracked.tracked.sigma_m)
+
+    def check_filter(self, spacing: Screened | None) -> None:
+        """Take the verdict on the distance of those places; None where it was not looked at."""
+        if self.tracked is not None and spacing is not None:
+            self.tracked = checked(self.tracked, spacing)
+
+    def finished(self) -> AntennaResult:
+        """Return the result of the chunk."""
+        assert self._result is not None, "followed() comes first"
+        return self._result
 
     def _single_epochs(self, result: AntennaResult) -> SingleEpochs:
         """Results of single epochs that the filter along the track uses."""

@@ -29,7 +29,8 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "status": "`tracking`; `several_branches`, the most probable place of several; `coasting`, predicted without a "
     "measurement; `lost`, measurements contradict the track and places are sought again; `expired`, predicted too "
     "far; `not_started`; `off_map`, no place, the satellites put the train away from the line; `map_offset`, a place "
-    "on a line that 3-D positions of the last minutes lie beside or above",
+    "on a line that 3-D positions of the last minutes lie beside or above; `antennas_disagree`, the places of the two "
+    "antennas are not as far apart as the antennas",
     "chainage_m": "distance along the line from the first point of the track",
     "kilometrage_m": "the line's own marking, where the track has one",
     "along_sigma_m": "standard deviation along the line",
@@ -64,6 +65,7 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "force_offset_mps2": "offset of the accelerometer, as estimated",
     "map_scale": "factor on the error of lengths along the map (`tracking.map_scale_m`): above 1 where the "
     "pseudoranges keep moving against the map",
+    "metric_antenna_spacing_m": "distance of the two antennas' places less that of the antennas; empty for one antenna",
     "innovation_wheel_m": "way of the wheel since the epoch before less the predicted one",
     "innovation_radar_m": "the same of the radar",
     "innovation_force_mps2": "mean specific force forward less the predicted one",
@@ -169,6 +171,7 @@ def antenna_train(name: str, result: AlongTrack) -> pl.DataFrame:
             "wheel_scale": float_column(tracked.wheel_scale),
             "force_offset_mps2": float_column(tracked.force_offset_mps2),
             "map_scale": float_column(tracked.map_scale),
+            "metric_antenna_spacing_m": float_column(result.spacing_error_m),
             **{
                 f"innovation_{kind.name.lower()}_{unit}": float_column(tracked.sensed[:, kind - 3])
                 for kind, unit in ((Kind.WHEEL, "m"), (Kind.RADAR, "m"), (Kind.FORCE, "mps2"), (Kind.PLACE, "m"))

@@ -24,7 +24,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import RailfixError, SettingsError
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.compared import PositionVerdict
+from railfix.pipeline.compared import Followed, PositionVerdict
 from railfix.pipeline.processor import AntennaChunk, EpochProcessor
 from railfix.pipeline.results import State
 from railfix.pipeline.smoothing import Replay, smooth
@@ -37,7 +37,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
-from railfix.screens import AntennaRanges, Verdict
+from railfix.screens import AntennaRanges, Screened, Verdict
 from railfix.tracking import Line
 
 if TYPE_CHECKING:
@@ -131,6 +131,14 @@ class AntennaRun:
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """See `ChunkSteps`."""
         self.chunk.check(verdicts)
+
+    def followed(self) -> Followed:
+        """See `ChunkSteps`."""
+        return self.chunk.followed()
+
+    def check_filter(self, spacing: Screened | None) -> None:
+        """See `ChunkSteps`."""
+        self.chunk.check_filter(spacing)
 
     def finished(self) -> Rows:
         """Return what the chunk gives to the results."""
@@ -261,6 +269,16 @@ class OtherProcess:
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """See `ChunkSteps`."""
         self._ask("check", tuple(verdicts))
+        self._ask("followed")
+
+    def followed(self) -> Followed:
+        """See `ChunkSteps`."""
+        followed: Followed = self._answer()
+        return followed
+
+    def check_filter(self, spacing: Screened | None) -> None:
+        """See `ChunkSteps`."""
+        self._ask("check_filter", spacing)
         self._ask("finished")
 
     def finished(self) -> Rows:
@@ -320,7 +338,7 @@ def _serve(pipe: Connection, other_end: Connection, make: Callable[[], AntennaRu
             elif step == "screened":
                 shown = {item.name: getattr(answer, item.name) for item in fields(AntennaRanges)}
                 pipe.send((step, AntennaRanges(**shown)))
-            elif step in ("solved", "finished", "smoothed"):
+            elif step in ("solved", "followed", "finished", "smoothed"):
                 pipe.send((step, answer))
                 if step == "finished":
                     run.read_ahead()

@@ -25,9 +25,13 @@ class AntennaSpacingLimits(Settings):
     ----------
     limit_m : float [m]
         Largest difference from the spacing; P1 table 6: 5.
+    filter_sigmas : float
+        Places by the filter differ by more than the limit where both were predicted: by so many of their standard
+        deviations too.
     """
 
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
+    filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
 
 
 def antenna_spacing_screen(
@@ -92,6 +96,19 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         return antenna_spacing_screen(
             front_chainage_m, rear_chainage_m, np.abs(along), facing=np.sign(along).astype(int), limits=limits
         )
+
+    def judge_filtered(
+        self,
+        front_chainage_m: Floats,
+        rear_chainage_m: Floats,
+        sigma_m: Floats,
+        pair: PairedEpochs,
+        limits: AntennaSpacingLimits,
+    ) -> Screened:
+        """Return metric and verdict of pairs of places by the filter: beyond the limit and what noise explains."""
+        found = self.judge(front_chainage_m, rear_chainage_m, pair, limits)
+        beyond = np.abs(found.metric) > np.nan_to_num(limits.filter_sigmas * sigma_m, nan=np.inf)
+        return Screened(metric=found.metric, reject=found.reject & beyond)
 
     def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:
         """Yield the differences from the spacing against the limit."""

@@ -310,3 +310,9 @@ class PositionScreen(_OfTwoAntennas[Limits]):
     @abstractmethod
     def judge(self, front_chainage_m: Floats, rear_chainage_m: Floats, pair: PairedEpochs, limits: Limits) -> Screened:
         """Return metric and verdict of the P pairs of positions, chainages of shape (P,) [m]."""
+
+    @abstractmethod
+    def judge_filtered(
+        self, front_chainage_m: Floats, rear_chainage_m: Floats, sigma_m: Floats, pair: PairedEpochs, limits: Limits
+    ) -> Screened:
+        """Return the same for places by the filter along the track; `sigma_m` is that of their difference, (P,) [m]."""
