@@ -132,8 +132,8 @@ def test_kinds(satellite: str, kind: str) -> None:
 # -- the file -----------------------------------------------------------------------------------------------
 
 SOURCE = Cn0CurveSource(
-    antenna='NOV703GGG.R2    NONE "x" \\', receiver="TRE_G3T\tDELTA", marker="駅",
-    file=({"name": "day.crx.gz", "sha256": "ab" * 32},),
+    antenna='NOV703GGG.R2    NONE "x" \\', receiver="TRE_G3T\tDELTA",
+    marker="駅", file=({"name": "day.crx.gz", "sha256": "ab" * 32},),
     start="2021-01-01T00:00:00", end="2021-01-01T23:59:30", epochs=2880, position_ecef_m=(1.5, -2.25, 3.0),
     railfix_version="0.1.0",
 )  # fmt: skip
