@@ -26,7 +26,7 @@ from railfix.pipeline.corrected_ranges import without
 from railfix.pipeline.processor import AntennaResult
 from railfix.positioning.constrained import Constrained, constrained_position
 from railfix.positioning.intersystem_bias import OffsetState, tie_clocks
-from railfix.positioning.noise_scale import NoiseState, own_sigma_m, robust_scale
+from railfix.positioning.noise_scale import NoiseState, noise_age, own_sigma_m, robust_scale
 from railfix.positioning.normal_equations import Ranges, clock_groups
 from railfix.positioning.robust_fit import map_information, robust_fit
 from railfix.positioning.section_search import SearchIndex, search
@@ -209,7 +209,8 @@ def smartloc_chain(
     known = np.isfinite(got.arc_m)
     at = np.where(known[:, None], trajectory.at_arc(np.where(known, got.arc_m, 0.0)), middle)
     agreeing = robust_fit(ranges, at, information=map_information(trajectory, np.maximum(got.section, 0)))
-    scale, _ = robust_scale(time, agreeing, known, NoiseState(), limits=config.noise_scale)
+    age = noise_age(time, NoiseState(), limits=config.noise_scale)
+    scale, _ = robust_scale(age, agreeing, known, NoiseState(), limits=config.noise_scale)
     failed = np.zeros(len(ranges), dtype=bool)
     if "raim" in config.screens:
         model = constrained_model(ranges, trajectory, got.arc_m, section=got.section)
