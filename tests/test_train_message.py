@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import cbor2
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from railfix.io.train_message import (
@@ -90,6 +90,19 @@ def test_size_and_keys_of_a_message() -> None:
     assert len(KEYS) == 20
 
 
+def test_a_key_sent_twice_is_damage() -> None:
+    """RFC 8949, 5.6: a map with a key twice is not valid; a reader that takes the last one reads another message."""
+    data = encode(PLACED)
+    doubled = bytes([data[0] + 1]) + data[1:] + cbor2.dumps(KEYS["over_cm"]) + cbor2.dumps(7)
+    with pytest.raises(MessageError, match="a key twice"):
+        decode(doubled)
+    with pytest.raises(MessageError, match="a key twice"):
+        decode(b"\xbf" + data[1:] + b"\xff")
+    many = cbor2.dumps({**cbor2.loads(data), **dict.fromkeys(range(100, 120), 0)})
+    assert many[0] == 0xB8
+    assert decode(many) == PLACED
+
+
 @given(data=st.binary(max_size=300))
 @settings(max_examples=500)
 def test_any_bytes_are_a_message_or_an_error(data: bytes) -> None:
@@ -97,6 +110,7 @@ def test_any_bytes_are_a_message_or_an_error(data: bytes) -> None:
         assert isinstance(decode(data), TrainMessage)
 
 
+@example(place=54, value=2)
 @given(place=st.integers(0, 80), value=st.integers(1, 255))
 @settings(max_examples=300)
 def test_damaged_messages_never_raise_anything_else(place: int, value: int) -> None:

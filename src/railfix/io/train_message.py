@@ -167,6 +167,8 @@ def decode(data: bytes) -> TrainMessage:
         raise MessageError(f"is not CBOR ({type(error).__name__})") from None
     if not isinstance(values, dict) or not all(type(key) is int for key in values):
         raise MessageError("is not a map with integer keys")
+    if len(values) != _entries(data):
+        raise MessageError("has a key twice, or is a map without a length")
     version = values.get(_VERSION_KEY)
     if type(version) is not int or version != VERSION:
         raise MessageError(f"is of version {version!r}, {VERSION} was expected")
@@ -176,6 +178,12 @@ def decode(data: bytes) -> TrainMessage:
         if type(value) is not expected:
             raise MessageError(f"{name}: {type(value).__name__} instead of {expected.__name__}")
     return _validated(named)
+
+
+def _entries(data: bytes) -> int:
+    """Number of entries in the head of a CBOR map (RFC 8949, 3.1); -1 without a length."""
+    size = data[0] & 0x1F
+    return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
 
 def _validated(values: dict[str, Any]) -> TrainMessage:
