@@ -188,6 +188,24 @@ print(loaded, len(kernels.REGISTERED), *names)
 
 
 @with_numba
+@pytest.mark.slow
+@pytest.mark.requirement("A8")
+def test_a_session_on_a_new_machine_compiles_all_kernels_before_it_begins(tmp_path: Path) -> None:
+    """Twice in processes of their own: the second finds all of them on disk."""
+    program = """
+from railfix import kernels
+from railfix.live.warm_up import compile_kernels
+print(compile_kernels(), *kernels.missing())
+"""
+    environment = {**os.environ, kernels.VARIABLE: "numba", "NUMBA_CACHE_DIR": str(tmp_path)}
+    for expected in ("True", "False"):
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True
+        )
+        assert done.stdout.split() == [expected]
+
+
+@with_numba
 @pytest.mark.requirement("A7")
 def test_code_on_disk_is_that_of_all_files_that_it_calls(tmp_path: Path) -> None:
     """numba looks at the file of the function alone; here a change of what it calls compiles anew."""

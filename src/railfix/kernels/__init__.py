@@ -72,7 +72,7 @@ def compiled(name: str) -> Callable[..., Any]:
 def load() -> int:
     """Load all compiled functions, so that none is loaded while epochs wait; return how many, 0 with numpy.
 
-    Those that have never run on this machine are compiled at their first call.
+    Those that have never run on this machine (`missing`) are compiled at their first call.
     """
     if CHOSEN == "numpy":
         return 0
@@ -80,6 +80,14 @@ def load() -> int:
         import_module(f"railfix.kernels.{module}")
     loaded: int = import_module("railfix.kernels.compiling").load()
     return loaded
+
+
+def missing() -> list[str]:
+    """Return the names of the compiled functions that `load` found nothing of; none with numpy."""
+    if CHOSEN == "numpy":
+        return []
+    names: list[str] = import_module("railfix.kernels.compiling").missing()
+    return names
 
 
 def compiled_by(module: str) -> Callable[[Callable[Arguments, Returned]], Callable[Arguments, Returned]]:

@@ -127,3 +127,8 @@ def load() -> int:
             function.compile(signature)
             loaded += 1
     return loaded
+
+
+def missing() -> list[str]:
+    """Return the names of the functions of `COMPILED` without code for any types of arguments."""
+    return [function.py_func.__name__ for function in COMPILED if not function.signatures]

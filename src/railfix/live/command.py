@@ -28,6 +28,7 @@ from railfix.live.settings import LiveSettings
 from railfix.live.sinks import open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
+from railfix.live.warm_up import compile_kernels
 from railfix.pipeline.config import Config
 from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
@@ -85,6 +86,8 @@ async def run_live(inputs: LiveInputs) -> list[str]:
         messages_on_terminal = sys.stdout.isatty() and any(text.endswith("@-") for text in inputs.send)
         log = SessionLog(inputs.log, live, status=not messages_on_terminal)
         held.callback(log.close)
+        if compile_kernels():
+            log.say("kernels compiled for this processor; later sessions load them")
         sinks = []
         for text in inputs.send:
             full = "wait" if replay else "drop"

@@ -22,7 +22,14 @@ from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.assemble import antenna_result, with_coordinates
 from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
-from railfix.pipeline.compared import ChunkSteps, Followed, PositionVerdict
+from railfix.pipeline.compared import (
+    ChunkSteps,
+    Followed,
+    PositionVerdict,
+    filter_verdicts,
+    pair_verdicts,
+    position_verdicts,
+)
 from railfix.pipeline.config import Config
 from railfix.pipeline.corrected_ranges import CorrectedRanges, correct_ranges
 from railfix.pipeline.feature_stage import LineFeatures
@@ -40,13 +47,11 @@ from railfix.screens import (
     AntennaRanges,
     ObservationScreen,
     PairedEpochs,
-    PairScreen,
-    PositionScreen,
     Screened,
     ScreenSetup,
     Verdict,
 )
-from railfix.screens.pairs import on_pairs, pair_antennas
+from railfix.screens.pairs import pair_antennas
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
@@ -267,14 +272,14 @@ class EpochProcessor:
         """
         ranges = {name: chunk.screened() for name, chunk in chunks.items()}
         pair = self._pair(ranges)
-        verdicts = self._pair_verdicts(pair, ranges)
+        verdicts = pair_verdicts(self._screens, pair, ranges)
         for name, chunk in chunks.items():
             chunk.judge(verdicts.get(name, ()))
         published = {name: chunk.solved() for name, chunk in chunks.items()}
-        checks = self._position_verdicts(pair, published)
+        checks = position_verdicts(self._screens, pair, published)
         for name, chunk in chunks.items():
             chunk.check(checks.get(name, ()))
-        spacing = self._filter_verdicts(pair, {name: chunk.followed() for name, chunk in chunks.items()})
+        spacing = filter_verdicts(self._screens, pair, {name: chunk.followed() for name, chunk in chunks.items()})
         for name, chunk in chunks.items():
             chunk.check_filter(spacing.get(name))
 
@@ -313,46 +318,6 @@ class EpochProcessor:
             self.trajectories["rear"],
             tolerance_s=self.config.antenna_pair.tag_tolerance_s,
         )
-
-    def _pair_verdicts(
-        self, pair: PairedEpochs | None, ranges: Mapping[str, AntennaRanges]
-    ) -> dict[str, tuple[Verdict, ...]]:
-        """Return the verdicts of the screens of common observations, by antenna."""
-        verdicts: dict[str, tuple[Verdict, ...]] = {}
-        for screen, limits in self._screens:
-            if pair is not None and isinstance(screen, PairScreen):
-                for name, more in screen.judge(ranges["front"], ranges["rear"], pair, limits).items():
-                    verdicts[name] = (*verdicts.get(name, ()), *more)
-        return verdicts
-
-    def _position_verdicts(
-        self, pair: PairedEpochs | None, chainage_m: Mapping[str, Floats]
-    ) -> dict[str, tuple[PositionVerdict, ...]]:
-        """Return the verdicts of the screens of the published positions, by antenna; both antennas get the status."""
-        checks: dict[str, tuple[PositionVerdict, ...]] = {}
-        for screen, limits in self._screens:
-            if pair is None or not isinstance(screen, PositionScreen):
-                continue
-            front, rear = chainage_m["front"][pair.front_epoch], chainage_m["rear"][pair.rear_epoch]
-            verdict = screen.judge(front, rear, pair, limits)
-            for name, epochs in (("front", pair.front_epoch), ("rear", pair.rear_epoch)):
-                screened = on_pairs(verdict, chainage_m[name].shape, epochs, epochs)
-                checks[name] = (*checks.get(name, ()), PositionVerdict(screen.name, screened, int(screen.status)))
-        return checks
-
-    def _filter_verdicts(self, pair: PairedEpochs | None, followed: Mapping[str, Followed]) -> dict[str, Screened]:
-        """Return the verdicts of the screens of positions on the places by the filter, by antenna."""
-        checks: dict[str, Screened] = {}
-        for screen, limits in self._screens:
-            if pair is None or self.config.filter == "off" or not isinstance(screen, PositionScreen):
-                continue
-            epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
-            front, rear = (followed[name].chainage_m[rows] for name, rows in epochs.items())
-            sigma = np.hypot(*(followed[name].sigma_m[rows] for name, rows in epochs.items()))
-            verdict = screen.judge_filtered(front, rear, sigma, pair, limits)
-            for name, rows in epochs.items():
-                checks[name] = on_pairs(verdict, followed[name].chainage_m.shape, rows, rows)
-        return checks
 
 
 class AntennaChunk:

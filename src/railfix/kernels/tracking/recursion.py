@@ -19,10 +19,8 @@ from railfix.kernels.tracking.layout import (
     DIRECTION,
     DRIFT,
     HYPOTHESES,
-    LEAST_SPEED,
     MAP_SCALE,
     MEASURED,
-    MOST_SPEED,
     OF_EPOCH,
     OLD_PLACE,
     PHASE_CLOCK,
@@ -47,6 +45,7 @@ from railfix.kernels.tracking.layout import (
 )
 from railfix.kernels.tracking.level import advance_subfilters, level_of, speed_bound
 from railfix.kernels.tracking.misfit import code_shift, learn_map
+from railfix.kernels.tracking.possible_speed import possible
 from railfix.kernels.tracking.prediction import add_bend, predict
 from railfix.kernels.tracking.update import apply_update, evidence_of, first_weights, reweight
 
@@ -292,27 +291,6 @@ def _update(
 
 
 @borrowing
-def _possible(numbers: Numbers, memory: Memory, rows: Rows, work: Work, dt: float, measured: bool) -> bool:
-    """Return whether the speed after an epoch is possible, and narrow its range: `railfix.tracking.possible_speed`."""
-    scalars, counts = memory.scalars, rows.counts
-    low, high = -math.inf, math.inf
-    if int(scalars[HYPOTHESES]) == 1:
-        change = numbers.service_acceleration_mps2 * dt
-        low, high = scalars[LEAST_SPEED] - change, scalars[MOST_SPEED] + change
-        if measured:
-            satellites = max(counts[1], counts[2])
-            if not 0 < satellites < numbers.trusted_satellites or counts[3] > 0:
-                low, high = -math.inf, math.inf
-            speed = work.new_mean[0, SPEED]
-            reach = numbers.speed_sigmas * math.sqrt(work.new_covariance[0, SPEED, SPEED])
-            if speed + reach < low or speed - reach > high:
-                return False
-            low, high = max(low, speed - reach), min(high, speed + reach)
-    scalars[LEAST_SPEED], scalars[MOST_SPEED] = low, high
-    return True
-
-
-@borrowing
 def _learn(
     numbers: Numbers,
     memory: Memory,
@@ -449,7 +427,7 @@ def advance(
         if measured:
             _write_variances(epochs, t, memory, rows, work.variance)
             shift = _update(epochs, t, course, numbers, active, memory, rows, work)
-        if not _possible(numbers, memory, rows, work, dt, measured):
+        if not possible(numbers, memory, rows, work, dt, measured):
             return t
         if measured:
             for h in range(count):
