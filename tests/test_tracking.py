@@ -129,7 +129,7 @@ def test_a_few_satellites_of_one_wall_do_not_stop_the_train() -> None:
 
 @pytest.mark.requirement("E5")
 def test_emergency_braking_is_followed() -> None:
-    """3 m/s2 down to rest, by all satellites and by a wheel with three of them."""
+    """3 m/s2 down to rest, by all satellites and by a wheel with three; three alone are an epoch behind at most."""
     case = ride(
         noise=1.0,
         speed_mps=lambda t: np.where(t < 60.0, np.minimum(0.5 * t, 15.0), np.maximum(15.0 - 3.0 * (t - 60.0), 0.0)),
@@ -143,6 +143,11 @@ def test_emergency_braking_is_followed() -> None:
     for result in (found, by_wheel):
         assert (result.status[60:70] == TrackStatus.TRACKING).all()
         assert np.abs(result.speed_mps - case.speed_mps)[58:70].max() < 0.5
+    alone, _ = track(few, case.line)
+    followed = alone.status[60:66] == TrackStatus.TRACKING
+    assert (followed[1:] | followed[:-1]).all()
+    assert np.abs(alone.speed_mps - case.speed_mps)[60:66].max() < 4.0
+    assert np.abs(alone.arc_m - case.arc_m)[58:75].max() < 5.0
 
 
 @pytest.mark.requirement("E5")

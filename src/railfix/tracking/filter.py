@@ -202,6 +202,7 @@ def _measure(
     trusted = not 0 < satellites < limits.trusted_satellites or len(rows.variance) > rows.bounds[2]
     if state.hypotheses == 1 and not possible(state, after[0][0], after[1][0], trusted=trusted):
         state.weak_motion_s += dt
+        widen(state, dt, limits, refused=True)
         write_rows(result, epoch, rows, rows.value[0], np.zeros_like(update.weight[0]))
         return False
     state.offset_known = offset_known

@@ -20,8 +20,8 @@ class TrackingLimits(Settings):
         brake and accelerate with up to 1.3 m/s2 and hold it for some seconds; cars with more, for shorter.
     service_acceleration_mps2, trusted_satellites : float, int
         The speed by fewer satellites, without a sensor on board, is not believed where it is beyond this acceleration
-        since the last one that was: one wall can reflect them all, and their measurements then agree with each other
-        (`possible_speed`).
+        since the last one that was: one wall, or a station roof, can leave reflections alone, and they then agree with
+        each other (`possible_speed`).
     degrees_of_freedom : float
         Of Student's t that measurement errors follow: 4 is the least integer with a finite kurtosis bound of the
         score, and what urban code errors look like.
@@ -114,7 +114,7 @@ class TrackingLimits(Settings):
     acceleration_mps2: float = Field(default=1.0, gt=0)
     acceleration_s: float = Field(default=2.0, gt=0)
     service_acceleration_mps2: float = Field(default=1.5, gt=0)
-    trusted_satellites: int = Field(default=5, ge=0)
+    trusted_satellites: int = Field(default=7, ge=0)
     degrees_of_freedom: float = Field(default=4.0, gt=2)
     late_degrees_of_freedom: float = Field(default=1.0, gt=0)
     passes: int = Field(default=4, ge=1)

@@ -19,10 +19,13 @@ from railfix.tracking.state import ANY_SPEED, TrackState, Unknown
 SPEED_SIGMAS: Final = 4.0
 
 
-def widen(state: TrackState, dt: float, limits: TrackingLimits) -> None:
-    """Widen the range of possible speeds by what a train does in `dt` seconds; no bounds on several branches."""
+def widen(state: TrackState, dt: float, limits: TrackingLimits, *, refused: bool = False) -> None:
+    """Widen the range of possible speeds by what a train does in `dt` seconds; no bounds on several branches.
+
+    After an epoch that was refused by what emergency braking does too, so that it is followed from the next one on.
+    """
     low, high = state.speed_range_mps if state.hypotheses == 1 else ANY_SPEED
-    change = limits.service_acceleration_mps2 * dt
+    change = (limits.level_acceleration_mps2 if refused else limits.service_acceleration_mps2) * dt
     state.speed_range_mps = (low - change, high + change)
 
 
