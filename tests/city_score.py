@@ -1,7 +1,8 @@
-"""Errors of the filter in simulated streets: ``python tests/city_score.py FIRST LAST [--set KEY=VALUE ...]``.
+"""Errors and levels of the filter in simulated streets: ``python tests/city_score.py FIRST LAST [OPTION ...]``.
 
 Runs of 20 minutes of the shipped scenario ``city``, seeds FIRST to LAST, two antennas; options after them go to
-``railfix run``. A line for each antenna with an error beyond 10 m where the status says that the place is known.
+``railfix run`` (``--set tracking.level=on`` for levels). A line for each antenna with an error beyond 10 m where the
+status says that the place is known, or over its level.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def made(folder: Path, seed: int, options: list[str]) -> pl.DataFrame:
 
 def main() -> None:
     first, last, *options = sys.argv[1:]
-    sizes, ratios, large = [], [], 0
+    sizes, ratios, levels, large, beyond = [], [], [], 0, 0
     for seed in range(int(first), int(last) + 1):
         with tempfile.TemporaryDirectory(prefix="railfix-city-") as name:
             rows = made(Path(name) / "run", seed, options)
@@ -48,6 +49,13 @@ def main() -> None:
             ratios.append((error / own["along_sigma_m"].to_numpy())[known])
             over = np.count_nonzero(sizes[-1] > LARGE_M)
             large += over
+            level = own["protection_level_m"].to_numpy()
+            bounded = np.isfinite(level)
+            levels.append(level[bounded])
+            misled = np.count_nonzero(error[bounded] > level[bounded])
+            beyond += misled
+            if misled:
+                print(f"seed {seed}, {antenna[0]}: {misled} epochs over their level")
             if over:
                 print(f"seed {seed}, {antenna[0]}: {over} epochs over {LARGE_M:g} m, largest {sizes[-1].max():.1f} m")
     error, ratio = np.concatenate(sizes), np.concatenate(ratios)
@@ -55,6 +63,11 @@ def main() -> None:
     print(f"{len(error)} epochs with a known place, {large} over {LARGE_M:g} m")
     print(f"error [m]: {at.format(*np.percentile(error, [50, 95, 99, 100]))}")
     print(f"error over sigma: {at.format(*np.percentile(ratio, [50, 95, 99, 100]))}")
+    level = np.concatenate(levels)
+    if len(level):
+        print(
+            f"{len(level)} levels, {beyond} errors over them; {at.format(*np.percentile(level, [50, 95, 99, 100]))} m"
+        )
 
 
 if __name__ == "__main__":
