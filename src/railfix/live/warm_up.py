@@ -1,4 +1,4 @@
-"""Kernels compiled before a session begins: in its middle one would hold up epochs for seconds."""
+"""Compilation of all kernels before a session begins: during a session it would delay epochs by seconds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from railfix.simulate.demonstration import demo_inputs
 from railfix.track import read_track
 from railfix.track.vehicle import antenna_trajectory, read_vehicle
 
-#: Settings and numbers of epochs that call every kernel, with a fault: all in use, and too few satellites for 3-D.
+#: Settings and numbers of epochs that together call every kernel; the second run has too few satellites for 3-D.
 _RUNS = (
     ({"filter": "track", "tracking": {"level": "on"}}, 60),
     ({"systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -23,7 +23,7 @@ _RUNS = (
 
 
 def compile_kernels() -> bool:
-    """Compile the kernels that have never run on this machine, on epochs of the demonstration; return whether any had.
+    """Compile kernels that have never run on this machine, on epochs of the demonstration; False where there are none.
 
     Raises
     ------

@@ -26,8 +26,8 @@ DIRECTION_TYPE: Final = pl.Enum(["falling", "unknown", "rising"])
 TRAIN_COLUMNS: Final[dict[str, str]] = {
     "time_gpst": "time tag of the receiver, GPS time",
     "antenna": "`front` or `rear`",
-    "status": "`tracking`; `several_branches`, the most probable place of several; `coasting`, predicted without a "
-    "measurement; `lost`, measurements contradict the track and places are sought again; `expired`, predicted too "
+    "status": "`tracking`; `several_branches`, the most probable place of several; `coasting`, predicted, no "
+    "measurement used; `lost`, measurements contradict the track and places are sought again; `expired`, predicted too "
     "far; `not_started`; `off_map`, no place, the satellites put the train away from the line; `map_offset`, a place "
     "on a line that 3-D positions of the last minutes lie beside or above; `antennas_disagree`, the places of the two "
     "antennas are not as far apart as the antennas",

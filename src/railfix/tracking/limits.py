@@ -91,7 +91,8 @@ class TrackingLimits(Settings):
     level_period_s : float
         Time between the epochs that the bank takes: codes of neighbouring epochs have the same errors.
     level_acceleration_mps2 : float
-        Largest acceleration between them: emergency braking of trains has up to 3 m/s2 (magnetic track brakes).
+        Largest acceleration between them: emergency braking of trains has up to 3 m/s2 (magnetic track brakes). After
+        an epoch whose speed was not believed, the next one may differ by it.
     level_risk_per_hour : float
         Probability an hour that the error exceeds the level unnoticed: 1e-7 for the satellite part (P1 2.4).
     level_samples_per_hour : float

@@ -1,7 +1,7 @@
 """Speeds that a train can have after those measured so far.
 
-Reflections off one wall can agree with each other on a speed and a place that are wrong; with three or four
-satellites in view nothing among the measurements tells. The speed does: no train goes from 11 m/s to rest in a second.
+Reflections off one wall can agree with each other on a speed and a place that are wrong; with few satellites in view
+the measurements do not show it. The speed does: no train goes from 11 m/s to rest in a second.
 The prediction's own standard deviation does not, as it grows with every epoch without redundancy.
 """
 
@@ -22,7 +22,7 @@ SPEED_SIGMAS: Final = 4.0
 def widen(state: TrackState, dt: float, limits: TrackingLimits, *, refused: bool = False) -> None:
     """Widen the range of possible speeds by what a train does in `dt` seconds; no bounds on several branches.
 
-    After an epoch that was refused by what emergency braking does too, so that it is followed from the next one on.
+    `refused`: after an epoch that was not used, by emergency braking, so that braking is followed from the next epoch.
     """
     low, high = state.speed_range_mps if state.hypotheses == 1 else ANY_SPEED
     change = (limits.level_acceleration_mps2 if refused else limits.service_acceleration_mps2) * dt

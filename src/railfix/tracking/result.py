@@ -26,7 +26,7 @@ class TrackStatus(IntEnum):
     TRACKING = 0
     #: Several places are possible; the most probable one is given.
     SEVERAL_BRANCHES = 1
-    #: No measurement of this epoch: the predicted place.
+    #: No measurement of this epoch, or none that is believed: the predicted place.
     COASTING = 2
     #: Measurements contradict the track: places are sought again.
     LOST = 3
