@@ -1,12 +1,13 @@
-"""Errors and levels of the filter in simulated streets: ``python tests/city_score.py FIRST LAST [OPTION ...]``.
+"""Errors and levels of the filter in simulated streets: ``python tests/city_score.py FIRST LAST``.
 
-Runs of 20 minutes of the shipped scenario ``city``, seeds FIRST to LAST, two antennas; options after them go to
-``railfix run`` (``--set tracking.level=on`` for levels). A line for each antenna with an error beyond 10 m where the
-status says that the place is known, or over its level.
+Runs of 20 minutes of the shipped scenario ``city``, seeds FIRST to LAST, two antennas, 1 Hz or ``--rate``; other
+options go to ``railfix run`` (``--set tracking.level=on`` for levels). A line for each antenna with an error beyond
+10 m where the status says that the place is known, or over its level.
 """
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -19,14 +20,14 @@ LARGE_M = 10.0
 KNOWN = ("tracking", "coasting")
 
 
-def made(folder: Path, seed: int, options: list[str]) -> pl.DataFrame:
+def made(folder: Path, seed: int, rate_hz: float, options: list[str]) -> pl.DataFrame:
     """Rows of the filter beside the true chainage."""
 
     def railfix(*words: str) -> None:
         command = [sys.executable, "-m", "railfix", *words]
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
-    railfix("simulate", "city", "--out", str(folder), "--set", f"seed={seed}", "--plain")
+    railfix("simulate", "city", "--out", str(folder), "--seed", str(seed), "--set", f"rate_hz={rate_hz}", "--plain")
     files = ("front.rnx", "rear.rnx", "nav.rnx", "track.csv", "vehicle.toml")
     given = [word for file in files for word in (f"--{Path(file).stem}", str(folder / file))]
     railfix("run", *given, "--out", str(folder / "run"), *options)
@@ -37,11 +38,15 @@ def made(folder: Path, seed: int, options: list[str]) -> pl.DataFrame:
 
 
 def main() -> None:
-    first, last, *options = sys.argv[1:]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("first", type=int)
+    parser.add_argument("last", type=int)
+    parser.add_argument("--rate", type=float, default=1.0)
+    given, options = parser.parse_known_args()
     sizes, ratios, levels, large, beyond = [], [], [], 0, 0
-    for seed in range(int(first), int(last) + 1):
+    for seed in range(given.first, given.last + 1):
         with tempfile.TemporaryDirectory(prefix="railfix-city-") as name:
-            rows = made(Path(name) / "run", seed, options)
+            rows = made(Path(name) / "run", seed, given.rate, options)
         for antenna, own in rows.group_by("antenna", maintain_order=True):
             error = (own["chainage_m"] - own["chainage_m_true"]).abs().to_numpy()
             known = own["status"].cast(pl.String).is_in(KNOWN).to_numpy()

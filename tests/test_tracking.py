@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from railfix.tracking import GnssEpochs, Line, Tracked, TrackingLimits, TrackStatus, track
+from railfix.tracking import GnssEpochs, Kind, Line, Tracked, TrackingLimits, TrackStatus, track
 from railfix.tracking.predict import singer_step
 from railfix.tracking.robust import applied, log_evidence, prior_of, robust_update
 from railfix.tracking.rows import Rows
@@ -281,3 +281,34 @@ def test_no_input_raises(garbage: str, level: str) -> None:
         epochs = replace(epochs, rate_mps=1e9 * epochs.rate_mps, phase_m=-1e6 * epochs.phase_m)
     result, _ = track(epochs, case.line, limits=TrackingLimits.model_validate({"level": level}))
     assert len(result) == 40
+
+
+@pytest.mark.requirement("E5")
+def test_codes_count_once_a_second_where_phases_or_dopplers_carry_the_place() -> None:
+    case = ride(40, rate_hz=10.0, noise=1.0)
+    result, _ = track(case.epochs, case.line)
+    coded = np.isfinite(result.innovation[:, Kind.CODE]).any(axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(coded), np.arange(0, 400, 10))
+    assert (result.status == TrackStatus.TRACKING)[20:].all()
+    # the same information as the codes of all epochs, whose white error is that of a second
+    every, _ = track(case.epochs, case.line, limits=TrackingLimits(code_period_s=0.0))
+    assert np.isfinite(every.innovation[:, Kind.CODE]).any(axis=1).all()
+    np.testing.assert_allclose(result.sigma_m[50:], every.sigma_m[50:], rtol=0.05)
+    assert (np.abs(result.arc_m - every.arc_m) < every.sigma_m)[50:].all()
+    # a log of codes alone has nothing else to go by
+    alone = replace(case.epochs, phase_m=case.epochs.phase_m * np.nan, rate_mps=case.epochs.rate_mps * np.nan)
+    assert np.isfinite(track(alone, case.line)[0].innovation[:, Kind.CODE]).any(axis=1).all()
+
+
+@pytest.mark.requirement("E5")
+def test_codes_count_at_once_when_they_come_back() -> None:
+    case = ride(40, rate_hz=10.0, noise=1.0)
+    code = case.epochs.code_m.copy()
+    code[205:254] = np.nan
+    result, _ = track(replace(case.epochs, code_m=code), case.line)
+    coded = np.flatnonzero(np.isfinite(result.innovation[:, Kind.CODE]).any(axis=1))
+    np.testing.assert_array_equal(coded, [*range(0, 201, 10), *range(254, 400, 10)])
+    # a second of codes that contradict the place counts as a second, not as one epoch of it
+    late = case.epochs.code_m + np.where(np.arange(400) >= 200, 300.0, 0.0)[:, None] * np.linspace(-1, 1, 10)
+    _, state = track(part(replace(case.epochs, code_m=late), slice(0, 225)), case.line)
+    assert state.weak_code_s == pytest.approx(3.0)

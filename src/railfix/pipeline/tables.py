@@ -123,7 +123,8 @@ OBSERVATION_COLUMNS: Final[dict[str, str]] = {
     **_screen_columns("observations"),
     "raim_own_error_m": "screen `raim`: error against all other ranges, of satellites named as faulty; empty where the "
     "robust fit rejected them",
-    "innovation_code_m": "filter along the track: code less what earlier epochs predict",
+    "innovation_code_m": "filter along the track: code less what earlier epochs predict, where codes count (once a "
+    "second)",
     "innovation_phase_m": "the same of the change of the carrier phase since the epoch before",
     "innovation_doppler_mps": "the same of the Doppler",
     "weight_code": "weight of the code in the filter; 1 is that of an error of one standard deviation",

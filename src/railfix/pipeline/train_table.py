@@ -51,8 +51,8 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "tachometer's least), `normal` (the wheel rolls), `inertial_spin`, `inertial_slide` (the wheel is faster or slower "
     "than the train), `rolling` (away, below the tachometer's least), `expired` (carried for too long). In `standing`, "
     "`low_speed`, `inertial_spin`, `inertial_slide`, `rolling` the way of the wheel is not used: inertia carries",
-    "sources": "measurements used with a weight of more than a half: `code`, `phase`, `doppler`, `wheel` "
-    "(`carry` where inertia takes its place), `radar`, `force`, `place` (a feature of the line or a range)",
+    "sources": "measurements used with a weight of more than a half: `code` (once a second), `phase`, `doppler`, "
+    "`wheel` (`carry` where inertia takes its place), `radar`, `force`, `place` (a feature of the line or a range)",
     "latitude_deg": "antenna, WGS 84",
     "longitude_deg": "antenna, WGS 84",
     "height_m": "antenna, above the ellipsoid",

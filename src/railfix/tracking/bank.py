@@ -212,7 +212,7 @@ def levelled(
     prior = prior_of(own, covariances)
     weight = first_weights(own, prior, limits.tails)
     update = robust_update(own, prior, weight, tails=limits.tails, passes=limits.level_passes, use=use)
-    weak_s = np.where(_contradicted(rows, update.weight, use, limits), weak_s + dt, 0.0)
+    weak_s = np.where(_contradicted(rows, update.weight, use, limits), weak_s + dt, 0.0 if rows.bounds[0] else weak_s)
     means, covariances = applied(means, covariances, prior, update)
     means = on_the_line(means, covariances, line, limits)
     return Bank(without=without, mean=means, covariance=covariances, weak_s=weak_s)

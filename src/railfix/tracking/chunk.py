@@ -17,6 +17,8 @@ from railfix.tracking.state import CLOCKS, TrackState
 _SHORTEST_S: Final = 1e-3
 #: Two epochs further apart than this have nothing to do with each other [s].
 _APART_S: Final = 3600.0
+#: Phases or Dopplers of an epoch that give speed and clock drift with redundancy.
+_MOTION: Final = 4
 #: Satellites unseen for this many correlation times of codes are dropped from the state.
 FORGOTTEN: Final = 3.0
 
@@ -44,7 +46,9 @@ class Chunk:
     has : ndarray of bool, shape (3, T, K)
         Where it is finite.
     variance : ndarray, shape (3, T, K)
-        Of their white errors, before the scales learnt from residuals.
+        Of their white errors, before the scales learnt from residuals; of codes the mean over a second.
+    moving : ndarray of bool, shape (T,)
+        Epochs with so many phases or Dopplers that the filter can go on by them.
     code_sigma_m : ndarray, shape (T, K) [m]
         Of the satellite's correlated error.
     fresh : ndarray of bool, shape (T, S)
@@ -67,6 +71,7 @@ class Chunk:
     measured: Floats
     has: Masks
     variance: Floats
+    moving: Masks
     code_sigma_m: Floats
     fresh: Masks
     off_map: Masks
@@ -109,7 +114,6 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
 
     cn0 = np.where(np.isnan(epochs.cn0_dbhz), 45.0, np.minimum(epochs.cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
-    code = (limits.code_white_share * epochs.code_sigma_m) ** 2 / np.minimum(interval, 1.0)[:, None]
     return Chunk(
         time=epochs.time,
         interval_s=interval,
@@ -124,16 +128,37 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
         has=has,
         variance=np.stack(
             [
-                code,
+                (limits.code_white_share * epochs.code_sigma_m) ** 2,
                 limits.phase_floor_m**2 + limits.phase_zenith_m**2 * weak,
                 limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
             ]
         ),
+        moving=np.asarray(np.count_nonzero(has[1:], axis=2).max(axis=0) >= _MOTION),
         code_sigma_m=epochs.code_sigma_m,
         fresh=fresh & ~kept,
         off_map=epochs.off_map,
         remembered=kept,
     )
+
+
+def code_interval_s(chunk: Chunk, epoch: int, coded: np.datetime64, limits: TrackingLimits) -> float:
+    """Time that the codes of an epoch stand for [s]; 0 where they do not count, being those of the last ones' second.
+
+    Parameters
+    ----------
+    chunk : Chunk
+    epoch : int
+    coded : datetime64[ns]
+        Last epoch whose codes counted; NaT before the first and after a restart.
+    limits : TrackingLimits
+    """
+    dt = float(chunk.interval_s[epoch])
+    if not chunk.has[0, epoch].any():
+        return dt
+    since = float("inf") if np.isnat(coded) else float(seconds(chunk.time[epoch] - coded))
+    if chunk.moving[epoch] and since < limits.code_period_s - 0.5 * dt:
+        return 0.0
+    return min(max(since, dt), max(limits.code_period_s, dt))
 
 
 def leave(chunk: Chunk, epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> None:

@@ -72,8 +72,13 @@ def clocks_of_epoch(
     return mean, covariance, known
 
 
-def learn(state: TrackState, rows: Rows, update: Update, best: int, dt: float, limits: TrackingLimits) -> None:
-    """Count how long mean weights of the best hypothesis have been low; learn the scales of Dopplers and phases."""
+def learn(
+    state: TrackState, rows: Rows, update: Update, best: int, dt: float, code_s: float, limits: TrackingLimits
+) -> None:
+    """Count how long mean weights of the best hypothesis have been low; learn the scales of Dopplers and phases.
+
+    `code_s` is the time that the epoch's codes stand for.
+    """
     gain = 1.0 - np.exp(-min(dt, 1.0) / SCALE_S)
     scales = []
     for part, old in zip((rows.common[2], rows.common[1]), state.log_scale, strict=True):
@@ -84,5 +89,6 @@ def learn(state: TrackState, rows: Rows, update: Update, best: int, dt: float, l
     motion = mean_weight(update.weight, rows.motion)[best]
     code = mean_weight(update.weight, rows.codes)[best]
     state.weak_motion_s = state.weak_motion_s + dt if motion < limits.lost_motion_weight else 0.0
-    state.weak_code_s = state.weak_code_s + dt if code < limits.lost_code_weight else 0.0
+    if code_s > 0.0:
+        state.weak_code_s = state.weak_code_s + code_s if code < limits.lost_code_weight else 0.0
     state.log_scale = (scales[0], scales[1])

@@ -126,6 +126,7 @@ class Compiled:
         scalars = np.array([
             count, state.weak_motion_s, state.weak_code_s, *state.log_scale, state.unaided_m, state.direction,
             seconds(state.measured - origin), *state.code_shift, state.map_log_scale, *state.speed_range_mps,
+            np.nan_to_num(seconds(state.coded - origin), nan=-np.inf),
         ])  # fmt: skip
         memory = self.layout.Memory(
             mean=_own(state.mean[:, full]),
@@ -246,6 +247,7 @@ class Compiled:
         state.code_shift, state.map_log_scale = (learnt[0], learnt[1]), learnt[2]
         state.speed_range_mps = (learnt[3], learnt[4])
         state.measured = self.chunk.time[0] + timedelta(measured)
+        state.coded = self.chunk.time[0] + timedelta(learnt[5])
 
 
 def _kernels() -> tuple[ModuleType, ModuleType]:

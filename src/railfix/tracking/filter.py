@@ -12,7 +12,7 @@ from railfix import kernels
 from railfix.core.arrays import Floats
 from railfix.tracking.bank import levelled
 from railfix.tracking.branches import judged, most_probable, on_the_line, surviving
-from railfix.tracking.chunk import Chunk, leave, prepared
+from railfix.tracking.chunk import Chunk, code_interval_s, leave, prepared
 from railfix.tracking.clocks import clocks_of_epoch, learn
 from railfix.tracking.compiled import Compiled
 from railfix.tracking.epochs import GnssEpochs, SensorEpochs
@@ -132,12 +132,18 @@ def _step(
         if trace is not None:
             trace.append(step)
         return
+    code_s = code_interval_s(chunk, epoch, state.coded, limits)
+    if code_s > 0.0:
+        chunk.variance[0, epoch] /= min(code_s, 1.0)
+    else:
+        chunk.has[0, epoch] = False
     mean = state.mean
     sensed = sensor_rows(sensors, epoch, line, mean, dt, state.direction)
     rows = rows_of(chunk, epoch, line, mean, mean[:, _PLACES], state.log_scale, sensed)
     widen(state, dt, limits)
     measured = len(rows.variance) > 0
-    measured = measured and _measure(chunk, epoch, rows, line, state, limits, sensors, result, lost, levels, step)
+    if measured:
+        measured = _measure(chunk, epoch, rows, line, state, limits, sensors, result, code_s, lost, levels, step)
     if not measured and state.bank is not None:
         means, covariances = predicted(state.bank.mean, state.bank.covariance, line, dt, limits, state.map_scale)
         state.bank = replace(state.bank, mean=means, covariance=covariances)
@@ -166,6 +172,7 @@ def _measure(
     limits: TrackingLimits,
     sensors: SensorEpochs,
     result: Tracked,
+    code_s: float,
     lost: bool,
     levels: bool,
     step: Step,
@@ -214,6 +221,8 @@ def _measure(
     step.updated = (covariance, settled.combine / prior.root[:, :, None], prior.information, update)
     state.mean, state.covariance = on_the_line(*after, line, limits), after[1]
     state.measured = chunk.time[epoch]
+    if rows.bounds[0]:
+        state.coded = chunk.time[epoch]
     best = most_probable(state.log_probability)
     if levels:
         bank = Bank.empty(mean.shape[1]) if state.bank is None or lost or best else state.bank
@@ -225,8 +234,8 @@ def _measure(
         state.bank = levelled(
             bank, settled, best, own, stepped, named, remembered, chunk, epoch, scale, line, limits, map_scale
         )
-    learn(state, rows, update, best, dt, limits)
-    learn_map(state, 0.0 if best else shift, dt, limits)
+    learn(state, rows, update, best, dt, code_s, limits)
+    learn_map(state, 0.0 if best else shift, code_s, limits)
     write_rows(result, epoch, rows, rows.value[best], update.weight[best])
     return True
 

@@ -36,6 +36,9 @@ class TrackingLimits(Settings):
         station is passed within about 100 m; at rest the fringe of one 10 m away lasts about a minute.
     code_white_share : float
         White part of a code's error, over its standard deviation; per second, not per epoch.
+    code_period_s : float
+        Codes count once in this time where phases or Dopplers of four satellites carry the place on: their errors
+        last for a minute, so the epochs between tell nothing new. 0 takes those of every epoch.
     slow_code_m, slow_code_s : float
         Displacement along the line by errors of orbits and ionosphere, about 1 m a satellite with a dilution of one,
         and how long it lasts:
@@ -122,6 +125,7 @@ class TrackingLimits(Settings):
     code_correlation_s: float = Field(default=60.0, gt=0)
     code_correlation_m: float = Field(default=100.0, gt=0)
     code_white_share: float = Field(default=0.5, gt=0)
+    code_period_s: float = Field(default=1.0, ge=0)
     slow_code_m: float = Field(default=1.0, ge=1e-6)
     slow_code_s: float = Field(default=7200.0, gt=0)
     doppler_floor_mps: float = Field(default=0.03, gt=0)

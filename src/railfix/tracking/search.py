@@ -64,6 +64,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
     if not lost:
         state.parent = np.array([k if item is None else item.parent for k, item in enumerate(narrowed)])
         state.narrowed = narrowed
+    state.coded = np.datetime64("NaT", "ns")
     state.weak_motion_s = state.weak_code_s = 0.0
     state.code_shift, state.speed_range_mps = (0.0, 0.0), ANY_SPEED
     return lost

@@ -130,6 +130,8 @@ class TrackState:
     previous : Previous or None
     measured : datetime64[ns]
         Last epoch with measurements that the filter used.
+    coded : datetime64[ns]
+        Last epoch whose codes counted (`railfix.tracking.chunk.code_interval_s`); NaT where the next ones do.
     weak_motion_s, weak_code_s : float [s]
         How long the mean weights have been low.
     log_scale : tuple of float
@@ -163,6 +165,7 @@ class TrackState:
     offset_known: Masks
     previous: Previous | None
     measured: np.datetime64
+    coded: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     weak_motion_s: float = 0.0
     weak_code_s: float = 0.0
     log_scale: tuple[float, float] = (0.0, 0.0)
@@ -223,6 +226,7 @@ class TrackState:
         self.code_shift = self.log_scale = (0.0, 0.0)
         self.map_log_scale = 0.0
         self.speed_range_mps = ANY_SPEED
+        self.coded = np.datetime64("NaT", "ns")
         self.bank = None
 
     def rearrange(self, kept: Indices, new: tuple[str, ...]) -> None:

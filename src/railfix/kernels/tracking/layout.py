@@ -42,6 +42,7 @@ class Epochs(NamedTuple):
     measured: Floats
     has: Masks
     variance: Floats
+    moving: Masks
     code_sigma_m: Floats
     fresh: Masks
     remembered: Masks
@@ -85,6 +86,7 @@ class Numbers(NamedTuple):
     map_roughness_m: float
     map_correlation_m: float
     map_scale_m: float
+    code_period_s: float
     map_misfit_sigmas: float
     map_misfit_s: float
     map_misfit_kept_s: float
@@ -258,7 +260,7 @@ class Work(NamedTuple):
 
 
 HYPOTHESES, WEAK_MOTION, WEAK_CODE, SCALE_DOPPLER, SCALE_PHASE, UNAIDED, DIRECTION, MEASURED = range(8)
-SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED = 8, 9, 10, 11, 12
+SHIFT, SHIFT_VARIANCE, MAP_SCALE, LEAST_SPEED, MOST_SPEED, CODED = 8, 9, 10, 11, 12, 13
 
 
 class Answers(NamedTuple):

@@ -176,7 +176,10 @@ def advance_subfilters(
             own = slots + clocks + rows.sensors[j]
             work.masked[gnss + j] = math.inf if own == b else work.variance[gnss + j]
         _update(epochs, t, course, numbers, active, rows, best, work, h)
-        bank.weak_s[b] = bank.weak_s[b] + dt if _contradicted(rows, numbers, work, h) else 0.0
+        if _contradicted(rows, numbers, work, h):
+            bank.weak_s[b] += dt
+        elif nc > 0:
+            bank.weak_s[b] = 0.0
         for c in range(n):
             bank.mean[b, c] = work.new_mean[h, c]
             for e in range(n):

@@ -12,9 +12,8 @@ from railfix.kernels.tracking.course import onto_line
 from railfix.kernels.tracking.equations import combine, write_equations
 from railfix.kernels.tracking.layout import (
     ACCELERATION,
-    C_SPEED,
-    C_WAY,
     CODE_CLOCK,
+    CODED,
     COMBINED,
     DIRECTION,
     DRIFT,
@@ -47,7 +46,7 @@ from railfix.kernels.tracking.level import advance_subfilters, level_of, speed_b
 from railfix.kernels.tracking.misfit import code_shift, learn_map
 from railfix.kernels.tracking.possible_speed import possible
 from railfix.kernels.tracking.prediction import add_bend, predict
-from railfix.kernels.tracking.update import apply_update, evidence_of, first_weights, reweight
+from railfix.kernels.tracking.update import apply_update, doubtful_fit, first_weights, reweight, second_start
 
 
 @borrowing
@@ -62,6 +61,24 @@ def _left_to_numpy(epochs: Epochs, t: int, course: Course, numbers: Numbers, mem
         left = left or (memory.mean[h, PLACE] < course.arc_m[0] and course.start_m == -math.inf)
         left = left or (memory.mean[h, PLACE] > course.arc_m[-1] and course.end_m == math.inf)
     return left
+
+
+@borrowing
+def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory) -> float:
+    """Time that the codes of an epoch stand for (`railfix.tracking.chunk.code_interval_s`), in force from here on."""
+    dt, since, coded = epochs.interval_s[t], epochs.time_s[t] - memory.scalars[CODED], False
+    for k in range(epochs.has.shape[2]):
+        coded = coded or epochs.has[0, t, k]
+    if not coded:
+        return float(dt)
+    recent = epochs.moving[t] and since < numbers.code_period_s - 0.5 * dt
+    code_s = 0.0 if recent else min(max(since, dt), max(numbers.code_period_s, dt))
+    for k in range(epochs.has.shape[2]):
+        if recent:
+            epochs.has[0, t, k] = False
+        else:
+            epochs.variance[0, t, k] /= min(code_s, 1.0)
+    return float(code_s)
 
 
 @borrowing
@@ -185,60 +202,6 @@ def _start_clocks(numbers: Numbers, rows: Rows, work: Work, h: int) -> None:
 
 
 @borrowing
-def _doubtful(numbers: Numbers, rows: Rows, work: Work, h: int) -> bool:
-    """Return whether codes, or phases and Dopplers, have lost so much weight that a second start is worth trying."""
-    nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
-    doubtful = False
-    for part in range(2):
-        first, last = (0, nc) if part == 0 else (nc, gnss)
-        total = 0.0
-        for i in range(first, last):
-            total += work.weight[h, i]
-        doubtful = doubtful or (last > first and total / (last - first) < numbers.doubtful)
-    return doubtful
-
-
-@borrowing
-def _second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -> None:
-    """Fit again with weights from innovations with place and speed set free, in row `other`; keep the better fit."""
-    own, root, sensed, share = work.own, work.root, work.sensed, work.right
-    nc, ns = rows.counts[0], rows.counts[3]
-    gnss, size = nc + rows.counts[1] + rows.counts[2], nc + COMBINED + ns
-    for i in range(size):
-        for j in range(i, size):
-            own[other, i, j] = own[h, i, j]
-    for kind in range(2):
-        for i in range(size):
-            coefficient = 0.0
-            if i >= nc + COMBINED:
-                coefficient = sensed[h, i - nc - COMBINED, 0 if kind == 0 else 2]
-            elif kind == 0 and i < nc:
-                coefficient = work.design[h, i, 0]
-            elif i == (nc + C_WAY if kind == 0 else nc + C_SPEED):
-                coefficient = 1.0
-            share[i] = coefficient / root[h, i]
-        freedom = numbers.freedom_place if kind == 0 else numbers.freedom_speed
-        for i in range(size):
-            for j in range(i, size):
-                own[other, i, j] += freedom * share[i] * share[j]
-    invert(own, other, size, work.factor, work.lower, work.information, other)
-    first_weights(rows, work.variance, numbers.degrees, numbers.freedom_place, numbers.freedom_speed, work, h, other)
-    log_after = 0.0
-    for by in (other, h):
-        log_after = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, by, other)
-    first = evidence_of(rows, numbers.degrees, work.log_after[h], work, h, h)
-    if evidence_of(rows, numbers.degrees, log_after, work, h, other) > first:
-        work.log_after[h] = log_after
-        for i in range(size):
-            work.change[h, i] = work.change[other, i]
-            for j in range(size):
-                work.after[h, i, j] = work.after[other, i, j]
-        for i in range(gnss + ns):
-            work.weight[h, i], work.residual[h, i] = work.weight[other, i], work.residual[other, i]
-            work.fitted[h, i] = work.fitted[other, i]
-
-
-@borrowing
 def _update(
     epochs: Epochs,
     t: int,
@@ -275,10 +238,10 @@ def _update(
                 if h == going and nc >= numbers.misfit_codes:
                     shift = code_shift(rows, numbers.misfit_clipped, work, h)
             work.log_after[h] = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, h, h)
-            doubtful = doubtful or (turn == 0 and _doubtful(numbers, rows, work, h))
+            doubtful = doubtful or (turn == 0 and doubtful_fit(numbers, rows, work, h))
         for h in range(count):
             if turn == 0 and doubtful:
-                _second_start(numbers, rows, work, h, room)
+                second_start(numbers, rows, work, h, room)
             apply_update(rows, work, h)
             furthest = max(furthest, abs(new_mean[h, PLACE] - work.now[h]))
         if furthest < numbers.moved_m:
@@ -301,6 +264,7 @@ def _learn(
     best: int,
     shift: float,
     dt: float,
+    code_s: float,
 ) -> None:
     """Learn the noise of phases and Dopplers and the error of the map; write weights and innovations."""
     scalars, weight, innovation = memory.scalars, work.weight, work.innovation
@@ -327,8 +291,9 @@ def _learn(
         for i in range(nc, gnss):
             motion += weight[best, i] / (gnss - nc)
     scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if motion < numbers.lost_motion_weight else 0.0
-    scalars[WEAK_CODE] = scalars[WEAK_CODE] + dt if code < numbers.lost_code_weight else 0.0
-    learn_map(scalars, 0.0 if best else shift, dt, numbers)
+    if code_s > 0.0:
+        scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if code < numbers.lost_code_weight else 0.0
+    learn_map(scalars, 0.0 if best else shift, code_s, numbers)
     answers.code_weight[t], answers.motion_weight[t] = code, motion
     for i in range(gnss):
         kind = 0 if i < nc else (1 if i < nc + nph else 2)
@@ -415,6 +380,7 @@ def advance(
     for t in range(first, last):
         if _left_to_numpy(epochs, t, course, numbers, memory):
             return t
+        code_s = _code_interval_s(epochs, t, numbers, memory)
         if not _choose_rows(epochs, t, numbers, memory, rows):
             return t
         count, dt, map_scale = int(scalars[HYPOTHESES]), epochs.interval_s[t], scalars[MAP_SCALE]
@@ -433,11 +399,13 @@ def advance(
             for h in range(count):
                 _take(memory.mean, memory.covariance, h, work.new_mean, work.new_covariance, h)
             scalars[MEASURED] = epochs.time_s[t]
+            if rows.counts[0] > 0:
+                scalars[CODED] = epochs.time_s[t]
         else:
             _coast(epochs, t, course, numbers, active, memory, bank, work, room)
         best = most_probable(memory.log_probability, count, numbers.switch)
         if measured:
-            _learn(numbers, memory, answers, rows, work, t, best, shift, dt)
+            _learn(numbers, memory, answers, rows, work, t, best, shift, dt, code_s)
             if len(bank.running):
                 advance_subfilters(epochs, t, course, numbers, active, bank, rows, best, map_scale, work, room)
         aided = rows.counts[0] > 0

@@ -6,8 +6,8 @@ import math
 
 from railfix.core.arrays import Floats
 from railfix.kernels.compiling import borrowing
-from railfix.kernels.tracking.algebra import factorise, invert_factor, median, multiply, square
-from railfix.kernels.tracking.layout import C_RIGHT, C_WAY, COMBINED, Rows, Work
+from railfix.kernels.tracking.algebra import factorise, invert, invert_factor, median, multiply, square
+from railfix.kernels.tracking.layout import C_RIGHT, C_SPEED, C_WAY, COMBINED, Numbers, Rows, Work
 
 
 @borrowing
@@ -170,6 +170,60 @@ def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work
             total += information[h, i, j] * change[to, j]
         away += change[to, i] * total
     return float(-0.5 * (usual + 1.0) / usual * fit - 0.5 * away + 0.5 * (log_after - work.log_before[h]))
+
+
+@borrowing
+def doubtful_fit(numbers: Numbers, rows: Rows, work: Work, h: int) -> bool:
+    """Return whether codes, or phases and Dopplers, have lost so much weight that a second start is worth trying."""
+    nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
+    doubtful = False
+    for part in range(2):
+        first, last = (0, nc) if part == 0 else (nc, gnss)
+        total = 0.0
+        for i in range(first, last):
+            total += work.weight[h, i]
+        doubtful = doubtful or (last > first and total / (last - first) < numbers.doubtful)
+    return doubtful
+
+
+@borrowing
+def second_start(numbers: Numbers, rows: Rows, work: Work, h: int, other: int) -> None:
+    """Fit again with weights from innovations with place and speed set free, in row `other`; keep the better fit."""
+    own, root, sensed, share = work.own, work.root, work.sensed, work.right
+    nc, ns = rows.counts[0], rows.counts[3]
+    gnss, size = nc + rows.counts[1] + rows.counts[2], nc + COMBINED + ns
+    for i in range(size):
+        for j in range(i, size):
+            own[other, i, j] = own[h, i, j]
+    for kind in range(2):
+        for i in range(size):
+            coefficient = 0.0
+            if i >= nc + COMBINED:
+                coefficient = sensed[h, i - nc - COMBINED, 0 if kind == 0 else 2]
+            elif kind == 0 and i < nc:
+                coefficient = work.design[h, i, 0]
+            elif i == (nc + C_WAY if kind == 0 else nc + C_SPEED):
+                coefficient = 1.0
+            share[i] = coefficient / root[h, i]
+        freedom = numbers.freedom_place if kind == 0 else numbers.freedom_speed
+        for i in range(size):
+            for j in range(i, size):
+                own[other, i, j] += freedom * share[i] * share[j]
+    invert(own, other, size, work.factor, work.lower, work.information, other)
+    first_weights(rows, work.variance, numbers.degrees, numbers.freedom_place, numbers.freedom_speed, work, h, other)
+    log_after = 0.0
+    for by in (other, h):
+        log_after = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, by, other)
+    first = evidence_of(rows, numbers.degrees, work.log_after[h], work, h, h)
+    if evidence_of(rows, numbers.degrees, log_after, work, h, other) > first:
+        work.log_after[h] = log_after
+        for i in range(size):
+            work.change[h, i] = work.change[other, i]
+            for j in range(size):
+                work.after[h, i, j] = work.after[other, i, j]
+        for i in range(gnss + ns):
+            work.weight[h, i], work.residual[h, i] = work.weight[other, i], work.residual[other, i]
+            work.fitted[h, i] = work.fitted[other, i]
 
 
 @borrowing
