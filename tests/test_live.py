@@ -296,7 +296,8 @@ def test_ephemerides_count_from_when_they_are_complete(recordings: Path, tmp_pat
     )
     state, statuses, records = ReceiverState(), [], 0
     for place in range(0, 500_000, 5_000):
-        items, state = receive_bytes(data[place : place + 5_000], state)
+        items = list(receive_bytes(data[place : place + 5_000], state))
+        state = items[-1].after
         for received in items:
             if received.navigation is not None:
                 engine.learn(received.navigation)

@@ -288,9 +288,10 @@ def test_waits_double_and_silence_is_a_break() -> None:
 def test_a_message_cut_off_by_a_break_does_not_swallow_the_next(log: bytes) -> None:
     frames = find_frames(np.frombuffer(log, np.uint8))
     second = int(frames.frame_start[1])
-    items, state = receive_bytes(log[: second + 40], ReceiverState())
+    items = list(receive_bytes(log[: second + 40], ReceiverState()))
+    state = items[-1].after
     assert sum(len(item.epochs) for item in items) == 1
-    items, _ = receive_bytes(log[second:], state.after_break())
+    items = list(receive_bytes(log[second:], state.after_break()))
     assert sum(len(item.epochs) for item in items) == EPOCHS - 1
 
 
@@ -372,7 +373,8 @@ def test_an_epoch_without_its_last_message_does_not_hold_up_the_stream() -> None
     state = ReceiverState(stream=StreamState(time=np.datetime64("2025-08-12", "ns")))
     epochs = 0
     for place in range(0, len(data), 50):
-        items, state = receive_bytes(data[place : place + 50], state)
+        items = list(receive_bytes(data[place : place + 50], state))
+        state = items[-1].after
         epochs += sum(len(item.epochs) for item in items)
         assert len(state.stream.rest) < 300
     assert epochs == 39
@@ -409,6 +411,26 @@ def test_a_file_is_replayed_at_its_speed(log: bytes, tmp_path: Path) -> None:
     asyncio.run(run_session(engine(), {"front": str(path)}, [], speed=2.0, hooks=hooks))
     assert len(arrivals) == EPOCHS
     assert arrivals[-1] - arrivals[0] > 0.9 * 0.1 * (EPOCHS - 1) / 2.0
+
+
+def test_two_files_keep_their_distance_in_a_replay(tmp_path: Path) -> None:
+    """The rear log begins 4 s after the front one: its epochs are due with those of the front antenna, 1 s later."""
+    files = demo_files()
+    assert files["vehicle"] is not None
+    line, vehicle = railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"])
+    sources = {}
+    for name, first in (("front", 0), ("rear", 40)):
+        sources[name] = str(tmp_path / f"{name}.ubx")
+        Path(sources[name]).write_bytes(log_of(railfix.read_observations(files[name])[first:60]))
+    paths = {name: railfix.antenna_trajectory(line, vehicle, name) for name in sources}
+    settings = QUICK.model_copy(update={"period_s": 0.1, "pair_wait_s": 0.5})
+    machine = LiveEngine(
+        railfix.EpochProcessor(railfix.Config(), paths, navigation=railfix.read_navigation(files["nav"])), settings
+    )
+    asyncio.run(run_session(machine, sources, [], speed=4.0))
+    assert machine.counts["rear alone"] == machine.counts["late"] == 0
+    assert machine.counts["paired"] == 20
+    assert machine.counts["front alone"] == 40
 
 
 def test_a_packed_log_is_a_stream_too(log: bytes, tags: list[np.datetime64], tmp_path: Path) -> None:

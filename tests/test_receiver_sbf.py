@@ -306,7 +306,8 @@ def test_a_stream_of_sbf_cut_anywhere_is_the_log(cold: tuple[Path, Navigation]) 
     known_at_epoch: list[int] = []
     while place < len(data):
         step = int(rng.integers(1, 3000))
-        items, state = receive_bytes(data[place : place + step], state)
+        items = list(receive_bytes(data[place : place + step], state))
+        state = items[-1].after
         place += step
         for item in items:
             if item.navigation is not None:

@@ -39,8 +39,8 @@ async def arrivals(
         return
     async for part in read_source(source, settings):
         if isinstance(part, bytes):
-            items, state = receive_bytes(part, state)
-            for item in items:
+            for item in receive_bytes(part, state):
+                state = item.after
                 yield item
         else:
             if isinstance(part, Lost):

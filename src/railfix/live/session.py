@@ -98,7 +98,11 @@ async def run_session(
     gc.disable()  # collections come in idle time
     if not replay:
         engine.start(now_ns=time.monotonic_ns())
-    pumps = [asyncio.create_task(session.pump(name, source, speed, queue)) for name, source in sources.items()]
+    pace = None if speed is None else _Pace(speed)
+    pumps = [
+        asyncio.create_task(session.pump(name, source, pace if is_file(source) else None, queue))
+        for name, source in sources.items()
+    ]
     try:
         await session.process(queue, pumps, replay=replay)
     finally:
@@ -153,9 +157,8 @@ class _Session:
             raise
         self.save()
 
-    async def pump(self, name: str, source: str, speed: float | None, queue: _Queue) -> None:
+    async def pump(self, name: str, source: str, pace: _Pace | None, queue: _Queue) -> None:
         """Move what a source's data complete into the queue, then None; recorded epochs wait for their time."""
-        pace = _Pace(speed) if speed is not None and is_file(source) else None
         async for received in self.received(name, source):
             if pace is not None and received.epochs:
                 await pace.wait(received.epochs[-1].time[-1])
@@ -234,7 +237,7 @@ class _Session:
 
 
 class _Pace:
-    """Waits until a recorded time tag is due."""
+    """Waits until a recorded time tag is due: one for all files, so that the epochs of a pair are due together."""
 
     def __init__(self, speed: float) -> None:
         self._speed = speed

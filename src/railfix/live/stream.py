@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -54,19 +55,20 @@ class Received:
     after: ReceiverState = field(default_factory=ReceiverState)
 
 
-def receive_bytes(data: bytes, state: ReceiverState) -> tuple[list[Received], ReceiverState]:
+def receive_bytes(data: bytes, state: ReceiverState) -> Iterator[Received]:
     """What some bytes of a receiver complete, in the order of the stream; any cutting of the stream gives the same.
 
     Each item ends with the message that completes an epoch, so that its navigation records came before its epoch.
-    Epochs with repeated or older time tags are kept: `LiveEngine.push` judges them.
+    The state to go on with is that of the last item, `Received.after`; there is always one. Epochs with repeated or
+    older time tags are kept: `LiveEngine.push` judges them.
     """
     kept = len(state.stream.rest)
     ends = epoch_ends(np.frombuffer(state.stream.rest + data, dtype=np.uint8)) - kept
-    items, place = [], 0
+    place = 0
     for end in [*np.unique(ends[(ends > 0) & (ends < len(data))]).tolist(), len(data)]:
-        items.append(_receive(data[place:end], state))
-        place, state = end, items[-1].after
-    return items, state
+        item = _receive(data[place:end], state)
+        place, state = end, item.after
+        yield item
 
 
 def epoch_ends(buffer: Bytes) -> Indices:

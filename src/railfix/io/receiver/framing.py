@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import binascii
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -69,8 +70,13 @@ class Frames:
 
     def of(self, protocol: str, *kinds: int) -> Indices:
         """Positions of the frames of a protocol, of some kinds or of all."""
-        wanted = self.protocol == protocol
-        return np.flatnonzero(wanted & np.isin(self.kind, kinds) if kinds else wanted)
+        own = self._by_protocol.get(protocol, np.empty(0, dtype=np.intp))
+        return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
+
+    @cached_property
+    def _by_protocol(self) -> dict[str, Indices]:
+        """Positions of the frames of each protocol that there is: a live epoch is asked for many that there are not."""
+        return {name: np.flatnonzero(self.protocol == name) for name in set(self.protocol.tolist())}
 
 
 @dataclass(frozen=True)
