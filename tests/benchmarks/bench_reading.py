@@ -132,12 +132,13 @@ def read_with_cssrlib(path: Path) -> int:
 
 
 def peak_memory_mb(path: Path) -> float:
-    """Peak memory of a process that scans a log in pieces [MB]."""
+    """Peak memory of a process that scans a log in pieces [MB]; `getrusage` would give that of its parent if larger."""
     program = (
-        "import resource, sys\n"
+        "import re, sys\n"
+        "from pathlib import Path\n"
         "from railfix.io.rinex import scan_observations\n"
         "total = sum(len(piece) for piece in scan_observations(sys.argv[1], epochs=600))\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+        "print(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1])\n"
     )
     done = subprocess.run([sys.executable, "-c", program, str(path)], check=True, capture_output=True, text=True)
     return float(done.stdout) / 1024.0
