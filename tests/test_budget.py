@@ -107,6 +107,7 @@ def result_of(reasons: list[list[int]], satellites: list[str], status: list[Stat
             satellite=np.array(satellites),
             map_offset=SimpleNamespace(statistic=np.full(epochs, np.nan)),
             screens={},
+            protection=None,
         ),
     )
 

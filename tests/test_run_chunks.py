@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import polars as pl
+import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from railfix.core.errors import OutputError
 from railfix.gnss.observations import Observations
+from railfix.pipeline.tables import rounded
 from railfix.run.chunks import aligned
 from railfix.run.output import OutputFolder
 
@@ -111,12 +116,94 @@ def test_files_appear_together(tmp_path: Path) -> None:
     assert json.loads(files["run.json"].read_text()) == {"a": 1}
 
 
+def rows(count: int, seed: int) -> pl.DataFrame:
+    """Rows of which no two are alike, so that a file of them is as large as they are."""
+    numbers = np.random.default_rng(seed).normal(size=(count, 2))
+    return pl.DataFrame({"antenna": ["front"] * count, "chainage_m": numbers[:, 0], "along_sigma_m": numbers[:, 1]})
+
+
+def test_rows_are_in_the_parquet_file_before_it_ends(tmp_path: Path) -> None:
+    tables = [rows(10_000, seed) for seed in range(60)]
+    with OutputFolder(tmp_path / "out") as folder:
+        for table in tables:
+            folder.append_parquet("positions.parquet", table)
+        # No pieces to join at the end, and of 60 tables few wait in memory.
+        assert [path.name for path in folder.staging.iterdir()] == ["positions.parquet"]
+        written = (folder.staging / "positions.parquet").stat().st_size
+        folder.end_parquet({"provenance": "x"})
+        assert folder.scan("positions.parquet").select(pl.len()).collect().item() == 600_000
+        file = folder.commit()["positions.parquet"]
+    assert written > 0.7 * file.stat().st_size
+    assert pl.read_parquet(file).equals(pl.concat(tables))
+    groups = pq.ParquetFile(file)
+    assert groups.metadata.metadata[b"provenance"] == b"x"
+    assert groups.read().to_pydict() == pl.concat(tables).to_dict(as_series=False)
+
+
+def test_a_table_is_written_again_some_rows_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("railfix.run.output._ROWS", 7)
+    seen = []
+
+    def widened(table: pl.DataFrame) -> pl.DataFrame:
+        seen.append(len(table))
+        return table.with_columns(smoothed_m=pl.col("chainage_m") + 1.0)
+
+    with OutputFolder(tmp_path / "out") as folder:
+        for seed in (1, 2):
+            folder.append_csv("train.csv", rows(10, seed))
+            folder.append_parquet("train.parquet", rows(10, seed))
+        folder.change("train", widened)
+        files = folder.commit({"provenance": "x"})
+    wanted = pl.concat([rows(10, 1), rows(10, 2)]).with_columns(smoothed_m=pl.col("chainage_m") + 1.0)
+    assert seen == [7, 7, 6]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["train.csv", "train.parquet"]
+    assert pl.read_parquet(files["train.parquet"]).equals(wanted)
+    assert pl.read_parquet_metadata(files["train.parquet"])["provenance"] == "x"
+    assert pl.read_csv(files["train.csv"]).equals(rounded(wanted))
+
+
 def test_an_error_leaves_nothing(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
     with pytest.raises(KeyboardInterrupt), OutputFolder(out) as folder:  # noqa: PT012
         folder.append_csv("positions.csv", TABLE)
+        folder.append_parquet("positions.parquet", TABLE)
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
+    assert "positions.parquet" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_an_error_of_writing_parquet_is_that_of_the_folder(tmp_path: Path) -> None:
+    def wrong(name: str) -> None:
+        with OutputFolder(tmp_path / "out") as folder:
+            folder.append_parquet("positions.parquet", rows(5, 1))
+            folder.append_parquet("positions.parquet", rows(5, 1).rename({"chainage_m": name}))
+            folder.commit()
+
+    with pytest.raises(OutputError, match=r"positions\.parquet: cannot be written \(rows have the columns"):
+        wrong("other")
+    wrong("chainage_m")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limit of size here")
+def test_a_full_disk_ends_the_writing_of_parquet(tmp_path: Path) -> None:
+    code = """
+import resource, signal, sys
+from pathlib import Path
+from test_run_chunks import OutputFolder, rows
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (500_000, 500_000))
+with OutputFolder(Path(sys.argv[1])) as folder:
+    for seed in range(int(sys.argv[2])):
+        folder.append_parquet("positions.parquet", rows(10_000, seed))
+    folder.commit()
+"""
+    for tables in ("4", "60"):  # the footer is what does not fit, or rows long before
+        command = [sys.executable, "-c", code, str(tmp_path / "out"), tables]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
+        assert "OutputError" in done.stderr
+        assert "positions.parquet: cannot be written" in done.stderr
+        assert "File too large" in done.stderr
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_an_existing_folder_is_refused_or_its_files_replaced(tmp_path: Path) -> None:

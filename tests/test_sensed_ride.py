@@ -11,7 +11,7 @@ from railfix.motion.samples import GroundUnits, RadarSpeeds
 from railfix.motion.slip import MotionState
 from railfix.motion.tachometer import TachometerLimits
 from railfix.pipeline.train_table import antenna_train
-from railfix.run.sensor_checks import sensor_notes
+from railfix.run.sensor_checks import doppler_speeds, sensor_notes
 from railfix.tracking import Kind
 from sensed_ride import Ride, ride
 
@@ -115,21 +115,21 @@ def test_a_jump_of_the_satellites_at_the_portal_is_refused(case: Ride, metres: f
 @pytest.mark.requirement("E2")
 def test_wrong_units_tags_and_diameters_are_told(case: Ride) -> None:
     found = case.run(filter_sources=GNSS)
-    train = antenna_train("front", found)
+    speeds = doppler_speeds(antenna_train("front", found))
     limits = TachometerLimits()
     speed, time = np.abs(case.speed_mps), case.observations.time
     right = replace(case.samples, radar=RadarSpeeds(time=time, speed_mps=speed))
-    assert sensor_notes(right, train, limits) == ()
+    assert sensor_notes(right, speeds, limits) == ()
     kmh = replace(case.samples, radar=RadarSpeeds(time=time, speed_mps=3.6 * speed))
-    assert [note for note in sensor_notes(kmh, train, limits) if "in km/h" in note and note.startswith("radar")]
+    assert [note for note in sensor_notes(kmh, speeds, limits) if "in km/h" in note and note.startswith("radar")]
     late = replace(case.samples, radar=RadarSpeeds(time=time + np.timedelta64(1, "s"), speed_mps=speed))
-    assert "1.0 s late" in " ".join(sensor_notes(late, train, limits))
-    (note,) = sensor_notes(case.samples, train, TachometerLimits(wheel_diameter_m=0.86 * 1.02))
+    assert "1.0 s late" in " ".join(sensor_notes(late, speeds, limits))
+    (note,) = sensor_notes(case.samples, speeds, TachometerLimits(wheel_diameter_m=0.86 * 1.02))
     assert "+2.0 %" in note or "+1.9 %" in note or "+2.1 %" in note
     assert "0.86" in note
     pulses = case.samples.tachometer
     shifted = replace(pulses, time=pulses.time - np.timedelta64(1, "s"))
-    assert "1.0 s early" in " ".join(sensor_notes(replace(case.samples, tachometer=shifted), train, limits))
+    assert "1.0 s early" in " ".join(sensor_notes(replace(case.samples, tachometer=shifted), speeds, limits))
 
 
 @pytest.mark.requirement("E5")

@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,14 @@ def railfix_command(folder: Path, out: Path, config: Path | None, tracking: str)
     command += ["--nav", f"{folder}/nav.rnx", "--track", f"{folder}/track.csv", "--vehicle", f"{folder}/vehicle.toml"]
     command += ["--filter", tracking]
     return [*command, "--out", str(out), *(["--config", str(config)] if config else [])]
+
+
+def first_hour(folder: Path) -> list[str]:
+    """Return the options of `railfix run` for the first hour of a log."""
+    with (folder / "front.rnx").open() as log:
+        first = next(row for row in log if row.startswith(">"))
+    start = datetime(*(int(word) for word in first.split()[1:6]))  # type: ignore[arg-type]
+    return ["--end", (start + timedelta(hours=1)).isoformat()]
 
 
 def line(name: str, rounds: list[Spent]) -> float:
@@ -167,6 +176,8 @@ def main() -> None:
             longer = scratch / "hours"
             simulate(longer, options.hours)
             print(f"logs of {options.hours} hours")
+            command = railfix_command(longer, scratch / "first", config, options.filter)
+            line("railfix run, their first hour", [run([*command, *first_hour(longer)])])
             whole = compare(longer, scratch, hours=options.hours, **chosen)
             own, theirs = ((b - a) / (options.hours - 1) for a, b in zip(first, whole, strict=True))
             print(f"a further hour: railfix {own:.2f} s, rnx2rtkp {theirs:.2f} s, {theirs / own:.2f} times as fast")

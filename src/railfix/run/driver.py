@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time as clock
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+import polars as pl
 
+from railfix import __version__
 from railfix.core.arrays import Floats
 from railfix.core.errors import MismatchError, SettingsError
 from railfix.gnss.navigation import Navigation
@@ -30,7 +32,7 @@ from railfix.run.options import RunOptions
 from railfix.run.output import OutputFolder
 from railfix.run.processor import processor_of
 from railfix.run.record import AlongSigma, Filtered, Levels, along_sigma, filtered, levels, package_versions, run_record
-from railfix.run.sensor_checks import sensor_notes
+from railfix.run.sensor_checks import doppler_speeds, sensor_notes
 from railfix.run.sensors import check_units, read_sensors, read_units
 from railfix.run.smoothed_columns import add_smoothed
 from railfix.run.sources import TRACK_FILE, Line, Log, open_line
@@ -123,8 +125,8 @@ def run_files(
             for name in tuple(inputs.logs)[1 : processes(options.workers)]
         ]
         folder = stack.enter_context(OutputFolder(out, overwrite=options.overwrite, inputs=inputs.paths))
-        beside = stack.enter_context(ThreadPoolExecutor(max_workers=1))
-        entries, packages = inputs.entries(beside, out), beside.submit(package_versions)
+        hashing, beside = (stack.enter_context(ThreadPoolExecutor(max_workers=1)) for _ in range(2))
+        entries, packages = inputs.entries(hashing, out), beside.submit(package_versions)
         navigation, line, logs = open_inputs(inputs, options, config)
         sensors, units = sensors_of(inputs)
         processor = processor_of(config, navigation, line.trajectories, track=line.track, units=units)
@@ -137,21 +139,24 @@ def run_files(
             if name not in {other.name for other in others}
         }
         runs |= {other.name: other.reads(logs[other.name]) for other in others}
-        tally = _position(runs, line, processor, folder, beside, progress)
+        speeds: list[pl.DataFrame] = []
+        tally = _position(runs, line, processor, folder, beside, progress, speeds if sensors else None)
         if smooth:
             add_smoothed(runs, folder)
         check_whole_run(navigation, tally, sbas=processor.received.sbas, sensors=sensors)
-        sigma, found_levels = along_sigma(folder), levels(folder)
-        tracks = filtered(folder) if config.filter == "track" else {}
         notes = (
             *notes_of(line, navigation, tally, logs, note_statistic=config.map_offset.note_threshold),
-            *_notes_of_levels(config, tally, found_levels),
-            *(_notes_of_sensors(folder, sensors, config) if tracks and sensors else ()),
+            *_notes_of_levels(config, tally),
+            *(sensor_notes(sensors, pl.concat(speeds), config.sensors.tachometer) if speeds else ()),
         )
+        sources = [entry.result() for entry in entries]
+        folder.end_parquet(_footer(sources, notes))
+        sigma, found_levels = along_sigma(folder, tally), levels(folder, tally)
+        tracks = filtered(folder, tally) if config.filter == "track" else {}
         level_basis = "protection" if basis_of(config) == "measured" else "indicative protection"
         wall = clock.perf_counter() - began
         record = run_record(
-            files=[entry.result() for entry in entries],
+            files=sources,
             packages=packages.result(),
             command=sys.argv,
             asked=asked or {},
@@ -170,7 +175,7 @@ def run_files(
         folder.write_json("run.json", record)
         if not line.from_file:
             write_track_csv(line.track, folder.staged(TRACK_FILE))
-        files = folder.commit(_footer(record))
+        files = folder.commit()
     return RunSummary(
         tally=tally, sigma=sigma, levels=found_levels, tracks=tracks, level_basis=level_basis, notes=notes, files=files,
         wall_s=wall,
@@ -247,12 +252,6 @@ def _antenna_run(name: Antenna, inputs: RunInputs, config: Config, options: RunO
     )
 
 
-def _notes_of_sensors(folder: OutputFolder, sensors: SensorSamples, config: Config) -> tuple[str, ...]:
-    """Return notes on sensors that contradict the speeds of the first antenna."""
-    rows = folder.scan("train.parquet").select("time_gpst", "antenna", "speed_mps", "sources").collect()
-    return sensor_notes(sensors, rows.filter(antenna=rows["antenna"][0]), config.sensors.tachometer)
-
-
 def sensors_of(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
     """Read the samples of the sensors on board, and the ground units that they measured ranges to.
 
@@ -278,10 +277,12 @@ def _position(
     folder: OutputFolder,
     beside: Executor,
     progress: Progress | None,
+    speeds: list[pl.DataFrame] | None,
 ) -> Tally:
     """Position chunk by chunk: counts and rows. Other processes come last in `runs`, and are asked first.
 
-    The rows of a chunk are written by `beside` while the next one is positioned.
+    The rows of a chunk are written by `beside` while the next one is positioned. `speeds` takes those by satellites of
+    the first antenna, where they are wanted.
     """
     tally = Tally(min_satellites=processor.config.min_satellites, order=processor.antenna_order())
     after = np.datetime64("NaT", "ns")
@@ -300,6 +301,9 @@ def _position(
         for name, of_antenna in rows.items():
             tally.antennas[name] = of_antenna.tally
             tally.notes.update(dict.fromkeys(of_antenna.notes))
+        train = next(iter(rows.values())).train
+        if speeds is not None and train is not None:
+            speeds.append(doppler_speeds(train))
         check_same_day(processor.received.navigation, tally)
         check_same_place(tally, antennas="all")
         if written is not None:
@@ -368,11 +372,11 @@ def _broken_notes(logs: Mapping[Antenna, Log]) -> Iterator[str]:
             yield f"{name}: skipped: {skipped}"
 
 
-def _notes_of_levels(config: Config, tally: Tally, levels: Mapping[str, Levels]) -> Iterator[str]:
+def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
     """Return notes on assumptions of the protection levels that this run contradicts."""
-    if not levels:
+    if not any(antenna.level_status for antenna in tally.antennas.values()):
         return
-    for name, of_antenna in levels.items():
+    for name, of_antenna in tally.antennas.items():
         if of_antenna.without_budget:
             yield (
                 f"{name}: {of_antenna.without_budget} epochs without a protection level, where more faults at a time "
@@ -399,11 +403,11 @@ def _notes_of_levels(config: Config, tally: Tally, levels: Mapping[str, Levels])
         )
 
 
-def _footer(record: Mapping[str, Any]) -> dict[str, str]:
+def _footer(files: Iterable[Mapping[str, Any]], notes: Iterable[str]) -> dict[str, str]:
     """Provenance in short, for the footer of the Parquet files."""
     return {
-        "railfix": str(record["versions"]["railfix"]),
-        "command": " ".join(record["command"]),
-        "inputs": "; ".join(f"{f['input']} {f['path']} sha256:{f['sha256']}" for f in record["inputs"]),
-        "notes": "; ".join(record["notes"]),
+        "railfix": __version__,
+        "command": " ".join(sys.argv),
+        "inputs": "; ".join(f"{f['input']} {f['path']} sha256:{f['sha256']}" for f in files),
+        "notes": "; ".join(notes),
     }

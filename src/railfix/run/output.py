@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, Literal, Self
 
 from railfix.core.errors import OutputError
 from railfix.run.lock import READY, clean_up, make_staging, move_in_place
+from railfix.run.parquet import ParquetFile
 
 if TYPE_CHECKING:
     import polars as pl
@@ -31,6 +32,8 @@ _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
 }
 #: How times are written to CSV: ISO 8601, GPS time, to the nanosecond, no time zone.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
+#: Rows that `OutputFolder.change` reads at a time.
+_ROWS: Final = 50_000
 
 
 class OutputFolder:
@@ -64,7 +67,7 @@ class OutputFolder:
         self._inputs = tuple(inputs)
         self._made: list[Path] = []
         self._csv: dict[str, IO[bytes]] = {}
-        self._pieces: dict[str, list[Path]] = {}
+        self._parquet: dict[str, ParquetFile] = {}
         self._staged: list[str] = []
         with _writing(path):
             check_folder(path, overwrite=overwrite)
@@ -94,6 +97,9 @@ class OutputFolder:
     ) -> None:
         for handle in self._csv.values():
             handle.close()
+        for file in self._parquet.values():
+            with suppress(Exception):  # it is removed
+                file.end()
         self._staging.remove()
         if kind is not None:
             self._unmake()
@@ -125,43 +131,41 @@ class OutputFolder:
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a Parquet file, kept as pieces (Arrow IPC) until `commit`."""
+        """Append rows to a Parquet file; they are written while the caller goes on (`ParquetFile`)."""
         with _writing(self.path / name):
-            pieces = self._pieces.setdefault(name, [])
-            piece = self.staged(name).with_name(f"{name}.{len(pieces):06d}")
-            table.write_ipc(piece, compression="lz4")
-            pieces.append(piece)
+            if name not in self._parquet:
+                self._parquet[name] = ParquetFile(self.staged(name), table.schema)
+            self._parquet[name].append(table)
+
+    def end_parquet(self, metadata: Mapping[str, str] | None = None) -> None:
+        """End the Parquet files, with `metadata` in the footer of each: from then on `scan` reads them."""
+        while self._parquet:
+            name, file = next(iter(self._parquet.items()))
+            with _writing(self.path / name):
+                file.end(metadata)
+            del self._parquet[name]
 
     def change(self, name: str, widened: Callable[[pl.DataFrame], pl.DataFrame]) -> None:
-        """Write a table again, Parquet and CSV, piece by piece with its rows changed."""
+        """Write a table again, Parquet and CSV, some rows at a time, changed."""
         import polars as pl
 
         from railfix.pipeline.tables import rounded
 
+        file = f"{name}.parquet"
         self._csv.pop(f"{name}.csv").close()
-        with _writing(self.path / f"{name}.parquet"):
-            for piece in self._pieces[f"{name}.parquet"]:
-                table = widened(pl.read_ipc(piece))
-                table.write_ipc(piece, compression="lz4")
+        with _writing(self.path / file):
+            self._parquet.pop(file).end()
+            before = pl.scan_parquet(self.staged(file).replace(self.staging / f"{file}.before"))
+            for start in range(0, before.select(pl.len()).collect().item(), _ROWS):
+                table = widened(before.slice(start, _ROWS).collect())
+                self.append_parquet(file, table)
                 self.append_csv(f"{name}.csv", rounded(table))
 
     def scan(self, name: str) -> pl.LazyFrame:
-        """Return what was appended so far to a Parquet file."""
+        """Return a Parquet file that has ended."""
         import polars as pl
 
-        return pl.scan_ipc(self._pieces[name])
-
-    def by_antenna(self, name: str, columns: Sequence[str], *, where: pl.Expr | None = None) -> dict[str, pl.DataFrame]:
-        """Return some columns of what was appended so far, by antenna; read piece by piece, as all rows may be many."""
-        import polars as pl
-
-        parts: dict[str, list[pl.DataFrame]] = {}
-        for piece in self._pieces[name]:
-            rows = pl.read_ipc(piece, columns=["antenna", *columns])
-            some = rows if where is None else rows.filter(where)
-            for key, part in some.partition_by("antenna", as_dict=True, include_key=False).items():
-                parts.setdefault(str(key[0]), []).append(part)
-        return {antenna: pl.concat(parts[antenna]) for antenna in sorted(parts)}
+        return pl.scan_parquet(self.staging / name)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write one JSON file; NaN and infinities, which JSON lacks, are written as words."""
@@ -170,16 +174,15 @@ class OutputFolder:
             self.staged(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
-        """Join the pieces and move every file in place; return where each stands, by its name.
+        """Move every file in place; return where each stands, by its name.
 
-        `metadata` is written into the footer of each Parquet file.
+        `metadata` is written into the footer of each Parquet file that has not ended.
         """
         staging = self._staging.path
         with _writing(self.path):
             for handle in self._csv.values():
                 handle.close()
-            for name in self._pieces:
-                self.scan(name).sink_parquet(staging / name, metadata=dict(metadata or {}))
+            self.end_parquet(metadata)
             ready = staging / f"{READY}.part"
             ready.mkdir()
             for name in self._staged:

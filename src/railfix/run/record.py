@@ -68,54 +68,53 @@ class Levels:
     without_budget: int
 
 
-def levels(folder: OutputFolder) -> dict[str, Levels]:
-    """Protection levels by antenna, from the rows written so far; empty where they are off."""
-    level, status = pl.col("protection_level_m"), pl.col("protection_status").cast(pl.String)
+def levels(folder: OutputFolder, tally: Tally) -> dict[str, Levels]:
+    """Protection levels by antenna, from the rows written; empty where they are off."""
+    level = pl.col("protection_level_m")
     finite = level.filter(level.is_finite())
-    figures = {
-        "p50_m": finite.quantile(0.5),
-        "p95_m": finite.quantile(0.95),
-        **{word: (status == word).sum() for word in ("available", "unavailable", "alarm")},
-        "without_budget": (pl.col("protection_cause").cast(pl.String) == "budget").sum(),
+    figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95)}
+    return {
+        name: Levels(
+            **_one_by_one(_rows(folder, "positions", name), figures),
+            **{word: antenna.level_status[word] for word in ("available", "unavailable", "alarm")},
+            without_budget=antenna.without_budget,
+        )
+        for name, antenna in tally.antennas.items()
+        if antenna.level_status
     }
-    columns = ("protection_level_m", "protection_status", "protection_cause")
-    tables = folder.by_antenna("positions.parquet", columns, where=pl.col("protection_status").is_not_null())
-    return {name: Levels(**table.select(**figures).row(0, named=True)) for name, table in tables.items()}
 
 
-def along_sigma(folder: OutputFolder) -> dict[str, AlongSigma]:
-    """Percentiles by antenna, from the rows written so far."""
+def along_sigma(folder: OutputFolder, tally: Tally, table: str = "positions") -> dict[str, AlongSigma]:
+    """Percentiles by antenna, from the rows written; an antenna without any is left out."""
     sigma = pl.col("along_sigma_m")
     figures = {"p50_m": sigma.quantile(0.5), "p95_m": sigma.quantile(0.95), "max_m": sigma.max()}
-    tables = folder.by_antenna("positions.parquet", ("along_sigma_m",), where=sigma.is_not_null())
-    return {name: AlongSigma(**table.select(**figures).row(0, named=True)) for name, table in tables.items()}
+    found = {name: _one_by_one(_rows(folder, table, name), figures) for name in tally.antennas}
+    return {name: AlongSigma(**row) for name, row in found.items() if row["max_m"] is not None}
 
 
-def filtered(folder: OutputFolder) -> dict[str, Filtered]:
-    """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written so far."""
-    sigma, status, level = pl.col("along_sigma_m"), pl.col("status").cast(pl.String), pl.col("protection_level_m")
+def filtered(folder: OutputFolder, tally: Tally) -> dict[str, Filtered]:
+    """Epochs of the filter by status and percentiles of its sigma, by antenna, from the rows written."""
+    status, level = pl.col("status"), pl.col("protection_level_m")
     finite = level.filter(level.is_finite())
-    figures = {
-        "level_p50": finite.quantile(0.5),
-        "level_p95": finite.quantile(0.95),
-        "levels": level.is_not_null().sum(),
-        "finite": finite.len(),
-        "p50": sigma.quantile(0.5),
-        "p95": sigma.quantile(0.95),
-        "max": sigma.max(),
-        **{word.text: (status == word.text).sum() for word in TrackStatus},
-    }
+    words = {word.text: (status == word.text).sum() for word in TrackStatus}
+    figures = {"p50_m": finite.quantile(0.5), "p95_m": finite.quantile(0.95), "finite": finite.len()}
+    along = along_sigma(folder, tally, "train")
     found = {}
-    for name, table in folder.by_antenna("train.parquet", ("along_sigma_m", "status", "protection_level_m")).items():
-        row = table.select(**figures).row(0, named=True)
-        along = AlongSigma(p50_m=row["p50"], p95_m=row["p95"], max_m=row["max"]) if row["max"] is not None else None
-        bound = FilterLevel(p50_m=row["level_p50"], p95_m=row["level_p95"], finite=row["finite"])
-        found[name] = Filtered(
-            status={s.text: row[s.text] for s in TrackStatus},
-            along_sigma_m=along,
-            level=bound if row["levels"] else None,
-        )
+    for name in (name for name, antenna in tally.antennas.items() if antenna.epochs):
+        rows = _rows(folder, "train", name)
+        counts = rows.select(**words, levels=level.count()).collect().row(0, named=True)
+        bound = FilterLevel(**_one_by_one(rows, figures)) if counts.pop("levels") else None
+        found[name] = Filtered(status=counts, along_sigma_m=along.get(name), level=bound)
     return found
+
+
+def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
+    return folder.scan(f"{table}.parquet").filter(pl.col("antenna") == antenna)
+
+
+def _one_by_one(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, Any]:
+    """Return figures of many rows; each reads its column anew, so that one copy of one column is in memory."""
+    return {name: rows.select(figure).collect().item() for name, figure in figures.items()}
 
 
 def run_record(

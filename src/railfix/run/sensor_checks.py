@@ -22,15 +22,19 @@ _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
 
 
-def sensor_notes(samples: SensorSamples, train: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
+def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
+    """Return times and speeds of filtered positions (`railfix.pipeline.train_table`) for which Dopplers were used."""
+    known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
+    return known.select("time_gpst", "speed_mps")
+
+
+def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
     """Return a sentence on each sensor whose speeds are in another unit, late, or off in scale.
 
-    `train` has the filtered positions of one antenna (`railfix.pipeline.train_table.TRAIN_COLUMNS`): their speeds count
-    where Dopplers were used. `tachometer` is the wheel as entered.
+    `speeds` are those by satellites of one antenna (`doppler_speeds`). `tachometer` is the wheel as entered.
     """
-    known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
-    right_time = known["time_gpst"].to_numpy().astype("datetime64[ns]")
-    right = known["speed_mps"].to_numpy()
+    right_time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
+    right = speeds["speed_mps"].to_numpy()
     notes: list[str] = []
     if len(samples.radar):
         found = _checked(samples.radar.time, samples.radar.speed_mps, right_time, right)
@@ -38,9 +42,9 @@ def sensor_notes(samples: SensorSamples, train: pl.DataFrame, tachometer: Tachom
     if len(samples.tachometer):
         first, last = (int(t.astype(np.int64)) for t in samples.tachometer.time[[0, -1]])
         grid = np.arange(first, last, _STEP_NS).astype("datetime64[ns]")
-        speeds = pulse_speeds(samples.tachometer, grid, limits=tachometer)
-        heard = np.isfinite(speeds.speed_mps)
-        found = _checked(speeds.time[heard], speeds.speed_mps[heard], right_time, right)
+        wheel = pulse_speeds(samples.tachometer, grid, limits=tachometer)
+        heard = np.isfinite(wheel.speed_mps)
+        found = _checked(wheel.time[heard], wheel.speed_mps[heard], right_time, right)
         real = np.nan if found is None else tachometer.wheel_diameter_m / found.ratio
         scale = (
             "the way of its wheel is {:+.1f} % off that by satellites; sensors.tachometer.wheel_diameter_m = "

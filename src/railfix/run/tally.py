@@ -12,6 +12,7 @@ import polars as pl
 
 from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.reasons import Reason, Status, first_reason, reason_names
+from railfix.integrity.protection import Cause, LevelStatus
 from railfix.pipeline.antenna_order import AntennaOrder
 from railfix.pipeline.processor import AntennaResult, Result
 
@@ -77,6 +78,10 @@ class AntennaTally:
         Least distance of a conventional position from the trajectory; NaN when there was none.
     map_detectable_m : ndarray, shape (2, 2) [m]
         Least and largest offset across (first column) and up that a window finds; NaN without any window.
+    level_status : Counter of str
+        Epochs by status of the protection level; empty where levels are off.
+    without_budget : int
+        Epochs without a level because more faults than can be left out are likelier than the risk allows.
     map_offset : MapOffsetFound or None
         Where the 3-D positions contradicted the map most; None before there were enough.
     """
@@ -100,6 +105,8 @@ class AntennaTally:
     last: np.datetime64 | None = None
     conventional: int = 0
     conventional_nearest_m: float = float("nan")
+    level_status: Counter[str] = field(default_factory=Counter)
+    without_budget: int = 0
     map_offset: MapOffsetFound | None = None
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
@@ -126,6 +133,10 @@ class AntennaTally:
         if np.isfinite(offset).any():
             self.conventional_nearest_m = float(np.fmin(self.conventional_nearest_m, np.nanmin(offset)))
         self._add_map_offset(result)
+        if result.protection is not None:
+            levels = np.bincount(result.protection.status, minlength=len(LevelStatus))
+            self.level_status.update({s.name.lower(): int(levels[s]) for s in LevelStatus})
+            self.without_budget += int(np.count_nonzero(result.protection.level.cause == Cause.BUDGET))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
         """Keep the window that contradicts the map most."""
