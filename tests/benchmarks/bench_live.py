@@ -3,7 +3,7 @@
 Prints median, 99th percentile and largest time an epoch, wall and processor time, over the demonstration
 run that comes with railfix, or over another simulated one::
 
-    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask] [--gap 600]
+    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask] [--filter off|track]
 
 The last line has the least processor time of the rounds at each epoch, which other work on the machine changes least.
 With ``--gap`` that many seconds are left out in the middle, and the slowest of the 20 epochs after them is printed; the
@@ -87,10 +87,11 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=1500)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--screens", choices=("all", "mask"), default="all", help="mask: elevation only")
+    parser.add_argument("--filter", choices=("off", "track"), default="off")
     parser.add_argument("--gap", type=float, default=0.0, help="seconds left out, as while nothing is received")
     parser.add_argument("--profile", action="store_true", help="print where the time goes, for one more round")
     options = parser.parse_args()
-    config = Config(screens=("elevation",)) if options.screens == "mask" else Config()
+    config = Config(filter=options.filter, **({"screens": ("elevation",)} if options.screens == "mask" else {}))
     gap = round(options.gap / PERIOD_S)
     loaded = kernels.load()
     processor, observations = prepared(options.run, options.epochs + WARM_UP + gap, config)
