@@ -33,7 +33,7 @@ from railfix.screens import (
     spacing_direction,
 )
 from railfix.screens.antenna_spacing import SCREEN
-from railfix.screens.base import PairedEpochs
+from railfix.screens.base import Followed, PairedEpochs
 from railfix.screens.pairs import on_pairs
 from railfix.tracking import TrackStatus
 
@@ -436,10 +436,33 @@ def test_places_by_the_filter_differ_by_more_than_the_limit_and_noise() -> None:
         rear_ecef_m=np.zeros((4, 3)),
         along_m=np.full(4, -18.0),
     )
-    front, rear = np.array([100.0, 100.0, 100.0, np.nan]), np.array([118.0, 130.0, 130.0, 118.0])
-    found = SCREEN.judge_filtered(front, rear, np.array([1.0, 1.0, 5.0, 1.0]), pair, AntennaSpacingLimits())
+    place, sigma = np.array([100.0, 100.0, 100.0, np.nan]), np.array([1.0, 1.0, 5.0, 1.0]) / np.sqrt(2.0)
+    front = Followed(place, sigma, speed_mps=np.full(4, 10.0), speed_sigma_mps=np.full(4, 0.1))
+    rear = front._replace(chainage_m=np.array([118.0, 130.0, 130.0, 118.0]))
+    found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
     np.testing.assert_allclose(found.metric, [0.0, 12.0, 12.0, np.nan])
     np.testing.assert_array_equal(found.reject, [False, True, False, False])
+    # speeds: beyond 0.5 m/s and four standard deviations of the difference
+    rear = front._replace(chainage_m=place + 18.0, speed_mps=np.array([10.4, 10.6, 10.6, np.nan]))
+    rear = rear._replace(speed_sigma_mps=np.array([0.01, 0.1, 0.2, 0.1]))
+    found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
+    np.testing.assert_array_equal(found.reject, [False, True, False, False])
+
+
+@pytest.mark.requirement("B5")
+@pytest.mark.parametrize("cuts", [[30], [10, 30, 33]])
+def test_places_are_doubtful_for_a_while_after_the_antennas_have_disagreed(cuts: list[int]) -> None:
+    """All speeds are unequal to such limits; after 3 s the rear antenna is silent, a second later the doubt ends."""
+    limits = {"filter_speed_mps": 1e-9, "filter_sigmas": 1e-9, "filter_held_s": 1.0}
+    one = processor({"filter": "track", "antenna_spacing": limits})
+    logs, state, status = clean_observations(), None, []
+    for first, end in zip([0, *cuts], [*cuts, 60], strict=True):
+        parts = {"front": logs["front"][first:end]} | ({"rear": logs["rear"][first:end]} if first < 30 else {})
+        result, state = one.process(parts, state)
+        status.append(result.fusion["front"].tracked.status)
+    found = np.concatenate(status)
+    assert (found[5:40] == TrackStatus.ANTENNAS_DISAGREE).all()
+    assert (found[40:] == TrackStatus.TRACKING).all()
 
 
 @pytest.mark.requirement("B5")

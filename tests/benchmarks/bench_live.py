@@ -3,7 +3,8 @@
 Prints median, 99th percentile and largest time an epoch, wall and processor time, over the demonstration
 run that comes with railfix, or over another simulated one::
 
-    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask] [--filter off|track]
+    python tests/benchmarks/bench_live.py [--run FOLDER] [--epochs 1500] [--rounds 3] [--screens all|mask]
+                                          [--filter off|track] [--gap 600]
 
 The last line has the least processor time of the rounds at each epoch, which other work on the machine changes least.
 With ``--gap`` that many seconds are left out in the middle, and the slowest of the 20 epochs after them is printed; the

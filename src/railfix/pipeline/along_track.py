@@ -109,6 +109,8 @@ class FilterState:
     fixed, anchor : Fixed or None
         Place of the filter at the last epoch, and at the last one before the present stretch.
     gate : ReturnState
+    disagreed : datetime64[ns]
+        Last epoch at which places or speeds of the two antennas disagreed.
     """
 
     line: Line | None = None
@@ -119,6 +121,7 @@ class FilterState:
     fixed: Fixed | None = None
     anchor: Fixed | None = None
     gate: ReturnState = field(default_factory=ReturnState)
+    disagreed: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -223,12 +226,22 @@ def along_track(
     return result, replace(after, line=line)
 
 
-def checked(result: AlongTrack, spacing: Screened) -> AlongTrack:
-    """Return the positions with the verdict on their distance from those of the other antenna, shape (T,)."""
-    status = result.tracked.status
-    doubtful = spacing.reject & np.isin(status, BOUNDED)
+def checked(
+    result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
+) -> tuple[AlongTrack, FilterState]:
+    """Return the positions with the verdict on distance and speed from those of the other antenna, and the state.
+
+    A verdict of shape (T,), None without any, lasts for `held_s` after it.
+    """
+    time, error = result.tracked.time, result.spacing_error_m
+    disagreed = np.full(len(time) + 1, state.disagreed)
+    if spacing is not None:
+        disagreed[1:], error = np.where(spacing.reject, time, np.datetime64("NaT", "ns")), spacing.metric
+    disagreed = np.fmax.accumulate(disagreed)
+    held = seconds(time - disagreed[1:]) <= held_s
+    doubtful = held & np.isin(result.tracked.status, BOUNDED)
     tracked = _doubted(result.tracked, doubtful, TrackStatus.ANTENNAS_DISAGREE)
-    return replace(result, tracked=tracked, spacing_error_m=spacing.metric)
+    return replace(result, tracked=tracked, spacing_error_m=error), replace(state, disagreed=disagreed[-1])
 
 
 def _doubted(tracked: Tracked, doubtful: Masks, status: TrackStatus) -> Tracked:

@@ -5,18 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-
 from railfix.core.arrays import Floats
-from railfix.screens import AntennaRanges, PairedEpochs, PairScreen, PositionScreen, Screened, Verdict
+from railfix.screens import AntennaRanges, Followed, PairedEpochs, PairScreen, PositionScreen, Screened, Verdict
 from railfix.screens.pairs import on_pairs
-
-
-class Followed(NamedTuple):
-    """Places of one antenna by the filter and their standard deviations, shape (T,) [m]; NaN without one."""
-
-    chainage_m: Floats
-    sigma_m: Floats
 
 
 class PositionVerdict(NamedTuple):
@@ -46,7 +37,7 @@ class ChunkSteps(Protocol):
         """Filter along the track and return its places; NaN where the filter is off."""
 
     def check_filter(self, spacing: Screened | None) -> None:
-        """Take the verdict on the distance of those places; None where it was not looked at."""
+        """Take the verdict on the distance and speeds of those places; None where they were not looked at."""
 
 
 def pair_verdicts(
@@ -86,9 +77,8 @@ def filter_verdicts(
         if pair is None or not isinstance(screen, PositionScreen):
             continue
         epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
-        front, rear = (followed[name].chainage_m[rows] for name, rows in epochs.items())
-        sigma = np.hypot(*(followed[name].sigma_m[rows] for name, rows in epochs.items()))
-        verdict = screen.judge_filtered(front, rear, sigma, pair, limits)
+        front, rear = (followed[name].take(rows) for name, rows in epochs.items())
+        verdict = screen.judge_filtered(front, rear, pair, limits)
         for name, rows in epochs.items():
             checks[name] = on_pairs(verdict, followed[name].chainage_m.shape, rows, rows)
     return checks

@@ -24,7 +24,6 @@ from railfix.pipeline.carrier_stage import CarrierState, smoothed, with_slips
 from railfix.pipeline.channels import ChannelBook
 from railfix.pipeline.compared import (
     ChunkSteps,
-    Followed,
     PositionVerdict,
     filter_verdicts,
     pair_verdicts,
@@ -45,6 +44,7 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
     AntennaRanges,
+    Followed,
     ObservationScreen,
     PairedEpochs,
     Screened,
@@ -388,7 +388,7 @@ class AntennaChunk:
         result = self._result = antenna_result(self._ranges, trajectory, self._solution, processor.config)
         if processor.config.filter == "off":
             nowhere = np.full(len(result), np.nan)
-            return Followed(chainage_m=nowhere, sigma_m=nowhere)
+            return Followed(nowhere, nowhere, nowhere, nowhere)
         self.tracked, self.filter_state = along_track(
             self._ranges,
             self._single_epochs(result),
@@ -399,12 +399,14 @@ class AntennaChunk:
             samples=self._sensors,
             surroundings=processor.surroundings(self._name, self._sensors),
         )
-        return Followed(chainage_m=self.tracked.chainage_m, sigma_m=self.tracked.tracked.sigma_m)
+        found = self.tracked.tracked
+        return Followed(self.tracked.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
 
     def check_filter(self, spacing: Screened | None) -> None:
-        """Take the verdict on the distance of those places; None where it was not looked at."""
-        if self.tracked is not None and spacing is not None:
-            self.tracked = checked(self.tracked, spacing)
+        """Take the verdict on the distance and speeds of those places; None where they were not looked at."""
+        if self.tracked is not None:
+            held_s = self._processor.config.antenna_spacing.filter_held_s
+            self.tracked, self.filter_state = checked(self.tracked, spacing, self.filter_state, held_s)
 
     def finished(self) -> AntennaResult:
         """Return the result of the chunk."""

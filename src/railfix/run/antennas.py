@@ -24,7 +24,7 @@ import numpy as np
 from railfix.core.arrays import Datetimes, Floats
 from railfix.core.errors import RailfixError, SettingsError
 from railfix.motion.samples import SensorSamples
-from railfix.pipeline.compared import Followed, PositionVerdict
+from railfix.pipeline.compared import PositionVerdict
 from railfix.pipeline.processor import AntennaChunk, EpochProcessor
 from railfix.pipeline.results import State
 from railfix.pipeline.smoothing import Replay, smooth
@@ -37,7 +37,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
-from railfix.screens import AntennaRanges, Screened, Verdict
+from railfix.screens import AntennaRanges, Followed, Screened, Verdict
 from railfix.tracking import Line
 
 if TYPE_CHECKING:

@@ -17,6 +17,7 @@ from railfix.screens.antenna_pair import (
 from railfix.screens.antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
 from railfix.screens.base import (
     AntennaRanges,
+    Followed,
     ObservationScreen,
     PairedEpochs,
     PairScreen,
@@ -49,6 +50,7 @@ __all__ = [
     "DopplerScreened",
     "DopplerState",
     "ElevationLimits",
+    "Followed",
     "ObservationScreen",
     "PairScreen",
     "PairedEpochs",

@@ -15,7 +15,15 @@ from pydantic import Field
 from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
 from railfix.core.settings import Settings
-from railfix.screens.base import PairedEpochs, PositionScreen, RunTables, ScreenColumn, Screened, ScreenPicture
+from railfix.screens.base import (
+    Followed,
+    PairedEpochs,
+    PositionScreen,
+    RunTables,
+    ScreenColumn,
+    Screened,
+    ScreenPicture,
+)
 
 
 class AntennaSpacingLimits(Settings):
@@ -27,11 +35,19 @@ class AntennaSpacingLimits(Settings):
         Largest difference from the spacing; P1 table 6: 5.
     filter_sigmas : float
         Places by the filter differ by more than the limit where both were predicted: by so many of their standard
-        deviations too.
+        deviations too. The same of their speeds.
+    filter_speed_mps : float [m/s]
+        Largest difference of the two speeds by the filter: antennas of one vehicle have one speed, but for a few
+        cm/s where the track curves or its cant changes.
+    filter_held_s : float [s]
+        A wrong speed leaves a wrong place behind, which codes take back within some 20 s: so long neither of the two
+        places is trusted.
     """
 
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
+    filter_speed_mps: float = Field(default=0.5, gt=0.0)
+    filter_held_s: float = Field(default=20.0, ge=0.0, allow_inf_nan=False)
 
 
 def antenna_spacing_screen(
@@ -98,17 +114,15 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         )
 
     def judge_filtered(
-        self,
-        front_chainage_m: Floats,
-        rear_chainage_m: Floats,
-        sigma_m: Floats,
-        pair: PairedEpochs,
-        limits: AntennaSpacingLimits,
+        self, front: Followed, rear: Followed, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
-        """Return metric and verdict of pairs of places by the filter: beyond the limit and what noise explains."""
-        found = self.judge(front_chainage_m, rear_chainage_m, pair, limits)
-        beyond = np.abs(found.metric) > np.nan_to_num(limits.filter_sigmas * sigma_m, nan=np.inf)
-        return Screened(metric=found.metric, reject=found.reject & beyond)
+        """Return metric and verdict of pairs by the filter: places or speeds beyond limit and noise."""
+        found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
+        apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)
+        faster = np.abs(front.speed_mps - rear.speed_mps)
+        unequal = faster > limits.filter_sigmas * np.hypot(front.speed_sigma_mps, rear.speed_sigma_mps)
+        reject = (found.reject & apart) | ((faster > limits.filter_speed_mps) & unequal)
+        return Screened(metric=found.metric, reject=reject)
 
     def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:
         """Yield the differences from the spacing against the limit."""

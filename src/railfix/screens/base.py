@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Generic, Literal, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -296,6 +296,19 @@ class PairScreen(_OfTwoAntennas[Limits]):
         """Return the verdicts on a chunk by antenna, "front" and "rear"."""
 
 
+class Followed(NamedTuple):
+    """Places [m] and speeds [m/s] of one antenna by the filter along the track, NaN without one, shape (T,)."""
+
+    chainage_m: Floats
+    sigma_m: Floats
+    speed_mps: Floats
+    speed_sigma_mps: Floats
+
+    def take(self, epochs: Indices) -> Followed:
+        """Return those of some epochs."""
+        return Followed(*(values[epochs] for values in self))
+
+
 class PositionScreen(_OfTwoAntennas[Limits]):
     """A screen of the positions of two antennas of one vehicle.
 
@@ -312,7 +325,5 @@ class PositionScreen(_OfTwoAntennas[Limits]):
         """Return metric and verdict of the P pairs of positions, chainages of shape (P,) [m]."""
 
     @abstractmethod
-    def judge_filtered(
-        self, front_chainage_m: Floats, rear_chainage_m: Floats, sigma_m: Floats, pair: PairedEpochs, limits: Limits
-    ) -> Screened:
-        """Return the same for places by the filter along the track; `sigma_m` is that of their difference, (P,) [m]."""
+    def judge_filtered(self, front: Followed, rear: Followed, pair: PairedEpochs, limits: Limits) -> Screened:
+        """Return the same for the P pairs of places and speeds by the filter along the track."""
