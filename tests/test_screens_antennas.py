@@ -442,9 +442,9 @@ def test_places_by_the_filter_differ_by_more_than_the_limit_and_noise() -> None:
     found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
     np.testing.assert_allclose(found.metric, [0.0, 12.0, 12.0, np.nan])
     np.testing.assert_array_equal(found.reject, [False, True, False, False])
-    # speeds: beyond 0.5 m/s and four standard deviations of the difference
-    rear = front._replace(chainage_m=place + 18.0, speed_mps=np.array([10.4, 10.6, 10.6, np.nan]))
-    rear = rear._replace(speed_sigma_mps=np.array([0.01, 0.1, 0.2, 0.1]))
+    # speeds: beyond 1.5 m/s and four standard deviations of the difference
+    rear = front._replace(chainage_m=place + 18.0, speed_mps=np.array([11.4, 11.6, 11.6, np.nan]))
+    rear = rear._replace(speed_sigma_mps=np.array([0.01, 0.1, 0.5, 0.1]))
     found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
     np.testing.assert_array_equal(found.reject, [False, True, False, False])
 

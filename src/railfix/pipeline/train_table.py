@@ -30,7 +30,7 @@ TRAIN_COLUMNS: Final[dict[str, str]] = {
     "measurement used; `lost`, measurements contradict the track and places are sought again; `expired`, predicted too "
     "far; `not_started`; `off_map`, no place, the satellites put the train away from the line; `map_offset`, a place "
     "on a line that 3-D positions of the last minutes lie beside or above; `antennas_disagree`, the places of the two "
-    "antennas are not as far apart as the antennas",
+    "antennas are not as far apart as the antennas, or their speeds differ, now or within the last 20 s",
     "chainage_m": "distance along the line from the first point of the track",
     "kilometrage_m": "the line's own marking, where the track has one",
     "along_sigma_m": "standard deviation along the line",

@@ -37,8 +37,8 @@ class AntennaSpacingLimits(Settings):
         Places by the filter differ by more than the limit where both were predicted: by so many of their standard
         deviations too. The same of their speeds.
     filter_speed_mps : float [m/s]
-        Largest difference of the two speeds by the filter: antennas of one vehicle have one speed, but for a few
-        cm/s where the track curves or its cant changes.
+        Largest difference of the two speeds by the filter. Antennas of one vehicle have one speed, but for a few cm/s
+        where the track curves or its cant changes; a lesser difference of single epochs moves no place by a metre.
     filter_held_s : float [s]
         A wrong speed leaves a wrong place behind, which codes take back within some 20 s: so long neither of the two
         places is trusted.
@@ -46,7 +46,7 @@ class AntennaSpacingLimits(Settings):
 
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
-    filter_speed_mps: float = Field(default=0.5, gt=0.0)
+    filter_speed_mps: float = Field(default=1.5, gt=0.0)
     filter_held_s: float = Field(default=20.0, ge=0.0, allow_inf_nan=False)
 
 

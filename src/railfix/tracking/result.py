@@ -39,7 +39,8 @@ class TrackStatus(IntEnum):
     #: One place, but 3-D positions of the last minutes lie beside or above the line: the map is wrong here, or it is
     #: another track.
     MAP_OFFSET = 7
-    #: One place, but not as far from that of the other antenna as the antennas are apart: one of the two is wrong.
+    #: One place, but not as far from that of the other antenna as the antennas are apart, or not as fast, within the
+    #: last 20 s: one of the two is wrong.
     ANTENNAS_DISAGREE = 8
 
     @property
