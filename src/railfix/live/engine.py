@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -26,6 +26,8 @@ from railfix.pipeline.received import merged_navigation
 from railfix.pipeline.results import Result, State
 from railfix.ranges.sbas import SbasMessages
 
+#: A time after all epochs [ns].
+END_NS: Final = 1 << 62
 #: Epochs of one antenna that may wait; more than that means the other antenna's clock is elsewhere.
 _LONGEST_QUEUE = 100
 #: Way after which the order of the antennas is looked at again [m].
@@ -256,7 +258,7 @@ class LiveEngine:
 
         `now_ns` is of the clock that `push` was given, `sent_ns` the GPS time of sending for the message; then one
         message goes out a period, that of the newest epoch. Without it (recorded epochs, the clock is that of their
-        tags) every epoch has its message.
+        tags) every epoch has its message; at `END_NS` all that wait are due, and no period without input follows.
         """
         outputs = [self._processed(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:
@@ -265,7 +267,7 @@ class LiveEngine:
                 self._due_ns, self._silent = now_ns, False
         else:
             numbered = self._one_a_period(outputs, now_ns, sent_ns)
-        if numbered or self._due_ns is None or self.settings.no_input == "skip":
+        if numbered or self._due_ns is None or self.settings.no_input == "skip" or now_ns >= END_NS:
             return numbered
         if now_ns - self._due_ns >= self._patience_ns():
             self.counts["no input"] += 1

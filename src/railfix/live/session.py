@@ -14,7 +14,7 @@ import numpy as np
 
 from railfix.core.timescale import GPS_EPOCH, utc_to_gpst
 from railfix.live.arrivals import arrivals, fresh_state, next_arrival
-from railfix.live.engine import LiveEngine, LiveOutput
+from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.metrics import Metrics
 from railfix.live.sinks import Sink
 from railfix.live.sources import Lost, hidden, is_file
@@ -28,8 +28,6 @@ _LONGEST_QUEUE: Final = 64
 _BETWEEN_COLLECTIONS: Final = 100
 #: How often the status is shown [s].
 _STATUS_S: Final = 0.5
-#: A time after all epochs [ns].
-_END_NS: Final = 1 << 62
 
 _LOG: Final = logging.getLogger("railfix.live")
 _Queue = asyncio.Queue[tuple[str, Received | None]]
@@ -98,9 +96,13 @@ async def run_session(
     gc.disable()  # collections come in idle time
     if not replay:
         engine.start(now_ns=time.monotonic_ns())
-    pace = None if speed is None else _Pace(speed)
+    session.read_to_ns = dict.fromkeys(sources, -1)
+    files = [name for name, source in sources.items() if is_file(source)]
+    turn: _Pace | _InTurn | None = None if speed is None else _Pace(speed, files)
+    if replay:
+        turn = _InTurn(session.read_to_ns)
     pumps = [
-        asyncio.create_task(session.pump(name, source, pace if is_file(source) else None, queue))
+        asyncio.create_task(session.pump(name, source, turn if name in files else None, queue))
         for name, source in sources.items()
     ]
     try:
@@ -117,20 +119,24 @@ async def run_session(
 
 @dataclass(kw_only=True)
 class _Session:
-    """A session at work: what it consists of, the states of its streams, and when things were done last (monotonic)."""
+    """A session at work: what it consists of, the states of its streams, and when things were done last (monotonic).
+
+    `read_to_ns` has the latest tag taken from each source that has not ended, -1 before the first.
+    """
 
     engine: LiveEngine
     sinks: Sequence[Sink]
     metrics: Metrics
     hooks: Hooks
     streams: dict[str, ReceiverState] = field(default_factory=dict)
+    read_to_ns: dict[str, int] = field(default_factory=dict)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     since_collection: int = 0
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
         """Process what the pumps bring until all have ended; a restart can continue from there."""
-        read_to_ns = dict.fromkeys(self.streams, -1)
+        read_to_ns = self.read_to_ns
         try:
             while read_to_ns:
                 for pump in pumps:
@@ -148,7 +154,7 @@ class _Session:
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
                 # In a replay the clock is the tag up to which all files have been read: no pair is torn, whatever file
                 # is ahead.
-                clock, sent = (min(read_to_ns.values(), default=_END_NS), None) if replay else (now, _gps_now_ns())
+                clock, sent = (min(read_to_ns.values(), default=END_NS), None) if replay else (now, _gps_now_ns())
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
                     self.in_idle_time(outputs)
@@ -157,12 +163,14 @@ class _Session:
             raise
         self.save()
 
-    async def pump(self, name: str, source: str, pace: _Pace | None, queue: _Queue) -> None:
-        """Move what a source's data complete into the queue, then None; recorded epochs wait for their time."""
+    async def pump(self, name: str, source: str, turn: _Pace | _InTurn | None, queue: _Queue) -> None:
+        """Move what a source's data complete into the queue, then None; recorded epochs wait for their turn."""
         async for received in self.received(name, source):
-            if pace is not None and received.epochs:
-                await pace.wait(received.epochs[-1].time[-1])
+            if turn is not None and received.epochs:
+                await turn.wait(name, received.epochs[-1].time[-1])
             await queue.put((name, received))
+        if turn is not None:
+            turn.ended(name)
         await queue.put((name, None))
 
     async def received(self, name: str, source: str) -> AsyncIterator[Received]:
@@ -237,19 +245,45 @@ class _Session:
 
 
 class _Pace:
-    """Waits until a recorded time tag is due: one for all files, so that the epochs of a pair are due together."""
+    """Waits until a recorded time tag is due: one for all files, counted from the earliest of their first tags."""
 
-    def __init__(self, speed: float) -> None:
+    def __init__(self, speed: float, files: Sequence[str]) -> None:
         self._speed = speed
+        self._to_come = set(files)
+        self._first: list[np.datetime64] = []
+        self._all_known = asyncio.Event()
         self._began = 0.0
-        self._first: np.datetime64 | None = None
 
-    async def wait(self, tag: np.datetime64) -> None:
-        now = asyncio.get_running_loop().time()
-        if self._first is None:
-            self._began, self._first = now, tag
-        due = self._began + float((tag - self._first) / np.timedelta64(1, "s")) / self._speed
-        await asyncio.sleep(max(0.0, due - now))
+    async def wait(self, name: str, tag: np.datetime64) -> None:
+        """Wait until an epoch of a file is due."""
+        if name in self._to_come:
+            self._first.append(tag)
+            self.ended(name)
+        await self._all_known.wait()
+        due = self._began + float((tag - min(self._first)) / np.timedelta64(1, "s")) / self._speed
+        await asyncio.sleep(max(0.0, due - asyncio.get_running_loop().time()))
+
+    def ended(self, name: str) -> None:
+        """Note that the first tag of a file is known, or that it has none."""
+        self._to_come.discard(name)
+        if not self._to_come and not self._all_known.is_set():
+            self._began = asyncio.get_running_loop().time()
+            self._all_known.set()
+
+
+class _InTurn:
+    """Holds back a file that has been read further than another one, so that none of its epochs pile up unpaired."""
+
+    def __init__(self, read_to_ns: Mapping[str, int]) -> None:
+        self._read_to_ns = read_to_ns
+
+    async def wait(self, name: str, _: np.datetime64) -> None:
+        """Wait until no other file is behind this one."""
+        while self._read_to_ns[name] > min(self._read_to_ns.values()):
+            await asyncio.sleep(0)
+
+    def ended(self, name: str) -> None:
+        """Nothing: what has ended is no longer in the table."""
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:

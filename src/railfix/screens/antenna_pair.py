@@ -16,6 +16,7 @@ relative to the car body by 3.5 deg (P1). Multipath below the difference that th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -171,11 +172,12 @@ def ambiguity_m(
     elevation_error_deg, azimuth_error_deg : float [deg]
     """
     angles = np.broadcast_arrays(np.radians(elevation_deg), np.radians(relative_azimuth_deg))
-    # rows of one element each where they are no table
-    elevation, azimuth = (np.ascontiguousarray(a.reshape(-1, a.shape[-1] if a.ndim > 1 else 1)) for a in angles)
+    shape = angles[0].shape  # rows of one element each where they are no table; a table may have no channel
+    rows = (math.prod(shape[:-1]), shape[-1]) if len(shape) > 1 else (-1, 1)
+    elevation, azimuth = (np.ascontiguousarray(a.reshape(rows)) for a in angles)
     errors = np.radians(elevation_error_deg), np.radians(azimuth_error_deg)
     changes = largest_changes(elevation, azimuth, float(errors[0]), float(errors[1]))
-    return np.asarray(np.asarray(spacing_m, dtype=np.float64) * changes.reshape(angles[0].shape))
+    return np.asarray(np.asarray(spacing_m, dtype=np.float64) * changes.reshape(shape))
 
 
 @compiled_by("screens")
