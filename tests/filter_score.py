@@ -3,7 +3,7 @@
 Tables: ``figures`` (single epochs beside, and smoothed), ``codes`` (whether their errors are common), ``ablation``
 (without each kind of measurement), ``gaps`` (windows without satellites, with and without a wheel), ``levels``,
 ``terms`` (what decides them), ``faults`` (of each satellite in turn, a quarter of an hour; only when asked for),
-``cost``. One setting for all recordings; distances are straight ones on the map.
+``systems`` (one constellation alone), ``cost``. One setting for all recordings; distances are straight ones on the map.
 """
 
 from __future__ import annotations
@@ -404,6 +404,23 @@ def with_fault(epochs: GnssEpochs, k: int, size: Callable[[np.ndarray], np.ndarr
     return replace(epochs, code_m=code, phase_m=phase, rate_mps=rate)
 
 
+def show_systems(all_cases: list[Case]) -> None:
+    """With one constellation alone: those with three codes at half of the epochs."""
+    for case in all_cases:
+        letter = case.epochs.satellite.astype("<U1")
+        for name in np.unique(letter).tolist():
+            own = letter == name
+            codes = int(np.median(np.isfinite(case.epochs.code_m[:, own]).sum(axis=1)))
+            if codes < 3 or own.all():
+                continue
+            part = {
+                field: np.where(own, getattr(case.epochs, field), np.nan) for field in ("code_m", "phase_m", "rate_mps")
+            }
+            found = case.run(epochs=replace(case.epochs, **part))
+            text = figures_of(case.error(found)[case.observed])
+            print(f"{case.name:9s} {name} {codes:2d} codes  {text}  {ratio_of(case, found)}", flush=True)
+
+
 def show_cost(all_cases: list[Case]) -> None:
     for case in all_cases:
         for label, levels in (("off", False), ("on", True)):
@@ -422,6 +439,7 @@ TABLES = {
     "levels": show_levels,
     "terms": show_terms,
     "faults": show_faults,
+    "systems": show_systems,
     "cost": show_cost,
 }
 
