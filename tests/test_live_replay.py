@@ -108,3 +108,36 @@ def test_a_pace_counts_from_the_earlier_log(speed: float) -> None:
     took = asyncio.run(waits())
     assert took["rear"] < 0.1
     assert 2.0 / speed - 0.01 < took["front"] < 2.0 / speed + 0.2
+
+
+@pytest.mark.parametrize("option", ["send", "state", "log", "link"])
+@pytest.mark.parametrize("role", ["front", "nav", "track", "vehicle"])
+def test_no_output_replaces_an_input(tmp_path: Path, option: str, role: str) -> None:
+    """Not even with --overwrite, nor under another name."""
+    files = {name: tmp_path / path.name for name, path in demo_files().items()}
+    for name, path in demo_files().items():
+        files[name].write_bytes(path.read_bytes())
+    before = files[role].read_bytes()
+    target = tmp_path / "link" if option == "link" else files[role]
+    if option == "link":
+        target.symlink_to(files[role])
+    command = ["live", "--front", str(files["front"]), "--nav", str(files["nav"]), "--track", str(files["track"])]
+    command += ["--vehicle", str(files["vehicle"]), "--overwrite"]
+    command += {"state": ["--state", str(target)], "log": ["--log", str(target)]}.get(
+        option, ["--send", f"json@{target}"]
+    )
+    ended = RUNNER.invoke(app, command)
+    assert ended.exit_code == 8
+    assert "is an input, which is never overwritten" in " ".join(ended.output.split())
+    assert files[role].read_bytes() == before
+
+
+def test_two_outputs_have_two_files(tmp_path: Path) -> None:
+    """The state in place of the messages, or two forms in one file."""
+    files, target = demo_files(), tmp_path / "a"
+    command = ["live", "--front", str(files["front"]), "--track", str(files["track"]), "--send", f"json@{target}"]
+    for more in (["--state", str(target)], ["--log", str(target)], ["--send", f"nmea@{target}"]):
+        ended = RUNNER.invoke(app, [*command, *more, "--overwrite"])
+        assert ended.exit_code == 8
+        assert "named for two outputs" in " ".join(ended.output.split())
+        assert not target.exists()

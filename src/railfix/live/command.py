@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from railfix.core.errors import SettingsError
+from railfix.core.errors import OutputError, SettingsError
 from railfix.core.settings import Settings, validated
 from railfix.io.logs import read_navigation
 from railfix.live.channels import TwoChannels
@@ -25,7 +25,7 @@ from railfix.live.outlets import Outlet
 from railfix.live.record import ResultTables
 from railfix.live.session import Hooks, run_session
 from railfix.live.settings import LiveSettings
-from railfix.live.sinks import open_sink
+from railfix.live.sinks import file_of, open_sink
 from railfix.live.sources import check_source, is_file
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
 from railfix.live.warm_up import compile_kernels
@@ -34,6 +34,7 @@ from railfix.pipeline.processor import EpochProcessor
 from railfix.pipeline.received import no_navigation
 from railfix.run.driver import time_of
 from railfix.run.options import LogReading, TrackReading
+from railfix.run.output import check_not_input
 from railfix.run.processor import processor_of
 from railfix.run.sources import Line, open_line
 
@@ -68,6 +69,22 @@ class LiveInputs(Settings):
         given = {"vehicle": self.vehicle, "cn0 curve": self.config.cn0_curve, "error model": self.config.error_model}
         return named | {name: path for name, path in given.items() if path is not None}
 
+    @property
+    def read(self) -> list[Path]:
+        """Every file that the session reads."""
+        logs = [Path(source.removeprefix("file:")) for source in self.sources.values() if is_file(source)]
+        parameters = [] if self.reading.jgd_parameters is None else [self.reading.jgd_parameters]
+        return [*self.files.values(), *self.nav, *logs, *parameters]
+
+    def check_outputs(self) -> None:
+        """Raise OutputError where a file to be written is one that is read, or is written twice."""
+        named = [file_of(text) for text in self.send]
+        written = [path for path in (*named, self.state, self.log) if path is not None]
+        for k, path in enumerate(written):
+            check_not_input(path, self.read)
+            if path.resolve() in [other.resolve() for other in written[:k]]:
+                raise OutputError(f"{path}: is named for two outputs; name another file for one of them")
+
 
 async def run_live(inputs: LiveInputs) -> list[str]:
     """Run a session until its sources end, or SIGINT or SIGTERM; return a summary, a line each.
@@ -77,6 +94,7 @@ async def run_live(inputs: LiveInputs) -> list[str]:
     """
     for source in inputs.sources.values():
         check_source(source)
+    inputs.check_outputs()
     live = validated(LiveSettings, inputs.live, source="--live")
     line, processor = _prepared(inputs)
     if any(text.startswith("etcs@") for text in inputs.send):
@@ -140,8 +158,7 @@ def _hooks(
     """Tables of results, state file and status line; and the streams' states where the state file is used."""
     observe, save, streams = None, None, {}
     if inputs.out is not None:
-        files = (*inputs.track, *inputs.nav, *filter(None, (inputs.vehicle,)))
-        tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=files))
+        tables = held.enter_context(ResultTables(inputs.out, overwrite=inputs.overwrite, inputs=inputs.read))
         rows: Outlet[LiveOutput] = Outlet(f"tables {inputs.out}", tables.add, waiting=live.waiting * 10, full=full)
         held.callback(_closed, rows, log)
         observe = rows.send

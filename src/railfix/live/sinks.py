@@ -221,6 +221,13 @@ class TcpServerSink:
             writer.close()
 
 
+def file_of(text: str) -> Path | None:
+    """The file that a text ``FORM@TARGET`` names; None for another target."""
+    target = text.partition("@")[2]
+    other = target in ("", "-") or urlsplit(target).scheme in ("udp", "tcp-server", "mqtt")
+    return None if other else Path(target)
+
+
 async def open_sink(
     text: str, settings: LiveSettings | None = None, *, overwrite: str = "refuse", full: str = "drop"
 ) -> Sink:
