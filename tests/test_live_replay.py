@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +15,12 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli import app
+from railfix.core.timescale import GPS_EPOCH
 from railfix.gnss.observations import Observations
 from railfix.live import engine, session
+from railfix.live.forms import nmea_bytes
+from railfix.live.settings import LiveSettings
+from railfix.live.stream import single_epochs
 from railfix.simulate.demo_data import demo_files
 from ubx_made import log_of, rawx
 
@@ -86,6 +91,35 @@ def test_logs_of_different_rates(
     monkeypatch.setattr(session, "_LONGEST_QUEUE", 8)
     rear = b"".join(rawx(epochs["rear"], k) for k in range(0, 300, 5))
     assert "epochs paired: 60" in assert_live_is_run({"front": log_of(epochs["front"]), "rear": rear}, tmp_path)
+
+
+def test_the_end_of_a_paced_replay_has_its_message(epochs: dict[str, Observations], tmp_path: Path) -> None:
+    """Epochs that wait for their pair or period where the logs end: all have rows, the newest has a message."""
+    logs = {"front": log_of(epochs["front"][:30]), "rear": log_of(epochs["rear"][:29])}
+    choices = ["--speed", "20", "--live", "period_s=60", "--live", "pair_wait_s=10"]
+    said = assert_live_is_run(logs, tmp_path, *choices)
+    assert "epochs front alone: 1" in said
+    times = [json.loads(line)["time_ns"] for line in (tmp_path / "m.json").read_text().splitlines()]
+    last = int((epochs["front"].time[29] - GPS_EPOCH).astype(np.int64))
+    assert times[-1] == last
+
+
+def test_a_speed_that_is_not_known_is_blank_in_nmea(epochs: dict[str, Observations]) -> None:
+    """Without the filter a message has no speed, and RMC none: not 0 knots."""
+    files = demo_files()
+    line = railfix.antenna_trajectory(
+        railfix.read_track([files["track"]]), railfix.read_vehicle(files["vehicle"]), "front"
+    )
+    processor = railfix.EpochProcessor(
+        railfix.Config(), {"front": line}, navigation=railfix.read_navigation(files["nav"])
+    )
+    live = engine.LiveEngine(processor, LiveSettings())
+    live.push("front", single_epochs(epochs["front"][:1])[0], now_ns=0)
+    (output,) = live.poll(now_ns=engine.END_NS)
+    assert output.message.speed_cmps is None
+    fields = next(text for text in nmea_bytes(output).decode().splitlines() if "RMC" in text).split(",")
+    assert fields[2] == "A"
+    assert fields[7] == ""
 
 
 @pytest.mark.parametrize("speed", [5.0, 10.0])

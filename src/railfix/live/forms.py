@@ -58,10 +58,11 @@ def nmea_bytes(output: LiveOutput) -> bytes:
         f"{_angle(latitude, 2)},{'N' if latitude >= 0 else 'S'},{_angle(longitude, 3)},{'E' if longitude >= 0 else 'W'}"
     )
     quality = (6 if output.message.status is MessageStatus.COASTING else 1) if valid else 0
-    knots = abs(output.message.speed_cmps or 0) * 0.01 * 3600.0 / 1852.0
+    speed = output.message.speed_cmps
+    knots = "" if speed is None else f"{abs(speed) * 0.01 * 3600.0 / 1852.0:.2f}"
     sentences = [
         f"GPGGA,{clock},{angles},{quality},{used:02d},,{height:.2f},M,0.00,M,,",
-        f"GPRMC,{clock},{'A' if valid else 'V'},{angles},{knots:.2f},,{day},,,{'A' if valid else 'N'}",
+        f"GPRMC,{clock},{'A' if valid else 'V'},{angles},{knots},,{day},,,{'A' if valid else 'N'}",
         f"GPGST,{clock},,{sigma:.2f},,,{sigma:.2f},{sigma:.2f},{2 * sigma:.2f}",
     ]
     return b"".join(map(_sentence, sentences))

@@ -158,6 +158,8 @@ class _Session:
                 outputs = self.emit(clock, sent)
                 if queue.empty() or replay:
                     self.in_idle_time(outputs)
+            if not replay:  # what still waits for its pair or for its period
+                self.emit(END_NS, _gps_now_ns())
         except asyncio.CancelledError:
             self.save()
             raise
