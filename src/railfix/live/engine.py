@@ -211,10 +211,11 @@ class LiveEngine:
             self.told.append(f"state file: positioning continues {age_s:.1f} s after the last epoch of the file")
         else:
             self._state = State(received=saved.state.received)
-            allowed = f"0 to {self.settings.state_age_s:g} s (state_age_s) were allowed"
+            side = "before" if age_s > 0.0 else "after"
+            allowed = f"up to {self.settings.state_age_s:g} s before it (state_age_s) are allowed"
             self.told.append(
-                f"state file: not used but for ephemerides and the sequence number: its last epoch is {age_s:.1f} s "
-                f"before the first new one, {allowed}"
+                f"state file: not used but for ephemerides and the sequence number: its last epoch is "
+                f"{abs(age_s):.1f} s {side} the first new one, {allowed}"
             )
         # What was known from the start of this session counts beside what the file has.
         known = self.processor.received.navigation
