@@ -43,7 +43,7 @@ def read_observations(
     Parameters
     ----------
     path : path or sequence of path
-        RINEX observation files, or logs in UBX or RTCM 3 (other protocols between them are passed over),
+        RINEX observation files, or logs in UBX, SBF or RTCM 3 (other protocols between them are passed over),
         plain or packed. Several files are put in order of time; they are all of one of these two kinds.
     broken_lines, systems, start, end
         As `railfix.io.rinex.read_observations`. What is broken in a receiver log is always counted.

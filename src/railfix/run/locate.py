@@ -25,7 +25,7 @@ from railfix.run.sources import Log
 class LocateInputs(InputFiles):
     """Input files of `railfix locate`."""
 
-    log: tuple[Path, ...] = input_option("Observations of one receiver: RINEX, UBX, RTCM 3.", metavar="OBS")
+    log: tuple[Path, ...] = input_option("Observations of one receiver: RINEX, UBX, SBF, RTCM 3.", metavar="OBS")
     nav: tuple[Path, ...] = input_option("Navigation files.", metavar="NAV")
 
 
