@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 import railfix
 from railfix.cli import app
+from railfix.core.errors import OutputError
 from railfix.io.train_message import from_json
 from railfix.live.engine import EngineState
 from railfix.live.state import SavedSession, belongs_to, load_state, write_state
@@ -96,7 +97,8 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
         "settings": (kept, ["--set", "largest_sigma_m=19"], None, "was made with another settings"),
         "damaged": (kept[:-1], [], None, "is damaged or cut off"),
         "changed": (kept[:-1] + bytes([kept[-1] ^ 1]), [], None, "is damaged or cut off"),
-        "text": (b"hello", [], None, "is no state file"),
+        "empty": (b"", [], None, "is no state file of this version"),
+        "older": (kept.replace(b"live state 2", b"live state 1", 1), [], None, "is no state file of this version"),
     }
     for name, (content, words, track, says) in cases.items():
         path.write_bytes(content)
@@ -116,6 +118,15 @@ def test_a_state_that_does_not_belong_is_not_used(parts: dict[str, Path], tmp_pa
     assert "its last epoch is 2.9 s after the first new one, up to 60 s before it (state_age_s) are allowed" in told
 
 
+def test_a_file_that_is_no_state_is_not_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "notes.txt"
+    for content in (b"hello", b'{"form": "minutes"}', b"[1]"):
+        path.write_bytes(content)
+        with pytest.raises(OutputError, match="is no state file of railfix live, which would overwrite it"):
+            load_state(path, {})
+        assert path.read_bytes() == content
+
+
 class Evil:
     def __reduce__(self) -> tuple[object, tuple[str]]:
         import os
@@ -132,7 +143,7 @@ def test_only_values_of_the_package_are_read(tmp_path: Path) -> None:
     write_state(path, saved, under)
     assert load_state(path, under).session == saved
     content = pickle.dumps(Evil())
-    head = {"form": "railfix live state 1", **under, "bytes": len(content)}
+    head = {"form": "railfix live state 2", **under, "bytes": len(content)}
     head["sha256"] = hashlib.sha256(content).hexdigest()
     path.write_bytes(json.dumps(head).encode() + b"\n" + content)
     loaded = load_state(path, under)

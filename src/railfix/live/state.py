@@ -27,7 +27,7 @@ from railfix.core.settings import Settings
 from railfix.live.engine import EngineState
 from railfix.live.stream import ReceiverState
 
-_FORM: Final = "railfix live state 1"
+_FORM: Final = "railfix live state 2"
 #: Classes beside those of this package that a state consists of.
 _PLAIN: Final = {
     ("numpy", "dtype"),
@@ -103,7 +103,10 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 
 
 def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
-    """Read a state file, if there is one that belongs to this session (`belongs_to`)."""
+    """Read a state file, if there is one that belongs to this session (`belongs_to`).
+
+    OutputError: the file is something else, which the session would overwrite.
+    """
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -114,8 +117,11 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     try:
         head = json.loads(line)
     except ValueError:
-        return _refused(path, "is no state file")
-    if not isinstance(head, dict) or head.get("form") != _FORM:
+        head = None
+    form = str(head.get("form")) if isinstance(head, dict) else ""
+    if data and not form.startswith("railfix live state "):
+        raise OutputError(f"{path}: is no state file of railfix live, which would overwrite it; name another file")
+    if form != _FORM:
         return _refused(path, "is no state file of this version")
     for name, value in under.items():
         if head.get(name) != value:
