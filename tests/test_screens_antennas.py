@@ -33,7 +33,7 @@ from railfix.screens import (
     spacing_direction,
 )
 from railfix.screens.antenna_spacing import SCREEN
-from railfix.screens.base import Followed, PairedEpochs
+from railfix.screens.base import FilteredMotion, PairedEpochs
 from railfix.screens.pairs import on_pairs
 from railfix.tracking import TrackStatus
 
@@ -437,7 +437,7 @@ def test_places_by_the_filter_differ_by_more_than_the_limit_and_noise() -> None:
         along_m=np.full(4, -18.0),
     )
     place, sigma = np.array([100.0, 100.0, 100.0, np.nan]), np.array([1.0, 1.0, 5.0, 1.0]) / np.sqrt(2.0)
-    front = Followed(place, sigma, speed_mps=np.full(4, 10.0), speed_sigma_mps=np.full(4, 0.1))
+    front = FilteredMotion(place, sigma, speed_mps=np.full(4, 10.0), speed_sigma_mps=np.full(4, 0.1))
     rear = front._replace(chainage_m=np.array([118.0, 130.0, 130.0, 118.0]))
     found = SCREEN.judge_filtered(front, rear, pair, AntennaSpacingLimits())
     np.testing.assert_allclose(found.metric, [0.0, 12.0, 12.0, np.nan])

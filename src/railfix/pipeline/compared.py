@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from railfix.core.arrays import Floats
-from railfix.screens import AntennaRanges, Followed, PairedEpochs, PairScreen, PositionScreen, Screened, Verdict
+from railfix.screens import AntennaRanges, FilteredMotion, PairedEpochs, PairScreen, PositionScreen, Screened, Verdict
 from railfix.screens.pairs import on_pairs
 
 
@@ -33,7 +33,7 @@ class ChunkSteps(Protocol):
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """Take the verdicts of the screens of the published positions."""
 
-    def followed(self) -> Followed:
+    def filtered(self) -> FilteredMotion:
         """Filter along the track and return its places; NaN where the filter is off."""
 
     def check_filter(self, spacing: Screened | None) -> None:
@@ -69,7 +69,7 @@ def position_verdicts(
 
 
 def filter_verdicts(
-    screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, followed: Mapping[str, Followed]
+    screens: Sequence[tuple[Any, Any]], pair: PairedEpochs | None, filtered: Mapping[str, FilteredMotion]
 ) -> dict[str, Screened]:
     """Return the verdicts of the screens of positions on the places by the filter, by antenna."""
     checks: dict[str, Screened] = {}
@@ -77,8 +77,8 @@ def filter_verdicts(
         if pair is None or not isinstance(screen, PositionScreen):
             continue
         epochs = {"front": pair.front_epoch, "rear": pair.rear_epoch}
-        front, rear = (followed[name].take(rows) for name, rows in epochs.items())
+        front, rear = (filtered[name].take(rows) for name, rows in epochs.items())
         verdict = screen.judge_filtered(front, rear, pair, limits)
         for name, rows in epochs.items():
-            checks[name] = on_pairs(verdict, followed[name].chainage_m.shape, rows, rows)
+            checks[name] = on_pairs(verdict, filtered[name].chainage_m.shape, rows, rows)
     return checks

@@ -44,7 +44,7 @@ from railfix.ranges.sbas import SbasMessages
 from railfix.screens import (
     SCREENS,
     AntennaRanges,
-    Followed,
+    FilteredMotion,
     ObservationScreen,
     PairedEpochs,
     Screened,
@@ -279,7 +279,7 @@ class EpochProcessor:
         checks = position_verdicts(self._screens, pair, published)
         for name, chunk in chunks.items():
             chunk.check(checks.get(name, ()))
-        spacing = filter_verdicts(self._screens, pair, {name: chunk.followed() for name, chunk in chunks.items()})
+        spacing = filter_verdicts(self._screens, pair, {name: chunk.filtered() for name, chunk in chunks.items()})
         for name, chunk in chunks.items():
             chunk.check_filter(spacing.get(name))
 
@@ -381,14 +381,14 @@ class AntennaChunk:
             self._ranges = changed(self._ranges, screens=screens)
             self._solution = changed(self._solution, status=status)
 
-    def followed(self) -> Followed:
+    def filtered(self) -> FilteredMotion:
         """Filter along the track and return its places; NaN where the filter is off."""
         assert self._solution is not None, "solved() comes first"
         processor, trajectory = self._processor, self._processor.trajectories[self._name]
         result = self._result = antenna_result(self._ranges, trajectory, self._solution, processor.config)
         if processor.config.filter == "off":
             nowhere = np.full(len(result), np.nan)
-            return Followed(nowhere, nowhere, nowhere, nowhere)
+            return FilteredMotion(nowhere, nowhere, nowhere, nowhere)
         self.tracked, self.filter_state = along_track(
             self._ranges,
             self._single_epochs(result),
@@ -400,7 +400,7 @@ class AntennaChunk:
             surroundings=processor.surroundings(self._name, self._sensors),
         )
         found = self.tracked.tracked
-        return Followed(self.tracked.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
+        return FilteredMotion(self.tracked.chainage_m, found.sigma_m, found.speed_mps, found.speed_sigma_mps)
 
     def check_filter(self, spacing: Screened | None) -> None:
         """Take the verdict on the distance and speeds of those places; None where they were not looked at."""
@@ -410,7 +410,7 @@ class AntennaChunk:
 
     def finished(self) -> AntennaResult:
         """Return the result of the chunk."""
-        assert self._result is not None, "followed() comes first"
+        assert self._result is not None, "filtered() comes first"
         return self._result
 
     def _single_epochs(self, result: AntennaResult) -> SingleEpochs:

@@ -37,7 +37,7 @@ from railfix.run.output import OutputFolder
 from railfix.run.sensors import until
 from railfix.run.sources import Log
 from railfix.run.tally import AntennaTally
-from railfix.screens import AntennaRanges, Followed, Screened, Verdict
+from railfix.screens import AntennaRanges, FilteredMotion, Screened, Verdict
 from railfix.tracking import Line
 
 if TYPE_CHECKING:
@@ -132,9 +132,9 @@ class AntennaRun:
         """See `ChunkSteps`."""
         self.chunk.check(verdicts)
 
-    def followed(self) -> Followed:
+    def filtered(self) -> FilteredMotion:
         """See `ChunkSteps`."""
-        return self.chunk.followed()
+        return self.chunk.filtered()
 
     def check_filter(self, spacing: Screened | None) -> None:
         """See `ChunkSteps`."""
@@ -269,12 +269,12 @@ class OtherProcess:
     def check(self, verdicts: Iterable[PositionVerdict]) -> None:
         """See `ChunkSteps`."""
         self._ask("check", tuple(verdicts))
-        self._ask("followed")
+        self._ask("filtered")
 
-    def followed(self) -> Followed:
+    def filtered(self) -> FilteredMotion:
         """See `ChunkSteps`."""
-        followed: Followed = self._answer()
-        return followed
+        filtered: FilteredMotion = self._answer()
+        return filtered
 
     def check_filter(self, spacing: Screened | None) -> None:
         """See `ChunkSteps`."""
@@ -338,7 +338,7 @@ def _serve(pipe: Connection, other_end: Connection, make: Callable[[], AntennaRu
             elif step == "screened":
                 shown = {item.name: getattr(answer, item.name) for item in fields(AntennaRanges)}
                 pipe.send((step, AntennaRanges(**shown)))
-            elif step in ("solved", "followed", "finished", "smoothed"):
+            elif step in ("solved", "filtered", "finished", "smoothed"):
                 pipe.send((step, answer))
                 if step == "finished":
                     run.read_ahead()

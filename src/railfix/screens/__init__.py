@@ -17,7 +17,7 @@ from railfix.screens.antenna_pair import (
 from railfix.screens.antenna_spacing import AntennaSpacingLimits, antenna_spacing_screen
 from railfix.screens.base import (
     AntennaRanges,
-    Followed,
+    FilteredMotion,
     ObservationScreen,
     PairedEpochs,
     PairScreen,
@@ -50,7 +50,7 @@ __all__ = [
     "DopplerScreened",
     "DopplerState",
     "ElevationLimits",
-    "Followed",
+    "FilteredMotion",
     "ObservationScreen",
     "PairScreen",
     "PairedEpochs",

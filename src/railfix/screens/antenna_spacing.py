@@ -16,7 +16,7 @@ from railfix.core.arrays import Floats
 from railfix.core.reasons import Status
 from railfix.core.settings import Settings
 from railfix.screens.base import (
-    Followed,
+    FilteredMotion,
     PairedEpochs,
     PositionScreen,
     RunTables,
@@ -114,14 +114,14 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
         )
 
     def judge_filtered(
-        self, front: Followed, rear: Followed, pair: PairedEpochs, limits: AntennaSpacingLimits
+        self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: AntennaSpacingLimits
     ) -> Screened:
         """Return metric and verdict of pairs by the filter: places or speeds beyond limit and noise."""
         found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
         apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)
-        faster = np.abs(front.speed_mps - rear.speed_mps)
-        unequal = faster > limits.filter_sigmas * np.hypot(front.speed_sigma_mps, rear.speed_sigma_mps)
-        reject = (found.reject & apart) | ((faster > limits.filter_speed_mps) & unequal)
+        difference = np.abs(front.speed_mps - rear.speed_mps)
+        beyond_noise = difference > limits.filter_sigmas * np.hypot(front.speed_sigma_mps, rear.speed_sigma_mps)
+        reject = (found.reject & apart) | ((difference > limits.filter_speed_mps) & beyond_noise)
         return Screened(metric=found.metric, reject=reject)
 
     def pictures(self, tables: RunTables, limits: AntennaSpacingLimits) -> Iterator[tuple[str, ScreenPicture]]:

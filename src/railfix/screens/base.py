@@ -296,7 +296,7 @@ class PairScreen(_OfTwoAntennas[Limits]):
         """Return the verdicts on a chunk by antenna, "front" and "rear"."""
 
 
-class Followed(NamedTuple):
+class FilteredMotion(NamedTuple):
     """Places [m] and speeds [m/s] of one antenna by the filter along the track, NaN without one, shape (T,)."""
 
     chainage_m: Floats
@@ -304,9 +304,9 @@ class Followed(NamedTuple):
     speed_mps: Floats
     speed_sigma_mps: Floats
 
-    def take(self, epochs: Indices) -> Followed:
+    def take(self, epochs: Indices) -> FilteredMotion:
         """Return those of some epochs."""
-        return Followed(*(values[epochs] for values in self))
+        return FilteredMotion(*(values[epochs] for values in self))
 
 
 class PositionScreen(_OfTwoAntennas[Limits]):
@@ -325,5 +325,7 @@ class PositionScreen(_OfTwoAntennas[Limits]):
         """Return metric and verdict of the P pairs of positions, chainages of shape (P,) [m]."""
 
     @abstractmethod
-    def judge_filtered(self, front: Followed, rear: Followed, pair: PairedEpochs, limits: Limits) -> Screened:
+    def judge_filtered(
+        self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: Limits
+    ) -> Screened:
         """Return the same for the P pairs of places and speeds by the filter along the track."""

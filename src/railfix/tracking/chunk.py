@@ -25,7 +25,7 @@ FORGOTTEN: Final = 3.0
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """T epochs of K channels and S errors of satellites.
+    """T epochs of K channels and S errors of satellites; `has` and `variance` of codes are settled epoch by epoch.
 
     Attributes
     ----------
@@ -47,8 +47,8 @@ class Chunk:
         Where it is finite.
     variance : ndarray, shape (3, T, K)
         Of their white errors, before the scales learnt from residuals; of codes the mean over a second.
-    moving : ndarray of bool, shape (T,)
-        Epochs with so many phases or Dopplers that the filter can go on by them.
+    motion_measured : ndarray of bool, shape (T,)
+        Epochs with phases or Dopplers of at least four satellites: they carry the place on without codes.
     code_sigma_m : ndarray, shape (T, K) [m]
         Of the satellite's correlated error.
     fresh : ndarray of bool, shape (T, S)
@@ -71,7 +71,7 @@ class Chunk:
     measured: Floats
     has: Masks
     variance: Floats
-    moving: Masks
+    motion_measured: Masks
     code_sigma_m: Floats
     fresh: Masks
     off_map: Masks
@@ -133,7 +133,7 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
                 limits.doppler_floor_mps**2 + limits.doppler_zenith_mps**2 * weak,
             ]
         ),
-        moving=np.asarray(np.count_nonzero(has[1:], axis=2).max(axis=0) >= _MOTION),
+        motion_measured=np.asarray(np.count_nonzero(has[1:], axis=2).max(axis=0) >= _MOTION),
         code_sigma_m=epochs.code_sigma_m,
         fresh=fresh & ~kept,
         off_map=epochs.off_map,
@@ -142,21 +142,21 @@ def prepared(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> C
 
 
 def code_interval_s(chunk: Chunk, epoch: int, coded: np.datetime64, limits: TrackingLimits) -> float:
-    """Time that the codes of an epoch stand for [s]; 0 where they do not count, being those of the last ones' second.
+    """Return the time that an epoch's codes represent [s]; 0 where they are not used, as others were within the period.
 
     Parameters
     ----------
     chunk : Chunk
     epoch : int
     coded : datetime64[ns]
-        Last epoch whose codes counted; NaT before the first and after a restart.
+        Last epoch whose codes were used; NaT before the first and after a restart.
     limits : TrackingLimits
     """
     dt = float(chunk.interval_s[epoch])
     if not chunk.has[0, epoch].any():
         return dt
     since = float("inf") if np.isnat(coded) else float(seconds(chunk.time[epoch] - coded))
-    if chunk.moving[epoch] and since < limits.code_period_s - 0.5 * dt:
+    if chunk.motion_measured[epoch] and since < limits.code_period_s - 0.5 * dt:
         return 0.0
     return min(max(since, dt), max(limits.code_period_s, dt))
 

@@ -42,7 +42,7 @@ class Epochs(NamedTuple):
     measured: Floats
     has: Masks
     variance: Floats
-    moving: Masks
+    motion_measured: Masks
     code_sigma_m: Floats
     fresh: Masks
     remembered: Masks

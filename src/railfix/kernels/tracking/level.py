@@ -28,7 +28,7 @@ from railfix.kernels.tracking.layout import (
     Work,
 )
 from railfix.kernels.tracking.prediction import add_bend, predict
-from railfix.kernels.tracking.update import apply_update, first_weights, reweight
+from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight
 
 
 @borrowing
@@ -107,18 +107,8 @@ def _update(
 @borrowing
 def _contradicted(rows: Rows, numbers: Numbers, work: Work, h: int) -> bool:
     """Return whether the measurements that a sub-filter uses, codes or phases and Dopplers, have lost their weight."""
-    nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
-    weak = False
-    for part in range(2):
-        first, last = (0, nc) if part == 0 else (nc, gnss)
-        total, used = 0.0, 0
-        for i in range(first, last):
-            if work.masked[i] < math.inf:
-                total += work.weight[h, i]
-                used += 1
-        least = numbers.lost_code_weight if part == 0 else numbers.lost_motion_weight
-        weak = weak or (used > 0 and total < least * used)
-    return weak
+    code, motion = mean_weights(rows, work.masked, work, h)
+    return code < numbers.lost_code_weight or motion < numbers.lost_motion_weight
 
 
 @borrowing

@@ -46,7 +46,7 @@ from railfix.kernels.tracking.level import advance_subfilters, level_of, speed_b
 from railfix.kernels.tracking.misfit import code_shift, learn_map
 from railfix.kernels.tracking.possible_speed import possible
 from railfix.kernels.tracking.prediction import add_bend, predict
-from railfix.kernels.tracking.update import apply_update, doubtful_fit, first_weights, reweight, second_start
+from railfix.kernels.tracking.update import apply_update, first_weights, mean_weights, reweight, second_start
 
 
 @borrowing
@@ -71,7 +71,7 @@ def _code_interval_s(epochs: Epochs, t: int, numbers: Numbers, memory: Memory) -
         coded = coded or epochs.has[0, t, k]
     if not coded:
         return float(dt)
-    recent = epochs.moving[t] and since < numbers.code_period_s - 0.5 * dt
+    recent = epochs.motion_measured[t] and since < numbers.code_period_s - 0.5 * dt
     code_s = 0.0 if recent else min(max(since, dt), max(numbers.code_period_s, dt))
     for k in range(epochs.has.shape[2]):
         if recent:
@@ -238,7 +238,9 @@ def _update(
                 if h == going and nc >= numbers.misfit_codes:
                     shift = code_shift(rows, numbers.misfit_clipped, work, h)
             work.log_after[h] = reweight(rows, work.variance, numbers.degrees, numbers.passes, work, h, h, h)
-            doubtful = doubtful or (turn == 0 and doubtful_fit(numbers, rows, work, h))
+            if turn == 0:
+                code, motion = mean_weights(rows, work.variance, work, h)
+                doubtful = doubtful or code < numbers.doubtful or motion < numbers.doubtful
         for h in range(count):
             if turn == 0 and doubtful:
                 second_start(numbers, rows, work, h, room)
@@ -281,15 +283,7 @@ def _learn(
                 total += weight[best, i] * square / work.variance[i]
             scalars[scalar] += share * math.log(total / (end - begin))
         scalars[scalar] = min(max(scalars[scalar], numbers.least_scale), numbers.largest_scale)
-    code, motion = math.nan, math.nan
-    if nc:
-        code = 0.0
-        for i in range(nc):
-            code += weight[best, i] / nc
-    if gnss > nc:
-        motion = 0.0
-        for i in range(nc, gnss):
-            motion += weight[best, i] / (gnss - nc)
+    code, motion = mean_weights(rows, work.variance, work, best)
     scalars[WEAK_MOTION] = scalars[WEAK_MOTION] + dt if motion < numbers.lost_motion_weight else 0.0
     if code_s > 0.0:
         scalars[WEAK_CODE] = scalars[WEAK_CODE] + code_s if code < numbers.lost_code_weight else 0.0

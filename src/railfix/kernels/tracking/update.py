@@ -173,17 +173,19 @@ def evidence_of(rows: Rows, degrees: tuple[float, float], log_after: float, work
 
 
 @borrowing
-def doubtful_fit(numbers: Numbers, rows: Rows, work: Work, h: int) -> bool:
-    """Return whether codes, or phases and Dopplers, have lost so much weight that a second start is worth trying."""
+def mean_weights(rows: Rows, variance: Floats, work: Work, h: int) -> tuple[float, float]:
+    """Return the mean weight of codes, and of phases and Dopplers, of finite variance; NaN without any."""
     nc, gnss = rows.counts[0], rows.counts[0] + rows.counts[1] + rows.counts[2]
-    doubtful = False
-    for part in range(2):
-        first, last = (0, nc) if part == 0 else (nc, gnss)
-        total = 0.0
-        for i in range(first, last):
-            total += work.weight[h, i]
-        doubtful = doubtful or (last > first and total / (last - first) < numbers.doubtful)
-    return doubtful
+    code, motion, codes, motions = 0.0, 0.0, 0, 0
+    for i in range(gnss):
+        if variance[i] < math.inf:
+            if i < nc:
+                code += work.weight[h, i]
+                codes += 1
+            else:
+                motion += work.weight[h, i]
+                motions += 1
+    return code / codes if codes else math.nan, motion / motions if motions else math.nan
 
 
 @borrowing
