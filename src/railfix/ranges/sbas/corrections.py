@@ -30,8 +30,9 @@ from railfix.ranges.sbas.satellites import (
 from railfix.ranges.sbas.standard import (
     DO_NOT_USE,
     INFLATION_M,
-    KEPT_S,
+    LEANT_ON,
     NOT_MONITORED,
+    OLDEST_S,
     STOP_S,
     UDRE_VARIANCE_M2,
     SbasLimits,
@@ -348,7 +349,6 @@ class SbasState:
     def kept_from(self, time: np.datetime64) -> SbasState:
         """The state without the messages that no epoch from `time` on can use."""
         kind, age = self.messages.type, seconds(time - self.messages.time)
-        kept = age <= np.where(kind == 27, 2.0 * self.limits.timeout_s("service"), KEPT_S)
-        # The covariance constant of type 10 has no time-out.
-        kept[np.flatnonzero((kind == 10) & (age >= 0.0))[-1:]] = True
+        oldest = np.where(kind == 27, self.limits.timeout_s("service"), OLDEST_S + 1.0)
+        kept = age <= np.where(np.isin(kind, (*LEANT_ON, 27)), 2.0 * oldest, oldest)
         return self if kept.all() else replace(self, messages=self.messages.take(kept))

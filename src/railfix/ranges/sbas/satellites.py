@@ -17,7 +17,6 @@ from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import (
     FAST_DEGRADATION_MPS2,
     FAST_TIMEOUT_S,
-    LONGEST_FAST_S,
     SERVICE_FACTOR,
     TIMEOUT_S,
     SbasLimits,
@@ -89,7 +88,7 @@ def fast_in_force(
     age, udre_age = seconds(time - udre["grows_from"][of_udre]), seconds(time - udre.time[of_udre])
     late = (age > timeout[indicator]) | (udre_age > limits.timeout_s("udrei"))
     own_age = seconds(time - fast.time[row])
-    late |= ~tables.masks.active(fast["iodp"][row], time) | (own_age > LONGEST_FAST_S)
+    late |= ~tables.masks.active(fast["iodp"][row], time)
     since = own_age + limits.message_s
     rate, growth, span, no_rate = _rate(fast, limits, row, stop, indicator, timeout[shortest], since)
     precision = np.array(FAST_TIMEOUT_S["precision"], dtype=np.float64)

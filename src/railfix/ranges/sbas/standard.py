@@ -136,10 +136,11 @@ NOT_MONITORED: Final = 14
 DO_NOT_USE: Final = 15
 #: A message of type 0 stops the use of its sender for so long [s] (DO-229D, A.4.4.1).
 STOP_S: Final = 60.0
-#: No fast correction older than this is used, however long type 6 renews its UDREI [s].
-LONGEST_FAST_S: Final = 3600.0
-#: For so long a message can matter: as a correction, and as the mask or the earlier correction of one [s].
-KEPT_S: Final = 2.0 * LONGEST_FAST_S
+#: No message older than this counts, however long type 6 renews a fast correction: the longest time-out but for regions
+#: of service [s].
+OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
+#: Types that matter for another such time, to messages that came after them: stops and masks.
+LEANT_ON: Final = (0, 1, 18)
 #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 INFLATION_M: Final = 8.0
 

@@ -24,7 +24,7 @@ from railfix.ranges.sbas.decode import (
     prn_masks,
 )
 from railfix.ranges.sbas.messages import SbasMessages
-from railfix.ranges.sbas.standard import NOT_MONITORED, SbasLimits
+from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S, SbasLimits
 
 #: Before every message.
 LONG_AGO: Final = GPS_EPOCH
@@ -33,6 +33,7 @@ ALARM: Final = 3
 #: Longest time that is resolved [ms]: 278 years, all that `datetime64[ns]` reaches.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
+_OLDEST_MS: Final = np.int64(1000.0 * OLDEST_S)
 #: Series of the placeholder row of an empty table, which no search asks for.
 _NO_SERIES: Final = 2**19
 
@@ -90,7 +91,7 @@ class Series:
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
-        """Newest row of each series at or before each instant; -1 where there is none.
+        """Newest row of each series at or before each instant; -1 where there is none, or none younger than `OLDEST_S`.
 
         Parameters
         ----------
@@ -101,8 +102,9 @@ class Series:
         """
         since = (time - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64) // _MS
         wanted_series, wanted_time = np.broadcast_arrays(series, np.clip(since, 0, _SPAN - 1))
-        at = np.searchsorted(self.key, wanted_series * _SPAN + wanted_time, side="right") - 1
-        known = (at >= 0) & (wanted_series >= 0) & (self.series[np.maximum(at, 0)] == wanted_series)
+        wanted = wanted_series * _SPAN + wanted_time
+        at = np.searchsorted(self.key, wanted, side="right") - 1
+        known = (at >= 0) & (wanted_series >= 0) & (wanted - self.key[np.maximum(at, 0)] <= _OLDEST_MS)
         return np.where(known, at, -1).astype(np.int64)
 
     def received(self, row: Integers) -> Datetimes:
