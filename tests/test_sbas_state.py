@@ -118,3 +118,14 @@ def test_a_fast_correction_is_not_used_after_twenty_minutes_however_often_type_6
     time = cases.START + np.array([1200, 1202, 1203], dtype="timedelta64[s]").astype("timedelta64[ns]")
     found = corrections.satellites(time, np.array(["G01"])).state[:, 0]
     assert found.tolist() == [SatelliteState.OK, SatelliteState.OK, SatelliteState.NO_FAST]
+
+
+def test_notes_count_what_a_whole_log_leaves_out_and_do_not_change_with_every_message() -> None:
+    """What is counted within the messages kept so far would be told anew as they come and go."""
+    log = cases.message_log(
+        [(1.0, 0, cases.mask(0, [1])), (2.0, 0, cases.integrity(0, [3])), (9.0, 0, cases.integrity(0, [3]))]
+    )
+    asked = SbasState(prn=137).corrections.notes
+    assert SbasState(prn=137).received(log).corrections.notes == asked
+    first, *rest = SbasCorrections.from_log(log, prn=137).notes[-2:]
+    assert (first, rest) == (asked[0], ["PRN 137: 2 UDREI of type 6 without a fast correction of their IODF, not used"])

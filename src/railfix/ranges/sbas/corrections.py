@@ -85,7 +85,7 @@ class SbasCorrections:
     prn : int
     limits : SbasLimits
     notes : tuple of str
-        Corrections asked for and used, one sentence each.
+        Corrections asked for and used, one sentence each; of a whole log (`from_log`) also what of it is not used.
     span : tuple of datetime64[ns]
         Reception of the first and the last message of that GEO; NaT without messages.
     unused : mapping of str to int
@@ -107,7 +107,7 @@ class SbasCorrections:
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
-        self.notes = (*notes, *self._notes(of_prn))
+        self.notes: tuple[str, ...] = (*notes, self._settings_note())
 
     @classmethod
     def from_log(
@@ -127,19 +127,25 @@ class SbasCorrections:
             choice = f"SBAS PRN {prn} was asked for; the log has {known}"
         else:
             raise ValueError(f"the log has no SBAS message of PRN {prn}; it has {known}")
-        return cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
+        corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
+        corrections.notes += tuple(corrections._left_out(messages.of(prn)))
+        return corrections
 
-    def _notes(self, messages: SbasMessages) -> list[str]:
+    def _settings_note(self) -> str:
         limits = self.limits
-        notes = [
+        return (
             f"SBAS corrections of {system_name(self.prn)} PRN {self.prn}: time-outs of "
             f"{limits.mode.replace('_', ' ')}, UDREI up to {limits.largest_udrei}, type 0 "
             f"{limits.type0.replace('_', ' ')}, range rate {limits.range_rate}, incomplete degradation data "
             f"{limits.incomplete}"
-        ]
+        )
+
+    def _left_out(self, messages: SbasMessages) -> list[str]:
+        """Notes on what of a whole log is not used."""
+        notes = []
         zeros = int((messages.type == 0).sum())
         if zeros:
-            used = "read as type 2" if limits.type0 == "as_type2" else "each stopped the GEO for 60 s"
+            used = "read as type 2" if self.limits.type0 == "as_type2" else "each stopped the GEO for 60 s"
             notes.append(f"PRN {self.prn} sent {zeros} messages of type 0 (do not use for safety): {used}")
         notes += [f"PRN {self.prn}: {number} {kind}, not used" for kind, number in self.unused.items()]
         return notes
